@@ -82,6 +82,14 @@ def say(text: str) -> None:
         print(escaped(text), file=sys.stderr, flush=True)
 
 
+def say_heights(rows: Sequence[Row]) -> None:
+    """Name the CRS of the world coordinates that rows show, and the unit and zero of their heights."""
+    for crs, heights in dict.fromkeys((getattr(row, "crs", None), getattr(row, "heights", None)) for row in rows):
+        if heights is None:
+            continue
+        say(f"world coordinates are in {crs}; heights are {heights}")
+
+
 # --- data ------------------------------------------------------------------------------------------------------------
 
 

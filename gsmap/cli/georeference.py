@@ -30,7 +30,11 @@ def command(
     ] = None,
     exif: Annotated[
         str | None,
-        typer.Option("--exif", metavar="DIR", help="Photos of the captures whose EXIF says where they were taken."),
+        typer.Option(
+            "--exif",
+            metavar="DIR",
+            help="Photos of the captures with positions in EXIF, in folders called as the scenes where names repeat.",
+        ),
     ] = None,
     scale_bar: Annotated[
         tuple[str, str, float] | None,
@@ -107,13 +111,13 @@ def command(
 def _print(map: str, report: WorldReport) -> None:
     from gsmap.types.rows import ResidualRow, TieRow
 
-    heights = "of the CRS" if report.own_heights else "above the ellipsoid"
-    origin = (
-        None if report.origin is None else f"{report.origin[0]:.4f} N, {report.origin[1]:.4f} E, {report.origin[2]:g} m"
-    )
+    origin = None
+    if report.origin is not None:
+        latitude, longitude, height = report.origin
+        origin = f"{latitude:.4f} N, {longitude:.4f} E, {height:g} m above the ellipsoid"
     facts = {
         "CRS": None if report.crs is None else f"{report.crs} ({report.crs_name})",
-        "heights": None if report.crs is None else heights,
+        "heights": report.heights or None,
         "frame": None if origin is None else f"metres east, north, up at {origin}",
         "unseen points": ", ".join(report.unseen),
         "stale": f"observations have changed: run gsmap optimize {map}" if report.stale else None,

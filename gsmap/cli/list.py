@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, AsOf, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, AsOf, MapPath, opened, print_rows, say, say_heights
 
 if TYPE_CHECKING:
     from gsmap.map import Map
@@ -57,6 +57,8 @@ def command(
     if left_out:
         say(left_out)
     print_rows(f"list {what}", rows, json, what)
+    if what is What.scenes and not json:
+        say_heights(rows)
 
 
 def _rows(

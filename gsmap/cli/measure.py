@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table, say, say_heights
 
 TAKES_POINTS = True
 _POINT = "X,Y,Z in the map; SCENE:X,Y,Z; SCENE:CAMERA@COLUMN,ROW; world:X,Y,Z or EPSG:N:X,Y,Z."
@@ -39,3 +39,4 @@ def command(
         return
     print(f"{report.distance_m:.4f} m +- {report.sigma_m:.2g} m ({report.known_by})")
     print_table("points", PlaceRow.columns, [report.a, report.b])
+    say_heights([report] if report.a.world is not None or report.b.world is not None else [])

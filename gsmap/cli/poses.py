@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say, say_heights
 
 
 def command(
@@ -48,3 +48,5 @@ def command(
                 say(f"wrote {path}")
     if json or out is None:
         print_rows("poses", rows, json)
+    if not json:
+        say_heights(rows)

@@ -3,8 +3,9 @@
 The first line names the coordinate reference system: ``EPSG:25832``, a PROJ string (``+proj=utm +zone=32 ...``), or
 ``WGS84 UTM 32N``. Every other line is a control point in one photo, ``geo_x geo_y geo_z im_x im_y image_name
 [gcp_name] [more]``, parted by spaces or tabs: easting or longitude first, height, then column and row in pixels from
-the image's upper left corner. Lines that begin with ``#``, and empty ones, say nothing. Points without a name are
-those of one place; images may have spaces in their names where tabs part the line.
+the image's upper left corner. Lines that begin with ``#``, and empty ones, are skipped, and so is what follows a ``#``
+on the first line. A point without a name is that of its place, however that is written. In a line parted by spaces an
+image's name, which may have spaces, ends with its suffix; where that is not clear, tabs must part the line.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ from __future__ import annotations
 import math
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmap.errors import InputError, NotFoundError
 
 _MOST_BYTES = 64 << 20
-_UTM = re.compile(r"WGS ?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+_UTM = re.compile(r"WGS ?84\s+UTM\s*(\d{1,2})\s*([NS])", re.IGNORECASE)
+_IMAGE_END = re.compile(r"\.(?:jpe?g|png|tiff?|webp|bmp|jp2|hei[cf]|dng|arw|cr[23]|nef|raw|exr)(?=\s|$)", re.IGNORECASE)
 _NUMBERS = ("geo_x", "geo_y", "geo_z", "im_x", "im_y")
 
 
@@ -32,6 +34,7 @@ class GcpLine:
         position: x, y, z in the file's system.
         pixel: column, row.
         image: name of the photo.
+        is_named: whether the file names the point.
     """
 
     line: int
@@ -39,6 +42,7 @@ class GcpLine:
     position: tuple[float, float, float]
     pixel: tuple[float, float]
     image: str
+    is_named: bool = True
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,9 @@ def parse(text: str, where: str = "gcp_list") -> GcpList:
     rows = [(number, line) for number, line in rows if line and not line.startswith("#")]
     if not rows:
         raise InputError(f"{where} is empty: its first line names the coordinate system, such as EPSG:25832")
-    crs = _crs(rows[0][1], f"{where}, line {rows[0][0]}")
+    crs = _crs(re.sub(r"\s+#.*", "", rows[0][1]), f"{where}, line {rows[0][0]}")
     found = [_line(number, line, f"{where}, line {number}") for number, line in rows[1:]]
+    found = _with_names(found, [line for _, line in rows[1:]])
     if not found:
         raise InputError(f"{where} names no control point: each line is geo_x geo_y geo_z im_x im_y image [name]")
     places: dict[str, GcpLine] = {}
@@ -124,13 +129,21 @@ def _crs(line: str, where: str) -> str:
 
 
 def _line(number: int, line: str, where: str) -> GcpLine:
-    parts = line.split("\t") if line.count("\t") >= 5 else line.split()
+    parts = line.split("\t") if line.count("\t") >= 5 else line.split(None, 5)
     parts = [part.strip() for part in parts]
+    if not _is_number(parts[0]):
+        raise InputError(
+            f"{where} has {len(line.split())} fields and begins with {parts[0][:40]!r}, which is no finite number: a "
+            "line is geo_x geo_y geo_z im_x im_y image_name [gcp_name], with pixels and photo, and the point's "
+            "name last"
+        )
     if len(parts) < 6:
         raise InputError(
             f"{where} has {len(parts)} of the fields geo_x geo_y geo_z im_x im_y image_name [gcp_name]: "
             + ("the height is missing" if len(parts) == 5 and not _is_number(parts[4]) else "some are missing")
         )
+    if line.count("\t") < 5:
+        parts[5:] = _image_and_name(parts[5], where)
     values = []
     for name, part in zip(_NUMBERS, parts, strict=False):
         if not _is_number(part):
@@ -138,9 +151,29 @@ def _line(number: int, line: str, where: str) -> GcpLine:
         values.append(float(part))
     if not parts[5]:
         raise InputError(f"{where} names no photo")
-    name = parts[6] if len(parts) > 6 and parts[6] else "_".join(parts[:3])
+    name = parts[6] if len(parts) > 6 else ""
     x, y, z, u, v = values
     return GcpLine(number, name, (x, y, z), (u, v), parts[5])
+
+
+def _image_and_name(text: str, where: str) -> list[str]:
+    """The name of an image, which may have spaces, and that of the point where there is one."""
+    ends = [found.end() for found in _IMAGE_END.finditer(text)]
+    words = [text[: ends[0]], *text[ends[0] :].split()[:1]] if ends else text.split()
+    # What looks like the number of a copy, "DJI_0001 (2)", is no point's name.
+    if len(ends) > 1 or (not ends and len(words) > 2) or (len(words) == 2 and re.fullmatch(r"\(\d+\)", words[1])):
+        raise InputError(
+            f"{where}: it is not clear where the photo's name ends in {text[:60]!r}: part the fields with tabs"
+        )
+    return words
+
+
+def _with_names(found: list[GcpLine], lines: list[str]) -> list[GcpLine]:
+    """Name points without a name: as another line names their place, else by their place as it is first written."""
+    named = {one.position: one.name for one in reversed(found) if one.name}
+    for one, line in zip(found, lines, strict=True):
+        named.setdefault(one.position, "_".join(line.split(None, 3)[:3]))
+    return [one if one.name else replace(one, name=named[one.position], is_named=False) for one in found]
 
 
 def _is_number(text: str) -> bool:

@@ -74,8 +74,9 @@ from gsmap.types.rows.localize_scan import ScanRow
 
 if TYPE_CHECKING:
     from gsmap.map.objects import Known
+    from gsmap.map.placed_photos import Localise
     from gsmap.map.settings import Settings
-    from gsmap.map.stages.georeference import Localise, Request
+    from gsmap.map.stages.georeference import Request
     from gsmap.map.stages.register import Pairs
     from gsmap.view import ViewServer
 
@@ -1059,9 +1060,11 @@ class Map(AbstractContextManager["Map"]):
             with at_work(self.store, "georeference"):
                 if remove is not None:
                     notes = (f"{take_back(self.store, remove)} observations were taken back",)
+                solution = None
                 if request is not None:
-                    notes += georeference(self.store, request, self.settings, localise)
-                solve(self.store, self.settings, self._progress)
+                    told, solution = georeference(self.store, request, self.settings, localise)
+                    notes += told
+                solve(self.store, self.settings, self._progress, solution)
         return reports.world_report(self.store, stale=not is_solved(self.store, self.settings), notes=notes)
 
     def set_world_position(

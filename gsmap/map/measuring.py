@@ -80,8 +80,20 @@ def measure(
     rows = [_row(solved, one, frame, crs) for one in placed]
     named = crs or (frame.crs if frame else None)
     sigma = float(np.sqrt(max(0.0, variance)))
+    heights = None
+    if named is not None:
+        from gsmap.world.crs import crs as crs_of
+
+        heights = crs_of(named).heights
     return MeasureReport(
-        distance_m=distance, sigma_m=sigma, known_by=known_by, a=rows[0], b=rows[1], crs=named, notes=tuple(notes)
+        distance_m=distance,
+        sigma_m=sigma,
+        known_by=known_by,
+        a=rows[0],
+        b=rows[1],
+        crs=named,
+        heights=heights,
+        notes=tuple(notes),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,9 +12,30 @@ import numpy as np
 
 from gsmap.errors import NotFoundError
 from gsmap.geometry.transforms import transform_poses
-from gsmap.map.stages.georeference import Localise, PlacedPhoto
 from gsmap.store import Store
 from gsmap.types import ScenePose
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPhoto:
+    """A photo that is no scene's camera, but was localised in one.
+
+    Args:
+        scene: id of the scene that it was localised by.
+        T_scene_camera: (4, 4).
+        intrinsics_px: (4,) ``fx fy cx cy``. size_px: (2,) width, height.
+        covariance: (6, 6) over [rotation (3, rad), translation (3, scene unit)] on the camera's side.
+    """
+
+    scene: str
+    T_scene_camera: np.ndarray
+    intrinsics_px: np.ndarray
+    size_px: tuple[int, int]
+    covariance: np.ndarray
+
+
+Localise = Callable[[Sequence[str]], dict[str, PlacedPhoto]]
+"""Photos by their names as the files have them, to those that were placed; the others are left out."""
 
 
 class Localised(Protocol):

@@ -6,6 +6,7 @@ import numpy as np
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rays import surface_along
+from gsmap.map.photo_names import rows_of_photo
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians
 
@@ -16,24 +17,14 @@ def camera_of(cameras: Cameras, name: str, scene_name: str) -> Cameras:
     Raises:
         NotFoundError: none, or several.
     """
-    exact = [k for k, known in enumerate(cameras.names) if known == name]
-    found = exact or [k for k, known in enumerate(cameras.names) if _stem(known) == _stem(name)]
+    found = rows_of_photo(cameras.names, name)
     if len(found) != 1:
         what = f"{len(found)} cameras" if found else "no camera"
-        some = ", ".join(cameras.names[:3])
-        raise NotFoundError(f"scene {scene_name} has {what} called {name!r}: its first ones are {some}")
+        some = ", ".join([cameras.names[row] for row in found[:3]] or cameras.names[:3])
+        raise NotFoundError(
+            f"scene {scene_name} has {what} called {name!r}: {'such as' if found else 'its first ones are'} {some}"
+        )
     return cameras[found]
-
-
-def _stem(name: str) -> str:
-    base = name.replace("\\", "/").rsplit("/", 1)[-1]
-    stem, dot, suffix = base.rpartition(".")
-    return stem if dot and stem and len(suffix) <= 5 and not suffix.isdigit() else base
-
-
-def same_photo(known: str, name: str) -> bool:
-    """Whether a camera's name and a photo's are of one photo."""
-    return known == name or _stem(known) == _stem(name)
 
 
 def surface_at(

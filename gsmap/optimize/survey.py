@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
+from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.gtsam_solve import held_directions
 from gsmap.optimize.measurements import all_rigid, measurements
@@ -24,7 +25,7 @@ from gsmap.optimize.survey_report import active_of, lengths_only, report, world_
 from gsmap.optimize.survey_system import Active, Component, Factor, System, Tests
 from gsmap.optimize.survey_terms import SurveyTerms, Terms, Unknowns
 from gsmap.types import Edge, PoseGraph, Prior, Sim3
-from gsmap.types.world import Survey, WorldFrame, WorldTie
+from gsmap.types.world import UNSOLVED, Survey, WorldFrame, WorldTie
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,14 +57,34 @@ def tie_component(
     if not terms:
         return None
     system = System(own, terms, poses[whole.scenes], params)
+    try:
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # what is not finite is caught below
+            surveyed = _surveyed(system, whole, poses, survey, index, marginal_scenes)
+    except (np.linalg.LinAlgError, RuntimeError, InputError):  # of numpy, a singular factor in scipy, and Sim3
+        surveyed = None
+    if surveyed is None or not _is_finite(surveyed):
+        return Surveyed(poses, None, lengths_only(system, index, survey, UNSOLVED))
+    return surveyed
+
+
+def _surveyed(
+    system: System, whole: Component, poses: Similarities, survey: Survey, index: int, marginal_scenes: int
+) -> Surveyed:
     found = _solve(system, survey.frame)
     if isinstance(found, str):
-        tie = lengths_only(system, index, survey, found)
-        return Surveyed(poses, None, tie)
+        return Surveyed(poses, None, lengths_only(system, index, survey, found))
     x, active, factor = found
     tie = report(system, x, active, factor, index, survey.frame)
-    covariances = factor.scene_covariances() if len(own.scenes) <= marginal_scenes else None
+    covariances = factor.scene_covariances() if len(whole.scenes) <= marginal_scenes else None
     return Surveyed(poses.replaced(whole.scenes, x.scenes), covariances, tie)
+
+
+def _is_finite(surveyed: Surveyed) -> bool:
+    poses, tie = surveyed.poses, surveyed.tie
+    numbers = [poses.rotations, poses.translations, poses.log_scales]
+    if tie.S_world_map is not None and tie.covariance is not None:
+        numbers += [tie.S_world_map.matrix(), tie.covariance]
+    return all(bool(np.isfinite(one).all()) for one in numbers)
 
 
 def joint_of_answer(

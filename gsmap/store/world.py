@@ -56,14 +56,20 @@ class World:
                 count += 1
         return count
 
-    def survey(self) -> Survey:
-        """All that stands, of living scenes, in the order of names."""
+    def survey(self, coming: Iterable[Observation] = ()) -> Survey:
+        """All that stands, of living scenes, in the order of names.
+
+        Args:
+            coming: observations that are taken as if they had been added; of living scenes.
+        """
         with self._catalog.read() as connection:
             alive = living_ids(connection)
             rows = [row for row in connection.execute(_standing()) if _lives(row, alive)]
+        items: dict[tuple[str, str, str], Any] = {_key(row): _item(row) for row in rows}
+        items |= {_key_of(_row(item)): item for item in coming}
         by_kind: dict[str, list[Any]] = {kind: [] for kind in _TYPES}
-        for row in sorted(rows, key=_key):
-            by_kind[row.kind].append(_item(row))
+        for key in sorted(items):
+            by_kind[key[0]].append(items[key])
         return Survey(
             by_kind["frame"][0] if by_kind["frame"] else None,
             tuple(by_kind["point"]),

@@ -1,10 +1,10 @@
 """What ties a map to the world: a coordinate reference system, observations of where things lie in it, and the answer.
 
 World coordinates are in a *CRS*: longitude or easting first, then latitude or northing, then height (what PROJ calls
-``always_xy``), with the height in the CRS's own vertical axis, ellipsoidal where it has none. No graph is solved in
-them: a projection bends and stretches lengths, and eight digits before the point cost the last of float64. The *world
-frame* is Euclidean, metres along east, north and up at an origin near the data (`WorldFrame`); ``S_world_map`` maps a
-component of the map into it.
+``always_xy``), with the height in the CRS's own vertical axis; where it has none, above the ellipsoid, in the unit of
+easting and northing. No graph is solved in them: a projection bends and stretches lengths, and eight digits before the
+point cost the last of float64. The *world frame* is Euclidean, metres along east, north and up at an origin near the
+data (`WorldFrame`); ``S_world_map`` maps a component of the map into it.
 """
 
 from __future__ import annotations
@@ -194,6 +194,9 @@ class Survey:
 
 
 # --- what was solved --------------------------------------------------------------------------------------------------
+
+UNSOLVED = "the observations have no solution: they contradict each other, or the registrations, beyond measure"
+"""The problem of a component whose least squares diverge or are singular; its poses are then those of its edges."""
 
 RESIDUAL_KINDS = ("point", "image", "fix", "bar")
 RESIDUAL_USES = ("used", "outlier", "check", "unused")

@@ -50,17 +50,24 @@ class Crs:
 
     @cached_property
     def full(self) -> Any:
-        """With a height: ellipsoidal where the system has none of its own."""
+        """With a height: ellipsoidal, in metres, where the system has none of its own; see `z_to_full`."""
         return self.named.to_3d()
 
     @cached_property
     def geodetic(self) -> Any:
-        """Longitude, latitude and ellipsoidal height on the system's own datum."""
+        """Longitude, latitude (deg) and ellipsoidal height (m) on the system's own datum and prime meridian."""
         from pyproj import CRS
 
         if self.named.is_geocentric:  # of whose datum PROJ gives no geographic system, so the ellipsoid alone
             return CRS.from_user_input(WGS84) if self.named.to_epsg() == 4978 else self._bare
-        return self.named.geodetic_crs.to_3d()
+        found = self.named.geodetic_crs.to_3d()
+        if [axis.unit_name for axis in found.axis_info] == ["degree", "degree", "metre"]:
+            return found
+        # Grads (NTF Paris), or feet (+vunits): the same datum, in the units that are promised here.
+        system = CRS.from_user_input(WGS84).to_json_dict()["coordinate_system"]
+        json = found.to_json_dict() | {"coordinate_system": system}
+        json.pop("id", None)
+        return CRS.from_json_dict(json)
 
     @cached_property
     def _bare(self) -> Any:
@@ -81,8 +88,41 @@ class Crs:
         """Of a coordinate, in the order in which gsmap gives and takes it."""
         if self.named.is_geocentric:
             return "X", "Y", "Z"
-        horizontal = self.named.sub_crs_list[0] if self.named.is_compound else self.named
-        return ("longitude", "latitude", "height") if horizontal.is_geographic else ("easting", "northing", "height")
+        plan = ("longitude", "latitude") if self._horizontal.is_geographic else ("easting", "northing")
+        return (*plan, "height")
+
+    @property
+    def _horizontal(self) -> Any:
+        return self.named.sub_crs_list[0] if self.named.is_compound else self.named
+
+    @cached_property
+    def z_to_full(self) -> float:
+        """Multiplies z as people give it into z of `full`.
+
+        A projected system without a vertical axis of its own counts heights in the unit of its plan, as surveyors do:
+        in a state plane in feet. PROJ would take them as metres.
+        """
+        plan_only = len(self.named.axis_info) == 2 and self.named.is_projected
+        return float(self.named.axis_info[0].unit_conversion_factor) if plan_only else 1.0
+
+    @property
+    def height_unit_m(self) -> float:
+        """Metres in a unit of z."""
+        return float(self.full.axis_info[2].unit_conversion_factor) * self.z_to_full
+
+    @property
+    def heights(self) -> str:
+        """The unit and zero of z, for people: ``US survey feet (0.3048006 m) above the ellipsoid (GRS 1980)``."""
+        axis = self.named.axis_info[0] if self.z_to_full != 1 else self.full.axis_info[2]
+        unit = axis.unit_name.replace("foot", "feet") if "foot" in axis.unit_name else f"{axis.unit_name}s"
+        if axis.unit_conversion_factor != 1:
+            unit = f"{unit} ({axis.unit_conversion_factor:.7g} m)"
+        if self.named.is_geocentric:
+            return f"none: X, Y, Z in {unit} from the Earth's centre"
+        if self.has_own_heights:
+            side = "below" if axis.direction == "down" else "above"
+            return f"{unit} {side} the geoid, as {self.full.sub_crs_list[-1].name} has it"
+        return f"{unit} above the ellipsoid ({self.geodetic.ellipsoid.name})"
 
     def to_geodetic(self, points: np.ndarray) -> np.ndarray:
         """Longitude and latitude (deg) and ellipsoidal height (m) on the system's own datum, of (N, 3) coordinates.
@@ -91,20 +131,21 @@ class Crs:
             InputError: a coordinate outside the projection's domain.
             ConfigError: the height system needs a grid that PROJ does not have here.
         """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3) * [1.0, 1.0, self.z_to_full]
         return _through(self.full, self.geodetic, points, self.text)
 
     def of_geodetic(self, points: np.ndarray) -> np.ndarray:
         """The reverse of `to_geodetic`."""
-        return _through(self.geodetic, self.full, points, self.text)
+        return _through(self.geodetic, self.full, points, self.text) / [1.0, 1.0, self.z_to_full]
 
     def check_area(self, points: np.ndarray, names: list[str], margin_deg: float) -> None:
         """Raise `InputError` naming the first of (N, 3) coordinates outside the area that the system is meant for."""
-        area = self.named.area_of_use
-        if self.named.is_compound and self.named.sub_crs_list[0].area_of_use is not None:
-            area = self.named.sub_crs_list[0].area_of_use
+        area = self._horizontal.area_of_use or self.named.area_of_use
         lonlat = self.to_geodetic(points)[:, :2]
         if area is None:
             return
+        meridian = self.geodetic.prime_meridian  # areas are counted from Greenwich
+        lonlat[:, 0] += np.degrees(meridian.longitude * meridian.unit_conversion_factor)
         beyond_lat = np.maximum(area.south - lonlat[:, 1], lonlat[:, 1] - area.north)
         width = (area.east - area.west) % 360 or 360.0
         along = (lonlat[:, 0] - area.west) % 360
@@ -172,20 +213,36 @@ def _through(source: Any, target: Any, points: np.ndarray, text: str) -> np.ndar
         raise _no_way(text, error) from error
     bad = ~np.isfinite(found).all(1)
     if bad.any():
+        if (grid := _missing_grid(source, target)) is not None:
+            raise _needs(text, grid)
         where = ", ".join(f"{x:.10g}" for x in points[int(np.argmax(bad))])
         raise InputError(f"{where} is no place in {_short(text)}: are the axes swapped, or is it another system?")
     return found
 
 
+def _missing_grid(source: Any, target: Any) -> str | None:
+    """A grid of the best way between two systems, where PROJ has the grids of none of the ways."""
+    from pyproj.transformer import TransformerGroup
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ways = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+    lacking = [] if ways.transformers else [grid for way in ways.unavailable_operations for grid in way.grids]
+    return next((str(grid.short_name) for grid in lacking if not grid.available), None)
+
+
 def _no_way(text: str, error: Exception) -> ConfigError:
     said = str(error)
     if "Grid " in said:
-        grid = said.split("Grid ", 1)[1].split(" ", 1)[0]
-        return ConfigError(
-            f"{_short(text)} needs the grid {grid}, which PROJ does not have here: run projsync --file {grid}, or name "
-            "the system without its heights if they are ellipsoidal"
-        )
+        return _needs(text, said.split("Grid ", 1)[1].split(" ", 1)[0])
     return ConfigError(f"PROJ knows no exact way from {_short(text)}: {said}")
+
+
+def _needs(text: str, grid: str) -> ConfigError:
+    return ConfigError(
+        f"{_short(text)} needs the grid {grid}, which PROJ does not have here: run pyproj sync --file {grid}, or name "
+        "the system without its heights if they are ellipsoidal"
+    )
 
 
 def _short(text: str) -> str:

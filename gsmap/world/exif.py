@@ -20,7 +20,7 @@ class PhotoPosition:
     """Where a photo says that it was taken.
 
     Args:
-        image: its file name.
+        image: its path as it was read.
         longitude_deg, latitude_deg: on WGS 84.
         height_m: as EXIF has it; None where it has none.
         above_ellipsoid: whether that is above the ellipsoid (EXIF 3), not above sea level.
@@ -46,18 +46,18 @@ class PhotoPosition:
         return (own, own * factor), (common, common * factor), sea_level
 
 
-def read_folder(folder: str | os.PathLike[str]) -> list[PhotoPosition]:
-    """The positions of all photos below a folder that have one, by path.
+def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | None]:
+    """The positions of all photos below a folder by path, in the order of paths; None for those without one.
 
     Raises:
         InputError: no folder, or no photo in it has a position.
     """
-    folder = Path(folder)
+    folder = Path(os.path.abspath(folder))  # whose own name, and those above, may be that of a scene
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of photos")
     photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
-    found = [position for path in photos if (position := read(path)) is not None]
-    if not found:
+    found = {path.as_posix(): read(path) for path in photos}
+    if not any(found.values()):
         raise InputError(f"none of the {len(photos)} photos in {folder} says where it was taken (EXIF GPS)")
     return found
 
@@ -84,7 +84,7 @@ def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
         height = -height
     error = _number(gps.get(_ERROR))
     return PhotoPosition(
-        Path(path).name, longitude, latitude, height, code in (2, 3), error if error and error > 0 else None
+        Path(path).as_posix(), longitude, latitude, height, code in (2, 3), error if error and error > 0 else None
     )
 
 

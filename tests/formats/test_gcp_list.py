@@ -37,6 +37,9 @@ def test_a_list_is_read() -> None:
         ("wgs84 utm 7s", "EPSG:32707"),
         ("+proj=utm +zone=32 +datum=WGS84 +units=m", "+proj=utm +zone=32 +datum=WGS84 +units=m"),
         ("EPSG:25832+7837", "EPSG:25832+7837"),
+        ("WGS84 UTM33N", "EPSG:32633"),
+        ("EPSG:32633 # site 4", "EPSG:32633"),
+        ("+proj=utm +zone=32 +datum=WGS84 +units=m  # by hand", "+proj=utm +zone=32 +datum=WGS84 +units=m"),
     ],
 )
 def test_the_first_line_names_the_system(line: str, crs: str) -> None:
@@ -56,11 +59,41 @@ def test_the_first_line_names_the_system(line: str, crs: str) -> None:
         ("EPSG:1\n1 nan 3 4 5 a.jpg", "line 2: geo_y is 'nan'"),
         ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 4 4 5 b.jpg P", "line 3: point P has other coordinates than on line 2"),
         ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 3 6 7 a.jpg P", "line 3: point P in a.jpg again, as on line 2"),
+        ("EPSG:1\nG1 1 2 3", "line 2 has 4 fields and begins with 'G1'.* pixels and photo, and the point's name last"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg b.jpg G1", "line 2: it is not clear .*tabs"),
+        ("EPSG:1\n1 2 3 4 5 DJI_0001 (2) G1", "line 2: it is not clear .*tabs"),
+        ("EPSG:1\n1 2 3 4 5 DJI_0001 (2)", "line 2: it is not clear .*tabs"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg\n1.0 2 3e0 6 7 a.jpg", "line 3: point 1_2_3 in a.jpg again, as on line 2"),
     ],
 )
 def test_what_is_wrong_is_named_with_its_line(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         gcp_list.parse(text, "g.txt")
+
+
+@pytest.mark.parametrize(
+    ("rest", "image", "name"),
+    [
+        ("DJI_0001 (2).JPG G1", "DJI_0001 (2).JPG", "G1"),
+        ("2022-09-26 15-24-47 DJI_0293.JPG G1", "2022-09-26 15-24-47 DJI_0293.JPG", "G1"),
+        ("flight 2/DJI_0001.JPG G1 extra", "flight 2/DJI_0001.JPG", "G1"),
+        ("my  photo.tiff", "my  photo.tiff", "1_2_3"),
+        ("photo.jpg.png P.1", "photo.jpg.png", "P.1"),
+        ("IMG_1 P1", "IMG_1", "P1"),
+        ("DJI_0001 (2).JPG\tG1", "DJI_0001 (2).JPG", "G1"),
+    ],
+)
+def test_a_photo_s_name_may_have_spaces(rest: str, image: str, name: str) -> None:
+    (line,) = gcp_list.parse(f"EPSG:32633\n1 2 3 4 5 {rest}").lines
+    assert (line.image, line.name, line.pixel) == (image, name, (4.0, 5.0))
+
+
+def test_one_place_is_one_point_however_it_is_written() -> None:
+    text = "EPSG:32633\n592836.5 6582077.25 62.4 1 2 a.JPG\n592836.50\t6582077.250\t6.24e1\t1\t1\tb.JPG"
+    assert [line.name for line in gcp_list.parse(text).lines] == ["592836.5_6582077.25_62.4"] * 2
+    assert [line.name for line in gcp_list.parse(f"{text}\n592836.5 6582077.25 62.40 5 5 c.JPG G1").lines] == ["G1"] * 3
+    other = gcp_list.parse(f"{text}\n592836.5 6582077.25 62.41 5 5 c.JPG")
+    assert other.lines[2].name == "592836.5_6582077.25_62.41"
 
 
 def test_a_list_round_trips(tmp_path: Path) -> None:

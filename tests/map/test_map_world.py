@@ -12,7 +12,8 @@ import pytest
 
 import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
-from gsmap.map.stages.georeference import PlacedPhoto, Request
+from gsmap.map.placed_photos import PlacedPhoto
+from gsmap.map.stages.georeference import Request
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
@@ -245,6 +246,43 @@ def test_a_point_in_one_photo_lies_on_the_surface(tmp_path: Path) -> None:
     assert min(min(sigma) for sigma in sigmas) > 0.003
 
 
+def test_heights_of_a_state_plane_are_in_feet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A list in US survey feet, its heights divided by hand; they come out in feet, and the output names the unit."""
+    from pyproj import Transformer
+
+    from gsmap.cli import app
+    from gsmap.formats import gcp_list
+    from gsmap.types.world import WorldFrame
+    from gsmap.world.frame import of_frame
+
+    foot = 1200 / 3937
+    boston = surveyed_site(3, replace(SITE, rows=2, num_control=4), WorldFrame("EPSG:6319", 42.36, -71.06, 30.0))
+    plan = Transformer.from_crs("EPSG:6318", "EPSG:6492", always_xy=True)
+
+    def in_feet(geodetic: np.ndarray) -> tuple[float, float, float]:
+        return (*plan.transform(*geodetic[:2]), geodetic[2] / foot)
+
+    lines = [replace(line, position=in_feet(np.array(line.position))) for line in boston.gcp_lines()]
+    gcp_list.write(tmp_path / "g.txt", "EPSG:6492", lines)
+    with made_map(tmp_path / "m.gsmap", boston) as m:
+        report = m.georeference(Request(gcp=tmp_path / "g.txt", check=boston.checks()))
+        (tie,) = report.components
+        assert (tie.problem, tie.num_outliers) == ("", 0)
+        assert report.height_unit_m == pytest.approx(foot)
+        rows = {row.scene_name: row for row in m.pose_rows()}
+    for name, S in zip(boston.names, boston.truth, strict=True):
+        want = in_feet(of_frame(boston.frame, S.translation[None])[0])
+        assert np.abs(rows[name].world - want).max() * foot < 0.05
+        assert "US survey feet" in rows[name].heights
+    for verb in (["georeference"], ["list"], ["poses"], ["measure"]):
+        rest = {"list": ["scenes"], "measure": ["site-000:0,0,0", "site-001:0,0,0"]}.get(verb[0], [])
+        with pytest.raises(SystemExit) as ended:
+            app.run([*verb, str(tmp_path / "m.gsmap"), *rest])
+        assert not ended.value.code
+        told = capsys.readouterr()
+        assert "US survey feet (0.3048006 m) above the ellipsoid (GRS 1980)" in " ".join((told.out + told.err).split())
+
+
 def test_surveyed_positions_of_scenes(site: Site, tmp_path: Path) -> None:
     from gsmap.world.frame import of_frame
 
@@ -380,6 +418,8 @@ def test_positions_in_exif_tie_a_map(tmp_path: Path) -> None:
         assert tie.num_outliers == 0
         sigma = np.sqrt(np.diag(tie.covariance))[3:6] * tie.metres_per_unit
         assert sigma.max() > 5, "forty metres of geoid, of which nine flights know no better"
+        assert any("above sea level" in note for note in report.notes)
+        assert any("above sea level" in note for note in m.georeference().notes), "as long as it is so"
         found = {row.scene_name: row.world for row in m.pose_rows()}
         want = of_frame(site.frame, site.truth[4].translation[None])[0]
         assert np.linalg.norm(found[site.names[4]][:2] - want[:2]) < 4

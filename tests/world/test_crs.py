@@ -69,6 +69,64 @@ def test_unknown_systems_are_refused(text: str, said: str) -> None:
         crs(text)
 
 
+FOOT = 1200 / 3937  # metres in a US survey foot
+
+
+@pytest.mark.parametrize(
+    ("text", "point", "metres", "heights"),
+    [
+        ("EPSG:2249", (775000.0, 2956000.0, 100.0), 100 * FOOT, "US survey feet (0.3048006 m) above the ellipsoid"),
+        ("EPSG:6578", (3200000.0, 10200000.0, 100.0), 100 * FOOT, "US survey feet"),
+        ("EPSG:2222", (700000.0, 1000000.0, 100.0), 30.48, "feet (0.3048 m)"),
+        ("+proj=utm +zone=18 +datum=NAD83 +units=us-ft", (1.9e6, 1.5e7, 100.0), 100 * FOOT, "US survey feet"),
+        ("+proj=utm +zone=18 +datum=NAD83 +units=us-ft +vunits=us-ft", (1.9e6, 1.5e7, 100.0), 100 * FOOT, "US survey"),
+        (
+            "+proj=utm +zone=18 +datum=NAD83 +units=us-ft +vunits=m",
+            (1.9e6, 1.5e7, 100.0),
+            100.0,
+            "metres above the ell",
+        ),
+        ("+proj=utm +zone=18 +datum=NAD83 +vunits=us-ft", (600000.0, 4500000.0, 100.0), 100 * FOOT, "US survey feet"),
+        ("+proj=utm +zone=32 +datum=WGS84 +units=km", (691.2, 5334.5, 0.1), 100.0, "kilometres"),
+        ("EPSG:25832", (691234.0, 5334567.0, 100.0), 100.0, "metres above the ellipsoid (GRS 1980)"),
+        ("EPSG:4326", (11.0, 48.0, 100.0), 100.0, "metres above the ellipsoid (WGS 84)"),
+    ],
+)
+def test_heights_are_in_the_unit_of_the_system(
+    text: str, point: tuple[float, float, float], metres: float, heights: str
+) -> None:
+    """In its vertical axis' where it has one, else in its plan's, and above the ellipsoid."""
+    system, points = crs(text), np.array([point, (*point[:2], point[2] + 10)])
+    found = system.to_geodetic(points)
+    assert found[0, 2] == pytest.approx(metres, abs=1e-6)
+    assert system.height_unit_m == pytest.approx(metres / point[2], rel=1e-12)
+    assert heights in system.heights
+    assert np.abs(system.of_geodetic(found) - points).max() < 1e-6
+    # Upwards in the frame by as many metres as ten units are, whatever the horizontal unit.
+    frame = frame_at(text, points)
+    east, north, up = np.diff(to_frame(frame, points), axis=0)[0] / (10 * system.height_unit_m)
+    assert (east, north, up) == pytest.approx((0, 0, 1), abs=1e-5)
+
+
+def test_systems_in_grads_from_paris_are_turned_into_degrees() -> None:
+    """The false origin of Lambert II lies by definition on the meridian of Paris, at 52 grads north, where k is 1."""
+    system, points = crs("EPSG:27572"), np.array([[600000.0, 2200000.0, 60.0], [601000.0, 2200000.0, 60.0]])
+    assert system.to_geodetic(points)[0] == pytest.approx((0.0, 52 * 0.9, 60.0), abs=1e-6)
+    system.check_area(points, ["P", "Q"], 0.1)
+    metres = np.diff(to_frame(frame_at("EPSG:27572", points), points), axis=0)
+    assert np.linalg.norm(metres) == pytest.approx(1000, abs=0.2)
+
+
+@pytest.mark.parametrize("text", ["EPSG:2249+6360", "EPSG:2249+5703"])
+def test_a_geoid_that_several_grids_lead_to_is_named(text: str) -> None:
+    """PROJ answers infinity, not an error, where it has the grid of none of several ways."""
+    system = crs(text)
+    assert "above the geoid" in system.heights
+    assert ("US survey feet" in system.heights) == text.endswith("6360")
+    with pytest.raises(ConfigError, match=r"needs the grid us_noaa_\w+\.tif"):
+        system.to_geodetic(np.array([[775000.0, 2956000.0, 100.0]]))
+
+
 def test_a_height_system_without_its_grid_is_refused() -> None:
     """PROJ would else give heights that are off by tens of metres, and say nothing."""
     system = crs("EPSG:25832+7837")

@@ -51,9 +51,9 @@ def scene_rows(
         return []
     placed, nodes = store.revisions.poses(*(among or ())), store.graphs.node_counts()
     said = store.scenes.latest_notes()
-    _, found = world_positions(store, placed)
+    system, found = world_positions(store, placed)
     rows = [
-        row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres, found)
+        row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres, found, system)
         for scene in store.scenes.list(among=among)
     ]
     return [
@@ -71,8 +71,8 @@ def scene_rows(
 def scene_row(store: Store, scene: Scene, metres: Mapping[int, Metre]) -> SceneRow:
     """The row of one scene."""
     placed, nodes = store.revisions.poses(scene.id), store.graphs.node_counts()
-    note, (_, found) = store.scenes.latest_notes().get(scene.id, ""), world_positions(store, placed)
-    return row_of_scene(scene, placed, nodes.get(scene.id), note, metres, found)
+    note, (system, found) = store.scenes.latest_notes().get(scene.id, ""), world_positions(store, placed)
+    return row_of_scene(scene, placed, nodes.get(scene.id), note, metres, found, system)
 
 
 def row_of_scene(
@@ -82,6 +82,7 @@ def row_of_scene(
     note: str,
     metres: Mapping[int, Metre] | None = None,
     in_world: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
+    system: tuple[str, str] | None = None,
 ) -> SceneRow:
     pose = placed.get(scene.id)
     metre = metres.get(pose.component) if metres and pose else None
@@ -102,6 +103,8 @@ def row_of_scene(
         metres_per_unit=metre.metres_per_unit if metre and metre.is_known else None,
         metric=None if at is None else at[0],
         world=None if at is None else at[1],
+        crs=None if at is None or system is None else system[0],
+        heights=None if at is None or system is None else system[1],
     )
 
 
@@ -114,7 +117,7 @@ def pose_rows(store: Store, crs: str | None = None) -> list[PoseRow]:
     """
     poses, ties = store.revisions.poses(), store.revisions.world()
     tied = {tie.component: tie.S_world_map for tie in ties if tie.S_world_map is not None}
-    named, found = world_positions(store, poses, crs)
+    system, found = world_positions(store, poses, crs)
     return [
         PoseRow(
             scene=scene.id,
@@ -124,7 +127,8 @@ def pose_rows(store: Store, crs: str | None = None) -> list[PoseRow]:
             S_map_scene=poses[scene.id].S_map_scene,
             S_world_scene=_in_world(tied, poses[scene.id]),
             world=found[scene.id][1] if scene.id in found else None,
-            crs=named if scene.id in found else None,
+            crs=system[0] if system and scene.id in found else None,
+            heights=system[1] if system and scene.id in found else None,
             covariance=poses[scene.id].covariance,
         )
         for scene in store.scenes.list()

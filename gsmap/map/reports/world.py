@@ -12,7 +12,7 @@ from gsmap.map.reports.common import names
 from gsmap.store import Store
 from gsmap.types import ScenePose
 from gsmap.types.rows.world import ResidualRow, TieRow, WorldReport
-from gsmap.types.world import Residual, WorldTie
+from gsmap.types.world import Residual, Survey, WorldTie
 
 
 @of_one_state
@@ -37,13 +37,27 @@ def world_report(store: Store, *, stale: bool, notes: Sequence[str] = ()) -> Wor
         crs_name="" if system is None else system.name,
         axes=() if system is None else system.axes,
         own_heights=False if system is None else system.has_own_heights,
+        heights="" if system is None else system.heights,
+        height_unit_m=None if system is None else system.height_unit_m,
         origin=None if frame is None else (frame.latitude_deg, frame.longitude_deg, frame.height_m),
         components=tuple(_tie_row(tie, sizes[tie.component], name_of) for tie in ties),
         unseen=tuple(point.name for point in survey.points if point.name not in shown),
         revision=store.revisions.current(),
         stale=stale,
-        notes=tuple(notes),
+        notes=(*notes, *_sea_level_note(survey)),
     )
+
+
+def _sea_level_note(survey: Survey) -> list[str]:
+    """A remark where nothing but EXIF heights above sea level tells how high a map lies."""
+    sigmas = [fix.sea_level_sigma_m for fix in survey.fixes]
+    if not sigmas or min(sigmas) == 0 or any(not point.check for point in survey.points):
+        return []
+    return [
+        "heights come from EXIF alone, which counts them above sea level (the geoid): as heights above the ellipsoid "
+        f"they may be off by tens of metres, all alike (taken as {max(sigmas):g} m); a control point, or photos with "
+        "heights above the ellipsoid, settle it"
+    ]
 
 
 def _tie_row(tie: WorldTie, num_scenes: int, name_of: Mapping[str, str]) -> TieRow:
@@ -90,8 +104,9 @@ def _rms(errors: Sequence[tuple[float, ...]]) -> float | None:
 
 def world_positions(
     store: Store, poses: Mapping[str, ScenePose], crs_text: str | None = None
-) -> tuple[str | None, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """The CRS, and by scene where its origin lies: metres of the world frame, and coordinates in the CRS.
+) -> tuple[tuple[str, str] | None, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """The CRS with how it counts heights, and by scene where its origin lies: metres of the world frame, and
+    coordinates in the CRS.
 
     Args:
         crs_text: another CRS than the map's.
@@ -99,6 +114,7 @@ def world_positions(
     ties = {tie.component: tie for tie in store.revisions.world() if tie.S_world_map is not None and tie.frame}
     if not ties:
         return None, {}
+    from gsmap.world.crs import crs
     from gsmap.world.frame import of_frame
 
     found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -112,4 +128,4 @@ def world_positions(
             metric = tie.S_world_map.apply(np.array([pose.S_map_scene.translation for pose in mine]))
             world = of_frame(tie.frame, metric, named)
             found |= {pose.scene: (metric[k], world[k]) for k, pose in enumerate(mine)}
-    return named, found
+    return (None if named is None else (named, crs(named).heights)), found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,41 +11,28 @@ import numpy as np
 
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
 from gsmap.formats import gcp_list
+from gsmap.ingest.dates import photo_date
+from gsmap.map.dates import parsed
+from gsmap.map.photo_names import PhotoMatches, match_photos
+from gsmap.map.placed_photos import Localise
 from gsmap.map.places import Place, place_in_scene
-from gsmap.map.seeing import same_photo, surface_at
+from gsmap.map.seeing import surface_at
 from gsmap.map.settings import Settings
+from gsmap.map.stages.optimize import Solution, solve_observed
 from gsmap.store import Store
 from gsmap.store.world import Observation
 from gsmap.types import Cameras
-from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldFrame
+from gsmap.types.world import UNSOLVED, ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldFrame
 from gsmap.world.crs import WGS84, crs
 from gsmap.world.exif import read_folder
+from gsmap.world.frame import frame_at, of_frame, to_frame
 from gsmap.world.survey import check_area, frame_for, in_frame
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedPhoto:
-    """A photo that is no scene's camera, but was localised in one.
-
-    Args:
-        scene: id of the scene that it was localised by.
-        T_scene_camera: (4, 4).
-        intrinsics_px: (4,) ``fx fy cx cy``. size_px: (2,) width, height.
-        covariance: (6, 6) over [rotation (3, rad), translation (3, scene unit)] on the camera's side.
-    """
-
-    scene: str
-    T_scene_camera: np.ndarray
-    intrinsics_px: np.ndarray
-    size_px: tuple[int, int]
-    covariance: np.ndarray
-
 
 SURVEYED = "survey"
 """The name of a fix that says where a scene's origin lies."""
 
-Localise = Callable[[Sequence[str]], dict[str, PlacedPhoto]]
-"""Photos by their names as the files have them, to those that were placed; the others are left out."""
+
+_OTHER_DAYS = 2  # more than clocks and zones are off, and than a night that a survey goes over
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,24 +70,28 @@ class _Noted:
 
 def georeference(
     store: Store, request: Request, settings: Settings, localise: Localise | None = None
-) -> tuple[str, ...]:
-    """Read, check and note observations; returns what a person should know. Where any is wrong nothing is noted.
+) -> tuple[tuple[str, ...], Solution | None]:
+    """Read, check and solve observations, and then note them. Where any is wrong nothing is noted.
 
     Args:
         localise: finds photos that are no scene's camera in the map.
 
+    Returns:
+        Remarks for the person, and the poses with these observations, not kept yet; None where the newest are that.
+
     Raises:
-        ConfigError, InputError, NotFoundError: an unknown CRS, a file that is wrong (with its line), a point that no
-            photo of the map shows, a place that does not exist.
+        ConfigError, InputError, NotFoundError: an unknown CRS, a file that is wrong (with its line), a photo that may
+            be one of several cameras, a point that no photo of the map shows, a place that does not exist, or
+            observations that have no solution.
     """
     noted = _Noted()
     before = store.world.survey()
     if request.crs is not None:
         crs(request.crs)
     if request.gcp is not None:
-        _read_gcp(store, Path(request.gcp), request, settings, localise, noted)
+        _read_gcp(store, Path(request.gcp), request, settings, localise, before, noted)
     if request.exif is not None:
-        _read_exif(store, Path(request.exif), settings, noted)
+        _read_exif(store, Path(request.exif), settings, before, noted)
     for one in request.bars:
         noted.items.append(_bar(store, *one, request.bar_sigma_m, settings))
     if request.check is not None:
@@ -114,8 +105,32 @@ def georeference(
     _refuse_unreachable(before, frame or before.frame, places)
     if not noted.items:
         raise ConfigError("say what ties the map to the world: --gcp FILE, --exif DIR, --scale-bar A B METRES")
+    solution = _solved(store, noted.items, settings)
     store.world.add(noted.items)
-    return tuple(noted.notes)
+    return tuple(noted.notes), solution
+
+
+def _solved(store: Store, items: Sequence[Observation], settings: Settings) -> Solution | None:
+    """Solve as if observations had been noted.
+
+    Raises:
+        InputError: a component that had a solution has none with them.
+    """
+    try:
+        solution = solve_observed(store, settings, store.world.survey(items))
+    except (np.linalg.LinAlgError, FloatingPointError, RuntimeError) as error:
+        raise InputError(
+            f"nothing was noted: the poses cannot be solved with these observations ({error}); check positions, "
+            "units and photos, or give fewer of them"
+        ) from error
+    before = {tie.problem for tie in store.revisions.world()}
+    for tie in solution.answer.world if solution is not None else ():
+        if tie.problem == UNSOLVED and UNSOLVED not in before:
+            raise InputError(
+                f"nothing was noted: in component {tie.component} {tie.problem}; check positions, units and photos, or "
+                "give fewer of them"
+            )
+    return solution
 
 
 def survey_position(
@@ -152,8 +167,6 @@ def _refuse_unreachable(before: Survey, frame: WorldFrame | None, new: Sequence[
 
 
 def _origin(frame: WorldFrame) -> np.ndarray:
-    from gsmap.world.frame import of_frame
-
     return of_frame(frame, np.zeros((1, 3)))
 
 
@@ -176,19 +189,34 @@ def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | Fi
 
 
 def _read_gcp(
-    store: Store, path: Path, request: Request, settings: Settings, localise: Localise | None, noted: _Noted
+    store: Store,
+    path: Path,
+    request: Request,
+    settings: Settings,
+    localise: Localise | None,
+    before: Survey,
+    noted: _Noted,
 ) -> None:
     found = gcp_list.read(path)
     crs(found.crs)
+    # A place without a name is the point that it was when it was given before, written otherwise.
+    known = {tuple(point.position): point.name for point in before.points if point.crs == found.crs}
+    names_known = [one if one.is_named else replace(one, name=known.get(one.position, one.name)) for one in found.lines]
+    found = replace(found, lines=tuple(names_known))
     params = settings.world
     sigma = request.sigma_m or (params.gcp_sigma_m, params.gcp_sigma_m)
     held = set(request.check or ())
     names = {line.name for line in found.lines}
     cameras = _Cameras(store)
-    of_photo = {line.image: cameras.find(line.image, f"{path}, line {line.line}") for line in found.lines}
+    first: dict[str, str] = {}
+    for line in found.lines:
+        first.setdefault(line.image, f"{path}, line {line.line}")
+    matches = cameras.match(first)
+    of_photo = {image: cameras[matches.cameras[image]] if image in matches.cameras else None for image in first}
     strangers = sorted(image for image, camera in of_photo.items() if camera is None)
     placed = localise(strangers) if localise is not None and strangers else {}
     seen: list[ImagePoint] = []
+    picked: dict[tuple[str, str, str], str] = {}
     missing: set[str] = set()
     for line in found.lines:
         where = f"{path}, line {line.line}"
@@ -205,6 +233,8 @@ def _read_gcp(
         else:
             missing.add(line.image)
             continue
+        if (earlier := picked.setdefault((line.name, scene, named), where)) is not where:
+            raise InputError(f"{where}: point {line.name} in {line.image} again, as on {earlier}")
         seen.append(
             ImagePoint(
                 line.name, named, scene, pixel, params.pixel_sigma_px, np.array(pose), np.array(intrinsics), covariance
@@ -249,39 +279,20 @@ def _pixel(
 
 
 class _Cameras:
-    """The cameras of all scenes by the names of photos; read once each."""
+    """The cameras of all scenes that have real ones; read once each."""
 
     def __init__(self, store: Store) -> None:
-        self._store = store
-        self._scenes = store.scenes.list()
-        self._cameras: dict[str, Cameras] = {}
+        scenes = {scene.name: (scene.id, store.scenes.cameras(scene.id)) for scene in store.scenes.list()}
+        self._of_scene = {name: one for name, one in scenes.items() if not one[1].synthesised}
 
-    def find(self, image: str, where: str) -> tuple[str, Cameras] | None:
-        """Scene and camera of a photo (``NAME``, or ``SCENE/NAME``); None where no scene has it.
+    def match(self, photos: Mapping[str, str]) -> PhotoMatches:
+        """Match photos, by where each was named, to cameras; see `gsmap.map.photo_names`."""
+        return match_photos(photos, {name: one.names for name, (_, one) in self._of_scene.items()}, photos)
 
-        Raises:
-            InputError: several scenes have it.
-        """
-        named = [scene for scene in self._scenes if image.startswith(f"{scene.name}/")]
-        found = []
-        for scene in named or self._scenes:
-            if scene.id not in self._cameras:
-                self._cameras[scene.id] = self._store.scenes.cameras(scene.id)
-            wanted = image.removeprefix(f"{scene.name}/") if named else image
-            cameras = self._cameras[scene.id]
-            if cameras.synthesised:
-                continue
-            rows = [k for k, name in enumerate(cameras.names) if name == wanted]
-            rows = rows or [k for k, name in enumerate(cameras.names) if same_photo(name, wanted)]
-            found += [(scene, cameras[[k]]) for k in rows]
-        if not found:
-            return None
-        if len(found) > 1:
-            one, other = found[0][0].name, found[1][0].name
-            raise InputError(
-                f"{where}: {image} is a camera of {one} and of {other}: write {one}/{image} or {other}/{image}"
-            )
-        return found[0][0].id, found[0][1]
+    def __getitem__(self, camera: tuple[str, int]) -> tuple[str, Cameras]:
+        """A scene's id and one of its cameras, by the scene's name and row."""
+        scene, cameras = self._of_scene[camera[0]]
+        return scene, cameras[[camera[1]]]
 
 
 def _with_depth(store: Store, image: ImagePoint, settings: Settings) -> ImagePoint:
@@ -312,31 +323,96 @@ def _hold_out(before: Survey, names: set[str], noted: _Noted) -> None:
 # --- positions and lengths --------------------------------------------------------------------------------------------
 
 
-def _read_exif(store: Store, folder: Path, settings: Settings, noted: _Noted) -> None:
-    cameras = _Cameras(store)
-    strangers, without_height = 0, 0
-    for photo in read_folder(folder):
-        found = cameras.find(photo.image, str(folder))
-        if found is None:
-            strangers += 1
+def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, noted: _Noted) -> None:
+    cameras, positions = _Cameras(store), read_folder(folder)
+    # Photos without a position take part: they may be those that a camera is of.
+    matches = cameras.match(dict.fromkeys(positions, str(folder)))
+    placed = {photo: one for photo, one in positions.items() if one is not None and photo in matches.cameras}
+    bare = {photo for photo in matches.by_file_name if photo in placed}
+    by_file_name: list[tuple[str, Fix]] = []
+    for photo, one in placed.items():
+        if one.height_m is None:
             continue
-        scene, camera = found
-        sigma, common, sea_level = photo.sigmas(settings.world)
-        height = photo.height_m
-        if height is None:
-            without_height += 1
-            continue
-        position = np.array([photo.longitude_deg, photo.latitude_deg, height])
-        noted.items.append(Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level))
+        scene, camera = cameras[matches.cameras[photo]]
+        sigma, common, sea_level = one.sigmas(settings.world)
+        position = np.array([one.longitude_deg, one.latitude_deg, one.height_m])
+        fix = Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level)
+        noted.items.append(fix)
+        if photo in bare:
+            by_file_name.append((photo, fix))
+    _refuse_moved(before, by_file_name)
+    _refuse_other_days(store, by_file_name)
+    strangers = [photo for photo in positions if photo not in matches.cameras and photo not in matches.left_out]
+    nowhere = [photo for photo in matches.cameras if photo not in placed]
+    without_height = [photo for photo, one in placed.items() if one.height_m is None]
+    notes = [
+        (strangers, "are in no scene of this map and were left out"),
+        (nowhere, "have no position in their EXIF (WGS 84, with N or S and E or W) and were left out"),
+        (without_height, "have a position without a height and were left out"),
+    ]
+    told = [f"{len(some)} photos in {folder} {what}, such as {Path(some[0]).name}" for some, what in notes if some]
+    if matches.left_out:
+        photo, other = next(iter(matches.left_out.items()))
+        told.append(
+            f"{len(matches.left_out)} photos in {folder} share only their file name with a camera of this map and were "
+            f"left out, such as {photo}; {other} lies where its scene's photos do"
+        )
     if not any(isinstance(one, Fix) for one in noted.items):
         raise NotFoundError(
-            f"no photo in {folder} that has a position with a height is a camera of this map: photos go by the names "
-            "that their captures' cameras have for them"
+            f"no photo in {folder} with a position and a height is a camera of this map: {'; '.join(told)}; photos go "
+            "by the names that their captures' cameras have for them, and by folders called as their scenes"
         )
-    if strangers:
-        noted.notes.append(f"{strangers} photos in {folder} are in no scene of this map and were left out")
-    if without_height:
-        noted.notes.append(f"{without_height} photos in {folder} have no height and were left out")
+    if bare:
+        scenes = sorted({matches.cameras[photo][0] for photo in bare})
+        some = ", ".join(scenes[:3]) + (", ..." if len(scenes) > 3 else "")
+        told.append(
+            f"{len(bare)} photos were matched to cameras of {some} by file name alone: photos of another flight that "
+            "are numbered alike would tie the map to a wrong place; folders called as the scenes rule that out"
+        )
+    noted.notes += told
+
+
+def _refuse_moved(before: Survey, photos: Sequence[tuple[str, Fix]]) -> None:
+    """Raise where a photo that only its file name ties to a camera lies far from where that camera is known to be."""
+    known = {(fix.name, fix.scene): fix for fix in before.fixes if fix.crs == WGS84}
+    again = [(photo, known[fix.name, fix.scene], fix) for photo, fix in photos if (fix.name, fix.scene) in known]
+    if not again:
+        return
+    places = np.array([[old.position, new.position] for _, old, new in again])
+    metres = to_frame(frame_at(WGS84, places[:, 1]), places.reshape(-1, 3)).reshape(-1, 2, 3)
+    off = np.linalg.norm(metres[:, 1, :2] - metres[:, 0, :2], axis=1)
+    reach = [5 * sum(fix.sigma_m[0] + fix.common_sigma_m[0] for fix in (old, new)) for _, old, new in again]
+    worst = int(np.argmax(off - reach))
+    if off[worst] > reach[worst]:
+        photo, old, _ = again[worst]
+        raise InputError(
+            f"{photo} has the file name of camera {old.name}, which is known to be {off[worst]:.3g} m away: if it is "
+            "that camera's photo, let a folder be called as the scene; if it is of another flight, leave it out"
+        )
+
+
+def _refuse_other_days(store: Store, photos: Sequence[tuple[str, Fix]]) -> None:
+    """Raise where all photos that only file names tie to a scene were taken days before or after it."""
+    of_scene: dict[str, list[str]] = {}
+    for photo, fix in photos:
+        of_scene.setdefault(fix.scene, []).append(photo)
+    for scene in map(store.scenes.get, of_scene):
+        if scene.captured_at is None:
+            continue
+        captured, off = parsed(scene.captured_at), dict[str, int]()
+        for photo in of_scene[scene.id]:
+            if (taken := photo_date(photo).when) is not None:
+                off[photo] = abs(parsed(taken) - captured).days
+                if off[photo] < _OTHER_DAYS:
+                    break
+        else:
+            if off:
+                photo, days = min(off.items(), key=lambda one: one[1])
+                raise InputError(
+                    f"{photo} has the file name of a camera of {scene.name} and was taken {days} days from it, as were "
+                    f"all {len(off)} with a date: if they are its photos, let a folder be called {scene.name}; if they "
+                    "are of another flight, leave them out"
+                )
 
 
 def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None, settings: Settings) -> ScaleBar:

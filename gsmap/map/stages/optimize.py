@@ -67,8 +67,12 @@ class PoseBasis:
 
 
 @of_one_state
-def pose_basis(store: Store, settings: Settings) -> PoseBasis:
-    """Read what names the poses; a few statements, and microseconds a scene."""
+def pose_basis(store: Store, settings: Settings, observed: Survey | None = None) -> PoseBasis:
+    """Read what names the poses; a few statements, and microseconds a scene.
+
+    Args:
+        observed: in place of what the map knows to be observed of the world.
+    """
     living, priors = store.scenes.brief(), store.priors.list()
     captured = {scene.id: None if scene.captured_at is None else parsed(scene.captured_at) for scene in living}
     hours = settings.optimize.aliasing.same_visit_h
@@ -80,7 +84,8 @@ def pose_basis(store: Store, settings: Settings) -> PoseBasis:
         if same:
             same_visits.add((one.target, one.source))
     ups, recipe = _ups(store, living, settings), solver.recipe_key(settings.optimize)
-    return PoseBasis([scene.id for scene in living], named, same_visits, priors, ups, store.world.survey(), recipe)
+    observed = store.world.survey() if observed is None else observed
+    return PoseBasis([scene.id for scene in living], named, same_visits, priors, ups, observed, recipe)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,12 +183,42 @@ def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
 
 def _optimize(store: Store, given: PoseInputs, settings: Settings, progress: StageProgress) -> int:
     progress("optimize", 0.0, "poses")
-    params, previous = settings.optimize, store.revisions.get()
-    answer = solver.optimize(given.scenes, given.edges, given.priors, previous, params, survey=given.survey)
-    answer = solver.kept_still(_upright(answer, given, params), previous, given.edges, params)
-    number = store.revisions.save(answer, given.key)
+    number = store.revisions.save(_answer(given, store.revisions.get(), settings), given.key)
     progress("optimize", 1.0, f"revision {number}")
     return number
+
+
+def _answer(given: PoseInputs, previous: PoseGraph | None, settings: Settings) -> PoseGraph:
+    params = settings.optimize
+    answer = solver.optimize(given.scenes, given.edges, given.priors, previous, params, survey=given.survey)
+    return solver.kept_still(_upright(answer, given, params), previous, given.edges, params)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Poses that were solved and not kept.
+
+    Args:
+        answer: the poses. key: what they were solved from. after: the revision that was the newest then.
+    """
+
+    answer: PoseGraph
+    key: RecipeKey
+    after: int | None
+
+
+def solve_observed(store: Store, settings: Settings, observed: Survey) -> Solution | None:
+    """Solve for all poses as if other observations of the world were known; None where the newest revision is that.
+
+    Nothing is kept: `solve` keeps it.
+    """
+    basis = pose_basis(store, settings, observed)
+    if _is_of(store, basis):
+        return None
+    newest = store.revisions.newest()
+    previous = None if newest is None else store.revisions.get(newest.number)
+    answer = _answer(_with_edges(store, basis), previous, settings)
+    return Solution(answer, basis.key, None if newest is None else newest.number)
 
 
 def _upright(answer: PoseGraph, basis: PoseBasis, params: solver.Params) -> PoseGraph:
@@ -204,15 +239,22 @@ def _grow(store: Store, given: _Growth, settings: Settings, progress: StageProgr
     return True
 
 
-def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
+def solve(store: Store, settings: Settings, progress: StageProgress, solution: Solution | None = None) -> bool:
     """Optimize unless the newest revision is what that would make; returns whether there is a new one.
 
     One process does it at a time: others wait, and then need not.
+
+    Args:
+        solution: kept in place of solving once more, where nothing has come or gone since it was solved.
     """
     told = False
     while not _is_of(store, pose_basis(store, settings)):
         if store.leases.try_hold("poses", "optimize"):
             try:
+                if solution is not None and _is_present(store, solution, settings):
+                    number = store.revisions.save(solution.answer, solution.key)
+                    progress("optimize", 1.0, f"revision {number}")
+                    return True
                 given = _inputs(store, settings)
                 if not _is_of(store, given.basis if isinstance(given, _Growth) else given):
                     if isinstance(given, _Growth) and not _grow(store, given, settings, progress):
@@ -228,6 +270,14 @@ def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
             told = True
         time.sleep(POLL_S)
     return told
+
+
+@of_one_state
+def _is_present(store: Store, solution: Solution, settings: Settings) -> bool:
+    """Whether a solution is what solving now would give."""
+    newest = store.revisions.newest()
+    same = (None if newest is None else newest.number) == solution.after
+    return same and pose_basis(store, settings).key.digest == solution.key.digest
 
 
 def is_solved(store: Store, settings: Settings) -> bool:

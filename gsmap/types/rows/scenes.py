@@ -49,6 +49,8 @@ class SceneRow(Row):
         metric: (3,) where its origin lies, metres east, north, up of the world frame; null where the map is not tied to
             the world (``gsmap georeference``).
         world: (3,) the same in the map's CRS; null as above.
+        crs: of that; null as above.
+        heights: the unit and zero of the heights in it, such as metres above the ellipsoid; null as above.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -79,6 +81,8 @@ class SceneRow(Row):
     metres_per_unit: float | None = None
     metric: np.ndarray | None = None
     world: np.ndarray | None = None
+    crs: str | None = None
+    heights: str | None = None
 
     @property
     def in_world(self) -> str | None:
@@ -363,6 +367,7 @@ class PoseRow(Row):
             world.
         world: (3,) where its origin lies in the CRS; null as above.
         crs: of that; null as above.
+        heights: the unit and zero of the heights in it, such as metres above the ellipsoid; null as above.
         covariance: (7, 7) over [rotation (3, rad), translation (3), log scale] on the scene side; null where it is not
             known.
     """
@@ -385,6 +390,7 @@ class PoseRow(Row):
     covariance: np.ndarray | None = None
     world: np.ndarray | None = None
     crs: str | None = None
+    heights: str | None = None
 
     @property
     def position(self) -> np.ndarray:

@@ -120,6 +120,9 @@ class WorldReport(Row):
         crs_name: the system's own name.
         axes: of a coordinate in it, in order.
         own_heights: whether its heights are its own (a geoid's); else they are above the ellipsoid.
+        heights: the unit and zero of its heights, such as US survey feet above the ellipsoid; empty where there is no
+            CRS.
+        height_unit_m: metres in that unit; null where there is no CRS.
         origin: latitude and longitude (deg) and ellipsoidal height (m) of the world frame's origin, on the datum of the
             CRS; null where there is none.
         components: those of which anything was observed.
@@ -135,6 +138,8 @@ class WorldReport(Row):
     crs_name: str
     axes: tuple[str, ...]
     own_heights: bool
+    heights: str
+    height_unit_m: float | None
     origin: tuple[float, ...] | None
     components: tuple[TieRow, ...]
     unseen: tuple[str, ...]
@@ -186,6 +191,7 @@ class MeasureReport(Row):
         a: one point.
         b: the other.
         crs: of their world coordinates; null where there is none.
+        heights: the unit and zero of the heights in it, such as metres above the ellipsoid; null as above.
         notes: what the sigma leaves out, and what else a person should know.
     """
 
@@ -197,4 +203,5 @@ class MeasureReport(Row):
     a: PlaceRow
     b: PlaceRow
     crs: str | None
+    heights: str | None
     notes: tuple[str, ...]
