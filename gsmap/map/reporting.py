@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import write_text_whole
+from gsmap.durable import is_stream, write_text_output
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.rotations import angle_between
@@ -90,10 +90,10 @@ def write_report(
     check_target(path)
     report = _Gatherer(store, settings, since, progress).report(pictures)
     text = page(report)
-    if (refused := note_target(store, path, {"report": True})) is not None:
+    if not is_stream(path) and (refused := note_target(store, path, {"report": True})) is not None:
         report = replace(report, notes=(*report.notes, f"{refused}: a purge of a scene will not find this page"))
         text = page(report)
-    write_text_whole(path, text)
+    write_text_output(path, text)
     standing, sentences = verdict(report)
     return WrittenReport(
         path=str(path),
@@ -114,7 +114,7 @@ def check_target(path: Path) -> None:
         raise ConfigError(f"{path} is a folder: name a file in it, such as {path / 'report.html'}")
     if not path.parent.is_dir():
         raise NotFoundError(f"cannot write {path}: {path.parent} does not exist")
-    if path.exists() and owner_of(path) is None:
+    if path.exists() and not is_stream(path) and owner_of(path) is None:
         raise ConfigError(f"{path} is there and was not written by gsmap report: choose another name, or delete it")
 
 
