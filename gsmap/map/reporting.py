@@ -54,6 +54,7 @@ from gsmap.report.content import CHI2_999
 from gsmap.report.words import verdict
 from gsmap.store import Store
 from gsmap.store.registrations import StoredRegistration
+from gsmap.store.set_aside import CAPTURE
 from gsmap.store.sizes import scene_sizes, sizes
 from gsmap.types import Gaussians, PoseGraph, Scene, ScenePose
 from gsmap.types.metre import Metre
@@ -530,6 +531,9 @@ def _up(state: _State, scenes: Sequence[Scene], poses: Sequence[ScenePose]) -> n
 def _places(store: Store) -> dict[str, str]:
     """What a page that goes to others says in place of paths of this machine."""
     targets = [*store.exports.targets(), str(store.folder), str(store.home), store.location]
+    for one in store.set_aside.list():
+        if one.what.startswith(f"{CAPTURE} "):  # and its cameras, which may lie above it
+            targets += [str(folder) for folder in [Path(one.about), *Path(one.about).parents][:4] if folder.name]
     return {target: Path(target).name for target in targets if "/" in target}
 
 
