@@ -20,6 +20,7 @@ import numpy as np
 from gsmap.durable import is_stream, write_output
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import family
+from gsmap.stream import clamped, clamped_column
 from gsmap.types import Cameras, FileInfo, Gaussians, GaussianSource
 
 _Part = TypeVar("_Part")
@@ -36,7 +37,7 @@ def suffix_of(path: str | os.PathLike[str]) -> str | None:
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the Gaussians of a file of any known format.
+    """Read the Gaussians of a file of any known format; infinities that are values are clamped (`gsmap.stream`).
 
     Raises:
         NotFoundError: no such file.
@@ -46,8 +47,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     suffix = _suffix(path, "read")
     # NaN and overflow in a damaged file are for `gsmap.ingest` to name, not for numpy to warn of.
     with _explained(path, "read"), np.errstate(all="ignore"):
-        found: Gaussians = _load(_layout(path, suffix)).read(path)
-        return found
+        return clamped(_load(_layout(path, suffix)).read(path))
 
 
 def stream(path: str | os.PathLike[str]) -> GaussianSource:
@@ -80,14 +80,16 @@ class _FileSource:
         return self.source.sh_degree
 
     def chunks(self) -> Iterator[Gaussians]:
-        yield from self._quietly(self.source.chunks())
+        for chunk in self._quietly(self.source.chunks()):
+            yield clamped(chunk)
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
-        yield from self._quietly(self.source.columns(name))
+        for column in self._quietly(self.source.columns(name)):
+            yield clamped_column(name, column)
 
     def load(self) -> Gaussians:
         with _explained(self.path, "read"), np.errstate(all="ignore"):
-            return self.source.load()
+            return clamped(self.source.load())
 
     def _quietly(self, parts: Iterator[_Part]) -> Iterator[_Part]:
         while True:
