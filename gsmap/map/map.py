@@ -1114,10 +1114,10 @@ class Map(AbstractContextManager["Map"]):
             metres_per_unit: of the scene's own frame; 0 takes it back.
             author: who says so.
         """
-        from gsmap.ingest import parse_date
+        from gsmap.ingest import given_date
 
         if captured_at is not None:
-            captured_at = "" if captured_at.strip().lower() == "none" else parse_date(captured_at)
+            captured_at = "" if captured_at.strip().lower() == "none" else given_date(captured_at).when
         scene = self.store.scenes.edit(
             ref,
             name=name,
