@@ -71,7 +71,7 @@ class Search:
     Args:
         captures: in the order given; a folder's in the order of their names.
         skipped: files that hold something other than Gaussians, and folders without captures.
-        unreadable: folders that the system refused to list.
+        unreadable: folders that the system refused to list, and links to files that are missing.
     """
 
     captures: list[Found] = field(default_factory=list)
@@ -146,7 +146,7 @@ def _captures(folder: Path, depth: int, seen: set[Path], search: Search) -> list
         whole = next((folder / name for name in _WHOLE if _is_whole(folder / name)), None)
     if whole is not None:
         return [_file(whole, alone=True)]
-    files = _splats(folder, search.skipped)
+    files = _splats(folder, search)
     newest = None if files else _checkpoint(folder)
     if newest is not None:
         return [_file(newest, alone=True)]
@@ -187,20 +187,24 @@ def _is_whole(path: Path) -> bool:
     return path.is_file() and (path.name != "meta.json" or any(path.parent.glob("means_l*.webp")))
 
 
-def _splats(folder: Path, skipped: list[LeftOut] | None = None) -> list[Path]:
+def _splats(folder: Path, search: Search | None = None) -> list[Path]:
     """Files that are splats, or damaged, by suffix and header; not the SfM points that trainers leave.
 
     Args:
-        skipped: gets the point clouds and meshes among them.
+        search: gets the others that are called as splats are.
     """
-    out = []
-    for path in sorted(p for p in folder.iterdir() if p.is_file() and _readable(p)):
+    out, search = [], search or Search()
+    for path in sorted(p for p in folder.iterdir() if not p.is_dir() and _readable(p)):
         if path.name in (*_SFM_POINTS, *_WHOLE) or path.suffix.lower() in _CHECKPOINTS:
             continue
-        if _may_hold_gaussians(path):
+        if not path.exists():
+            search.unreadable.append(LeftOut(path, f"cannot read {path}: the file that it is a link to is missing"))
+        elif not path.is_file():
+            search.skipped.append(LeftOut(path, f"{path} is a pipe or a device, not a file"))
+        elif _may_hold_gaussians(path):
             out.append(path)
-        elif skipped is not None:
-            skipped.append(LeftOut(path, f"{path} is no splat but a point cloud or a mesh (gsmap localize)"))
+        else:
+            search.skipped.append(LeftOut(path, f"{path} is no splat but a point cloud or a mesh (gsmap localize)"))
     return out
 
 
@@ -288,6 +292,8 @@ def _why_none(folder: Path, *, is_empty: bool) -> str:
         return f"no captures: it has checkpoints, but {where}: name the file, or export a .ply"
     if (told := _photographed(Counter(kind for path in files for kind in _kind(path)))) is not None:
         return f"{told} and no splat: {_TRAIN}, or localize them: gsmap localize MAP {folder}/*"
+    if any(path.name in _SFM_POINTS for path in files):
+        return f"the points of a COLMAP model and no splat: {_TRAIN}"
     return f"no captures: no file of it ends with {', '.join(formats.known('read'))}" if is_empty else ""
 
 

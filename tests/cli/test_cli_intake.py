@@ -72,6 +72,7 @@ BAD: dict[str, Callable[[Path], object]] = {
     "no Gaussians": lambda p: formats.write(p, splat(0, 60)[np.zeros(60, bool)]),
     "damaged cameras": lambda p: p.with_name(f"{p.stem}.cameras.json").write_text('[{"id": 0'),
     "a date that is none": lambda p: p.with_name(f"{p.stem}.json").write_text('{"captured_at": "soon"}'),
+    "a link to a file that is missing": lambda p: (p.unlink(), p.symlink_to("gone.ply")),
     "another format": lambda p: p.rename(p.with_suffix(".spz")),
 }
 
@@ -91,7 +92,7 @@ def test_one_bad_capture_ends_nothing(tmp_path: Path, kind: str, caplog: pytest.
         assert Path(aside.about).name.startswith("night1.")
         assert aside.reason in caplog.text
 
-        if kind == "another format":
+        if kind.startswith("a"):  # another file lies there
             Path(aside.about).unlink()
         write(tmp_path / "night1.ply", 1)  # mended, as by a copy that was completed
         (tmp_path / "night1.json").unlink(missing_ok=True)
@@ -178,6 +179,8 @@ def test_a_trainers_folder_holds_one_capture(tmp_path: Path) -> None:
     assert search.skipped == []
     rewrite(model / "points3D.ply", lambda b: b[:20])  # a damaged one is nobody's business either
     assert found(tmp_path) == ["splat.ply"]
+    with pytest.raises(InputError, match="points of a COLMAP model and no splat"):
+        search_captures([room / "sparse"])
 
 
 def test_clouds_meshes_maps_and_exports_are_skipped_and_named(tmp_path: Path) -> None:
@@ -219,6 +222,14 @@ def test_a_draft_of_splats_in_gltf_is_set_aside_not_skipped(tmp_path: Path) -> N
         tmp_path / "draft.glb", {"asset": {"version": "2.0"}, "extensionsUsed": ["KHR_spz_gaussian_splats_compression"]}
     )
     assert found(tmp_path) == ["draft.glb"]
+
+
+def test_a_pipe_in_a_folder_is_skipped(tmp_path: Path) -> None:
+    write(tmp_path / "a.ply", 0)
+    os.mkfifo(tmp_path / "b.ply")
+    search = search_captures([tmp_path])
+    assert [one.path.name for one in search.captures] == ["a.ply"]
+    assert [one.path.name for one in search.skipped] == ["b.ply"]
 
 
 def photographs(folder: Path, count: int) -> Path:

@@ -116,7 +116,9 @@ def _set_aside(store: Store, bad: Sequence[LeftOut], done: Sequence[Path]) -> No
         if not aside.what.startswith(f"{CAPTURE} ") or aside.what in still:
             continue
         path = Path(aside.about)
-        is_deleted = not path.exists() and path.parent.is_dir()  # of a disk that is not mounted nothing is known
+        is_deleted = (
+            not os.path.lexists(path) and path.parent.is_dir()
+        )  # of a disk that is not mounted nothing is known
         if is_deleted or aside.what in mended or not places.isdisjoint((path, *path.parents)):
             forgotten.append(aside.what)
     if forgotten:
