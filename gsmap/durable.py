@@ -1,7 +1,8 @@
 """What must survive a power cut, and what must not happen outside a folder.
 
 Names in a folder that last, files that appear whole or not at all, and deleting, looking and opening below a folder
-without ever following a link that lies in it: such a folder may come from a stranger.
+without ever following a link that lies in it: such a folder may come from a stranger. A path that a person names as
+output is another matter: `write_output` follows its links and writes to pipes and devices.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ import fcntl
 import os
 import shutil
 import stat
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
-from gsmap.errors import BusyError, CorruptError
+from gsmap.errors import BusyError, CorruptError, InputError
 
 
 def sync_folder(folder: Path) -> None:
@@ -54,10 +57,85 @@ def write_text_whole(path: Path, text: str) -> None:
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` fill a file under a passing name, synchronise it, and put it in its place by one rename.
 
+    For files of gsmap's own folders: a link at ``path`` is replaced and never followed. See `write_output`.
+
     Raises:
         OSError: what the system says; the file that was there before stays as it was.
     """
-    staged = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    _replace(path, path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}"), write)
+
+
+def write_output(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill the output file that a person named.
+
+    A file is replaced whole or not at all, and of a symbolic link the file that it leads to. A pipe, a character device
+    and an open file of this process (``/dev/stdout``) get the bytes once all are there. Nothing else is replaced.
+
+    Args:
+        write: fills the file at the path it gets, whose name ends with that of ``path``.
+
+    Raises:
+        InputError: a folder, a socket or a block device.
+        OSError: what the system says; the file that was there before stays as it was.
+    """
+    if is_stream(path):
+        with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
+            staged = Path(folder, path.name)
+            write(staged)
+            with open(staged, "rb") as whole, _opened_stream(path) as out:
+                shutil.copyfileobj(whole, out)
+        return
+    with contextlib.suppress(FileNotFoundError):
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError(f"cannot write {path}: it is a folder; name a file in it")
+        if not stat.S_ISREG(mode):
+            raise InputError(f"cannot write {path}: it is a socket or a block device; name a file, or a pipe")
+    target = Path(os.path.realpath(path))
+    # A name that nobody can have put a link at, with the suffix that was asked for.
+    _replace(target, target.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}"), write)
+
+
+def write_text_output(path: Path, text: str) -> None:
+    """Write a text (UTF-8) to the output file that a person named; see `write_output`."""
+    write_output(path, lambda staged: staged.write_bytes(text.encode("utf-8")))
+
+
+def is_stream(path: Path) -> bool:
+    """Whether bytes written to a path go to a pipe, a character device or an open file of this process."""
+    if _descriptor(path) is not None:
+        return True
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISFIFO(mode) or stat.S_ISCHR(mode)
+
+
+def _descriptor(path: Path) -> int | None:
+    """The number of this process's open file that a path names (``/dev/stdout``, ``/dev/fd/63``); None where none.
+
+    Opening such a path anew would cut what a shell redirects to, and replacing it would replace another process's file.
+    """
+    own = {os.path.realpath(folder) for folder in ("/proc/self/fd", "/dev/fd")}
+    for _ in range(40):  # as many links as the system follows
+        folder = os.path.realpath(path.parent)
+        if folder in own and path.name.isdecimal():
+            return int(path.name)
+        if not path.is_symlink():
+            return None
+        path = Path(folder, os.readlink(path))
+    return None
+
+
+def _opened_stream(path: Path) -> BinaryIO:
+    """A pipe, a device or an open file of this process, to be written to; never makes or cuts a file."""
+    number = _descriptor(path)
+    return open(os.open(path, os.O_WRONLY | os.O_NOCTTY | os.O_CLOEXEC) if number is None else os.dup(number), "wb")
+
+
+def _replace(path: Path, staged: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill ``staged``, and put it in the place of ``path``."""
     try:
         write(staged)
         sync_file(staged)

@@ -4,6 +4,7 @@
 
     GsmapError
     ├── InputError (ValueError)            a file, array or argument cannot be used as given
+    │   └── NotGaussiansError              a sound file that holds something other than Gaussians
     ├── ConfigError (ValueError)           an option or combination of options makes no sense
     ├── NotFoundError (LookupError)        a scene, edge, revision or file that is named does not exist
     ├── StoreError                         the map on disk
@@ -43,6 +44,10 @@ def _one_line(text: str) -> str:
 
 class InputError(GsmapError, ValueError):
     """A file, array or argument cannot be used as given."""
+
+
+class NotGaussiansError(InputError):
+    """A sound file that holds something other than Gaussians, such as a point cloud or a mesh."""
 
 
 class ConfigError(GsmapError, ValueError):

@@ -1,7 +1,7 @@
 """The ``gsmap`` program: collects the verbs and turns errors into one line and an exit code.
 
-Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 done but for jobs that were set aside; 130 after Ctrl-C, 143 after SIGTERM,
-129 after SIGHUP (`gsmap.cli.stopping`).
+Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 done but for jobs or captures that were set aside; 130 after Ctrl-C,
+143 after SIGTERM, 129 after SIGHUP (`gsmap.cli.stopping`).
 """
 
 from __future__ import annotations
@@ -119,10 +119,9 @@ def run(arguments: list[str] | None = None) -> None:
     try:
         build()(arguments)
     except SystemExit as ended:
-        if ended.code or not (count := left()):
+        if ended.code or not (message := left()):
             raise
         code = 3
-        message = f"{count} {'job is' if count == 1 else 'jobs are'} set aside: gsmap status MAP says which, and why"
     except ConfigError as error:
         code, message = 2, str(error)
     except GsmapError as error:

@@ -18,6 +18,7 @@ from gsmap.texts import escaped, shown
 
 if TYPE_CHECKING:
     from gsmap.map import Map
+    from gsmap.store.set_aside import StoredSetAside
     from gsmap.types.progress import StageProgress
     from gsmap.types.rows import Row
 
@@ -205,17 +206,26 @@ def opened(
         if values or preset is not None:
             m.with_settings(values, preset)
         yield m
-        _left.extend(m.store.set_aside.met)
+        _left.extend(m.store.set_aside.met.values())
 
 
-_left: list[str] = []  # what they would have made
+_left: list[StoredSetAside] = []
 
 
-def left() -> int:
-    """Jobs that verbs of this process have set aside or left out; forgets them."""
-    count = len(_left)
+def left() -> str:
+    """Name what verbs of this process have set aside or left out, and forget it; empty where that is nothing."""
+    if not _left:
+        return ""
+    from gsmap.store.set_aside import CAPTURE
+
+    captures = [one for one in _left if one.what.startswith(f"{CAPTURE} ")]
+    jobs = len(_left) - len(captures)
     _left.clear()
-    return count
+    parts = [f"{len(captures)} capture{'s' * (len(captures) != 1)}"] if captures else []
+    parts += [f"{jobs} job{'s' * (jobs != 1)}"] if jobs else []
+    names = f" ({', '.join(one.about for one in captures)})" if captures else ""
+    verb = "is" if len(captures) + jobs == 1 else "are"
+    return f"{' and '.join(parts)} {verb} set aside{names}: gsmap status MAP says which, and why"
 
 
 @contextmanager

@@ -81,8 +81,10 @@ def _draw(m: Map, path: Path) -> None:
     """The map's picture: every placed scene, what ties it to which, and where the cameras went."""
     from PIL import Image
 
+    from gsmap.durable import write_output
     from gsmap.view.map_picture import map_picture
 
     parts = [(scene.name, *m.read(scene.name, frame="map")) for scene in m.scenes()]
     edges = [(row.target_name, row.source_name) for row in m.edge_rows() if row.used]
-    Image.fromarray(map_picture(parts, edges)).save(path, optimize=True)
+    picture = Image.fromarray(map_picture(parts, edges))
+    write_output(path, lambda staged: picture.save(staged, optimize=True))

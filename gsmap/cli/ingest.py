@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
-Paths = Annotated[list[str], typer.Argument(metavar="FILE_OR_FOLDER...", help="Captures: files or folders.")]
+Paths = Annotated[list[str] | None, typer.Argument(metavar="FILE_OR_FOLDER...", help="Captures: files or folders.")]
 CamerasFile = Annotated[str | None, typer.Option("--cameras", help="Cameras of the one capture given.")]
 Name = Annotated[str | None, typer.Option("--name", help="Name of the one capture given.")]
 CapturedAt = Annotated[
@@ -21,7 +24,7 @@ Scale = Annotated[
 
 def command(
     map: MapPath,
-    paths: Paths,
+    paths: Paths = None,
     cameras: CamerasFile = None,
     name: Name = None,
     captured_at: CapturedAt = None,
@@ -40,9 +43,43 @@ def command(
 
     Example: `gsmap ingest site.gsmap monday.ply tuesday/`
     """
+    from gsmap.errors import ConfigError
+
+    refuse_capture_as_map("ingest", map, paths or [])
+    if not paths:
+        raise ConfigError(f"name the files or folders of captures: gsmap ingest {shlex.quote(map)} FILE_OR_FOLDER...")
     with opened(map, bars=True) as m:
         rows = m.ingest(*paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, supersedes=supersedes)
     for row in rows:
         for note in row.notes:
             say(f"{row.scene_name}: {note}")
     print_rows("ingest", rows, json)
+
+
+def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
+    """Refuse a capture, or a folder of captures, that is named where MAP belongs, with the command that was meant.
+
+    The map is guessed: one that is named behind, or the only one in the working folder.
+
+    Raises:
+        ConfigError: MAP is no map, but holds captures or photographs.
+    """
+    from gsmap.errors import ConfigError, InputError
+    from gsmap.ingest import search_captures
+    from gsmap.store.branches import holds_catalog
+
+    given = Path(map)
+    if not given.exists() or given.suffix == ".gsmap" or holds_catalog(given):
+        return
+    if given.is_dir() and ((given / "arrays").is_dir() or not any(given.iterdir())):
+        return  # a damaged map, or the place for one
+    try:
+        search_captures([given])
+    except InputError as error:
+        raise ConfigError(f"{map} is not a gsmap map: {error}") from error
+    named = [path for path in paths if holds_catalog(Path(path))]
+    near = named or sorted(path.name for path in Path().iterdir() if holds_catalog(path))
+    guess = near[0] if len(near) == 1 else f"{given.resolve().stem or 'site'}.gsmap" if not near else "MAP"
+    meant = ["gsmap", verb, guess, map, *(path for path in paths if path not in named)]
+    also = f" (MAP is one of {', '.join(near)})" if len(near) > 1 else ""
+    raise ConfigError(f"{map} holds captures and is no map; MAP comes first. Did you mean: {shlex.join(meant)}{also}")

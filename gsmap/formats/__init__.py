@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,8 +17,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from gsmap.durable import is_stream, write_output
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import family
+from gsmap.stream import clamped, clamped_column
 from gsmap.types import Cameras, FileInfo, Gaussians, GaussianSource
 
 _Part = TypeVar("_Part")
@@ -36,7 +37,7 @@ def suffix_of(path: str | os.PathLike[str]) -> str | None:
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the Gaussians of a file of any known format.
+    """Read the Gaussians of a file of any known format; infinities that are values are clamped (`gsmap.stream`).
 
     Raises:
         NotFoundError: no such file.
@@ -46,8 +47,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     suffix = _suffix(path, "read")
     # NaN and overflow in a damaged file are for `gsmap.ingest` to name, not for numpy to warn of.
     with _explained(path, "read"), np.errstate(all="ignore"):
-        found: Gaussians = _load(_layout(path, suffix)).read(path)
-        return found
+        return clamped(_load(_layout(path, suffix)).read(path))
 
 
 def stream(path: str | os.PathLike[str]) -> GaussianSource:
@@ -80,14 +80,16 @@ class _FileSource:
         return self.source.sh_degree
 
     def chunks(self) -> Iterator[Gaussians]:
-        yield from self._quietly(self.source.chunks())
+        for chunk in self._quietly(self.source.chunks()):
+            yield clamped(chunk)
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
-        yield from self._quietly(self.source.columns(name))
+        for column in self._quietly(self.source.columns(name)):
+            yield clamped_column(name, column)
 
     def load(self) -> Gaussians:
         with _explained(self.path, "read"), np.errstate(all="ignore"):
-            return self.source.load()
+            return clamped(self.source.load())
 
     def _quietly(self, parts: Iterator[_Part]) -> Iterator[_Part]:
         while True:
@@ -109,6 +111,8 @@ def info(path: str | os.PathLike[str]) -> FileInfo:
 def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: object) -> None:
     """Write Gaussians in the format of the path's suffix; the file appears whole or not at all.
 
+    Links, pipes and devices: see `gsmap.durable.write_output`; only a format of one file is written to a pipe.
+
     What is still to be read is written a chunk at a time by formats that can (``.ply``), and is loaded for others.
 
     Args:
@@ -124,14 +128,11 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
     if not suffix.startswith("."):  # a folder by what lies in it, such as ``tileset.json``
         with _explained(path.parent, "write"):
             path.parent.mkdir(parents=True, exist_ok=True)
-    staged = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")  # a name that nobody can have put a link at
-    try:
-        with _explained(path, "write"):
-            module.write(staged, gaussians if hasattr(module, "stream") else gaussians.load(), **options)
-            os.replace(staged, path)
-    finally:
-        with contextlib.suppress(OSError):
-            staged.unlink(missing_ok=True)
+        if is_stream(path):
+            raise InputError(f"cannot write {path}: a pipe or device holds one file, and {suffix} has others beside it")
+    with _explained(path, "write"):
+        content = gaussians if hasattr(module, "stream") else gaussians.load()
+        write_output(path, lambda staged: module.write(staged, content, **options))
 
 
 def read_cameras(path: str | os.PathLike[str]) -> Cameras:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.durable import write_text_output
 from gsmap.errors import InputError
 from gsmap.formats.camera_files import unique
 from gsmap.types import Cameras
@@ -39,4 +40,4 @@ def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
         if (cx, cy) != (width / 2, height / 2):
             entry |= {"cx": cx, "cy": cy}
         entries.append(entry)
-    Path(path).write_text(json.dumps(entries))
+    write_text_output(Path(path), json.dumps(entries))

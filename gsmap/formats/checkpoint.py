@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import MALFORMED, InputError
+from gsmap.errors import MALFORMED, InputError, NotGaussiansError
 from gsmap.formats.quantise import check_size
 from gsmap.types import FileInfo, Gaussians
 
@@ -49,7 +49,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     missing = [name for name in _REQUIRED if name not in found]
     if missing:
         held = ", ".join(sorted(found)) or "none of what a splat has"
-        raise InputError(f"{path} holds no Gaussians: it has {held} and lacks {', '.join(missing)}")
+        raise NotGaussiansError(f"{path} holds no Gaussians: it has {held} and lacks {', '.join(missing)}")
     n = len(found["means"])
     size = os.path.getsize(path)
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh0": (1, 3)}

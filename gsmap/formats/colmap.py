@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import write_text_whole
+from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import unique
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
@@ -104,7 +104,7 @@ def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
 
 def _write_lines(path: Path, lines: list[str]) -> None:
     text = "\n".join(lines) + "\n"
-    write_text_whole(path, text)
+    write_text_output(path, text)
 
 
 def _calibration(model: object, width: int, height: int, params: list[float]) -> tuple[float, ...]:

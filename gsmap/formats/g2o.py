@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.geometry.similarities import without_scale
@@ -108,7 +109,7 @@ def write_graph(
         upper = " ".join(repr(float(v)) for v in information[_UPPER])
         ends = f"{numbers[edge.target]} {numbers[edge.source]}"
         lines.append(f"EDGE_SE3:QUAT {ends} {_values(edge.S_target_source, name)} {upper}")
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+    write_text_output(Path(path), "\n".join(lines) + "\n")
     return numbers
 
 

@@ -16,6 +16,7 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 
 _MOST_BYTES = 64 << 20
@@ -110,7 +111,7 @@ def write(path: str | os.PathLike[str], crs: str, lines: list[GcpLine]) -> None:
     for one in lines:
         numbers = "\t".join(repr(float(v)) for v in (*one.position, *one.pixel))
         parts.append(f"{numbers}\t{one.image}\t{one.name}")
-    Path(path).write_text("\n".join(parts) + "\n", encoding="utf-8")
+    write_text_output(Path(path), "\n".join(parts) + "\n")
 
 
 def _crs(line: str, where: str) -> str:

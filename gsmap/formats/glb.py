@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import MALFORMED, InputError
+from gsmap.errors import MALFORMED, InputError, NotGaussiansError
 from gsmap.formats import spz
 from gsmap.formats.axes import GLTF, PLY, change_axes
 from gsmap.formats.quantise import check_size, opacity_bytes, require_writable
@@ -69,7 +69,7 @@ def holds_splats(path: str | os.PathLike[str]) -> bool:
         InputError: not a GLB, or damaged.
     """
     used = _read_container(path)[0].get("extensionsUsed", [])
-    return isinstance(used, list) and EXTENSION in used
+    return isinstance(used, list) and any("gaussian_splat" in str(name) for name in used)  # drafts, too: `read` says so
 
 
 def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -> Gaussians:
@@ -86,7 +86,7 @@ def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -
             raise
         raise InputError(f"{path} is not valid glTF: {type(error).__name__} {error}") from error
     if not parts:
-        raise InputError(f"{path} holds no Gaussian splats ({EXTENSION}): a mesh or a point cloud?")
+        raise NotGaussiansError(f"{path} holds no Gaussian splats ({EXTENSION}): a mesh or a point cloud?")
     return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)
 
 

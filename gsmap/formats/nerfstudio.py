@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import write_text_whole
+from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import load_json, unique
 from gsmap.types import Cameras, Sim3
@@ -74,7 +74,7 @@ def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
         frame |= dict(zip(("fl_x", "fl_y", "cx", "cy"), cameras.intrinsics_px[i].tolist(), strict=True))
         frames.append(frame | {"transform_matrix": pose[i].tolist()})
     text = json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1)
-    write_text_whole(path, text)
+    write_text_output(path, text)
 
 
 def _rows_to_matrix(rows: list[list[float]]) -> np.ndarray:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.errors import InputError
+from gsmap.errors import InputError, NotGaussiansError
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.stream import loaded
 from gsmap.types import FileInfo, Gaussians, GaussianSource
@@ -104,7 +104,9 @@ def stream(path: str | os.PathLike[str]) -> PlySource:
     missing = [n for field in ("means", "sh", "logit_opacities", "log_scales", "quats") for n in columns[field]]
     missing = [n for n in missing if n not in names]
     if missing:
-        raise InputError(f"{path} is not a 3DGS .ply: its vertices lack {', '.join(missing)} (a point cloud or mesh?)")
+        raise NotGaussiansError(
+            f"{path} is not a 3DGS .ply: its vertices lack {', '.join(missing)} (a point cloud or mesh?)"
+        )
     return PlySource(rows, columns, tuple(rest), "filter_3D" in names)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.types import Sim3
@@ -54,4 +55,4 @@ def write_trajectory(
     for time_s, pose in zip(times, poses, strict=True):
         w, x, y, z = matrices_to_quats(pose.rotation[None])[0].tolist()
         lines.append(" ".join(repr(v) for v in [float(time_s), *pose.translation.tolist(), x, y, z, w]))
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+    write_text_output(Path(path), "\n".join(lines) + "\n")

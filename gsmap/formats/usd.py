@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import InputError, MissingDependencyError
+from gsmap.errors import InputError, MissingDependencyError, NotGaussiansError
 from gsmap.formats.axes import PLY, change_axes
 from gsmap.formats.quantise import check_size, require_writable
 from gsmap.formats.scans.params import Params
@@ -58,7 +58,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         raise InputError(f"{path}: its up axis is {up!r}; gsmap reads Y and Z")
     parts = [_splat(path, told, i) for i in range(int(told["count"]))]
     if not parts:
-        raise InputError(f"{path} holds no ParticleField3DGaussianSplat: a mesh, or splats of an older schema?")
+        raise NotGaussiansError(f"{path} holds no ParticleField3DGaussianSplat: a mesh, or splats of an older schema?")
     return change_axes(Gaussians.concatenate(parts), PLY, _UP[up])
 
 

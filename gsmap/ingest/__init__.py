@@ -3,19 +3,22 @@
 from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.ingest.capture import Capture, read_capture, read_captures, take_capture
 from gsmap.ingest.dates import CaptureDate, find_date, given_date, parse_date
-from gsmap.ingest.find import Found, find_captures
+from gsmap.ingest.find import Found, LeftOut, Search, find_captures, search_captures
 from gsmap.ingest.validate import validate
 
 __all__ = [
     "Capture",
     "CaptureDate",
     "Found",
+    "LeftOut",
+    "Search",
     "find_captures",
     "find_date",
     "given_date",
     "parse_date",
     "read_capture",
     "read_captures",
+    "search_captures",
     "synthesise_cameras",
     "take_capture",
     "validate",

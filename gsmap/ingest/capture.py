@@ -15,6 +15,7 @@ from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.find import Found, find_captures
 from gsmap.ingest.validate import validate_cameras, validate_gaussians
+from gsmap.stream import clamped
 from gsmap.types import Cameras, Gaussians, GaussianSource
 from gsmap.types.progress import Progress
 from gsmap.types.scene import SCALE_POLICIES
@@ -134,8 +135,9 @@ def take_capture(
         raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
     date = given_date(captured_at)
     where = source or f"capture {name!r}"
-    notes: list[str] = []
-    validate_gaussians(gaussians, where)
+    if isinstance(gaussians, Gaussians):
+        gaussians = clamped(gaussians)
+    notes = list(validate_gaussians(gaussians, where))
     if cameras is None:
         cameras = synthesise_cameras(gaussians)
         notes.append(f"no cameras were found beside it: {len(cameras)} were synthesised in its free space")

@@ -7,7 +7,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,12 +24,16 @@ _FIRST_YEAR = 1990  # a digital camera that says less lost its clock
 _PHOTOGRAPHS = ("JPEG", "MPO", "TIFF", "WEBP")
 _SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 _EXIF_IFD, _TAKEN, _TAKEN_OFFSET = 0x8769, 0x9003, 0x9011
-# Compact dates stand alone, since eight digits are often a number or part of a digest.
+# Compact dates stand alone, since eight digits are often a number or part of a digest; those with their time follow a
+# camera's word (DJI_20260531140000). After a minus a time has its seconds (rosbag), or is a number.
 _DATE = re.compile(
     r"""(?: (?<!\d) (?P<y>\d{4}) (?P<s>[-_]) (?P<m>\d\d) (?P=s) (?P<d>\d\d) (?!\d)
-          | (?<![A-Za-z0-9.]) (?P<day>\d{8}) (?![0-9A-SU-Za-z]) )
-        (?: [T_\ ] (?!\d{4}[-_]\d\d[-_]\d\d)  # another date is no time
-            (?P<h>\d\d) (?P<t>[-_:]?) (?P<min>\d\d) (?:(?P=t)(?P<sec>\d\d))? (?P<z>Z|\+\d\d:?\d\d)? (?![0-9A-Za-z]) )?
+          | (?<![A-Za-z0-9.]) (?P<day>\d{8}) (?![0-9A-SU-Za-z])
+          | (?<=[A-Za-z][-_]) (?P<stamp>\d{14}) (?![0-9A-Za-z]) )
+        (?: (?: [T_\ ] (?!\d{4}[-_]\d\d[-_]\d\d)  # another date is no time
+              | - (?=\d\d[-_:]\d\d[-_:]\d\d(?!\d) | \d{6}(?:\d{3})?(?!\d)) )
+            (?P<h>\d\d) (?P<t>[-_:]?) (?P<min>\d\d) (?: (?P=t) (?P<sec>\d\d) (?: (?<=\d{6}) (?P<ms>\d{3}) )? )?
+            (?P<z>Z|\+\d\d:?\d\d)? (?![0-9A-Za-z]) )?
     """,
     re.VERBOSE | re.ASCII,
 )
@@ -64,22 +68,26 @@ def given_date(when: str | datetime | None) -> CaptureDate:
     """The date that a person gives.
 
     Raises:
-        ConfigError: not a date.
+        ConfigError: not a date, or one that lies more than a day in the future.
     """
     date = _parsed(when)
     if date is None:
         return CaptureDate()
     known = _zoned(date).isoformat()
+    if _zoned(date) > datetime.now(UTC) + timedelta(days=1):
+        raise ConfigError(f"captured-at {known} lies in the future: correct it, or this computer's clock")
     return CaptureDate(known, "", "" if date.tzinfo else f"dated {known} as told: no zone was given, taken as UTC")
 
 
 def photo_date(path: str | os.PathLike[str]) -> CaptureDate:
     """When a photograph was taken, as its EXIF says; nothing where that says nothing plausible."""
-    found = _exif_date(Path(path), datetime.now(UTC) + timedelta(days=1))
+    found = _exif_date(Path(path))
     if found is None:
         return CaptureDate()
     date, zoned = found
     name = shown(Path(path).name)
+    if not _plausible(date, datetime.now(UTC) + timedelta(days=1)):
+        return CaptureDate(note=f"no date: {_in_future(date, f'the EXIF of {name}')}")
     return _dated(date, f"the EXIF of {name}", "" if zoned else f"{name}: its EXIF has no zone, taken as UTC")
 
 
@@ -101,24 +109,42 @@ def find_date(
         InputError: a sidecar whose date is none.
     """
     latest = (now or datetime.now(UTC)) + timedelta(days=1)
-    return (
+    notes: list[str] = []
+    date = (
         _from_sidecar(found, latest)
-        or _from_frames(_photographs(found, cameras, frames), latest)
-        or _from_names(found, latest)
+        or _from_frames(_photographs(found, cameras, frames), latest, notes)
+        or _from_names(found, latest, notes)
         or CaptureDate()
     )
+    if not notes:
+        return date
+    return replace(date, note="; ".join([date.note or "no date", *notes]))
 
 
 def date_in_name(name: str, *, now: datetime | None = None) -> tuple[datetime | None, str]:
     """The date in a name such as ``hall_2026-05-31T14-00``, UTC where it has no zone, and what to know of it.
 
-    None where there is no date, or where there are several.
+    None where there is no date, where there are several, or where it lies in the future.
     """
-    latest = (now or datetime.now(UTC)) + timedelta(days=1)
-    dates = [date for match in _DATE.finditer(name) if (date := _matched(match, latest)) is not None]
+    notes: list[str] = []
+    date, note = _date_in_name(name, (now or datetime.now(UTC)) + timedelta(days=1), notes)
+    return date, "; ".join([*([note] if note else []), *notes])
+
+
+def _date_in_name(name: str, latest: datetime, notes: list[str]) -> tuple[datetime | None, str]:
+    """As `date_in_name`; a date that lies in the future is named in ``notes``."""
+    dates = [date for match in _DATE.finditer(name) if (date := _matched(match)) is not None]
+    future = [day for day, _ in dates if day > latest]
+    dates = [(day, note) for day, note in dates if day <= latest]
+    if future and not dates:
+        notes.append(_in_future(min(future), f"the name {shown(name)}"))
     if len({day.date() for day, _ in dates}) > 1:
         return None, f"the name {shown(name)} has several dates: none of them was taken"
     return max(dates, key=lambda date: not date[1], default=(None, ""))
+
+
+def _in_future(date: datetime, source: str) -> str:
+    return f"{date.isoformat()} by {source} lies in the future and was not taken: is this computer's clock behind?"
 
 
 def shown(name: str) -> str:
@@ -207,8 +233,12 @@ def _picture(name: str, folders: Sequence[Path]) -> Path | None:
     return None
 
 
-def _from_frames(pictures: Sequence[Path], latest: datetime) -> CaptureDate | None:
-    taken = [(*date, path) for path in pictures if (date := _exif_date(path, latest)) is not None]
+def _from_frames(pictures: Sequence[Path], latest: datetime, notes: list[str]) -> CaptureDate | None:
+    read = [(*date, path) for path in pictures if (date := _exif_date(path)) is not None]
+    taken = [one for one in read if _plausible(one[0], latest)]
+    if not taken and read:
+        earliest, _, path = min(read, key=lambda one: one[0])
+        notes.append(_in_future(earliest, f"the EXIF of {shown(path.name)}"))
     if not taken:
         return None
     first, has_zone, path = min(taken, key=lambda one: one[0])
@@ -219,8 +249,8 @@ def _from_frames(pictures: Sequence[Path], latest: datetime) -> CaptureDate | No
     return _dated(first, f"the EXIF of {shown(path.name)}", note)
 
 
-def _exif_date(path: Path, latest: datetime) -> tuple[datetime, bool] | None:
-    """When a photograph was taken, and whether its zone is known; None where it does not say so or cannot be right."""
+def _exif_date(path: Path) -> tuple[datetime, bool] | None:
+    """When a photograph was taken, and whether its zone is known; None where there is no date, or that of no clock."""
     from PIL import Image
 
     try:
@@ -240,15 +270,15 @@ def _exif_date(path: Path, latest: datetime) -> tuple[datetime, bool] | None:
         except ValueError:  # an offset of more than a day
             zoned = False
     date = _zoned(date)
-    return (date, zoned) if _plausible(date, latest) else None
+    return (date, zoned) if date.year >= _FIRST_YEAR else None
 
 
 # --- names -----------------------------------------------------------------------------------------------------------
 
 
-def _from_names(found: Found, latest: datetime) -> CaptureDate | None:
+def _from_names(found: Found, latest: datetime, notes: list[str]) -> CaptureDate | None:
     for name in _telling_names(found):
-        date, note = date_in_name(name, now=latest - timedelta(days=1))
+        date, note = _date_in_name(name, latest, notes)
         if date is not None:
             return _dated(date, f"the name {shown(name)}", note)
         if note:
@@ -270,8 +300,14 @@ def _telling_names(found: Found) -> Iterator[str]:
             yield name
 
 
-def _matched(match: re.Match[str], latest: datetime) -> tuple[datetime, str] | None:
-    """The date of a match and what to know of it; None where there is no such day."""
+def _matched(match: re.Match[str]) -> tuple[datetime, str] | None:
+    """The date of a match and what to know of it; None where there is no such day, or no camera had that clock."""
+    if match["stamp"]:
+        try:
+            date = _zoned(datetime.strptime(match["stamp"], "%Y%m%d%H%M%S"))
+        except ValueError:
+            return None
+        return (date, "no zone was given, taken as UTC") if date.year >= _FIRST_YEAR else None
     day = match["day"] or match["y"] + match["m"] + match["d"]
     try:
         date = datetime.strptime(day, "%Y%m%d")
@@ -280,13 +316,19 @@ def _matched(match: re.Match[str], latest: datetime) -> tuple[datetime, str] | N
     note = "no time of day was given, taken as 00:00 UTC"
     if match["h"]:
         try:
-            date = date.replace(hour=int(match["h"]), minute=int(match["min"]), second=int(match["sec"] or 0))
+            milliseconds = int(match["ms"] or 0)
+            date = date.replace(
+                hour=int(match["h"]),
+                minute=int(match["min"]),
+                second=int(match["sec"] or 0),
+                microsecond=1000 * milliseconds,
+            )
             note = "" if match["z"] else "no zone was given, taken as UTC"
             date = datetime.fromisoformat(date.isoformat() + (match["z"] or ""))
         except ValueError:  # a number that follows, and no time
             date, note = datetime.strptime(day, "%Y%m%d"), "no time of day was given, taken as 00:00 UTC"
     date = _zoned(date)
-    return (date, note) if _plausible(date, latest) else None
+    return (date, note) if date.year >= _FIRST_YEAR else None
 
 
 # --- what they share -------------------------------------------------------------------------------------------------

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 from gsmap import formats
-from gsmap.errors import InputError, NotFoundError
-from gsmap.formats import colmap
+from gsmap.errors import GsmapError, InputError, NotFoundError
+from gsmap.formats import colmap, scans
 
 MAX_DEPTH = 5
 # What a trainer calls every one of its files, so the folder tells more.
@@ -23,6 +25,9 @@ _GENERIC_FOLDER = re.compile(
 )
 _WHOLE = "tileset.json", "lod-meta.json", "meta.json"  # files by which a folder is one scene
 _CHECKPOINTS = (".pt", ".pth", ".ckpt")
+_SFM_POINTS = ("input.ply", "points3D.ply")  # trainers leave them beside a splat, and in a COLMAP model
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".dng")
+_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
 
 
 @dataclass(frozen=True)
@@ -47,51 +52,121 @@ class Found:
     alone: bool = True
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """A file or folder that is not ingested.
+
+    Args:
+        reason: one line that names it.
+    """
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True)
+class Search:
+    """The result of a search for captures.
+
+    Args:
+        captures: in the order given; a folder's in the order of their names.
+        skipped: files that hold something other than Gaussians, and folders without captures.
+        unreadable: folders that the system refused to list, and links to files that are missing.
+    """
+
+    captures: list[Found] = field(default_factory=list)
+    skipped: list[LeftOut] = field(default_factory=list)
+    unreadable: list[LeftOut] = field(default_factory=list)
+
+
 def find_captures(paths: Iterable[str | os.PathLike[str]]) -> list[Found]:
-    """All captures in files and folders, in the order given; a folder's in the order of their names.
+    """All captures in files and folders; see `search_captures`."""
+    return search_captures(paths).captures
+
+
+def search_captures(paths: Iterable[str | os.PathLike[str]]) -> Search:
+    """Search files and folders for captures.
 
     A folder is the output of gaussian-splatting (its last iteration is taken), of gsplat (the last ``.ply``), or of
-    nerfstudio, or it holds files and folders of captures.
+    nerfstudio, or it holds files and folders of captures. SfM points of COLMAP models, maps and exports in it are
+    passed over.
 
     Raises:
         NotFoundError: no such file or folder.
-        InputError: an unknown suffix, or a folder without captures.
+        InputError: a pipe or a device, or nothing that could be a capture: an unknown suffix, folders without captures.
     """
-    out: list[Found] = []
-    for path in map(Path, paths):
+    search, given = Search(), [Path(path) for path in paths]
+    num_splats_in = cache(lambda folder: len(_splats(folder)))
+    for path in given:
         if not path.exists():
             raise NotFoundError(f"no such file or folder: {path}")
-        if not path.is_dir():
-            if not path.is_file():
-                raise InputError(f"{path} is a pipe or a device, not a file: save what comes from it first")
-            out.append(_file(path, alone=len(_splats(path.parent)) <= 1))
-            continue
-        found = _folder(path.resolve() if path.name in ("", "..") else path, MAX_DEPTH, set())
-        if not found:
-            raise InputError(f"{path} holds no captures: {_why_none(path)}")
-        out.extend(found)
-    return out
+        if path.is_dir():
+            _search_folder(path, search)
+        elif not path.is_file():
+            raise InputError(f"{path} is a pipe or a device, not a file: save what comes from it first")
+        elif formats.suffix_of(path) is None:
+            search.skipped.append(LeftOut(path, _unknown(path)))
+        else:
+            search.captures.append(_file(path, alone=num_splats_in(path.parent) <= 1))
+    if given and not search.captures and not search.unreadable:
+        raise InputError(_why_nothing(given, search.skipped))
+    return search
 
 
-def _folder(folder: Path, depth: int, seen: set[Path]) -> list[Found]:
+def _search_folder(path: Path, search: Search) -> None:
+    """Add the captures of a folder that was named, or the reason why it has none."""
+    if (folder := _product(path)) == "a gsmap map":
+        search.skipped.append(LeftOut(path, f"{path} is {folder}, no capture: gsmap merge adds its scenes"))
+        return
+    num_skipped, num_unreadable = len(search.skipped), len(search.unreadable)
+    found = _folder(path.resolve() if path.name in ("", "..") else path, MAX_DEPTH, set(), search)
+    search.captures.extend(found)
+    if not found and num_unreadable == len(search.unreadable):
+        why = _why_none(path, is_empty=num_skipped == len(search.skipped))
+        if why:
+            search.skipped.insert(num_skipped, LeftOut(path, f"{path} holds {why}"))
+
+
+def _folder(folder: Path, depth: int, seen: set[Path], search: Search) -> list[Found]:
     """The captures of a folder and of those in it, each of which is looked at once, however many links lead to it."""
     if folder.resolve() in seen:
         return []
     seen.add(folder.resolve())
+    try:
+        return _captures(folder, depth, seen, search)
+    except OSError as error:
+        search.unreadable.append(LeftOut(folder, f"cannot read {folder}: {error.strerror or error}"))
+        return []
+
+
+def _captures(folder: Path, depth: int, seen: set[Path], search: Search) -> list[Found]:
+    """See `_folder`."""
     whole = _last(folder.glob("point_cloud/iteration_*/point_cloud.*")) or _last(folder.glob("ply/point_cloud_*.*"))
     if whole is None:  # what lies below it are parts of one scene
         whole = next((folder / name for name in _WHOLE if _is_whole(folder / name)), None)
     if whole is not None:
         return [_file(whole, alone=True)]
-    files = _splats(folder)
+    files = _splats(folder, search)
     newest = None if files else _checkpoint(folder)
     if newest is not None:
         return [_file(newest, alone=True)]
     out = [_file(path, alone=len(files) == 1) for path in files]
     if depth > 0:
         for child in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
-            out.extend(_folder(child, depth - 1, seen))
+            if (product := _product(child)) is not None:
+                search.skipped.append(LeftOut(child, f"{child} is {product}: name it to ingest what lies in it"))
+            else:
+                out.extend(_folder(child, depth - 1, seen, search))
     return out
+
+
+def _product(folder: Path) -> str | None:
+    """What gsmap made a folder as, which is no capture of a place; None where it did not."""
+    if (folder / "map.sqlite").is_file() or (folder / "catalog.url").is_file():
+        return "a gsmap map"
+    if (folder / "tiles.json").is_file() and any(folder.glob("component_*")):
+        return "an export of gsmap"
+    return None
 
 
 def _checkpoint(folder: Path) -> Path | None:
@@ -112,10 +187,33 @@ def _is_whole(path: Path) -> bool:
     return path.is_file() and (path.name != "meta.json" or any(path.parent.glob("means_l*.webp")))
 
 
-def _splats(folder: Path) -> list[Path]:
-    """Files with a suffix that can be read; not the SfM points that trainers leave as ``input.ply``."""
-    files = (p for p in folder.iterdir() if p.is_file() and _readable(p))
-    return sorted(p for p in files if p.name not in ("input.ply", *_WHOLE) and p.suffix.lower() not in _CHECKPOINTS)
+def _splats(folder: Path, search: Search | None = None) -> list[Path]:
+    """Files that are splats, or damaged, by suffix and header; not the SfM points that trainers leave.
+
+    Args:
+        search: gets the others that are called as splats are.
+    """
+    out, search = [], search or Search()
+    for path in sorted(p for p in folder.iterdir() if not p.is_dir() and _readable(p)):
+        if path.name in (*_SFM_POINTS, *_WHOLE) or path.suffix.lower() in _CHECKPOINTS:
+            continue
+        if not path.exists():
+            search.unreadable.append(LeftOut(path, f"cannot read {path}: the file that it is a link to is missing"))
+        elif not path.is_file():
+            search.skipped.append(LeftOut(path, f"{path} is a pipe or a device, not a file"))
+        elif _may_hold_gaussians(path):
+            out.append(path)
+        else:
+            search.skipped.append(LeftOut(path, f"{path} is no splat but a point cloud or a mesh (gsmap localize)"))
+    return out
+
+
+def _may_hold_gaussians(path: Path) -> bool:
+    """Whether a file's header promises Gaussians; also where it is damaged, which is said when the file is read."""
+    try:
+        return path.suffix.lower() not in scans.SUFFIXES or scans.holds_splat(path)
+    except (GsmapError, OSError):
+        return True
 
 
 def _readable(path: Path) -> bool:
@@ -131,9 +229,7 @@ def _last(paths: Iterable[Path]) -> Path | None:
 def _file(path: Path, *, alone: bool) -> Found:
     suffix = formats.suffix_of(path)
     if suffix is None:
-        raise InputError(
-            f"{path} has the unknown suffix {path.suffix!r}: gsmap can read {', '.join(formats.known('read'))}"
-        )
+        raise InputError(_unknown(path))
     stem = path.name[: -len(suffix)]
     names = _names(path, stem)
     name = stem if _tells_nothing(names[-1][1]) else names[-1][1]
@@ -177,7 +273,49 @@ def _shared_cameras(path: Path) -> Path | None:
     return None
 
 
-def _why_none(folder: Path) -> str:
-    if any(p.suffix in _CHECKPOINTS for p in folder.rglob("*")):
-        return "it has checkpoints, but not where trainers put those of one GPU: name the file, or export a .ply"
-    return f"no file of it ends with {', '.join(formats.known('read'))}"
+def _unknown(path: Path) -> str:
+    """Why a file that was named is not taken for a capture."""
+    for kind in _kind(path):
+        return f"{path} is a {kind} and no splat: {_TRAIN}, or localize it: gsmap localize MAP {path}"
+    return f"{path} has the unknown suffix {path.suffix!r}: gsmap can read {', '.join(formats.known('read'))}"
+
+
+def _why_none(folder: Path, *, is_empty: bool) -> str:
+    """What a folder without captures holds, and what to do.
+
+    Args:
+        is_empty: say so where there is neither a checkpoint nor a photograph; else the answer is empty.
+    """
+    files = [path for path in folder.rglob("*") if not path.is_dir()]
+    if any(path.suffix in _CHECKPOINTS for path in files):
+        where = "not where trainers put those of one GPU"
+        return f"no captures: it has checkpoints, but {where}: name the file, or export a .ply"
+    if (told := _photographed(Counter(kind for path in files for kind in _kind(path)))) is not None:
+        return f"{told} and no splat: {_TRAIN}, or localize them: gsmap localize MAP {folder}/*"
+    if any(path.name in _SFM_POINTS for path in files):
+        return f"the points of a COLMAP model and no splat: {_TRAIN}"
+    return f"no captures: no file of it ends with {', '.join(formats.known('read'))}" if is_empty else ""
+
+
+def _why_nothing(given: list[Path], skipped: list[LeftOut]) -> str:
+    """Why nothing that was named is a capture, in one line."""
+    kinds = Counter(kind for path in given if path.is_file() for kind in _kind(path))
+    if sum(kinds.values()) == len(given) > 1:
+        return f"{_photographed(kinds)} and no splat: {_TRAIN}, or localize them: gsmap localize MAP FILE..."
+    more = f" (and {len(skipped) - 1} more without a capture)" if len(skipped) > 1 else ""
+    return f"{skipped[0].reason}{more}"
+
+
+_TRAIN = "train a splat from them first (docs/start.md names trainers)"
+
+
+def _kind(path: Path) -> list[str]:
+    """``photograph`` or ``video``, by the suffix; empty where it is neither."""
+    suffix = path.suffix.lower()
+    return ["photograph"] if suffix in _PHOTOGRAPHS else ["video"] if suffix in _VIDEOS else []
+
+
+def _photographed(kinds: Counter[str]) -> str | None:
+    """How many photographs and videos there are; None where there are none."""
+    told = [f"{n} {kind}{'s' * (n != 1)}" for kind in ("photograph", "video") if (n := kinds[kind])]
+    return " and ".join(told) or None

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.projection import in_image, project
+from gsmap.stream import clamped, num_clamped
 from gsmap.types import Cameras, GaussianSource
 from gsmap.types.gaussians import FIELDS
 from gsmap.types.source import gathered
@@ -28,14 +29,14 @@ def validate(
         where: what to call it in messages (its file).
 
     Raises:
-        InputError: no Gaussians; NaN, infinity, an absurd scale or a zero quaternion, with its row; cameras of which
-            none sees a Gaussian, or with pictures larger than any.
+        InputError: no Gaussians; NaN, an infinity that is no value (see `gsmap.stream.clamped`), an absurd scale or a
+            zero quaternion, with its row; cameras of which none sees a Gaussian, or with pictures larger than any.
     """
-    validate_gaussians(gaussians, where)
-    return () if cameras is None else validate_cameras(cameras, gaussians, where)
+    notes = validate_gaussians(gaussians, where)
+    return notes if cameras is None else (*notes, *validate_cameras(cameras, gaussians, where))
 
 
-def validate_gaussians(gaussians: GaussianSource, where: str) -> None:
+def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]:
     """As `validate`, of the Gaussians alone; they are read once."""
     n = gaussians.num_gaussians
     if not n:
@@ -44,7 +45,10 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> None:
     widest = np.empty(n, np.float32)
     sampled = []
     start, step = 0, _step(n)
-    for chunk in gaussians.chunks():
+    opacities, scales = 0, 0
+    for chunk in map(clamped, gaussians.chunks()):
+        infinite = num_clamped(chunk)
+        opacities, scales = opacities + infinite[0], scales + infinite[1]
         for name in FIELDS:
             rows = getattr(chunk, name).reshape(len(chunk), -1)
             # One sum finds any NaN or infinity in a pass; only a bad file pays for the second.
@@ -63,6 +67,12 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> None:
     absurd = _Rows()
     absurd.note(0, widest.astype(np.float64) > np.log(MAX_SCALE_OVER_EXTENT * extent))
     absurd.refuse(where, f"a scale over {MAX_SCALE_OVER_EXTENT:g} extents")
+    if not opacities and not scales:
+        return ()
+    return (
+        f"{opacities} opacities are 0 or 1 and {scales} scales are 0, which is infinite as a logit or logarithm: "
+        "finite numbers that draw the same stand for them",
+    )
 
 
 def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) -> tuple[str, ...]:

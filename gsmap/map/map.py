@@ -230,6 +230,9 @@ class Map(AbstractContextManager["Map"]):
     ) -> Table[IngestRow]:
         """Add captures: those found at files and folders, or one in memory. Each is checked whole before it is written.
 
+        Of several, those that cannot be read are set aside: they are named in the logs (``gsmap.map``), by `status` and
+        in ``store.set_aside.met``, and tried again whenever they are given. What is no splat is skipped with a warning.
+
         Args:
             captures: files and folders; or `Gaussians`, with `Cameras` or none.
             cameras, name: of the one capture given.
@@ -241,7 +244,8 @@ class Map(AbstractContextManager["Map"]):
                 checked and not searched again.
 
         Raises:
-            NotFoundError, InputError, ConfigError: see `gsmap.ingest`; captures before the bad one are in the map.
+            NotFoundError, InputError, ConfigError: see `gsmap.ingest`; where nothing could be a capture, or the one
+                file that is named cannot be read.
             InputError: a capture that does not lie where the scene that it supersedes lies; nothing is changed.
         """
         from gsmap.map.stages.ingest import ingest, readers
@@ -249,11 +253,11 @@ class Map(AbstractContextManager["Map"]):
 
         options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale": scale}
         if supersedes is not None:
-            found = readers(captures, **options)
+            found, _ = readers(captures, **options)
             if len(found) != 1:
                 raise ConfigError(f"one capture takes the place of {supersedes}, {len(found)} were found: name one")
             with at_work(self.store, "ingest"):
-                capture = found[0][1]()
+                capture = found[0].read()
                 done = supersede(self.store, capture, supersedes, self.settings, self._progress, named=name is not None)
             return Table([reports.ingest_row(done.scene, new=True, dated=False, notes=(*capture.notes, *done.notes))])
 
@@ -1113,10 +1117,10 @@ class Map(AbstractContextManager["Map"]):
             metres_per_unit: of the scene's own frame; 0 takes it back.
             author: who says so.
         """
-        from gsmap.ingest import parse_date
+        from gsmap.ingest import given_date
 
         if captured_at is not None:
-            captured_at = "" if captured_at.strip().lower() == "none" else parse_date(captured_at)
+            captured_at = "" if captured_at.strip().lower() == "none" else given_date(captured_at).when
         scene = self.store.scenes.edit(
             ref,
             name=name,

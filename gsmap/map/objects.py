@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import write_text_whole
+from gsmap.durable import write_text_output
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.geometry.directions import level_frame
 from gsmap.map.object_words import apart, with_words
@@ -378,7 +378,7 @@ def write_graph(known: Known, out: str | os.PathLike[str], format: str) -> Path:
         raise ConfigError(f"the graph is written as {' or '.join(FORMATS)}, got {format!r}")
     path = Path(out)
     if format == "json":
-        write_text_whole(path, json.dumps({"schema": SCHEMA, **objects_report(known).to_json()}, indent=1))
+        write_text_output(path, json.dumps({"schema": SCHEMA, **objects_report(known).to_json()}, indent=1))
         return path
-    write_text_whole(path, graphml(as_networkx(known)))
+    write_text_output(path, graphml(as_networkx(known)))
     return path

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import make_folder, open_file, remove_file, write_text_whole, write_whole
+from gsmap.durable import make_folder, open_file, remove_file, write_output, write_text_whole, write_whole
 from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
 from gsmap.geometry.metres import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -188,7 +188,7 @@ def save_picture(picture: np.ndarray, path: str | os.PathLike[str]) -> None:
     from PIL import Image
 
     try:
-        Image.fromarray(picture).save(path)
+        write_output(Path(path), Image.fromarray(picture).save)
     except ValueError as error:  # a suffix that Pillow does not know
         raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
 

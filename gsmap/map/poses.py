@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import write_text_whole
+from gsmap.durable import is_stream, write_text_output
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats import colmap, g2o, nerfstudio, tum
 from gsmap.geometry.transforms import transform_cameras
@@ -37,7 +37,7 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
     Raises:
         ConfigError: another format.
         NotFoundError: no scene has a pose yet.
-        InputError: a pose that the format cannot say.
+        InputError: a pose that the format cannot say, or several components for one pipe.
     """
     if format not in FORMATS:
         raise ConfigError(f"poses are written as {', '.join(FORMATS)}, got {format!r}")
@@ -53,9 +53,11 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
     if format == "json":
         rows = [row.to_json() for row in reports.pose_rows(store, crs)]
         text = json.dumps({"schema": SCHEMA, "poses": rows}, indent=1)
-        write_text_whole(out, text)
+        write_text_output(out, text)
         return [out]
     components = sorted({pose.component for pose in placed})
+    if len(components) > 1 and is_stream(out):
+        raise InputError(f"{out} takes one file, and each of {len(components)} components gets its own: name a file")
     written = []
     for component in components:
         members = [pose for pose in placed if pose.component == component]

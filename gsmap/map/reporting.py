@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import write_text_whole
+from gsmap.durable import is_stream, write_text_output
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.rotations import angle_between
@@ -54,6 +54,7 @@ from gsmap.report.content import CHI2_999
 from gsmap.report.words import verdict
 from gsmap.store import Store
 from gsmap.store.registrations import StoredRegistration
+from gsmap.store.set_aside import CAPTURE
 from gsmap.store.sizes import scene_sizes, sizes
 from gsmap.types import Gaussians, PoseGraph, Scene, ScenePose
 from gsmap.types.metre import Metre
@@ -90,10 +91,10 @@ def write_report(
     check_target(path)
     report = _Gatherer(store, settings, since, progress).report(pictures)
     text = page(report)
-    if (refused := note_target(store, path, {"report": True})) is not None:
+    if not is_stream(path) and (refused := note_target(store, path, {"report": True})) is not None:
         report = replace(report, notes=(*report.notes, f"{refused}: a purge of a scene will not find this page"))
         text = page(report)
-    write_text_whole(path, text)
+    write_text_output(path, text)
     standing, sentences = verdict(report)
     return WrittenReport(
         path=str(path),
@@ -114,7 +115,7 @@ def check_target(path: Path) -> None:
         raise ConfigError(f"{path} is a folder: name a file in it, such as {path / 'report.html'}")
     if not path.parent.is_dir():
         raise NotFoundError(f"cannot write {path}: {path.parent} does not exist")
-    if path.exists() and owner_of(path) is None:
+    if path.exists() and not is_stream(path) and owner_of(path) is None:
         raise ConfigError(f"{path} is there and was not written by gsmap report: choose another name, or delete it")
 
 
@@ -530,6 +531,9 @@ def _up(state: _State, scenes: Sequence[Scene], poses: Sequence[ScenePose]) -> n
 def _places(store: Store) -> dict[str, str]:
     """What a page that goes to others says in place of paths of this machine."""
     targets = [*store.exports.targets(), str(store.folder), str(store.home), store.location]
+    for one in store.set_aside.list():
+        if one.what.startswith(f"{CAPTURE} "):  # and its cameras, which may lie above it
+            targets += [str(folder) for folder in [Path(one.about), *Path(one.about).parents][:4] if folder.name]
     return {target: Path(target).name for target in targets if "/" in target}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from gsmap.map.changes import num_open
 from gsmap.map.metres import map_metres
@@ -16,6 +17,7 @@ from gsmap.map.stages.register import num_stale
 from gsmap.register.duplicate import SAME_CAPTURE
 from gsmap.store import Store
 from gsmap.store.leases import Lease
+from gsmap.store.set_aside import CAPTURE
 from gsmap.types import PoseGraph
 from gsmap.types.metre import Metre
 from gsmap.types.rows import AtWorkRow, MapStatus, MetreRow, TodoRow
@@ -25,6 +27,7 @@ from gsmap.types.rows import AtWorkRow, MapStatus, MetreRow, TodoRow
 def status(store: Store, settings: Settings) -> MapStatus:
     """``gsmap status MAP``, from the catalog alone: no array is read, nothing is computed."""
     at = shlex.quote(store.location)
+    update = f"gsmap update {at} --no-create"
     scenes = store.scenes.brief()
     newest, graph = store.revisions.newest(), PoseGraph(store.revisions.poses(), world=store.revisions.world())
     todo: list[TodoRow] = []
@@ -37,11 +40,11 @@ def status(store: Store, settings: Settings) -> MapStatus:
     living = {scene.id for scene in scenes}
     lacking = without_graph(store, keys)
     bare = set(lacking) - (set(store.graphs.node_counts()) if lacking else set())
-    add("undescribed", len(bare), f"gsmap update {at}", "scenes without a graph")
+    add("undescribed", len(bare), update, "scenes without a graph")
     add(
         "stale_graphs",
         len(lacking) - len(bare),
-        f"gsmap update {at}",
+        update,
         "graphs made by other settings or another version",
     )
     pairs = store.registrations.keys()
@@ -49,13 +52,13 @@ def status(store: Store, settings: Settings) -> MapStatus:
     add(
         "unregistered",
         len(living - registered) if len(scenes) > 1 else 0,
-        f"gsmap update {at}",
+        update,
         "scenes that were never tried with another",
     )
     add(
         "stale_edges",
         num_stale(pairs, keys, settings),
-        f"gsmap update {at}",
+        update,
         "edges made by other settings or versions",
     )
     _add_unsolved(store, settings, add, f"gsmap optimize {at}")
@@ -96,13 +99,15 @@ def status(store: Store, settings: Settings) -> MapStatus:
 
 
 def set_aside_rows(store: Store) -> list[TodoRow]:
-    """What was set aside, one row a job, with the command that tries it again."""
+    """What was set aside, one row a job or capture, with the command that tries it again."""
     aside = store.set_aside.list()
     at, names = shlex.quote(store.location), store.scenes.names() if aside else {}
     rows = []
     for one in aside:
         kind = one.what.partition(" ")[0]
-        if kind == "tile":
+        if kind == CAPTURE:
+            verb, about = f"gsmap update {at} --no-create {shlex.quote(one.about)}", Path(one.about).name
+        elif kind == "tile":
             verb, about = f"gsmap export {at} {shlex.quote(one.about)}", f"a tile in {one.about}"
         else:
             scenes = [names[scene] for scene in one.about.split() if scene in names]

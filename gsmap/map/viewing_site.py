@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from gsmap.durable import make_folder, open_file, remove_tree, sync_folder, write_whole
+from gsmap.durable import is_stream, make_folder, open_file, remove_tree, sync_folder, write_output
 from gsmap.errors import MALFORMED, ConfigError, CorruptError, NotFoundError
 from gsmap.map.pictures import note_target
 from gsmap.map.settings import Settings
@@ -67,7 +67,7 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
         raise ConfigError(f"a page in one file ends with .html, not {path.name or path}")
     if not path.parent.is_dir():
         raise NotFoundError(f"cannot write {path}: {path.parent} does not exist")
-    if os.path.lexists(path) and (path.is_dir() or owner_of(path) != store.id):
+    if path.exists() and not is_stream(path) and owner_of(path) != store.id:
         raise ConfigError(f"{path} is there and is no page of this map: choose another name, or delete it")
     page, doors = built_page(), MapDoors(store, settings)
     made: list[site.SiteContents] = []
@@ -84,8 +84,8 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
             progress=told,
             mark=mark,
         )
-        refused = note_target(store, path, {"page": True})
-        write_whole(path, lambda staged: made.append(write(staged)))
+        refused = None if is_stream(path) else note_target(store, path, {"page": True})
+        write_output(path, lambda staged: made.append(write(staged)))
     notes = made[0].notes
     if refused is not None:
         notes = (*notes, f"{refused}: a purge of a scene will not find this page")

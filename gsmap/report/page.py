@@ -80,6 +80,8 @@ def page(report: Report) -> str:
 
 def owner_of(path: Path) -> str | None:
     """The id of the map whose report a file is; None where it is none."""
+    if not path.is_file():  # opening a pipe would wait for its writer
+        return None
     try:
         with path.open("rb") as file:
             found = _MARK.search(file.read(_HEAD_BYTES))

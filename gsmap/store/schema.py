@@ -480,11 +480,11 @@ leases = _table(
     Column("expires_at", Text, nullable=False),
 )
 
-# Jobs that ended the processes they ran in: left out until a person asks for them.
+# Jobs that ended the processes they ran in, left out until a person asks for them; captures that could not be read.
 set_aside = _table(
     "set_aside",
-    Column("what", Line, primary_key=True),  # KIND and RecipeKey.digest
-    Column("about", Line, nullable=False),  # ids of scenes, or a folder
+    Column("what", Line, primary_key=True),  # KIND and RecipeKey.digest, or a digest of a path
+    Column("about", Line, nullable=False),  # ids of scenes, a folder, or a file
     Column("reason", Line, nullable=False),
     Column("created_at", Text, nullable=False),
 )

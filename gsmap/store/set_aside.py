@@ -1,4 +1,6 @@
-"""Jobs that are left out until a person asks for them, since they ended the processes they ran in."""
+"""Jobs that are left out until a person asks for them, since they ended the processes they ran in; and captures that
+could not be read, which are tried again whenever their files or folders are named.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +12,19 @@ from sqlalchemy import delete, insert, select
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.schema import set_aside
 
+CAPTURE = "capture"
+
 
 @dataclass(frozen=True)
 class StoredSetAside:
     """A job that was set aside.
 
     Args:
-        what: ``graph KEY``, ``edge KEY``, ``comparison KEY`` or ``tile KEY``: what it would have made.
-        about: ids of the scenes it reads, with spaces between them; of a tile the folder that was exported to.
-        reason: what became of the processes.
+        what: ``graph KEY``, ``edge KEY``, ``comparison KEY`` or ``tile KEY``: what it would have made; ``capture
+            DIGEST``, of its path.
+        about: ids of the scenes it reads, with spaces between them; of a tile the folder that was exported to; of a
+            capture its path.
+        reason: what became of the processes, or why the capture cannot be read.
         created_at: when it was set aside.
     """
 
@@ -29,7 +35,7 @@ class StoredSetAside:
 
 
 class SetAsides:
-    """The jobs of a map that were set aside.
+    """The jobs and captures of a map that were set aside.
 
     Attributes:
         met: those that this open map set aside or left out.
@@ -46,7 +52,7 @@ class SetAsides:
             return [StoredSetAside(**row) for row in rows.mappings()]
 
     def add(self, what: str, about: str, reason: str) -> None:
-        """Set a job aside; an older one of its kind about the same was of another recipe, and goes."""
+        """Set a job or a capture aside; an older one of its kind about the same was of another recipe, and goes."""
         row = {"what": what, "about": about, "reason": reason, "created_at": now()}
         kind = what.partition(" ")[0]
         with self._catalog.write() as connection:

@@ -65,7 +65,7 @@ def test_update_takes_a_date_for_its_captures(site: Path, left: Path, cli: Run) 
 
 def test_a_wrong_sidecar_changes_nothing(site: Path, left: Path, cli: Run) -> None:
     (left / "left.json").write_text('{"captured_at": "31.5.2026"}')
-    refused = cli("ingest", site, left)
+    refused = cli("ingest", site, left / "left.ply")
     assert refused.code == 1
     (line,) = (line for line in refused.stderr.splitlines() if line.startswith("gsmap:"))
     assert "left.json: captured_at must be ISO 8601" in line

@@ -3,9 +3,10 @@ import json
 import numpy as np
 import pytest
 
+import gsmap.formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats import cameras_json, write
-from gsmap.ingest import find_captures, read_captures, validate
+from gsmap.ingest import find_captures, read_captures, take_capture, validate
 from gsmap.types import Cameras, Gaussians
 
 
@@ -216,8 +217,18 @@ def test_a_sound_capture_passes():
     assert validate(box(), looking()) == ()
 
 
-@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities", "sh"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+VALID = {("logit_opacities", np.inf), ("logit_opacities", -np.inf), ("log_scales", -np.inf)}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        (name, value)
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh")
+        for value in (np.nan, np.inf, -np.inf)
+        if (name, value) not in VALID
+    ],
+)
 def test_nan_and_infinity_are_refused_with_their_row(name, value):
     array = getattr(box(), name).copy()
     array.reshape(len(array), -1)[17, -1] = value
@@ -226,6 +237,34 @@ def test_nan_and_infinity_are_refused_with_their_row(name, value):
     array.reshape(len(array), -1)[40, -1] = value
     with pytest.raises(InputError, match=r"row 17 \(2 such rows\)"):
         validate(replaced(box(), **{name: array}))
+
+
+@pytest.mark.parametrize("suffix", [".ply", "memory", ".spz", ".sog", ".glb", ".splat", ".compressed.ply"])
+def test_infinities_that_are_values_are_clamped_at_every_door(tmp_path, suffix):
+    """An opacity of 1 has an infinite logit, a flat Gaussian a logarithm of minus infinity."""
+    logits, log_scales = box().logit_opacities.copy(), box().log_scales.copy()
+    logits[3], logits[4], log_scales[5, 0], log_scales[6] = np.inf, -np.inf, -np.inf, -np.inf
+    given = replaced(box(), logit_opacities=logits, log_scales=log_scales)
+    assert len(validate(given)) == 1
+    if suffix == "memory":
+        capture = take_capture(given, looking(), name="a")
+    else:
+        write(tmp_path / f"a{suffix}", given)
+        cameras_json.write(tmp_path / "a.cameras.json", looking())
+        assert validate(gsmap.formats.stream(tmp_path / f"a{suffix}")) is not None
+        (capture,) = read_captures(tmp_path / f"a{suffix}")
+    for got in (capture.gaussians, Gaussians.concatenate(list(capture.content.chunks()))):
+        assert np.isfinite(got.logit_opacities).all()
+        assert np.isfinite(got.log_scales).all()
+        if suffix in (".ply", "memory"):  # others store in another order, and fewer bits
+            np.testing.assert_allclose(got.opacities[[3, 4]], [1, 0], atol=1e-6)
+            assert (got.scales[6] < 1e-8).all()
+            sound = np.delete(np.arange(len(got)), [3, 4, 5, 6])
+            np.testing.assert_array_equal(got.logit_opacities[sound], logits[sound])
+            np.testing.assert_array_equal(got.log_scales[sound], log_scales[sound])
+            assert any("infinite" in note for note in capture.notes)
+    for name in ("log_scales", "logit_opacities"):
+        assert all(np.isfinite(column).all() for column in capture.content.columns(name))
 
 
 def test_absurd_values_are_refused_with_their_row():

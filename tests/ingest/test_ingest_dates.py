@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsmap.errors import InputError
+from gsmap.errors import ConfigError, InputError
 from gsmap.formats import cameras_json, write
 from gsmap.ingest import find_captures, find_date, read_captures
 from gsmap.ingest.dates import MAX_FRAMES, date_in_name, given_date
@@ -57,6 +57,17 @@ def date_of(path: Path, **given):
         ("2026_05_31_1400", "2026-05-31T14:00:00+00:00", "no zone"),
         ("hall-20260531_140059-b", "2026-05-31T14:00:59+00:00", "no zone"),
         ("20260531T140059Z", "2026-05-31T14:00:59+00:00", ""),
+        ("run_2026-05-31-14-00-59", "2026-05-31T14:00:59+00:00", "no zone"),  # rosbag
+        ("run_2026-05-31-14-00-59_0", "2026-05-31T14:00:59+00:00", "no zone"),  # its first part
+        ("rosbag2_2026_05_31-14_00_59", "2026-05-31T14:00:59+00:00", "no zone"),
+        ("Screenshot_20260531-140059", "2026-05-31T14:00:59+00:00", "no zone"),
+        ("PXL_20260531_140059123", "2026-05-31T14:00:59.123000+00:00", "no zone"),  # Pixel
+        ("PXL_20260531_140059123.MP", "2026-05-31T14:00:59.123000+00:00", "no zone"),
+        ("DJI_20260531140059_0001_V", "2026-05-31T14:00:59+00:00", "no zone"),  # DJI since 2022
+        ("2026-05-31-14", "2026-05-31T00:00:00+00:00", "no time of day"),  # the number of a take
+        ("2026-05-31-1400", "2026-05-31T00:00:00+00:00", "no time of day"),
+        ("20260531-1234567", "2026-05-31T00:00:00+00:00", "no time of day"),
+        ("2026-05-31-25-00-00", "2026-05-31T00:00:00+00:00", "no time of day"),
         ("2026-05-31T14-00+0200", "2026-05-31T14:00:00+02:00", ""),
         ("2026-05-31_9900", "2026-05-31T00:00:00+00:00", "no time of day"),  # the number of a take
         ("2026_05_31_2", "2026-05-31T00:00:00+00:00", "no time of day"),
@@ -80,8 +91,6 @@ def test_dates_in_names(name: str, when: str, note: str) -> None:
         "2026-13-01",
         "2026-02-30",
         "1989-12-31",
-        "20261123",  # after tomorrow
-        "2062-01-01",
         "120260531",
         "202605311",
         "20260531140059",
@@ -100,6 +109,38 @@ def test_dates_in_names(name: str, when: str, note: str) -> None:
 )
 def test_numbers_that_are_no_dates(name: str) -> None:
     assert date_in_name(name, now=NOW) == (None, "")
+
+
+@pytest.mark.parametrize("name", ["20261123", "2062-01-01", "DJI_20620101140000_0001", "2062-01-01_2063-01-01"])
+def test_a_date_in_the_future_is_not_taken_and_named(name: str, tmp_path: Path) -> None:
+    date, note = date_in_name(name, now=NOW)
+    assert date is None
+    assert "lies in the future" in note
+    found = date_of(capture(tmp_path / "a" / f"{name}.ply"))
+    assert found.when is None
+    assert note in found.note
+    found = date_of(capture(tmp_path / "2026-05-31" / f"{name}.ply", 1))  # the folder tells, and the note stays
+    assert found.when == "2026-05-31T00:00:00+00:00"
+    assert note in found.note
+    assert date_in_name(f"{name}_2026-05-31", now=NOW)[0] == datetime(2026, 5, 31, tzinfo=UTC)
+
+
+def test_photographs_of_the_future_are_named(tmp_path: Path) -> None:
+    """The clock of this computer may be behind, after its battery was changed."""
+    path = capture(tmp_path / "hall.ply")
+    photograph(tmp_path / "images" / "a.jpg", "2062:01:01 00:00:00")
+    found = date_of(path)
+    assert found.when is None
+    assert "2062-01-01" in found.note
+    assert "a.jpg" in found.note
+    photograph(tmp_path / "images" / "b.jpg", "2026:05:31 00:00:00")
+    assert date_of(path).when == "2026-05-31T00:00:00+00:00"
+
+
+def test_a_person_s_date_in_the_future_is_refused() -> None:
+    for when in ("2262-01-01", "2262-01-01T00:00:00+02:00"):
+        with pytest.raises(ConfigError, match="in the future"):
+            given_date(when)
 
 
 @pytest.mark.parametrize("name", ["2026-05-31_2026-06-02", "20260531_20260602", "2025-05-31_vs_2026-05-31"])

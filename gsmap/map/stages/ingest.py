@@ -1,7 +1,9 @@
-"""Ingest: captures in files or in memory become scenes."""
+"""Ingest: captures in files or in memory become scenes. Captures that cannot be read are set aside."""
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,14 +11,33 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gsmap.errors import ConfigError
-from gsmap.ingest import Capture, find_captures, given_date, read_capture, take_capture
+from gsmap.errors import ConfigError, GsmapError, NotGaussiansError, StoreError
+from gsmap.ingest import Capture, LeftOut, Search, given_date, read_capture, search_captures, take_capture
 from gsmap.map.sharing import noting
 from gsmap.store import Store
+from gsmap.store.set_aside import CAPTURE
+from gsmap.texts import escaped
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import StageProgress
 
 Source = str | os.PathLike[str] | Gaussians
+
+_log = logging.getLogger("gsmap.map")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A capture that was found.
+
+    Args:
+        name: of the capture.
+        read: reads and checks it.
+        path: its file; None where it is in memory.
+    """
+
+    name: str
+    read: Callable[[], Capture]
+    path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -48,14 +69,76 @@ def ingest(
 ) -> list[Ingested]:
     """Every capture found; see `gsmap.map.Map.ingest`."""
     dates = {scene.id: scene.captured_at for scene in store.scenes.list()}
-    found = readers(sources, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
+    found, search = readers(sources, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
+    skipped, bad, good = list(search.skipped), list(search.unreadable), list[Path]()
+    is_only_one = len(found) == 1 and not bad and _is_named(found[0], sources)
     results: list[Ingested] = []
     with noting(lambda: f"{len(results)} of {len(found)} captures are in the map"):
-        for i, (called, read) in enumerate(found):
-            progress("ingest", i / len(found), called)
-            results.append(_add(store, read(), dates))
+        for i, one in enumerate(found):
+            progress("ingest", i / len(found), one.name)
+            try:
+                results.append(_add(store, one.read(), dates))
+            except StoreError:  # of the map, and so of every capture
+                raise
+            except GsmapError as error:
+                if is_only_one or one.path is None:
+                    raise
+                (skipped if isinstance(error, NotGaussiansError) else bad).append(LeftOut(one.path, str(error)))
+            else:
+                good += [] if one.path is None else [one.path]
+    if len(skipped) > len(search.skipped) and not results and not bad:
+        raise NotGaussiansError(skipped[-1].reason)
+    for left_out in skipped:
+        _log.warning("skipped: %s", left_out.reason)
+    _set_aside(store, bad, [*good, *(Path(source) for source in sources if not isinstance(source, Gaussians))])
     progress("ingest", 1.0, f"{len(results)} captures")
     return results
+
+
+def _is_named(one: Reader, sources: Sequence[Source]) -> bool:
+    """Whether a capture's file, and no folder around it, was named."""
+    return one.path in [Path(source) for source in sources if not isinstance(source, Gaussians)]
+
+
+def _set_aside(store: Store, bad: Sequence[LeftOut], done: Sequence[Path]) -> None:
+    """Keep which captures could not be read, for `gsmap status`, and forget those that were mended or deleted.
+
+    Args:
+        done: the files and folders that were gone through, all of whose other captures are in the map.
+    """
+    for one in bad:
+        _log.warning("a capture is set aside: %s", one.reason)
+        store.set_aside.add(_what(one.path), escaped(str(one.path.absolute())), escaped(one.reason))
+    still, mended = {_what(one.path) for one in bad}, {_what(path) for path in done}
+    places = {place for path in done for place in (path.absolute(), path.resolve())}
+    forgotten = []
+    for aside in store.set_aside.list():
+        if not aside.what.startswith(f"{CAPTURE} ") or aside.what in still:
+            continue
+        path = Path(aside.about)
+        is_deleted = (
+            not os.path.lexists(path) and path.parent.is_dir()
+        )  # of a disk that is not mounted nothing is known
+        if is_deleted or aside.what in mended or not places.isdisjoint((path, *path.parents)):
+            forgotten.append(aside.what)
+    if forgotten:
+        store.set_aside.forget(forgotten)
+
+
+def _what(path: Path) -> str:
+    """The name under which a capture is set aside."""
+    return f"{CAPTURE} {hashlib.sha256(os.fsencode(path.absolute())).hexdigest()[:32]}"
+
+
+def check_captures(paths: Sequence[str | os.PathLike[str]], captured_at: str | None = None) -> None:
+    """Refuse what `ingest` would refuse, before a map is made for it.
+
+    Raises:
+        NotFoundError, InputError, ConfigError: see `gsmap.map.Map.ingest`.
+    """
+    found, search = readers(paths, cameras=None, name=None, captured_at=captured_at, scale="auto")
+    if len(found) == 1 and not search.unreadable and _is_named(found[0], paths):
+        found[0].read()
 
 
 def readers(
@@ -65,8 +148,8 @@ def readers(
     name: str | None,
     captured_at: str | None,
     scale: str,
-) -> list[tuple[str, Callable[[], Capture]]]:
-    """What reads and checks each capture found, and what it is called; see `gsmap.map.Map.ingest`."""
+) -> tuple[list[Reader], Search]:
+    """A reader of each capture found, and the search that found them; see `gsmap.map.Map.ingest`."""
     given_date(captured_at)  # refuses what is none before anything is searched
     memory = [source for source in sources if isinstance(source, Gaussians)]
     if memory and len(sources) > 1:
@@ -76,14 +159,15 @@ def readers(
             raise ConfigError("Gaussians in memory go with gsmap.Cameras, or with none")
         called = name or "capture"
         take = partial(take_capture, memory[0], cameras, name=called, captured_at=captured_at, scale_policy=scale)
-        return [(called, take)]
+        return [Reader(called, take)], Search()
     if isinstance(cameras, Cameras):
         raise ConfigError("cameras in memory go with Gaussians in memory; for a file name a file of cameras")
-    found = find_captures([Path(source) for source in sources if not isinstance(source, Gaussians)])
+    search = search_captures([Path(source) for source in sources if not isinstance(source, Gaussians)])
+    found = search.captures
     if len(found) > 1 and (cameras is not None or name is not None):
         raise ConfigError(f"cameras and name are for one capture, {len(found)} were found: ingest them one by one")
     options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale_policy": scale}
-    return [(files.name, partial(read_capture, files, **options)) for files in found]
+    return [Reader(files.name, partial(read_capture, files, **options), files.path) for files in found], search
 
 
 def _add(store: Store, capture: Capture, dates: dict[str, str | None]) -> Ingested:

@@ -25,7 +25,8 @@ class TodoRow(Row):
             ``undecided`` edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``;
             ``world_outliers``, observations of the world that contradict the others; ``untied`` components, whose place
             in the world is not determined; ``duplicates``, pairs that are one capture twice; ``isolated`` scenes;
-            ``set_aside``, work that twice ended the process it ran in and is left out until it is asked for by name.
+            ``set_aside``, work that twice ended the process it ran in and is left out until it is asked for by name, or
+            a capture that could not be read and is tried again whenever it is given.
         count: how many; 1 for ``unsolved``, ``stale_poses`` and ``set_aside``.
         verb: the command that helps.
         meaning: the same in words.

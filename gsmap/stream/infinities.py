@@ -1,0 +1,41 @@
+"""Infinities that are values and not damage: an opacity of exactly 0 or 1, and a Gaussian without thickness."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.types import Gaussians
+
+MAX_LOGIT = np.float32(25 * np.log(2))  # its opacity is 1 in float32
+MIN_LOG_SCALE = np.float32(np.log(2e-9))  # of the unit
+
+
+def clamped(gaussians: Gaussians) -> Gaussians:
+    """Replace infinite logits, and logarithms of scales of minus infinity, by finite values that draw the same.
+
+    Scales of plus infinity and infinities elsewhere stay: they are damage (`gsmap.ingest.validate`).
+    """
+    logits = clamped_column("logit_opacities", gaussians.logit_opacities)
+    log_scales = clamped_column("log_scales", gaussians.log_scales)
+    if logits is gaussians.logit_opacities and log_scales is gaussians.log_scales:
+        return gaussians
+    return Gaussians(gaussians.means, gaussians.quats, log_scales, logits, gaussians.sh)
+
+
+def clamped_column(name: str, column: np.ndarray) -> np.ndarray:
+    """One field of Gaussians, as `clamped`; the array itself where there is nothing to replace."""
+    if name not in ("logit_opacities", "log_scales") or not np.isinf(column).any():
+        return column
+    column = column.copy()
+    if name == "logit_opacities":
+        column[np.isposinf(column)] = MAX_LOGIT
+        column[np.isneginf(column)] = -MAX_LOGIT
+    else:
+        column[np.isneginf(column)] = MIN_LOG_SCALE
+    return column
+
+
+def num_clamped(gaussians: Gaussians) -> tuple[int, int]:
+    """How many opacities and how many scales have the value that `clamped` gives them."""
+    logits, log_scales = gaussians.logit_opacities, gaussians.log_scales
+    return int((np.abs(logits) == MAX_LOGIT).sum()), int((log_scales == MIN_LOG_SCALE).sum())
