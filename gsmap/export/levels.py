@@ -18,7 +18,7 @@ from gsmap.errors import ConfigError
 from gsmap.formats import tiles3d
 from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
-from gsmap.render.fit import FitOptions, LearningRates, make_fitter
+from gsmap.render.fit import FitOptions, LearningRates, make_fitter, with_enough_memory
 from gsmap.types import Cameras, Gaussians
 
 VERSION = 4
@@ -87,7 +87,9 @@ def make_level(finer: Gaussians, max_count: int, cameras: Cameras | None, params
     kept = np.arange(len(views)) % 4 == 3
     depths = _depths(start, views)  # it has the depths of what it stands for, at a fraction of the cost
     footprint = float(np.exp(np.median(start.log_scales.max(1)))) / params.deviation_px
-    fitted = _fitted(start, finer, views[~kept], depths[~kept], footprint, params)
+    fitted = with_enough_memory(
+        lambda backend: _fitted(start, finer, views[~kept], depths[~kept], footprint, params, backend)
+    )
 
     @cache
     def judges(footprint: float) -> list[_View]:
@@ -153,13 +155,19 @@ def _decibels(level: Gaussians, views: list[_View]) -> np.ndarray:
 
 
 def _fitted(
-    start: Gaussians, finer: Gaussians, views: Cameras, depths: np.ndarray, footprint: float, params: Params
+    start: Gaussians,
+    finer: Gaussians,
+    views: Cameras,
+    depths: np.ndarray,
+    footprint: float,
+    params: Params,
+    backend: str,
 ) -> Gaussians:
     """The start, made to look like the finer Gaussians."""
     seen = _seen_at(views, depths, footprint)
     wanted = [_picture(finer, camera) for camera in seen]
     size = float(np.exp(np.median(start.log_scales.max(1))))
-    fitter = make_fitter(start, options=FitOptions(ssim_weight=0.2))
+    fitter = make_fitter(start, options=FitOptions(ssim_weight=0.2), backend=backend)
     pictures = [fitter.load(picture[None]) for picture in wanted]
     rng = np.random.default_rng(0)
     turns = -(-params.steps // len(seen))

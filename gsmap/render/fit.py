@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.render.backends import backend as resolved
 from gsmap.types import Cameras, Gaussians
+
+logger = logging.getLogger(__name__)
+
+Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
@@ -168,6 +174,25 @@ def make_fitter(
     from gsmap.render.native_fit import NativeFitter
 
     return NativeFitter(gaussians, learning_rates, frozen=frozen, options=options)
+
+
+def with_enough_memory(fit: Callable[[str], Fitted], backend: str = "auto") -> Fitted:
+    """Run a fit on a backend; where the GPU's memory runs out, run it once more on the CPU, with a warning.
+
+    Args:
+        fit: given the name of a backend, makes a fitter, steps it and returns what was wanted.
+    """
+    chosen = resolved(backend)
+    if chosen == "native":
+        return fit(chosen)
+    import torch
+
+    try:
+        return fit(chosen)
+    except torch.OutOfMemoryError as error:
+        logger.warning("the GPU's memory cannot hold an optimization; it runs on the CPU: %s", error)
+    torch.cuda.empty_cache()
+    return fit("native")
 
 
 def checked_mask(mask: np.ndarray | None, n: int) -> np.ndarray | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable
@@ -69,7 +70,7 @@ class DrawableGaussians:
         scales: (M, 3) standard deviations.
         opacities: (M,) in [0, 1].
         sh: (M, K, 3).
-        rows: (M,) index of each among all N.
+        rows: (M,) index of each among all N, or None where all can be drawn.
         num_all: N.
     """
 
@@ -78,7 +79,7 @@ class DrawableGaussians:
     scales: torch.Tensor
     opacities: torch.Tensor
     sh: torch.Tensor
-    rows: torch.Tensor
+    rows: torch.Tensor | None
     num_all: int
 
     @classmethod
@@ -88,14 +89,14 @@ class DrawableGaussians:
         n = len(means)
         # gsplat has no word for a Gaussian that cannot be drawn; the native backend leaves it out.
         sound = drawable(means, quats, log_scales, logits) & torch.isfinite(sh).flatten(1).all(1)
-        rows = torch.nonzero(sound)[:, 0]
-        if len(rows) < n:
+        rows = None if bool(sound.all()) else torch.nonzero(sound)[:, 0]
+        if rows is not None:
             means, quats, log_scales, logits, sh = (t[rows] for t in (means, quats, log_scales, logits, sh))
         return cls(means, unit_or_identity(quats), log_scales.exp(), torch.sigmoid(logits), sh, rows, n)
 
     @property
     def nbytes(self) -> int:
-        parts = (self.means, self.quats, self.scales, self.opacities, self.sh, self.rows)
+        parts = (self.means, self.quats, self.scales, self.opacities, self.sh)
         return sum(t.numel() * t.element_size() for t in parts)
 
 
@@ -150,17 +151,19 @@ class _Kept:
 
     def __init__(self) -> None:
         self._entries: OrderedDict[int, tuple[weakref.ref[Gaussians], DrawableGaussians]] = OrderedDict()
+        self._lock = threading.RLock()  # pages are drawn by several threads
 
     def get(self, gaussians: Gaussians) -> DrawableGaussians:
         key = id(gaussians)
-        if key in self._entries:
-            self._entries.move_to_end(key)
-            return self._entries[key][1]
-        moved = DrawableGaussians.of(GaussianTensors.of(gaussians, device=str(device())))
-        self._entries[key] = weakref.ref(gaussians, lambda _: self._entries.pop(key, None)), moved
-        while len(self._entries) > 1 and sum(d.nbytes for _, d in self._entries.values()) > _kept_bytes():
-            self._entries.popitem(last=False)
-        return moved
+        with self._lock:
+            if key in self._entries:
+                self._entries.move_to_end(key)
+                return self._entries[key][1]
+            moved = DrawableGaussians.of(GaussianTensors.of(gaussians, device=str(device())))
+            self._entries[key] = weakref.ref(gaussians, lambda _: self._entries.pop(key, None)), moved
+            while len(self._entries) > 1 and sum(d.nbytes for _, d in self._entries.values()) > _kept_bytes():
+                self._entries.popitem(last=False)
+            return moved
 
     def clear(self) -> None:
         self._entries.clear()
@@ -268,7 +271,7 @@ def _draw(
     ids = weights = None
     if dominant_id or max_weight:
         ids, weights = blending_weights(lists, views.height, views.width, len(scene.means), max_weight)
-        if len(scene.means) < scene.num_all:
+        if scene.rows is not None:
             ids = torch.where(ids >= 0, scene.rows.to(torch.int32)[ids.clamp_min(0)], ids)
             if weights is not None:
                 weights = weights.new_zeros(scene.num_all).index_copy(0, scene.rows, weights)

@@ -129,7 +129,7 @@ class GsplatFitter(Fitter):
             scales.requires_grad_(),
             opacities.requires_grad_(),
             sh.detach().requires_grad_(),
-            rows=self._updates,
+            rows=None,
             num_all=len(means),
         )
 

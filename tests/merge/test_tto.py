@@ -161,7 +161,7 @@ class WatchedFitter(NativeFitter):
 
 @pytest.fixture
 def watched(monkeypatch):
-    monkeypatch.setattr(tto, "make_fitter", WatchedFitter)
+    monkeypatch.setattr(tto, "make_fitter", lambda start, *, backend, **settings: WatchedFitter(start, **settings))
     return WatchedFitter
 
 

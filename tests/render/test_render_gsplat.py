@@ -20,6 +20,7 @@ from gsmap.render import (
     render,
 )
 from gsmap.render.backends import gsplat_available
+from gsmap.render.fit import with_enough_memory
 from gsmap.render.gsplat_fit import GsplatFitter
 from gsmap.render.image_loss import image_loss
 from gsmap.types import Cameras, Gaussians
@@ -235,6 +236,29 @@ def test_batches_shrink_where_memory_runs_out_and_the_answer_stays(device, monke
     assert np.array_equal(on_cpu.colour, native.colour)
     assert np.array_equal(on_cpu.max_weight, native.max_weight)
     assert "rendering on the CPU" in caplog.text
+
+
+def test_a_fit_that_the_gpu_cannot_hold_runs_on_the_cpu(device, monkeypatch, caplog):
+    gaussians, cameras = scene(n=60, size=(24, 16))
+    image = np.zeros((1, 16, 24, 3), np.float32)
+
+    def fit(backend):
+        fitter = make_fitter(gaussians, backend=backend)
+        return backend, [float(fitter.step(cameras, image)) for _ in range(3)]
+
+    assert with_enough_memory(fit)[0] == "gsplat"
+    step = gsplat.rasterize
+    calls = []
+
+    def second_fails(*args, **options):
+        calls.append(args)
+        if len(calls) == 2:
+            raise torch.OutOfMemoryError("no memory")
+        return step(*args, **options)
+
+    monkeypatch.setattr(gsplat, "rasterize", second_fails)
+    assert with_enough_memory(fit) == fit("native")
+    assert "runs on the CPU" in caplog.text
 
 
 def test_a_scene_is_moved_once_and_forgotten_with_the_object(device):

@@ -26,7 +26,7 @@ from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.placed import pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
 from gsmap.merge.selection import beside, one_owner_per_cell
-from gsmap.render.fit import FitOptions, LearningRates, make_fitter
+from gsmap.render.fit import FitOptions, LearningRates, make_fitter, with_enough_memory
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
@@ -225,7 +225,9 @@ def merge(
     if wanted.num_photos:
         many = wanted.num_photos > 1
         notes.append(f"{wanted.num_photos} photograph{'s were' if many else ' was'} reproduced as well")
-    fitted, steps, truncated = _fit(start, frozen, wanted, params, deadline, progress)
+    fitted, steps, truncated = with_enough_memory(
+        lambda backend: _fit(start, frozen, wanted, params, deadline, progress, backend)
+    )
     # A Gaussian stays with the tile it started in: one that crossed the border would be lost to both or kept by both.
     mine = inside(start.means, bounds)
     fitted = replace(fitted[mine], means=pulled_inside(fitted.means[mine], bounds))
@@ -286,6 +288,7 @@ def _fit(
     params: Params,
     deadline: float | None,
     progress: Progress,
+    backend: str,
 ) -> tuple[Gaussians, int, bool]:
     """The start fitted to the references; steps taken; whether time ran out."""
     stopping = params.stopping
@@ -294,7 +297,7 @@ def _fit(
     options = FitOptions(
         ssim_weight=params.ssim_weight, huber_delta=params.huber_delta, betas=(params.rates.momentum, 0.999)
     )
-    fitter = make_fitter(start, frozen=frozen, options=options)
+    fitter = make_fitter(start, frozen=frozen, options=options, backend=backend)
     cameras = [wanted.cameras[v] for v in range(len(wanted))]
     pictures = [fitter.load(image[None]) for image in wanted.images]
     weights = [fitter.load(weight[None]) for weight in wanted.weights]
