@@ -18,7 +18,8 @@ from gsmap.errors import ConfigError
 from gsmap.formats import tiles3d
 from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
-from gsmap.render.fit import FitOptions, LearningRates, make_fitter, with_enough_memory
+from gsmap.render.fit import make_fitter, with_enough_memory
+from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Cameras, Gaussians
 
 VERSION = 4

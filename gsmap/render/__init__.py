@@ -6,7 +6,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from gsmap.render.backends import backend
-from gsmap.render.fit import FitOptions, Fitter, LearningRates, make_fitter
+from gsmap.render.fit import make_fitter
+from gsmap.render.fitter import FitOptions, Fitter, LearningRates
 from gsmap.render.index import ChunkIndex
 from gsmap.render.native import num_threads, set_num_threads
 from gsmap.render.outputs import Rendered

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from gsmap.render.fit import LearningRates
+from gsmap.render.fitter import LearningRates
 
 HAS_TRITON = importlib.util.find_spec("triton") is not None
 _ROWS = 64

@@ -10,14 +10,22 @@ import torch
 
 from gsmap.render import adam, gsplat, native
 from gsmap.render.blending_weights import TileLists, blending_weights
-from gsmap.render.fit import FitOptions, Fitter, LearningRates, Statistics, check_appended, check_pixels, checked_mask
+from gsmap.render.fitter import (
+    FitOptions,
+    Fitter,
+    LearningRates,
+    Statistics,
+    check_appended,
+    check_pixels,
+    checked_mask,
+)
 from gsmap.render.image_loss import image_loss
 from gsmap.render.outputs import image_size
 from gsmap.types import Cameras, Gaussians
 
 
 class GsplatFitter(Fitter):
-    """See `gsmap.render.fit.Fitter`. Gradients are added up in another order in every run."""
+    """See `gsmap.render.fitter.Fitter`. Gradients are added up in another order in every run."""
 
     def __init__(
         self,

@@ -6,13 +6,21 @@ import numpy as np
 
 from gsmap._native import fit_step, image_loss
 from gsmap.render import native
-from gsmap.render.fit import FitOptions, Fitter, LearningRates, Statistics, check_appended, check_pixels, checked_mask
+from gsmap.render.fitter import (
+    FitOptions,
+    Fitter,
+    LearningRates,
+    Statistics,
+    check_appended,
+    check_pixels,
+    checked_mask,
+)
 from gsmap.render.outputs import image_size
 from gsmap.types import Cameras, Gaussians
 
 
 class NativeFitter(Fitter):
-    """See `gsmap.render.fit.Fitter`; the same inputs give the same bits for any number of threads.
+    """See `gsmap.render.fitter.Fitter`; the same inputs give the same bits for any number of threads.
 
     The arrays ``means quats log_scales logit_opacities sh`` are live and may be edited in place between steps.
     """

@@ -41,7 +41,8 @@ def train(
 
     Step sizes follow the Gaussians' own size, so any unit of length trains alike, and fall to a tenth in the end.
     """
-    from gsmap.render.fit import FitOptions, LearningRates, make_fitter
+    from gsmap.render.fit import make_fitter
+    from gsmap.render.fitter import FitOptions, LearningRates
 
     params = params or Params()
     unit = float(np.median(gaussians.scales.max(1)))

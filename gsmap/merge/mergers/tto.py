@@ -26,7 +26,8 @@ from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.placed import pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
 from gsmap.merge.selection import beside, one_owner_per_cell
-from gsmap.render.fit import FitOptions, LearningRates, make_fitter, with_enough_memory
+from gsmap.render.fit import make_fitter, with_enough_memory
+from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
