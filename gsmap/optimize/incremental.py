@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.contradictions import contested, contradicting
 from gsmap.optimize.cycles import Vote
 from gsmap.optimize.doubt import find_doubtful
 from gsmap.optimize.fingerprint import fingerprint
@@ -139,6 +140,10 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     after = component_labels(m, rows)
     mine = np.flatnonzero(after == after[-1])[:-1]
     if len(np.unique(before[mine])) > 1:
+        return None
+    # What one edge ties and another contradicts is for the whole map to decide.
+    at_odds = np.union1d(contradicting(m, state, params), np.flatnonzero(contested(m, state, params)))
+    if state.accepted[len(around) :].sum() < 2 and (at_odds >= len(around)).any():
         return None
     component = max((p.component for p in previous.poses.values()), default=-1) + 1
     fixed = np.ones(m.num_scenes, dtype=bool)

@@ -117,17 +117,9 @@ def _thing(s: Surfaces, rng: np.random.Generator) -> None:
     tone = colour(rng, saturation=(0.3, 0.8), value=(0.3, 0.9))
     kind = int(rng.integers(3))
     if kind == 0:
-        print_ = tx.picture(palette(rng, 5), seed, int(rng.integers(4)))
-        s.box(
-            0,
-            0,
-            0,
-            *rng.uniform(0.4, 1.0, 2),
-            rng.uniform(0.4, 1.1),
-            tx.planks(tone, seed, 0.12, False),
-            print_,
-            glow=_GLOW,
-        )
+        front = tx.picture(palette(rng, 5), seed, int(rng.integers(4)))
+        (wide, deep), high = rng.uniform(0.4, 1.0, 2), rng.uniform(0.4, 1.1)
+        s.box(0, 0, 0, wide, deep, high, tx.planks(tone, seed, 0.12, False), front, glow=_GLOW)
     elif kind == 1:
         s.lathe(0, 0, 0, [(0.3, 0), (0.45, 0.5), (0.4, 0.55), (0.15, 0.5)], tx.plaster(tone, seed), 12, _GLOW)
     else:
