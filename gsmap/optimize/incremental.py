@@ -38,7 +38,8 @@ def place_new(
 
     A full solve is due when scenes, measurements between old scenes or the recipe changed, when the map grew by
     ``params.growth`` since the last one, or when a new scene ties components together, closes a long loop or comes with
-    edges that are in doubt. Poses placed here are provisional: only the surroundings of a new scene give way to it.
+    edges that are in doubt or contradict each other. Poses placed here are provisional: only the surroundings of a new
+    scene give way to it.
     """
     new = _to_place(scene_ids, previous, params)
     if not new or not {*survey.scenes(), *(prior.scene for prior in priors)} <= set(previous.poses):
