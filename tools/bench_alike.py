@@ -125,7 +125,7 @@ def report(street: Street, left_out: set[str]) -> None:
         "           right: used tentative unused   wrong: used tentative unused   scenes: placed tentative alone   "
         "components  folded"
     )
-    blind = [replace(edge, disagreement=float("nan")) for edge in edges]
+    blind = [replace(edge, disagreement=float("nan"), log_odds_wrong=float("nan")) for edge in edges]
     for name, given in (("blind", blind), ("as it is", edges)):
         answer = optimize(kept, given, params=replace(settings.optimize, marginals=False))
         print(row_of(name, street, answer))

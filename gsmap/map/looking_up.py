@@ -17,7 +17,8 @@ from gsmap.types.retrieval import Candidate
 from gsmap.types.segments import InMemory, Segment
 
 _AT_ONCE = 16  # scenes that ask together: what they find is in memory, some 7 MB of each
-_KEPT = 2  # times as many candidates are kept as are tried, to be shown
+KEPT = 2
+"""Times as many candidates are kept as are tried, to be shown."""
 
 
 def ask(
@@ -116,4 +117,4 @@ def _voters(store: Store, key: RecipeKey, params: retrieve.Params) -> Voters:
 
 def _lookup(voters: Voters, said: Sequence[Candidate], params: retrieve.Params) -> Lookup:
     key = retrieve.recipe_key(params).of(voters.member.graph)
-    return Lookup(voters.member.scene, key.digest, tuple(said[: _KEPT * params.top_k]))
+    return Lookup(voters.member.scene, key.digest, tuple(said[: KEPT * params.top_k]))

@@ -7,10 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.map.looking_up import KEPT, keys_of_lookups
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports import pair_report
 from gsmap.map.settings import Settings
+from gsmap.map.stages.describe import graph_keys
+from gsmap.map.stages.register import placed_scenes
 from gsmap.register import verdict
+from gsmap.retrieve import Rounds, neighbours
 from gsmap.store import Store
 from gsmap.types import Scene
 from gsmap.types.rows import PairReport, WhyReport, WhyStep
@@ -20,31 +24,60 @@ from gsmap.types.rows import PairReport, WhyReport, WhyStep
 def why(store: Store, settings: Settings, a: Scene, b: Scene) -> WhyReport:
     """Every step of a pair, from what is stored of it; nothing is computed again."""
     pair = pair_report(store, a, b)
-    steps = [_retrieval(store, settings, a, b, pair.status != "never registered"), *_steps(pair, settings)]
-    advice = _advice(pair, settings, {step.name: step for step in steps})
+    is_tried = pair.status != "never registered"
+    rank, untried = _retrieval(store, settings, a, b)
+    value = f"tried{rank}" if is_tried else f"never tried{rank}; {untried}"
+    retrieval = WhyStep(name="retrieval", value=value, bar="among the candidates", passed=is_tried)
+    steps = [retrieval, *_steps(pair, settings)]
+    advice = _advice(pair, settings, {step.name: step for step in steps}, untried)
     ends = {name: getattr(pair, name) for name in ("target", "target_name", "source", "source_name")}
     return WhyReport(**ends, status=pair.status, reason=pair.reason, steps=tuple(steps), advice=advice)
 
 
-def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene, is_tried: bool) -> WhyStep:
-    """Whether retrieval proposed the pair, at which place of whose list, and why it was not tried where it was not."""
-    top_k, best = settings.retrieve.top_k, None
-    for scene, other in ((a, b), (b, a)):
-        for one in store.indexes.lookups([scene.id]):
-            for place, candidate in enumerate(one.candidates, 1):
-                if candidate.scene == other.id and (best is None or place < best[0]):
-                    best = place, scene.name, candidate.score, one.num_left is None
-    said = "tried" if is_tried else "never tried"
-    if best is not None:
-        place, name, score, is_new = best
-        said += f": no. {place} of what {name} was paired with, score {score:.3g}"
-        if not is_tried and place > top_k:
-            said += f", of which the first {top_k} are tried"
-        elif not is_tried and is_new:
-            said += ", which the next gsmap update tries"
-        elif not is_tried:
-            said += f"; both have {settings.retrieve.enough} edges without doubt, which tie them over another scene"
-    return WhyStep(name="retrieval", value=said, bar="among the candidates", passed=is_tried)
+def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[str, str]:
+    """The pair's best rank among what either scene was paired with, and the reason for which ``--pairs auto`` did not
+    try the pair if it did not; by the rules of `gsmap.map.stages.register`."""
+    params, names = settings.retrieve, {a.id: a.name, b.id: b.name}
+    keys = keys_of_lookups(graph_keys(store, (a, b), settings), params)
+    lookups = {one.scene: one for one in store.indexes.lookups(list(names))}
+    listed = sorted(
+        (rank, one.scene, candidate.score)
+        for one in lookups.values()
+        for rank, candidate in enumerate(one.candidates, 1)
+        if candidate.scene in names
+    )
+    rank = ""
+    if listed:
+        first, scene, score = listed[0]
+        rank = f": no. {first} of what {names[scene]} was paired with, score {score:.3g}"
+    if any(scene not in lookups or lookups[scene].key != keys[scene] for scene in names):
+        return rank, "the next gsmap update looks for scenes that show what they show"
+    held, enough = _held(store, settings), f"{params.enough} edges without doubt (retrieve.enough)"
+    askers = {scene for first, scene, _ in listed if first <= params.top_k}
+    is_open = {
+        one: lookups[one].num_left is None or sum(one in pair for pair in held) < params.enough for one in askers
+    }
+    if any(is_open.values()):
+        return rank, "the next gsmap update tries it"
+    if askers:
+        return rank, f"left out to save time: both had {enough} by then, and these tied them over another scene"
+    if neighbours({scene: at for scene, at in placed_scenes(store).items() if scene in names}, params):
+        if Rounds((), (), held, params).is_rigid(a.id, b.id):
+            return rank, f"left out to save time: both have {enough}, and these tie them over another scene"
+        return rank, "the map's poses let them touch, and gsmap update tries the nearest of such pairs"
+    if listed or any(len(one.candidates) >= KEPT * params.top_k for one in lookups.values()):
+        return rank, f"other scenes are more promising, and the first {params.top_k} are tried (retrieve.top_k)"
+    return rank, "retrieval found nothing that both show"
+
+
+def _held(store: Store, settings: Settings) -> list[tuple[str, str]]:
+    """The pairs whose edge stands and is not in doubt."""
+    bar = settings.optimize.aliasing.max_disagreement
+    return [
+        (one.target, one.source)
+        for one in store.registrations.tried()
+        if one.usable and (one.is_told or not one.disagreement > bar)
+    ]
 
 
 def _steps(pair: PairReport, settings: Settings) -> list[WhyStep]:
@@ -92,14 +125,14 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
     ]
 
 
-def _advice(pair: PairReport, settings: Settings, steps: Mapping[str, WhyStep]) -> str:
+def _advice(pair: PairReport, settings: Settings, steps: Mapping[str, WhyStep], untried: str) -> str:
     """What would settle the first thing that is open; empty where nothing is."""
     a, b, at = pair.target_name, pair.source_name, "MAP"
     failed = {name for name, step in steps.items() if step.passed is False}
     if pair.review or pair.used is True:
         return ""
     if pair.status == "never registered":
-        return f"nothing says that they share a place; where you know better: gsmap register {at} {pair.pair}"
+        return f"{untried}; to try it all the same: gsmap register {at} --pairs {pair.pair}"
     in_doubt = "disagreement" in failed
     if in_doubt and pair.status == "accepted":
         return (

@@ -13,6 +13,7 @@ import numpy as np
 
 from gsmap.optimize.changes import diff, motion, moved
 from gsmap.optimize.gravity import gravity_align
+from gsmap.optimize.likelihood import log_odds_wrong
 from gsmap.optimize.measurements import check_priors
 from gsmap.optimize.params import Params
 from gsmap.optimize.recipe import recipe_key
@@ -29,6 +30,7 @@ __all__ = [
     "grow",
     "joint_covariance",
     "kept_still",
+    "log_odds_wrong",
     "motion",
     "moved",
     "optimize",

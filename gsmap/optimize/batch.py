@@ -10,11 +10,12 @@ from scipy.stats import chi2
 
 from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.contradictions import contested, part_contradicted
 from gsmap.optimize.cycles import Vote, vote
-from gsmap.optimize.doubt import bar_of_map, find_doubtful, take_in_doubtful
+from gsmap.optimize.doubt import find_doubtful, find_doubtful_in_map, take_in_doubtful
 from gsmap.optimize.final import solve_components
 from gsmap.optimize.fingerprint import fingerprint
-from gsmap.optimize.growing import attach_singles, close_through_singles, cut_weak_bridges, take_in_agreeing
+from gsmap.optimize.growing import attach_singles, close_through_singles, cut_weak_bridges, take_in, take_in_agreeing
 from gsmap.optimize.measurements import Measurements, all_rigid, check_priors, measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.perceptual_aliasing import contradicted_priors, resolve_aliased_loops
@@ -48,7 +49,7 @@ def solve_batch(
     doubtful = find_doubtful(m, params.aliasing.max_disagreement)
     state, votes = _grown_from(m, ~doubtful, terms, gate, params, progress)
     if (m.disagreement > 0).any() and not state.accepted.all():
-        stricter = find_doubtful(m, bar_of_map(m, state, doubtful, gate, params))
+        stricter = find_doubtful_in_map(m, state, doubtful, gate, params)
         if (stricter & ~doubtful).any():
             doubtful = stricter
             state, votes = _grown_from(m, ~doubtful, terms, gate, params, progress)
@@ -98,6 +99,10 @@ def _grown(m: Measurements, terms: PriorTerms, gate: float, params: Params, prog
         elif not _part_aliased(m, votes, state, gate, params):
             break
     attach_singles(m, state, params)
+    while part_contradicted(m, state, params):
+        refine(m, state, gate, 1.0, params)
+        take_in(m, state, params)
+    state.ambiguous |= contested(m, state, params)
     return state, votes
 
 

@@ -16,10 +16,14 @@ from gsmap.optimize.structure import ranges
 
 
 def consistent_with_component(
-    edges: Measurements, rows: np.ndarray, drift: DriftModel, probability: float
+    edges: Measurements, rows: np.ndarray, drift: DriftModel, probability: float, gates: float = 1.0
 ) -> np.ndarray:
-    """(len(rows),) bool: the edge, inside one component, agrees with the component's own prediction of it."""
-    limit = chi2.ppf(probability, edges.dim)
+    """(len(rows),) bool: the edge, inside one component, agrees with the component's own prediction of it.
+
+    Args:
+        gates: an edge agrees up to this many times the chi-square of ``probability``.
+    """
+    limit = gates * chi2.ppf(probability, edges.dim)
     out = drift.labels[edges.targets[rows]] == drift.labels[edges.sources[rows]]
     r = residuals(edges[rows], drift.poses)
     for hops in (drift.bound, drift.hops):

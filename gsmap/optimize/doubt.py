@@ -10,7 +10,9 @@ right as often as any. It fails where rooms are repeated entirely, their furnitu
 `gsmap.optimize.perceptual_aliasing` for what is left then.
 
 How much is too much differs: noisy captures disagree more, and bare rooms less. So where edges contradict each other
-they are taken in by how little they disagree, and the first that the map contradicts tell where doubt begins in it.
+the likeliest are taken in first, and the first that the map contradicts tell where doubt begins in it. Likelihood is
+that of all that registration saw (`gsmap.optimize.likelihood`), for less disagrees where a facade repeats than where
+two captures see a place from afar. Edges of unknown likelihood are ranked by disagreement.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from gsmap.optimize.structure import component_labels
 _COST = 10.0  # right edges in doubt that a wrong one believed is as bad as
 _LEAST_SPREAD = 0.15  # of logarithms of disagreements, where few are known
 _SCENE_STEPS, _FEWEST_STEPS = 2000, 8  # large maps take more in at a step, for each costs them a solve
-_STEPS = 64  # in which edges are taken in by how little they disagree, at most
+_STEPS = 64  # in which edges are taken in by their likelihood, at most
 
 
 def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
@@ -41,12 +43,14 @@ def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
     return found
 
 
-def bar_of_map(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> float:
-    """From which disagreement on the edges of this map are in doubt: ``max_disagreement`` at most.
+def find_doubtful_in_map(
+    m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params
+) -> np.ndarray:
+    """(E,) bool: edges in doubt by ``max_disagreement`` or by the contradictions of this map.
 
     Where the map contradicts more of the doubtful edges than it bears out, it has look-alikes, and the bar is what best
-    divides its other edges from those. Where the other edges contradict each other it lies no higher than
-    `first_contradicted`.
+    divides the disagreement of its other edges from that of those. Where the other edges contradict each other, those
+    from `first_contradicted` on are in doubt as well.
 
     Args:
         state: of the map that the edges without doubt make.
@@ -62,9 +66,10 @@ def bar_of_map(m: Measurements, state: State, doubtful: np.ndarray, gate: float,
     believed = state.accepted & (m.disagreement > 0)
     if alike > params.aliasing.max_chance_alike and believed.any():
         bar = min(bar, dividing_bar(m.disagreement[believed], m.disagreement[contradicted]))
-    if not (state.accepted | doubtful).all():
-        bar = min(bar, first_contradicted(m, state.terms, gate, params))
-    return bar
+    found = find_doubtful(m, bar)
+    if not (state.accepted | state.ambiguous | doubtful).all():
+        found |= first_contradicted(m, ~(state.ambiguous | doubtful), state.terms, gate, params)
+    return found
 
 
 def dividing_bar(believed: np.ndarray, contradicted: np.ndarray) -> float:
@@ -79,43 +84,51 @@ def dividing_bar(believed: np.ndarray, contradicted: np.ndarray) -> float:
     return float(np.exp((low + high) / 2 - sigma**2 * np.log(_COST) / (high - low)))
 
 
-def first_contradicted(m: Measurements, terms: PriorTerms, gate: float, params: Params) -> float:
-    """The least disagreement from which on edges are contradicted more often than not; ``max_disagreement`` at most.
+def first_contradicted(
+    m: Measurements, eligible: np.ndarray, terms: PriorTerms, gate: float, params: Params
+) -> np.ndarray:
+    """(E,) bool: edges from the rank on at which edges are contradicted more often than not; none where no rank is.
 
-    Edges are taken in by how little they disagree, each tying whatever it ties; those that come late find their scenes
-    tied.
+    Edges are taken in the likeliest first, each tying whatever it ties; those that come late find their scenes tied.
+
+    Args:
+        eligible: (E,) bool, edges that are taken in; the others decide nothing.
     """
-    most, disagreement = params.aliasing.max_disagreement, np.nan_to_num(m.disagreement, nan=0.0)
-    disagreement[m.confirmed] = 0.0
+    rank, known = _ranked(m)
     tying = replace(params, joining=replace(params.joining, small_component=m.num_scenes + 1))
     state = State.fresh(m, Similarities.identity(m.num_scenes), np.zeros(len(m), dtype=bool), terms)
     agrees, contradicted = np.zeros((2, len(m)), dtype=bool)
-    steps = np.unique(disagreement[disagreement < most])
-    steps = np.unique(
-        np.quantile(
-            steps,
-            np.linspace(0, 1, min(len(steps), _STEPS, max(_FEWEST_STEPS, _SCENE_STEPS // m.num_scenes))),
-            method="nearest",
-        )
-    )
-    below = -1.0
-    for step in steps.tolist():
-        state.rejected = disagreement > step
-        new = (disagreement > below) & ~state.rejected
-        known = _within(m, state.accepted)
+    steps = np.unique(rank[eligible])
+    most = min(len(steps), _STEPS, max(_FEWEST_STEPS, _SCENE_STEPS // m.num_scenes))
+    below = -1
+    for step in np.unique(np.quantile(steps, np.linspace(0, 1, most), method="nearest")).tolist():
+        state.rejected = (rank > step) | ~eligible
+        new = (rank > below) & ~state.rejected
+        tied = _within(m, state.accepted)
         take_in(m, state, tying)
         refine(m, state, gate, 1.0, tying)
-        agrees |= new & known & state.accepted
+        agrees |= new & tied & state.accepted
         contradicted |= new & _within(m, state.accepted) & ~state.accepted
         below = step
-    for bar in np.unique(disagreement[contradicted & (disagreement > 0)]).tolist():
-        above = disagreement >= bar
+    for bar in np.unique(rank[contradicted & known]).tolist():
+        above = rank >= bar
         if (
             chance_alike(int((agrees & above).sum()), int((contradicted & above).sum()))
             > params.aliasing.max_chance_alike
         ):
-            return bar
-    return most
+            return above & known
+    return np.zeros(len(m), dtype=bool)
+
+
+def _ranked(m: Measurements) -> tuple[np.ndarray, np.ndarray]:
+    """(E,) rank of each edge, the likeliest 0, equals alike, and (E,) bool whether its likelihood is known; confirmed
+    edges and those of unknown likelihood come first."""
+    known = np.isfinite(m.log_odds_wrong)
+    value = m.log_odds_wrong
+    if not known.any():
+        known, value = m.disagreement > 0, m.disagreement
+    known = known & ~m.confirmed
+    return np.unique(np.where(known, value, -np.inf), return_inverse=True)[1], known
 
 
 def take_in_doubtful(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> None:

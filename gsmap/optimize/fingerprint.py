@@ -37,4 +37,4 @@ def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = (), survey: Sur
 
 def _named(edge: Edge) -> str:
     """What is hashed of an edge besides its numbers."""
-    return f"{edge.target}\0{edge.source}\0{edge.disagreement!r}{edge.same_visit!r}"
+    return f"{edge.target}\0{edge.source}\0{edge.disagreement!r}{edge.same_visit!r}{edge.log_odds_wrong!r}"

@@ -68,7 +68,7 @@ def join_components(m: Measurements, state: State, params: Params, *, single: bo
     drift = state.drift(m, params)
     sizes = np.bincount(drift.labels)
     offers = find_joins(m, rows, drift, params.gate_probability)
-    decisions = [join_decision(join, m, sizes, params.joining) for join in offers]
+    decisions = [join_decision(join, m, sizes, params.joining, params.aliasing.sure) for join in offers]
     wanted = "single" if single else "agreed"
     fitting = [join for join, decision in zip(offers, decisions, strict=True) if decision == wanted]
     if single:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.contradictions import contested, contradicting
 from gsmap.optimize.cycles import Vote
 from gsmap.optimize.doubt import find_doubtful
 from gsmap.optimize.fingerprint import fingerprint
@@ -37,7 +38,8 @@ def place_new(
 
     A full solve is due when scenes, measurements between old scenes or the recipe changed, when the map grew by
     ``params.growth`` since the last one, or when a new scene ties components together, closes a long loop or comes with
-    edges that are in doubt. Poses placed here are provisional: only the surroundings of a new scene give way to it.
+    edges that are in doubt or contradict each other. Poses placed here are provisional: only the surroundings of a new
+    scene give way to it.
     """
     new = _to_place(scene_ids, previous, params)
     if not new or not {*survey.scenes(), *(prior.scene for prior in priors)} <= set(previous.poses):
@@ -139,6 +141,10 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     after = component_labels(m, rows)
     mine = np.flatnonzero(after == after[-1])[:-1]
     if len(np.unique(before[mine])) > 1:
+        return None
+    # What one edge ties and another contradicts is for the whole map to decide.
+    at_odds = np.union1d(contradicting(m, state, params), np.flatnonzero(contested(m, state, params)))
+    if state.accepted[len(around) :].sum() < 2 and (at_odds >= len(around)).any():
         return None
     component = max((p.component for p in previous.poses.values()), default=-1) + 1
     fixed = np.ones(m.num_scenes, dtype=bool)

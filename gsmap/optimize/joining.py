@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +26,9 @@ class Join:
         edges: rows of the edges that agree, the one that most others agree with first.
         rival: how many edges the largest group has that contradicts them.
         offered: rows of all edges between the two.
+        log_odds_wrong: of the least likely of the edges that agree (`Measurements.log_odds_wrong`); 0 where unknown.
+        log_odds: natural log-odds that the likeliest edge that contradicts them is wrong, against the least likely of
+            them; 0 where that is not known or nothing contradicts them.
     """
 
     target: int
@@ -31,6 +36,8 @@ class Join:
     edges: np.ndarray
     rival: int
     offered: np.ndarray
+    log_odds_wrong: float = 0.0
+    log_odds: float = 0.0
 
 
 def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probability: float) -> list[Join]:
@@ -51,8 +58,11 @@ def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probabi
     # A pair of scenes tied twice is one piece of evidence when it comes to counting pairs; see `join_decision`.
     weight = -np.log(np.trace(edges.covariance[rows], axis1=1, axis2=2))
     group = np.repeat(np.arange(len(starts)), ends - starts)
-    # The edge that most others agree with, but a confirmed one before any other.
-    best = np.lexsort((weight, np.diff(neighbours.indptr), edges.confirmed[rows], group))[ends - 1]
+    wrong = edges.log_odds_wrong[rows]
+    # The edge that most others agree with, of equals the likeliest, but a confirmed one before any other.
+    best = np.lexsort((weight, -np.nan_to_num(wrong), np.diff(neighbours.indptr), edges.confirmed[rows], group))[
+        ends - 1
+    ]
     mine = np.zeros(len(rows), dtype=bool)
     mine[best] = True
     mine |= neighbours @ mine.astype(float) > 0
@@ -63,21 +73,28 @@ def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probabi
     for k, (begin, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
         others = begin + np.flatnonzero(mine[begin:end])
         chosen = np.r_[best[k], others[others != best[k]]]
-        out.append(Join(int(low[begin]), int(high[begin]), rows[chosen], int(rivals[k]), rows[begin:end]))
+        against = wrong[begin:end][apart[begin:end]]
+        least = float(wrong[chosen].max())
+        odds = np.nan_to_num([least, against.min() - least if len(against) else 0.0]).tolist()
+        out.append(Join(int(low[begin]), int(high[begin]), rows[chosen], int(rivals[k]), rows[begin:end], *odds))
     return out
 
 
-def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Joining) -> str:
+def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Joining, sure: float = 0.9) -> str:
     """``agreed``, ``single`` or, where the evidence does not suffice, the reason in words.
 
     For what is assumed of edges that agree see `Joining`.
+
+    Args:
+        sure: as many edges as contradict them suffice where their evidence makes them right this probably.
     """
     rows = join.edges
     if edges.confirmed[join.offered].any():
         return "agreed"
     large = min(sizes[join.target], sizes[join.source]) >= params.small_component
     aliased = join.rival >= params.rival_edges and len(rows) < params.rival_factor * join.rival
-    if len(rows) <= join.rival or (large and aliased):
+    outweighed = len(rows) <= join.rival - int(join.log_odds >= np.log(sure / (1 - sure)))
+    if outweighed or (large and aliased):
         return f"{len(rows)} edges agree and {join.rival} others contradict them: undecided"
     low = np.minimum(edges.targets[rows], edges.sources[rows])
     high = np.maximum(edges.targets[rows], edges.sources[rows])
@@ -142,23 +159,34 @@ def spanning_joins(offers: list[Join], count: int) -> list[Join]:
 
 
 def attaching_joins(offers: list[Join], sizes: np.ndarray, small_component: int) -> list[Join]:
-    """Joins by single edges: from the largest component outwards, each step taking in one small component."""
+    """Joins by single edges: each takes in one small component, the likeliest join first (a minimum spanning forest as
+    Prim's); of equals those of the largest component, from it outwards."""
     ties: dict[int, list[tuple[int, Join]]] = {}
     for join in offers:
         ties.setdefault(join.target, []).append((join.source, join))
         ties.setdefault(join.source, []).append((join.target, join))
-    taken: set[int] = set()
-    out = []
-    for start in sorted(ties, key=lambda label: (-sizes[label], label)):
-        if start in taken:
+    starts = sorted(ties, key=lambda label: (-sizes[label], label))
+    taken = {label for label in starts if sizes[label] >= small_component}
+    out: list[Join] = []
+    front: list[tuple[float, int, int, int, Join]] = []
+    pushed = itertools.count()
+
+    def reach(here: int, rank: int) -> None:
+        for there, join in sorted(ties[here], key=lambda tie: tie[0]):
+            heapq.heappush(front, (join.log_odds_wrong, rank, next(pushed), there, join))
+
+    for rank, start in enumerate(starts):
+        if start in taken and sizes[start] < small_component:
             continue
         taken.add(start)
-        front = [start]
+        reach(start, rank)
+        # Components that are not small reach out together: what lies between goes to the likelier.
+        if rank + 1 < len(starts) and sizes[starts[rank + 1]] >= small_component:
+            continue
         while front:
-            here = front.pop(0)
-            for there, join in sorted(ties[here], key=lambda tie: tie[0]):
-                if there not in taken and sizes[there] < small_component:
-                    taken.add(there)
-                    out.append(join)
-                    front.append(there)
+            _, mine, _, there, join = heapq.heappop(front)
+            if there not in taken:
+                taken.add(there)
+                out.append(join)
+                reach(there, mine)
     return out

@@ -25,6 +25,7 @@ class Measurements:
         confirmed: (E,) bool.
         disagreement: (E,) share of the surface seen twice that is not the same, NaN where unknown.
         same_visit: (E,) bool, next to nothing can have changed between the two captures.
+        log_odds_wrong: (E,) of the evidence, up to a constant; NaN where unknown.
     """
 
     scene_ids: tuple[str, ...]
@@ -35,6 +36,7 @@ class Measurements:
     confirmed: np.ndarray
     disagreement: np.ndarray
     same_visit: np.ndarray
+    log_odds_wrong: np.ndarray
 
     @property
     def num_scenes(self) -> int:
@@ -69,6 +71,7 @@ class Measurements:
             self.confirmed[rows],
             self.disagreement[rows],
             self.same_visit[rows],
+            self.log_odds_wrong[rows],
         )
 
 
@@ -116,6 +119,7 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
         np.array([e.confirmed for e in edges], dtype=bool),
         np.array([e.disagreement for e in edges], dtype=np.float64),
         np.array([e.same_visit for e in edges], dtype=bool),
+        np.array([e.log_odds_wrong for e in edges], dtype=np.float64),
     )
 
 

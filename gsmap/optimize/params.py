@@ -221,7 +221,7 @@ class Params:
         restart: in gates; poses from which an accepted edge is off by more are no start for Gauss-Newton, and are
             found anew by chordal relaxation.
         contradiction: in gates; edges that people confirmed contradict each other if one of them is off by more after
-            giving way to the others.
+            giving way to the others, and an edge contradicts those it makes a loop with if it is off by more.
         max_rounds: rounds of taking edges in and refining.
         max_failures: an edge that was let go this many times is not taken in again.
         marginals: compute a covariance per scene.

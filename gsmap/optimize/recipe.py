@@ -9,8 +9,8 @@ from gsmap.optimize.params import Params
 from gsmap.types.plain import plain
 
 VERSIONS = {
-    "optimize": 3,
-    "optimize.incremental": 3,
+    "optimize": 4,
+    "optimize.incremental": 4,
     "perceptual_aliasing": 1,
     "gravity_align": 1,
     "kept_still": 1,

@@ -78,6 +78,8 @@ def _outcomes(
             reason = state.pending.get(k, "contradicts what else is known of the two components")
             if state.doubtful[k]:
                 reason = f"{_unlike(m, k)}; {reason}"
+            elif state.ambiguous[k]:
+                reason = "contradicts an edge whose evidence is about as good: one is of another place that looks alike"
             elif state.undecided[k]:
                 reason = "edges that agree among themselves contradict each other here: places that look alike?"
             out[key] = EdgeOutcome("unused", None, reason, undecided=True)

@@ -28,6 +28,7 @@ class State:
         terms: priors that are believed.
         pending: by edge, why the components that it ties may not join.
         doubtful: (E,) bool, edges whose captures disagree in too much of what both show.
+        ambiguous: (E,) bool, edges that contradict each other and of which the evidence does not tell which is wrong.
     """
 
     poses: Similarities
@@ -38,12 +39,14 @@ class State:
     terms: PriorTerms
     pending: dict[int, str]
     doubtful: np.ndarray
+    ambiguous: np.ndarray
 
     @classmethod
     def fresh(cls, m: Measurements, poses: Similarities, accepted: np.ndarray, terms: PriorTerms) -> State:
         """Nothing has failed yet."""
-        undecided, rejected, doubtful = np.zeros((3, len(m)), dtype=bool)  # one array each: they change in place
-        return cls(poses, accepted, np.zeros(len(m), dtype=np.int64), undecided, rejected, terms, {}, doubtful)
+        failures = np.zeros(len(m), dtype=np.int64)
+        undecided, rejected, doubtful, ambiguous = np.zeros((4, len(m)), dtype=bool)  # they change in place
+        return cls(poses, accepted, failures, undecided, rejected, terms, {}, doubtful, ambiguous)
 
     def spread(self, rows: np.ndarray, count: int) -> State:
         """The state of the edges at ``rows`` as that of all ``count``, of which the others are not taken in."""
@@ -62,6 +65,7 @@ class State:
             self.terms,
             {int(rows[row]): why for row, why in self.pending.items()},
             put(self.doubtful),
+            put(self.ambiguous),
         )
 
     def open(self, max_failures: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from gsmap.retrieve.codes import NUM_DIMS
 from gsmap.types import NodeLayer, SceneGraph
 from gsmap.types.retrieval import Member
 
-INDEX_VERSION = 1
+INDEX_VERSION = 2
 """Of what an index holds of a scene; another one is made anew."""
 
 WIDTH = NUM_DIMS + 6 + 4
@@ -53,15 +53,19 @@ class Voters:
 
 
 def voters_of(graph: SceneGraph, key: str, nodes_per_scene: int) -> Voters:
-    """The strongest nodes of each layer of a graph that is kept under a key."""
+    """Select the strongest nodes of each layer of a graph that is kept under a key.
+
+    The layers at guessed units are left out where the same landmarks have nodes at any size that takes the scene's unit
+    for a metre (``landmarks``, ``landmarks@K``). An empty layer counts as absent: the corners and patterns of a large,
+    coarse capture may all be larger than landmarks at the metre.
+    """
     upright = graph.up is not None
-    metric = {name for name in graph.layers if ":" not in name}
+    metric = {name.split("@")[0] for name, layer in graph.layers.items() if ":" not in name and len(layer)}
     level = np.eye(3) if graph.up is None else level_frame(graph.up)
     kept: list[Nodes] = []
     asking: list[Nodes] = []
     for name, layer in sorted(graph.layers.items()):
-        # With guessed units a scene votes through several layers; none does where one in metres may be right.
-        if not len(layer) or (name not in metric and name.split(":")[0] in metric):
+        if not len(layer) or (":" in name and name.split(":")[0] in metric):
             continue
         other_frame = name.startswith("landmarks_gravity_free")
         unit_m = 1.0 if "landmarks" in metric else layer.unit_m  # the scene's unit, where that may be the metre

@@ -26,6 +26,8 @@ class Edge:
         disagreement: of the surface that both scenes saw under this pose, the share that is not the same in both (a
             place that changed, or two that look alike); NaN where nobody looked.
         same_visit: both were captured so shortly after each other that next to nothing can have changed.
+        log_odds_wrong: natural log-odds that the pose is wrong, by the evidence of registration and up to a constant
+            that all edges share (`gsmap.optimize.likelihood`); NaN where that is not known.
     """
 
     target: str
@@ -35,6 +37,7 @@ class Edge:
     confirmed: bool = False
     disagreement: float = float("nan")
     same_visit: bool = False
+    log_odds_wrong: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,6 @@ def test_no_wrong_edge_of_a_street_of_look_alikes_is_used(tmp_path):
     assert {pose.component for pose in answer.poses.values()} == {0}
     assert bench_alike.off_m(street, answer, 0) < bench_alike.FOLDED_M
     # Who does not look at what disagrees folds it.
-    blind = [replace(edge, disagreement=float("nan")) for edge in given.edges]
+    blind = [replace(e, disagreement=float("nan"), log_odds_wrong=float("nan")) for e in given.edges]
     folded = optimize(given.scenes, blind, params=street.map.settings.optimize)
     assert bench_alike.off_m(street, folded, 0) > bench_alike.FOLDED_M

@@ -148,6 +148,7 @@ def test_an_interrupted_run_goes_on_with_what_it_had_proposed(
         assert None in {left for _, left in m.store.indexes.asked().values()}
         (why,) = [step for step in m.why(f"{NAMES[0]}:{NAMES[3]}").steps if step.name == "retrieval"]
         assert "the next gsmap update tries" in str(why.value)
+        assert "the next gsmap update tries" in m.why(f"{NAMES[0]}:{NAMES[3]}").advice
         assert len(m.register("auto")) == 3
 
 
@@ -166,12 +167,41 @@ def test_pairs_are_not_tried_where_the_map_is_rigid(made: Described, tmp_path: P
         (why,) = [step for step in m.why(untried).steps if step.name == "retrieval"]
         assert "edges without doubt" in str(why.value)
         assert not why.passed
+        # They share a place, and were left out for cost: that is the advice, and no word of nothing that they share.
+        assert "left out to save time" in m.why(untried).advice
+        assert f"--pairs {untried}" in m.why(untried).advice
         # The edges of one are rejected: what was left of its list is tried.
         scene = max(left, key=lambda name: left[name] or 0)
         for a, b in sorted(sorted(pair) for pair in tried if scene in pair):
             m.reject(f"{a}:{b}")
+        assert "the next gsmap update tries" in m.why(_untried_of(scene, tried)).advice
         m.register("auto")
         assert len(pairs(m)) > len(tried)
+
+
+def test_why_tells_what_is_not_looked_up_from_what_is_not_listed(made: Described, site: Path) -> None:
+    with gsmap.map.open(site) as m:
+        made.ingest(m, NAMES[3])
+        pair = f"{NAMES[0]}:{NAMES[3]}"
+        assert "looks for" in m.why(pair).advice
+    with gsmap.map.open(site) as m:
+        m.with_settings({"retrieve.top_k": 1, "retrieve.num_spatial": 0})
+        m.register("auto")
+        told = {}
+        for k, a in enumerate(NAMES):
+            for b in NAMES[k + 1 :]:
+                report = m.why(f"{a}:{b}")
+                told[report.status, "the first 1 are tried" in report.advice] = report
+        assert ("never registered", True) in told
+        assert ("never registered", False) not in told
+
+
+def _untried_of(scene: str, tried: set[frozenset[str]]) -> str:
+    return next(
+        ":".join(sorted((scene, other)))
+        for other in NAMES
+        if frozenset((scene, other)) not in tried | {frozenset((scene,))}
+    )
 
 
 def _recipe(m: Map) -> str:

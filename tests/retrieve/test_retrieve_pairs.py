@@ -6,7 +6,7 @@ import numpy as np
 from retrieve_worlds import layer, walk
 
 from gsmap.retrieve import Params, Placed, candidate_pairs, neighbours
-from gsmap.types import SceneGraph
+from gsmap.types import NodeLayer, SceneGraph
 
 
 def test_small_maps_are_tried_exhaustively():
@@ -117,3 +117,25 @@ def test_neighbours_of_many_sizes_are_those_that_touch():
     assert len(found) == len(expected) > 50
     nearest = neighbours(placed, Params(num_spatial=2))
     assert set(nearest) < expected
+
+
+def test_a_scene_whose_layers_at_the_metre_are_empty_is_found_by_those_at_guessed_units():
+    """Large coarse captures have no landmark as small as the metre asks for, and many at a guess."""
+    graphs = [
+        replace(graph, layers={"landmarks": NodeLayer.empty("test", 24), "landmarks:0": graph.layers["landmarks"]})
+        if graph.scene_id in ("s003", "s004")
+        else graph
+        for graph in walk(30)
+    ]
+    pairs = candidate_pairs(graphs, params=Params(top_k=3))
+    assert {("s002", "s003"), ("s003", "s004"), ("s004", "s005")} <= set(pairs)
+    assert {("s006", "s007"), ("s020", "s021")} <= set(pairs)
+
+
+def test_guesses_do_not_vote_where_landmarks_have_nodes_in_metres():
+    rng = np.random.default_rng(8)
+    guessed, own = layer(rng, 40), layer(rng, 40, descriptor="own")
+    for name in ("landmarks", "landmarks@2"):
+        knows = {"landmarks": NodeLayer.empty("own", 16), "landmarks:0": guessed, name: own}
+        guesses = SceneGraph("b", {"landmarks:0": guessed})
+        assert candidate_pairs([SceneGraph("a", knows), guesses]) == []

@@ -123,6 +123,7 @@ def _edges(store: Store, basis: PoseBasis, among: Collection[str] | None = None)
             confirmed=stored.review == "confirm",
             disagreement=stored.registration.evidence.get("disagreement", float("nan")),
             same_visit=(stored.registration.target, stored.registration.source) in basis.same_visits,
+            log_odds_wrong=solver.log_odds_wrong(stored.registration.evidence, stored.registration.overlap),
         )
         for stored in store.registrations.usable(among)
         if stored.registration.S_target_source is not None and stored.registration.information is not None
