@@ -208,7 +208,7 @@ class _Groups:
             return split
         missing = some[near].missing(self.params, world)
         if missing is not None:
-            return missing if near.all() else self._contradicted(rows[~near], world, missing)
+            return missing if near.all() else self._contradicted(rows[~near], rows[near], world, missing)
         x = self.system.terms.start(self.system.scenes, world)
         x = replace(x, points=first_points(self.system, x))
         allowed = self._allowed(rows, bars=bars)
@@ -224,15 +224,34 @@ class _Groups:
             return split
         return weakness(self.system, factor) or tie
 
-    def _contradicted(self, rows: np.ndarray, world: Sim3, missing: str) -> Contradiction:
-        """Places that leave too few others to tie the component by."""
-        some, kind = self.places[rows], str(self.places.kinds[rows[0]])
+    def _contradicted(self, rows: np.ndarray, others: np.ndarray, world: Sim3, missing: str) -> Contradiction:
+        """Places that contradict others that are too few to tie the component by.
+
+        Args:
+            world: the similarity that the others agree with.
+        """
+        some = self.places[rows]
         off = np.median(some.in_world - world.apply(some.in_map), axis=0)
-        shift = Shift(off, np.diag(np.median(np.hypot(some.own_m, some.common_m), axis=0)) ** 2, 0.0, rows >= 0)
-        why = causes(some, shift, self.frame, None)
+        shift = Shift(off, np.diag(np.median(some.reach_m(), axis=0)) ** 2, 0.0, rows >= 0)
+        group, against = (self._most(one) for one in (rows, others))
+        why = causes(some, shift, self.frame, self._ground(others))
+        if group == against:
+            why = ("split", *why)
+        else:
+            back = causes(self.places[others], replace(shift, shift_m=-off), self.frame, self._ground(rows))
+            if set(back) & set(_SPECIFIC) and not set(why) & set(_SPECIFIC):
+                rows, shift, group, against, why = others, replace(shift, shift_m=-off), against, group, back
         scenes = tuple(sorted(set(self._scenes(rows))))
-        text = f"{missing} (the others contradict them: {reason_of(why)})"
-        return Contradiction(kind, kind, "split", why, count=len(rows), scenes=scenes, text=text)
+        sigma = tuple(np.sqrt(np.diag(shift.covariance)).tolist())
+        text = f"{missing} ({GROUPS[group]} contradict {GROUPS[against]}: {reason_of(why)})"
+        return Contradiction(
+            group, against, why[0], why[1:], "none", tuple(shift.shift_m.tolist()), sigma, None, len(rows), scenes, text
+        )
+
+    def _most(self, rows: np.ndarray) -> str:
+        """The kind that most of some places are of."""
+        kinds, counts = np.unique(self.places.kinds[rows], return_counts=True)
+        return str(kinds[np.argmax(counts)])
 
     def _allowed(self, rows: np.ndarray, *, bars: bool) -> Active:
         some, usable = self.places[rows], self.system.usable

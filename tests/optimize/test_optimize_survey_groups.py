@@ -122,6 +122,26 @@ def test_equally_precise_sources_are_not_tied_and_a_third_decides() -> None:
     assert [(one.group, one.kept) for one in decided.contradictions] == [("scenes", "against")]
 
 
+@pytest.mark.parametrize("wide_m", [60.0, 300.0])
+def test_two_points_show_photos_that_have_the_mark_of_take_off(wide_m: float) -> None:
+    """On the wide site photos alone tie the map, on the small one they do not."""
+    m = made(11, wide_m)
+    tie, _ = solved(m, m.photos(bench.PHONE, m.takeoff), m.points(keep=2))
+    assert tie.S_world_map is None
+    assert tie.problem_code == "contradiction"
+    (one,) = tie.contradictions
+    assert (one.group, one.against, one.cause) == ("photos", "points", "above_takeoff")
+    assert one.offset_m[2] == pytest.approx(-520, abs=40)
+
+
+def test_points_with_the_mark_of_feet_do_not_untie_photos() -> None:
+    m = made(11, 300.0)
+    tie, off = solved(m, m.photos(bench.PHONE), m.points(m.feet, keep=2))
+    assert off < 150
+    (one,) = tie.contradictions
+    assert (one.group, one.against, one.cause, one.kept) == ("points", "photos", "feet", "against")
+
+
 def test_photos_without_altitude_do_not_tie_a_map() -> None:
     m = made(7)
     tie, _ = solved(m, m.photos(bench.PHONE, m.zero))
