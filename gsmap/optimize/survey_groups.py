@@ -233,7 +233,7 @@ class _Groups:
         some = self.places[rows]
         off = np.median(some.in_world - world.apply(some.in_map), axis=0)
         shift = Shift(off, np.diag(np.median(some.reach_m(), axis=0)) ** 2, 0.0, rows >= 0)
-        group, against = (self._most(one) for one in (rows, others))
+        group, against = self._most(rows), self._most(others if len(others) else rows)
         why = causes(some, shift, self.frame, self._ground(others))
         if group == against:
             why = ("split", *why)
@@ -292,14 +292,11 @@ class _Groups:
             if not (fixes.any() or active[0].any()):
                 return x, active, factor, rows
             active = active[0], active[1], fixes, active[3]
-            try:
-                x, active = without_outliers(
-                    self.system, x, (active[0], active[1], allowed[2], active[3]),
-                    (~active[0], ~active[1], allowed[2] & ~fixes, ~active[3]),
-                )  # fmt: skip
-            except (np.linalg.LinAlgError, RuntimeError):
-                return x, active, factor, rows
-        return x, active, factor, rows
+            x, active = without_outliers(
+                self.system, x, (active[0], active[1], allowed[2], active[3]),
+                (~active[0], ~active[1], allowed[2] & ~fixes, ~active[3]),
+            )  # fmt: skip
+        return x, active, self.system.factor(x, self.system.as_weights(active)), rows
 
     def _split(self, tie: _Tie, rows: np.ndarray) -> Contradiction | None:
         """Whether places that contradict the tie by them are too many, or agree with each other, to be blunders."""
@@ -503,13 +500,22 @@ class _Groups:
             gross = (gross[0], allowed[1] & ~reference.active[1], gross[2], np.zeros_like(bars))
             try:
                 x, active = without_outliers(self.system, reference.x, allowed, gross)
-                x, active, factor, rows = self._without_units(x, active, rows)
+                x, active, factor, kept = self._without_units(x, active, rows)
                 lost = start.sum() > 2 * self._is_active(active, reference.rows).sum()
                 if not (lost or weakness(self.system, factor)):
-                    best = _Tie(x, active, factor, rows)
+                    best = _Tie(x, active, factor, kept)
+                    self._name_units(best, np.setdiff1d(rows, kept))
             except (np.linalg.LinAlgError, RuntimeError):
                 pass
         return Solution(best.x, best.active, best.factor, tuple(self.verdicts.found), dict(self.verdicts.reasons))
+
+    def _name_units(self, tie: _Tie, rows: np.ndarray) -> None:
+        """Name captures that were left out at last."""
+        terms = self.system.terms.observations(tie.x)
+        for unit in np.unique(self.places.units[rows]):
+            mine = rows[self.places.units[rows] == unit]
+            shift = shift_of(self.system, terms, tie.factor, self.places[mine], used=False)
+            self._blunder([mine], [shift], tie.rows)
 
     def _bars(self, reference: _Tie) -> np.ndarray:
         """(G,) bool, the scale bars to solve from; those that contradict the reference in common are named."""
