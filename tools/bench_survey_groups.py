@@ -6,7 +6,8 @@ Sites are 6 to 600 m wide, at altitudes of 5 to 1,609 m, of 4 or 9 captures. See
 observations before `+`, then those after it are added. A tie is wrong where it is off by more than five of its own
 standard deviations; with correct control points, where it is off by more than 10 cm. A tie is lost where the first
 observations tie the map rightly and all together do not; where equal groups contradict each other no tie is right.
-Hidden are mixtures whose common error is below five standard deviations of what the observations state: left out.
+Hidden are mixtures whose common error is below five standard deviations of what the observations state: no reason need
+be named, and without control points nothing can tell which group is right.
 """
 
 from __future__ import annotations
@@ -324,8 +325,9 @@ def run(name: str, mixture: Mixture, seed: int, tally: Tally, *, verbose: bool =
     tie, off, sigma = solved(m.site, both(first, added))
     tied = tie.S_world_map is not None
     beyond = bool(mixture.cause) and is_beyond(m, first, added)
-    if mixture.cause and not beyond:  # nothing can tell
-        tally.hidden += 1
+    hidden = bool(mixture.cause) and not beyond
+    tally.hidden += hidden
+    if hidden and not mixture.near:  # nothing can tell which group is right
         return
     near = mixture.near and all(len(one.points) != 2 for one in (first, added))
     wrong = tied and (off > 5 * sigma + 0.005 or (near and off > 0.1) or mixture.tied is False)
