@@ -128,5 +128,7 @@ def _print(map: str, report: WorldReport) -> None:
         print_table("residuals", ResidualRow.columns, tie.residuals)
         for note in tie.notes:
             say(f"component {tie.component}: {note}")
+        for one in tie.contradictions if not tie.problem else ():
+            say(f"component {tie.component}: {one.text} Left out: {one.group}, reason {one.cause}")
         if tie.problem:
             say(f"component {tie.component} is not tied to the world: {tie.problem}")

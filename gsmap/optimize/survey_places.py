@@ -1,24 +1,26 @@
-"""What is known both in the map and in the world before anything is bent: whether it determines where the map lies."""
+"""Places known both in the map and in the world before anything is bent, and whether they determine where it lies."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.rotations import skew
 from gsmap.geometry.umeyama import umeyama
 from gsmap.optimize.params import SurveyParams
-from gsmap.optimize.survey_system import Active, System
-from gsmap.optimize.survey_terms import SurveyTerms
+from gsmap.optimize.survey_system import System
 from gsmap.types import Sim3
+from gsmap.types.world import Fix
 
 NOTHING = (
     "position, rotation and scale are not determined: it takes three control points that photos of the map show, or "
     "positions of cameras or scenes, that are not on one line"
 )
+SURVEYED = "survey"  # the name of a fix of a scene's origin; other fixes are photos
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,25 +29,46 @@ class Places:
 
     Args:
         names: for people. in_map, in_world: (P, 3).
-        sigma_m: (P,) of each by itself. reach_m: (P,) with what it is off by together with others.
-        rows: (P,) of the control point; -1 of a fix.
+        own_m: (P, 3) standard deviations of each by itself. common_m: (P, 3) of what it shares with its unit.
+        sea_m: (P,) of the sea level, which all places that count from it share.
+        kinds: (P,) ``points``, ``photos`` or ``scenes``. rows: (P,) row among the control points or fixes.
+        units: (P,) the unit that a place belongs to: the photos of a capture are one, other places are by themselves.
+        sources: (P,) control points, surveyed scenes, photos with and those without corrections are a source each.
     """
 
     names: tuple[str, ...]
     in_map: np.ndarray
     in_world: np.ndarray
-    sigma_m: np.ndarray
-    reach_m: np.ndarray
+    own_m: np.ndarray
+    common_m: np.ndarray
+    sea_m: np.ndarray
+    kinds: np.ndarray
     rows: np.ndarray
+    units: np.ndarray
+    sources: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
 
     def __getitem__(self, keep: np.ndarray) -> Places:
-        names = tuple(name for name, k in zip(self.names, keep.tolist(), strict=True) if k)
-        arrays = (self.in_map, self.in_world, self.sigma_m, self.reach_m, self.rows)
-        return Places(names, *(array[keep] for array in arrays))
+        rows = np.flatnonzero(keep) if keep.dtype == bool else keep
+        arrays = (self.in_map, self.in_world, self.own_m, self.common_m, self.sea_m)
+        labels = (self.kinds, self.rows, self.units, self.sources)
+        return Places(tuple(self.names[k] for k in rows.tolist()), *(one[rows] for one in (*arrays, *labels)))
 
-    def missing(self, params: SurveyParams) -> str | None:
-        """What they do not determine, and what would; None where they determine everything."""
-        n = len(self.names)
+    def reach_m(self) -> np.ndarray:
+        """(P, 3) standard deviations with all errors that a place shares."""
+        out = np.hypot(self.own_m, self.common_m)
+        out[:, 2] = np.hypot(out[:, 2], self.sea_m)
+        return out
+
+    def missing(self, params: SurveyParams, S: Sim3 | None = None) -> str | None:
+        """What they do not determine, and what would; None where they determine everything.
+
+        Args:
+            S: ``S_world_map`` near the answer; without it only the number of places is looked at.
+        """
+        n = len(self)
         if not n:
             return NOTHING
         if n == 1:
@@ -53,39 +76,62 @@ class Places:
                 f"rotation and scale are not determined: only {self.names[0]} is known both in the map and in the "
                 "world; add two more that are not on one line with it"
             )
-        sigma = float(np.sqrt((self.sigma_m**2).mean()))
-        spread = np.minimum(*[_spread(points, size) for points, size in self._in_metres()])
-        if spread[0] < 3 * sigma:
+        best = float((1 / self.own_m.max(1) ** 2).mean() ** -0.5)
+        limit = np.radians(params.max_rotation_sigma_deg)
+        turns, scale = (np.array([0.0, 0.0, np.pi]), 0.0) if S is None else self._sigmas(S)
+        if scale > params.max_log_scale_sigma or turns[1] > limit:
             return (
                 f"rotation and scale are not determined: {_listed(self.names)} lie at one place within their errors; "
-                f"add others further off than {3 * sigma:.2g} m"
+                f"add others further off than {3 * best:.2g} m"
             )
-        limit = np.radians(params.max_rotation_sigma_deg)
-        if n == 2 or spread[1] < sigma / limit:
-            turn = (
-                "" if n == 2 else f" (known to {min(180.0, float(np.degrees(sigma / max(spread[1], 1e-12)))):.2g} deg)"
-            )
+        if n == 2 or (S is not None and turns[2] > limit):
+            turn = "" if n == 2 else f" (known to {min(180.0, float(np.degrees(turns[2]))):.2g} deg)"
             return (
                 f"rotation about the line through {_listed(self.names)} is not determined{turn}: add a control point "
-                f"or position at least {sigma / limit:.2g} m off that line, better as far as they are apart"
+                f"or position at least {best / limit:.2g} m off that line, better as far as they are apart"
             )
         return None
 
-    def _in_metres(self) -> list[tuple[np.ndarray, float]]:
-        """World and map, the map as large as the world: a blunder may put on a line what is not, or the reverse."""
-        size = float(np.median(np.linalg.norm(self.in_map - np.median(self.in_map, axis=0), axis=1)))
-        true = float(np.median(np.linalg.norm(self.in_world - np.median(self.in_world, axis=0), axis=1)))
-        return [(self.in_world, 1.0), (self.in_map, true / size if size > 0 and true > 0 else 1.0)]
+    def _sigmas(self, S: Sim3) -> tuple[np.ndarray, float]:
+        """(3,) standard deviations of the rotation about its principal axes, smallest first, and of the log scale.
+
+        Information adds up: each place brings its own, with what it shares with others taken as unknown.
+        """
+        q = S.apply(self.in_map)
+        q = q - q.mean(0)
+        size = float(np.abs(q).max()) or 1.0
+        by = np.zeros((len(q), 3, 8))
+        by[:, :, :3], by[:, :, 3:6], by[:, :, 6] = -skew(q) / size, np.eye(3), q / size
+        by[:, 2, 7] = self.sea_m
+        weights = self.own_m**-2
+        H = np.einsum("pai,pa,paj->ij", by, weights, by)
+        H[7, 7] += 1
+        _, unit = np.unique(self.units, return_inverse=True)
+        shared = np.zeros((unit.max() + 1, 8, 3))
+        np.add.at(shared, unit, np.einsum("pai,pa->pia", by, weights * self.common_m))
+        known = np.ones((unit.max() + 1, 3))
+        np.add.at(known, unit, weights * self.common_m**2)
+        H -= np.einsum("uia,ua,uja->ij", shared, 1 / known, shared)
+        root = np.sqrt(np.maximum(np.diag(H), 1e-18 * np.diag(H).max()))
+        covariance = np.linalg.inv(H / root / root[:, None] + 1e-12 * np.eye(8)) / root / root[:, None]
+        turns = np.sqrt(np.maximum(0, np.linalg.eigvalsh(covariance[:3, :3]))) / size
+        return turns, float(np.sqrt(max(0.0, covariance[6, 6]))) / size
 
     def robust_fit(self, params: SurveyParams) -> tuple[Sim3, np.ndarray]:
         """``S_world_map`` that most of them agree with, and (P,) bool which do.
 
         Every triple is tried, or so many of them; what agrees is what lies within its error and the drift of a map.
+        What all places share moves all of them alike, and is no part of an error here.
+
+        Raises:
+            InputError: no similarity fits, for all places coincide.
         """
-        n = len(self.names)
+        n = len(self)
         middle = np.median(self.in_world, axis=0)
         extent = 2 * float(np.median(np.linalg.norm(self.in_world - middle, axis=1)))
-        bar = 5 * self.reach_m + params.drift_share * extent
+        reach = self.own_m.max(1) + (self.common_m.max(1) if len(np.unique(self.units)) > 1 else 0.0)
+        reach = np.hypot(reach, self.sea_m if self.sea_m.min() == 0 else 0.0)
+        bar = 5 * reach + params.drift_share * extent
         triples = list(itertools.combinations(range(n), 3)) if n <= 15 else self._drawn(params.draws)
         best, least = None, np.inf
         for three in triples:
@@ -94,7 +140,7 @@ class Places:
                 S = umeyama(self.in_world[rows], self.in_map[rows], with_scale=True)
             except InputError:
                 continue
-            if _spread(self.in_map[rows], 1.0)[1] < 0.02 * _spread(self.in_map[rows], 1.0)[0]:
+            if _spread(self.in_map[rows])[1] < 0.02 * _spread(self.in_map[rows])[0]:
                 continue
             cost = float(np.minimum(self._off(S) / bar, 1).sum())
             if cost < least - 1e-9:
@@ -114,46 +160,80 @@ class Places:
 
     def _drawn(self, count: int) -> list[tuple[int, ...]]:
         rng = np.random.default_rng(0)
-        return [tuple(rng.choice(len(self.names), 3, replace=False).tolist()) for _ in range(count)]
+        return [tuple(rng.choice(len(self), 3, replace=False).tolist()) for _ in range(count)]
 
     def _off(self, S: Sim3) -> np.ndarray:
         out: np.ndarray = np.linalg.norm(S.apply(self.in_map) - self.in_world, axis=1)
         return out
 
-    def gross(self, near: np.ndarray, terms: SurveyTerms) -> Active:
-        """Observations that are far from what most agree on: left out before anything is bent to them."""
-        points = np.zeros(len(terms.points), dtype=bool)
-        of_points = self.rows >= 0
-        points[self.rows[of_points & ~near]] = True
-        none = np.zeros(len(terms.images), dtype=bool), np.zeros(len(terms.bars), dtype=bool)
-        return points, none[0], ~near[~of_points], none[1]
+    def misfit_m(self) -> float:
+        """RMS of the best similarity."""
+        off = umeyama(self.in_world, self.in_map, with_scale=True).apply(self.in_map) - self.in_world
+        return float(np.sqrt((off**2).sum(1).mean()))
+
+    def noise_m(self, *, sea: bool = True) -> float:
+        """Misfit that stated errors and the drift of a map may have: three standard deviations, 0.2 % of the extent.
+
+        Args:
+            sea: count that of the sea level, which moves some places beside others but not all of them.
+        """
+        reach = self.reach_m() if sea else np.hypot(self.own_m, self.common_m)
+        extent = float(np.linalg.norm(np.ptp(self.in_world[:, :2], axis=0)))
+        return 3 * float(np.sqrt((reach**2).sum(1).mean())) + 0.002 * extent
+
+    def moved(self, rows: np.ndarray, by_m: np.ndarray) -> Places:
+        """With some places elsewhere in the world, by (n, 3) or (3,)."""
+        in_world = self.in_world.copy()
+        in_world[rows] += by_m
+        return replace(self, in_world=in_world)
 
 
 def known_places(system: System) -> Places:
-    """What is known both in the map and in the world, as it lies before anything is bent."""
+    """All places of a component, as the map lies before anything is bent."""
     terms, x = system.terms, system.terms.start(system.scenes, Sim3.identity())
     in_map, _, told = terms.triangulated(x, system.usable[1])
     chosen = np.flatnonzero(told & ~system.is_check)
-    names = [f"control point {terms.points[k].name}" for k in chosen.tolist()]
-    names += [f"{fix.name} of a scene" for fix in terms.fixes]
-    world = [terms.points[k].position for k in chosen.tolist()] + [fix.position for fix in terms.fixes]
-    sigmas = [max(terms.points[k].sigma_m) for k in chosen.tolist()]
-    reach = sigmas + [float(np.hypot(max(f.sigma_m) + max(f.common_sigma_m), f.sea_level_sigma_m)) for f in terms.fixes]
-    sigmas = sigmas + [max(fix.sigma_m) for fix in terms.fixes]
-    places = np.concatenate([in_map[chosen], terms.fix_points(system.scenes)])
+    points, fixes = [terms.points[k] for k in chosen.tolist()], terms.fixes
+    kinds = ["points"] * len(points) + [fix_kind(fix) for fix in fixes]
+    captures = {group: k for k, group in enumerate(sorted(set(terms.fix_groups)))}
+    units = list(range(len(points)))
+    units += [
+        len(points) + (captures[group] if fix_kind(fix) == "photos" else len(captures) + k)
+        for k, (fix, group) in enumerate(zip(fixes, terms.fix_groups, strict=True))
+    ]
+    corrected = [True] * len(points) + [
+        group[1] if fix_kind(fix) == "photos" else True for fix, group in zip(fixes, terms.fix_groups, strict=True)
+    ]
+    sources = sorted(set(zip(kinds, corrected, strict=True)))
+    zeros = [(0.0, 0.0)] * len(points)
+    positions = [point.position for point in points] + [fix.position for fix in fixes]
     return Places(
-        tuple(names),
-        places,
-        np.array(world, dtype=np.float64).reshape(-1, 3),
-        np.array(sigmas, dtype=np.float64),
-        np.array(reach, dtype=np.float64),
-        np.r_[chosen, np.full(len(terms.fixes), -1)],
+        tuple([f"control point {p.name}" for p in points] + [f"{fix.name} of a scene" for fix in fixes]),
+        np.concatenate([in_map[chosen], terms.fix_points(system.scenes)]),
+        np.array(positions, dtype=np.float64).reshape(-1, 3),
+        _axes([point.sigma_m for point in points] + [fix.sigma_m for fix in fixes]),
+        _axes(zeros + [fix.common_sigma_m for fix in fixes]),
+        np.array([0.0] * len(points) + [fix.sea_level_sigma_m for fix in fixes]),
+        np.array(kinds, dtype="<U6"),
+        np.r_[chosen, np.arange(len(fixes))].astype(np.int64),
+        np.array(units, dtype=np.int64),
+        np.array([sources.index(key) for key in zip(kinds, corrected, strict=True)], dtype=np.int64),
     )
 
 
-def _spread(points: np.ndarray, size: float) -> np.ndarray:
+def fix_kind(fix: Fix) -> str:
+    """The group of observations that a fix belongs to."""
+    return "scenes" if fix.name == SURVEYED else "photos"
+
+
+def _axes(sigmas_m: Sequence[tuple[float, float]]) -> np.ndarray:
+    """(P, 3) of horizontal and vertical ones."""
+    return np.array(sigmas_m, dtype=np.float64).reshape(-1, 2)[:, [0, 0, 1]]
+
+
+def _spread(points: np.ndarray) -> np.ndarray:
     """(3,) root of the sum of squares along the principal axes, largest first."""
-    found = np.linalg.svd((points - points.mean(0)) * size, compute_uv=False)
+    found = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return np.r_[found, np.zeros(3)][:3]
 
 

@@ -2,14 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from gsmap.optimize.survey_system import Active, Factor, System, Tests
 from gsmap.optimize.survey_terms import Terms, Unknowns
-from gsmap.types.world import Residual, Survey, WorldFrame, WorldTie
+from gsmap.types.world import Contradiction, Residual, Survey, WorldFrame, WorldTie
+
+_CONTRADICTS = "it contradicts the other observations"
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A solved component.
+
+    Args:
+        active: observations that it was solved from.
+        contradictions: groups that were left out, or the observations that cannot be told apart.
+        reasons: by (kind, row) of an observation, the contradiction that left it out.
+    """
+
+    x: Unknowns
+    active: Active
+    factor: Factor
+    contradictions: tuple[Contradiction, ...] = ()
+    reasons: dict[tuple[str, int], str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """Why a component is not tied.
+
+    Args:
+        problem: observations that are missing, or that contradict each other.
+        code: of `gsmap.types.world.PROBLEMS`.
+        contradictions: groups that contradict each other.
+    """
+
+    problem: str
+    code: str
+    contradictions: tuple[Contradiction, ...] = ()
 
 
 def active_of(system: System, tie: WorldTie) -> Active:
@@ -29,17 +63,12 @@ def active_of(system: System, tie: WorldTie) -> Active:
     return points, images, fixes, bars
 
 
-def report(
-    system: System, x: Unknowns, active: Active, factor: Factor, index: int, frame: WorldFrame | None
-) -> WorldTie:
+def report(system: System, solved: Solution, index: int, frame: WorldFrame | None) -> WorldTie:
     """The tie with all residuals."""
+    x, active, factor = solved.x, solved.active, solved.factor
     tests = system.tests(x, active, factor)
-    rows = _point_rows(system, x, active, factor, tests)
-    rows += (
-        _image_rows(system, x, active, tests)
-        + _fix_rows(system, x, active, tests)
-        + _bar_rows(system, x, active, tests)
-    )
+    rows = _point_rows(system, solved, tests)
+    rows += _image_rows(system, x, active, tests) + _fix_rows(system, solved, tests) + _bar_rows(system, solved, tests)
     covariance = world_covariance(system, factor)
     factor_of = _variance_factor(system, x, active, tests)
     notes = []
@@ -60,16 +89,20 @@ def report(
         frame,
         tuple(rows),
         notes=tuple(notes),
+        contradictions=solved.contradictions,
     )
 
 
-def lengths_only(system: System, index: int, survey: Survey, missing: str) -> WorldTie:
+def lengths_only(system: System, index: int, survey: Survey, refusal: Refusal) -> WorldTie:
     """What scale bars alone tell, where positions do not determine the rest: the metre, and nothing else."""
-    terms = system.terms
+    terms, missing = system.terms, refusal.problem
+    nothing = WorldTie(
+        index, frame=survey.frame, problem=missing, problem_code=refusal.code, contradictions=refusal.contradictions
+    )
     rows = [Residual("point", p.name, "", "check" if p.check else "unused", reason=missing) for p in terms.points]
     rows += [Residual("fix", f.name, f.scene, "unused", reason=missing) for f in terms.fixes]
     if not terms.bars:
-        return WorldTie(index, frame=survey.frame, residuals=tuple(rows), problem=missing)
+        return replace(nothing, residuals=tuple(rows))
     logs, variances = [], []
     for bar in terms.bars:
         poses = [system.scenes.item(terms._row[scene]) for scene in bar.scenes]
@@ -92,7 +125,7 @@ def lengths_only(system: System, index: int, survey: Survey, missing: str) -> Wo
                 (float(bar.length_m * np.sqrt(variance)),), reason="" if used else "the other bars contradict it",
             )
         )  # fmt: skip
-    return WorldTie(index, None, None, float(np.exp(log)), sigma, survey.frame, tuple(rows), problem=missing)
+    return replace(nothing, metres_per_unit=float(np.exp(log)), scale_sigma=sigma, residuals=tuple(rows))
 
 
 def world_covariance(system: System, factor: Factor) -> np.ndarray:
@@ -121,7 +154,8 @@ def _variance_factor(system: System, x: Unknowns, active: Active, tests: Tests) 
     return total / free
 
 
-def _point_rows(system: System, x: Unknowns, active: Active, factor: Factor, tests: Tests) -> list[Residual]:
+def _point_rows(system: System, solved: Solution, tests: Tests) -> list[Residual]:
+    x, active, factor = solved.x, solved.active, solved.factor
     show = active[1] | (system.is_check[system.terms.image_points] if len(system.terms.images) else active[1])
     met, picking, told = system.terms.triangulated(x, show)
     at = replace(x, points=met)
@@ -144,7 +178,7 @@ def _point_rows(system: System, x: Unknowns, active: Active, factor: Factor, tes
         elif point.check or not active[0][k]:
             reason = "no two photos show it, and no surface was rendered where one does"
         if use == "outlier" and not reason:
-            reason = "it contradicts the other observations"
+            reason = solved.reasons.get(("point", k), _CONTRADICTS)
         rows.append(Residual("point", point.name, "", use, error, sigma, (), statistic, dof, reason))
     return rows
 
@@ -174,7 +208,7 @@ def _image_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> li
     rows = []
     for k, image in enumerate(system.terms.images):
         use = "check" if checked[k] else "used" if active[1][k] else "outlier"
-        reason = "it contradicts the other observations" if use == "outlier" else ""
+        reason = _CONTRADICTS if use == "outlier" else ""
         statistic = None if checked[k] or system.lone[k] else _given(tests.statistics[1][k], tests.dofs[1][k])
         error = (float(errors[k, 0]), float(errors[k, 1])) if abs(errors[k]).max() < 1e6 else ()
         rows.append(
@@ -186,8 +220,8 @@ def _image_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> li
     return rows
 
 
-def _fix_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> list[Residual]:
-    rows = []
+def _fix_rows(system: System, solved: Solution, tests: Tests) -> list[Residual]:
+    rows, x, active = [], solved.x, solved.active
     at = x.world.item(0).apply(system.terms.fix_points(x.scenes))
     for k, fix in enumerate(system.terms.fixes):
         use = "used" if active[2][k] else "outlier"
@@ -198,14 +232,14 @@ def _fix_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> list
             Residual(
                 "fix", fix.name, fix.scene, use, (float(off[0]), float(off[1]), float(off[2])),
                 (float(h), float(h), float(v)), (), _given(tests.statistics[2][k], tests.dofs[2][k]),
-                int(tests.dofs[2][k]), "" if active[2][k] else "it contradicts the other observations",
+                int(tests.dofs[2][k]), "" if active[2][k] else solved.reasons.get(("fix", k), _CONTRADICTS),
             )
         )  # fmt: skip
     return rows
 
 
-def _bar_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> list[Residual]:
-    rows = []
+def _bar_rows(system: System, solved: Solution, tests: Tests) -> list[Residual]:
+    rows, x, active = [], solved.x, solved.active
     terms = system.terms.observations(x)[3]
     for k, bar in enumerate(system.terms.bars):
         use = "used" if active[3][k] else "outlier"
@@ -218,7 +252,7 @@ def _bar_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> list
             Residual(
                 "bar", bar.name, bar.scenes[0], use, (off,), (float(sigma),), (),
                 _given(tests.statistics[3][k], tests.dofs[3][k]), int(tests.dofs[3][k]),
-                "" if active[3][k] else "it contradicts the other observations",
+                "" if active[3][k] else solved.reasons.get(("bar", k), _CONTRADICTS),
             )
         )  # fmt: skip
     return rows

@@ -1,14 +1,16 @@
 """Observations of the world as least-squares terms over scene poses, and the unknowns that only they have.
 
 Unknowns are scene poses ``S_map_scene``, the component's ``S_world_map``, the control points (world frame), cameras of
-photos that were localised, and what the fixes of a scene are off by together. Steps are on the source side, as
-everywhere; a point ``x`` in the source frame moves by ``G(x) step`` with ``G(x) = [-skew(x), I, x]``.
+photos that were localised, and the errors that fixes have in common: offset and drift of a capture, the sea level.
+Steps are on the source side, as everywhere; a point ``x`` in the source frame moves by ``G(x) step`` with
+``G(x) = [-skew(x), I, x]``.
 
 Sums of few terms with many unknowns are what a survey is, so that everything here is arrays by kind of term.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,6 +24,8 @@ from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey
 
 _FAR = 1e6  # m: how little is known of a point that no term holds; keeps the system regular and pulls at nothing
 _BEHIND = 1e3  # standard deviations of a photo that has the point behind it
+_DRIFT = 0.5  # of a common sigma: errors of satellites last hours, a flight a quarter of one (Gauss-Markov, 2 h: 0.48)
+_CORRECTED = 0.5  # m: receivers with corrections are better than this, those without are not
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +34,7 @@ class Unknowns:
 
     Args:
         scenes: N poses. world: ``S_world_map``, as one row. points: (K, 3). cameras: M poses, scene frame.
-        offsets: (B, 3) common errors of fixes, m: of scenes, and of the sea level.
+        offsets: (B, 3) common errors of fixes in standard deviations: of groups, their drifts, and of the sea level.
     """
 
     scenes: Similarities
@@ -154,9 +158,7 @@ class SurveyTerms:
 
     @property
     def columns(self) -> Columns:
-        return Columns(
-            len(self.scene_ids), self.dim, len(self.points), len(self._camera_rows), len(self._offset_sigmas)
-        )
+        return Columns(len(self.scene_ids), self.dim, len(self.points), len(self._camera_rows), self._loads[1])
 
     @cached_property
     def _row(self) -> dict[str, int]:
@@ -195,9 +197,33 @@ class SurveyTerms:
         return np.array([self._camera_rows.get((i.scene, i.image), -1) for i in self.images], dtype=np.int64)
 
     @cached_property
-    def _offset_scenes(self) -> list[str]:
-        """Whose fixes are off together; the sea level, where any fix counts from it, comes after them."""
-        return sorted({fix.scene for fix in self.fixes if max(fix.common_sigma_m) > 0})
+    def fix_groups(self) -> list[tuple[str, bool]]:
+        """(F) by fix, what it shares its common error with: its scene, and whether its receiver has corrections.
+
+        Receivers with and without corrections err by themselves, also where both are of one capture.
+        """
+        return [(f.scene, float(np.hypot(f.sigma_m[0], f.common_sigma_m[0])) < _CORRECTED) for f in self.fixes]
+
+    @cached_property
+    def _loads(self) -> tuple[list[tuple[np.ndarray, np.ndarray]], int]:
+        """By kind of common error (offset, drift, sea level): its row of each fix, -1 where none, and (F, 3) metres of
+        a standard deviation of it; and the number of rows.
+
+        A fix carries its own sigma of what it shares: one that is poor makes the others no worse.
+        """
+        sigmas = np.array([_per_axis(f.common_sigma_m) for f in self.fixes]).reshape(-1, 3)
+        sea = np.array([[0.0, 0.0, f.sea_level_sigma_m] for f in self.fixes]).reshape(-1, 3)
+        groups = sorted({g for g, s in zip(self.fix_groups, sigmas, strict=True) if s.any()})
+        row = {group: k for k, group in enumerate(groups)}
+        own = np.array([row.get(g, -1) for g in self.fix_groups], dtype=np.int64)
+        along = np.zeros(len(self.fixes))
+        for k in range(len(groups)):
+            mine = sorted(np.flatnonzero(own == k).tolist(), key=lambda i: _natural(self.fixes[i].name))
+            along[mine] = np.linspace(-0.5, 0.5, len(mine)) if len(mine) > 1 else 0.0
+        drift = np.where(own >= 0, own + len(groups), -1)
+        level = np.where(sea[:, 2] > 0, 2 * len(groups), -1)
+        kinds = [(own, sigmas), (drift, _DRIFT * along[:, None] * sigmas), (level, sea)]
+        return kinds, 2 * len(groups) + int(sea.any())
 
     def start(self, scenes: Similarities, world: Sim3) -> Unknowns:
         """Points where they were surveyed, cameras where they were localised, no common errors."""
@@ -207,7 +233,7 @@ class SurveyTerms:
             Similarities.stack([world]),
             np.array([point.position for point in self.points], dtype=np.float64).reshape(-1, 3),
             Similarities.stack(cameras),
-            np.zeros((len(self._offset_sigmas), 3)),
+            np.zeros((self._loads[1], 3)),
         )
 
     # --- terms -------------------------------------------------------------------------------------------------------
@@ -242,26 +268,14 @@ class SurveyTerms:
             ((columns.cameras + 6 * np.arange(m), roots @ back),),
             np.ones(m, dtype=bool),
         )
-        b = len(self._offset_sigmas)
-        weights = 1 / self._offset_sigmas
+        b = self._loads[1]
         offsets = Terms(
             "",
-            x.offsets * weights,
-            ((columns.offsets + 3 * np.arange(b), weights[:, :, None] * np.eye(3)),),
+            x.offsets,
+            ((columns.offsets + 3 * np.arange(b), np.tile(np.eye(3), (b, 1, 1))),),
             np.ones(b, dtype=bool),
         )
         return points, cameras, offsets
-
-    @cached_property
-    def _offset_sigmas(self) -> np.ndarray:
-        """(B, 3); the largest that any fix of the scene has."""
-        out = np.full((len(self._offset_scenes), 3), 1e-6)
-        for k, scene in enumerate(self._offset_scenes):
-            for fix in self.fixes:
-                if fix.scene == scene:
-                    out[k] = np.maximum(out[k], _per_axis(fix.common_sigma_m))
-        sea_level = max((fix.sea_level_sigma_m for fix in self.fixes), default=0.0)
-        return np.concatenate([out, np.array([[1e-6, 1e-6, sea_level]])]) if sea_level else out
 
     def _points(self, x: Unknowns) -> Terms:
         weights = np.array([1 / _per_axis(point.sigma_m) for point in self.points]).reshape(-1, 3)
@@ -341,19 +355,19 @@ class SurveyTerms:
         weights = np.array([1 / _per_axis(fix.sigma_m) for fix in self.fixes])
         pose, world = x.scenes[scenes], x.world[np.zeros(count, dtype=np.int64)]
         in_map = pose.apply(points)
-        of_scene = {scene: k for k, scene in enumerate(self._offset_scenes)}
-        common = np.array([of_scene.get(f.scene, -1) if max(f.common_sigma_m) > 0 else -1 for f in self.fixes])
-        sea = np.array([len(self._offset_scenes) if fix.sea_level_sigma_m else -1 for fix in self.fixes])
+        loads, _ = self._loads
         off = np.zeros((count, 3))
-        for rows in (common, sea):
-            off[rows >= 0] += x.offsets[rows[rows >= 0]]
+        for rows, metres in loads:
+            off[rows >= 0] += metres[rows >= 0] * x.offsets[rows[rows >= 0]]
         residual = (world.apply(in_map) + off - measured) * weights
         turn = _linear(world)
         parts = (
             (scenes * self.dim, weights[:, :, None] * (turn @ _linear(pose) @ _moves(points)[:, :, : self.dim])),
             (np.full(count, columns.world), weights[:, :, None] * (turn @ _moves(in_map))),
-            (np.where(common >= 0, columns.offsets + 3 * common, -1), weights[:, :, None] * np.eye(3)),
-            (np.where(sea >= 0, columns.offsets + 3 * sea, -1), weights[:, :, None] * np.eye(3)),
+            *(
+                (np.where(rows >= 0, columns.offsets + 3 * rows, -1), (weights * metres)[:, :, None] * np.eye(3))
+                for rows, metres in loads
+            ),
         )
         return Terms("fix", residual, parts, np.ones(count, dtype=bool))
 
@@ -463,6 +477,11 @@ def _ray(image: ImagePoint) -> np.ndarray:
 
 def _per_axis(sigma_m: tuple[float, float]) -> np.ndarray:
     return np.array([sigma_m[0], sigma_m[0], sigma_m[1]], dtype=np.float64)
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Order of names as people count: 2 before 10."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _linear(poses: Similarities) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.errors import CorruptError, GsmapError
 from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
 from gsmap.types.plain import plain
-from gsmap.types.world import Residual, WorldFrame, WorldTie
+from gsmap.types.world import Contradiction, Residual, WorldFrame, WorldTie
 
 _PAIRS = ("error_m", "sigma_m", "error_px")
 
@@ -26,6 +26,8 @@ def tie_value(tie: WorldTie) -> dict[str, Any]:
         "residuals": [plain(row) for row in tie.residuals],
         "problem": tie.problem,
         "notes": list(tie.notes),
+        "problem_code": tie.problem_code,
+        "contradictions": [plain(one) for one in tie.contradictions],
     }
 
 
@@ -68,4 +70,18 @@ def _tie(value: dict[str, Any]) -> WorldTie:
         tuple(rows),
         str(value["problem"]),
         tuple(map(str, value["notes"])),
+        # Ties of earlier releases were written without these.
+        str(value.get("problem_code", "undetermined" if value["problem"] else "")),
+        tuple(_contradiction(one) for one in value.get("contradictions", [])),
     )
+
+
+def _contradiction(value: dict[str, Any]) -> Contradiction:
+    lists = {k: tuple(v) for k, v in value.items() if isinstance(v, list | tuple)}
+    one = Contradiction(**{**value, **lists})
+    if not all(isinstance(text, str) for text in (one.text, *one.scenes)):
+        raise ValueError("names that are no texts")
+    numbers = [*one.offset_m, *one.sigma_m, *([] if one.ratio is None else [one.ratio])]
+    if not all(isinstance(number, float | int) for number in numbers) or not isinstance(one.count, int):
+        raise ValueError("no numbers")
+    return one

@@ -120,7 +120,8 @@ class Fix:
         crs: of ``position``; ``local`` once it is in the world frame.
         position: (3,) x y z in it.
         sigma_m: (2,) standard deviations, horizontal (per axis) and vertical, each fix by itself.
-        common_sigma_m: (2,) the same of what all fixes of a scene are off by together: satellites, antenna.
+        common_sigma_m: (2,) the same of what all fixes of a scene are off by together: satellites, antenna. It may
+            drift by half of that from the first to the last fix of the scene, in the order of their names.
         sea_level_sigma_m: how far the surface that heights are counted from may be from that of the CRS, which is the
             same for all fixes of a map; 0 where it is none other.
     """
@@ -237,6 +238,61 @@ class Residual:
             raise InputError(f"no such residual: {self.kind!r}, {self.use!r}")
 
 
+GROUP_KINDS = ("points", "photos", "scenes", "bars")
+CAUSES = (
+    "altitude_zero",
+    "feet",
+    "above_takeoff",
+    "height_system",
+    "vertical_shift",
+    "horizontal_shift",
+    "shape",
+    "scale",
+    "split",
+)
+"""Likely reasons of a contradiction: altitudes are 0; heights or lengths are in feet; heights are above take-off;
+ellipsoidal against orthometric heights; a vertical or horizontal shift without a known reason; positions whose shape is
+not that of the map (of another flight or place); lengths in another unit; a group that contradicts itself."""
+KEPT = ("group", "against", "none")
+PROBLEMS = ("", "undetermined", "contradiction", "unsolved")
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A group of observations that differs from another group by more than their common errors explain.
+
+    Args:
+        group: ``points`` (control points), ``photos`` (of captures), ``scenes`` (surveyed scenes) or ``bars``.
+        against: the group that it contradicts; the same kind where a group contradicts itself.
+        cause: the likeliest reason, of `CAUSES`.
+        other_causes: further reasons that explain it as well.
+        kept: the side that is solved from: ``against``, ``group``, or ``none`` where the observations cannot tell.
+        offset_m: (3,) east, north, up of the group less where the other group has it; empty of bars.
+        sigma_m: (3,) its standard deviations, common errors included; empty of bars.
+        ratio: of bars: measured length by the length in the map; None of the other kinds.
+        count: observations of the group that differ so.
+        scenes: ids of the captures, of photos and surveyed scenes.
+        text: all this in a sentence.
+    """
+
+    group: str
+    against: str
+    cause: str
+    other_causes: tuple[str, ...] = ()
+    kept: str = "none"
+    offset_m: tuple[float, ...] = ()
+    sigma_m: tuple[float, ...] = ()
+    ratio: float | None = None
+    count: int = 0
+    scenes: tuple[str, ...] = ()
+    text: str = ""
+
+    def __post_init__(self) -> None:
+        causes = {self.cause, *self.other_causes}
+        if not ({self.group, self.against} <= set(GROUP_KINDS) and causes <= set(CAUSES) and self.kept in KEPT):
+            raise InputError(f"no such contradiction: {self.group!r}, {self.against!r}, {causes}, {self.kept!r}")
+
+
 @dataclass(frozen=True, eq=False)
 class WorldTie:
     """Where a component of the map lies in the world.
@@ -252,6 +308,9 @@ class WorldTie:
         residuals: of all observations of this component.
         problem: what is missing for ``S_world_map``; empty where it is there.
         notes: what a person should know.
+        problem_code: ``undetermined`` (observations are missing), ``contradiction`` (groups of observations contradict
+            each other and none is to be preferred), ``unsolved`` (no finite solution), or empty where there is no problem.
+        contradictions: groups of observations that contradict each other.
     """
 
     component: int
@@ -263,6 +322,12 @@ class WorldTie:
     residuals: tuple[Residual, ...] = field(default=())
     problem: str = ""
     notes: tuple[str, ...] = ()
+    problem_code: str = ""
+    contradictions: tuple[Contradiction, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.problem_code not in PROBLEMS:
+            raise InputError(f"no such problem: {self.problem_code!r}")
 
     def left_out(self) -> set[tuple[str, str, str]]:
         """(kind, name, scene) of the observations that were not solved from."""

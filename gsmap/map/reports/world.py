@@ -11,8 +11,8 @@ from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import names
 from gsmap.store import Store
 from gsmap.types import ScenePose
-from gsmap.types.rows.world import ResidualRow, TieRow, WorldReport
-from gsmap.types.world import Residual, Survey, WorldTie
+from gsmap.types.rows.world import ContradictionRow, ResidualRow, TieRow, WorldReport
+from gsmap.types.world import Contradiction, Residual, Survey, WorldTie
 
 
 @of_one_state
@@ -75,8 +75,14 @@ def _tie_row(tie: WorldTie, num_scenes: int, name_of: Mapping[str, str]) -> TieR
         num_outliers=sum(row.use == "outlier" for row in tie.residuals),
         residuals=tuple(residual_row(row, name_of) for row in tie.residuals),
         problem=tie.problem,
+        problem_code=tie.problem_code,
+        contradictions=tuple(_contradiction_row(one, name_of) for one in tie.contradictions),
         notes=tie.notes,
     )
+
+
+def _contradiction_row(one: Contradiction, name_of: Mapping[str, str]) -> ContradictionRow:
+    return ContradictionRow(**vars(one), scene_names=tuple(name_of.get(scene, "") for scene in one.scenes))
 
 
 def residual_row(row: Residual, name_of: Mapping[str, str]) -> ResidualRow:

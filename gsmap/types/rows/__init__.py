@@ -66,7 +66,7 @@ from gsmap.types.rows.truth import (
     PoseErrorRow,
 )
 from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
-from gsmap.types.rows.world import MeasureReport, PlaceRow, ResidualRow, TieRow, WorldReport
+from gsmap.types.rows.world import ContradictionRow, MeasureReport, PlaceRow, ResidualRow, TieRow, WorldReport
 
 __all__ = [
     "SCHEMA",
@@ -81,6 +81,7 @@ __all__ = [
     "CloneReport",
     "ComparisonRow",
     "ComponentErrorRow",
+    "ContradictionRow",
     "ConvertReport",
     "DemoReport",
     "EdgeErrorRow",

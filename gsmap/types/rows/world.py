@@ -66,6 +66,56 @@ class ResidualRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ContradictionRow(Row):
+    """A group of observations that differs from another group by more than their common errors explain.
+
+    Args:
+        group: ``points`` (control points), ``photos`` (of captures), ``scenes`` (surveyed scenes) or ``bars``.
+        against: the group that it contradicts; the same where a group contradicts itself.
+        cause: the likeliest reason: ``altitude_zero``, ``feet`` (taken for metres), ``above_takeoff`` (heights above
+            take-off), ``height_system`` (ellipsoidal against orthometric heights), ``vertical_shift`` or
+            ``horizontal_shift`` (no known reason, another datum or flight), ``shape`` (of another flight or place),
+            ``scale`` (another unit of length) or ``split`` (the group contradicts itself).
+        other_causes: further reasons that explain it as well.
+        kept: the side that is solved from: ``against``, ``group``, or ``none`` where nothing tells which is right.
+        offset_m: east, north, up of the group less where the other group has it; empty of bars.
+        sigma_m: standard deviations of ``offset_m``, common errors included; empty of bars.
+        ratio: of bars, measured length by the length in the map; null of other groups.
+        count: observations of the group that differ so.
+        scenes: ids of the captures that they are of.
+        scene_names: names of these captures.
+        text: all this in a sentence.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "group": "group",
+        "against": "against",
+        "cause": "likely reason",
+        "kept": "kept",
+        "count": "observations",
+        "offset": "offset E N U, m",
+    }
+
+    group: str
+    against: str
+    cause: str
+    other_causes: tuple[str, ...]
+    kept: str
+    offset_m: tuple[float, ...]
+    sigma_m: tuple[float, ...]
+    ratio: float | None
+    count: int
+    scenes: tuple[str, ...]
+    scene_names: tuple[str, ...]
+    text: str
+
+    @property
+    def offset(self) -> str:
+        """The offset for people, in metres."""
+        return " ".join(f"{value:.2f}" for value in self.offset_m)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TieRow(Row):
     """Where a component of the map lies in the world.
 
@@ -84,6 +134,9 @@ class TieRow(Row):
         num_outliers: observations that were left out.
         residuals: of all its observations.
         problem: what is missing for ``S_world_map``; empty where it is there.
+        problem_code: ``undetermined`` (observations are missing), ``contradiction`` (groups contradict each other and
+            none is to be preferred), ``unsolved`` (no finite solution), or empty where there is no problem.
+        contradictions: groups of observations that contradict each other.
         notes: what a person should know.
     """
 
@@ -108,6 +161,8 @@ class TieRow(Row):
     num_outliers: int
     residuals: tuple[ResidualRow, ...]
     problem: str
+    problem_code: str
+    contradictions: tuple[ContradictionRow, ...]
     notes: tuple[str, ...]
 
 

@@ -1,0 +1,236 @@
+"""Common shifts of groups of observations against the rest of a solve, and the likely reasons of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from gsmap.optimize.survey_places import Places
+from gsmap.optimize.survey_system import Factor, System
+from gsmap.optimize.survey_terms import Terms
+from gsmap.types.world import Contradiction, WorldFrame
+
+FEET = 0.3048
+GEOID_M = 110.0  # the geoid lies between 107 m below and 86 m above the ellipsoid
+_EARTH_M = 6_371_000.0
+_SITE_M = 10.0  # how far above or below the marks of a site a drone takes off
+_FLOWN_M = 150.0  # how high above that it flies
+
+GROUPS = {"points": "control points", "photos": "photos", "scenes": "surveyed scenes", "bars": "scale bars"}
+_REASONS = {
+    "altitude_zero": "their altitudes are 0, which is not measured",
+    "feet": "feet taken for metres",
+    "above_takeoff": "heights above take-off",
+    "height_system": "ellipsoidal against orthometric heights",
+    "vertical_shift": "no known reason",
+    "horizontal_shift": "another datum, or photos of another flight",
+    "shape": "they are of another flight or place, or far less precise than stated",
+    "scale": "another unit of length",
+    "split": "they contradict each other",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
+    """The common shift of some places against a solve.
+
+    Args:
+        shift_m: (3,) measured less predicted. covariance: (3, 3) with all common errors; of directions that nothing
+            checks without bound.
+        log_p: logarithm of the probability of a shift as large by chance.
+        agree: (n,) the places that share it. shaped: whether the places have the shape that the map has.
+    """
+
+    shift_m: np.ndarray
+    covariance: np.ndarray
+    log_p: float
+    agree: np.ndarray
+    shaped: bool = True
+
+
+def shift_of(system: System, all_terms: Sequence[Terms], factor: Factor, places: Places, *, used: bool) -> Shift:
+    """The shift that some places have in common.
+
+    Args:
+        all_terms: of points, images, fixes and bars at the answer that the factor is of.
+        places: all control points, or all fixes.
+        used: whether the solve rests on them: then its own share is taken out (Baarda 1968, with one alternative
+            hypothesis for all of them); else they are predicted.
+    """
+    terms = all_terms[0 if places.kinds[0] == "points" else 2]
+    weights = 1 / places.own_m
+    r = terms.residuals[places.rows]
+    apart = -r / weights
+    agree = np.ones(len(places), dtype=bool)
+    if not used and len(places) > 2:
+        far = np.linalg.norm((apart - np.median(apart, axis=0)) * weights, axis=1)
+        agree = far <= max(5.0, 4 * float(np.median(far)))
+    mine, W, r = places.rows[agree], weights[agree], r[agree]
+    own = (W**2).sum(0)
+    crossed = _crossed(terms, mine, W, system.size)
+    V = crossed.T @ factor.solve(crossed)
+    V = (V + V.T) / 2
+    b = -(W * r).sum(0)
+    if not used:
+        shift, covariance = b / own, (np.diag(own) + V) / own / own[:, None]
+        log_p = float(chi2.logsf(shift @ np.linalg.solve(covariance, shift), 3))
+        return Shift(shift, covariance, log_p, agree, _shaped(system, factor, terms, mine, apart[agree], W, own))
+    root = np.sqrt(own)
+    values, axes = np.linalg.eigh((np.diag(own) - V) / root / root[:, None])
+    checked = values > system.params.min_redundancy
+    along = axes.T @ (b / root)
+    shift = (axes[:, checked] @ (along[checked] / values[checked])) / root
+    spread = np.where(checked, 1 / np.maximum(values, 1e-300), 1e12)
+    covariance = (axes * spread) @ axes.T / root / root[:, None]
+    statistic = float((along[checked] ** 2 / values[checked]).sum())
+    log_p = float(chi2.logsf(statistic, int(checked.sum()))) if checked.any() else 0.0
+    return Shift(shift, covariance, log_p, agree)
+
+
+def _crossed(terms: Terms, rows: np.ndarray, W: np.ndarray, size: int) -> np.ndarray:
+    """(size, 3) derivatives by all columns against a shift of some measured positions."""
+    out = np.zeros((size, 3))
+    for first, J in terms.parts:
+        there = first[rows] >= 0
+        some = rows[there]
+        at = first[some][:, None] + np.arange(J.shape[2])
+        # A residual is the prediction less the measurement, so that a shift of the measurement lowers it.
+        np.add.at(out, at, np.einsum("gmw,gm->gwm", J[some], W[there]))
+    return out
+
+
+def _shaped(
+    system: System, factor: Factor, terms: Terms, rows: np.ndarray, apart: np.ndarray, W: np.ndarray, own: np.ndarray
+) -> bool:
+    """Whether places lie beside each other as the map has them, within their own errors and the map's."""
+    gate = chi2.ppf(system.params.gate_probability, 3)
+    mean = (W**2 * apart).sum(0) / own
+    if len(rows) < 3 or np.median((((apart - mean) * W) ** 2).sum(1)) <= gate:
+        return True
+    some = np.linspace(0, len(rows) - 1, min(len(rows), 64)).astype(int)
+    J = Terms(
+        terms.kind,
+        terms.residuals[rows],
+        tuple((first[rows], J[rows]) for first, J in terms.parts),
+        terms.valid[rows],
+    ).rows(system.size)
+    J = J / W[:, :, None]
+    J = J - np.einsum("gm,gmw->mw", W**2 / own, J)
+    statistics = []
+    for k in some.tolist():
+        covariance = np.diag(W[k] ** -2) + J[k] @ factor.solve(J[k].T)
+        statistics.append((apart[k] - mean) @ np.linalg.solve(covariance, apart[k] - mean))
+    return bool(np.median(statistics) <= gate)
+
+
+def altitudes(frame: WorldFrame, positions: np.ndarray) -> np.ndarray:
+    """(N,) heights above the surface that the world frame's origin counts from, of (N, 3) positions in that frame."""
+    out: np.ndarray = positions[:, 2] + frame.height_m + (positions[:, :2] ** 2).sum(1) / (2 * _EARTH_M)
+    return out
+
+
+def is_unmeasured(places: Places, frame: WorldFrame) -> bool:
+    """Whether the altitudes of photos are all 0: the device wrote none."""
+    return len(places) >= 3 and bool((np.abs(altitudes(frame, places.in_world)) < 0.02).all())
+
+
+def clusters(shifts: Sequence[Shift], probability: float) -> list[np.ndarray]:
+    """Rows of shifts that agree with each other, the largest set first."""
+    left, out = list(range(len(shifts))), []
+    gate = chi2.ppf(probability, 3)
+    while left:
+        best: list[int] = []
+        for k in left:
+            near = [j for j in left if _agree(shifts[k], shifts[j], gate)]
+            best = near if len(near) > len(best) else best
+        out.append(np.array(best, dtype=np.int64))
+        left = [k for k in left if k not in best]
+    return sorted(out, key=len, reverse=True)
+
+
+def _agree(a: Shift, b: Shift, gate: float) -> bool:
+    off = a.shift_m - b.shift_m
+    slack = (0.05 * max(np.abs(a.shift_m).max(), np.abs(b.shift_m).max())) ** 2
+    return bool(off @ np.linalg.solve(a.covariance + b.covariance + slack * np.eye(3), off) < gate)
+
+
+def joined(shifts: Sequence[Shift]) -> Shift:
+    """The mean of shifts that agree; as uncertain as the best of them, for their errors are shared."""
+    best = min(shifts, key=lambda one: float(np.trace(one.covariance)))
+    mean = np.mean([one.shift_m for one in shifts], axis=0)
+    return Shift(mean, best.covariance, min(one.log_p for one in shifts), best.agree, all(one.shaped for one in shifts))
+
+
+def causes(places: Places, shift: Shift, frame: WorldFrame, ground_m: np.ndarray | None) -> tuple[str, ...]:
+    """Reasons that explain a shift, the likeliest first, if these places are wrong and what they are compared with is
+    right.
+
+    Args:
+        ground_m: altitudes of marks on the ground, or None where there are none.
+    """
+    if not shift.shaped:
+        return ("shape",)
+    sigmas = np.sqrt(np.diag(shift.covariance))
+    across, up = float(np.linalg.norm(shift.shift_m[:2])), float(shift.shift_m[2])
+    horizontal = across > 3.5 * float(sigmas[:2].max())
+    vertical = abs(up) > 3.5 * float(sigmas[2])
+    out = list(_heights(places, up, sigmas[2], frame, ground_m)) if vertical or not horizontal else []
+    if horizontal:
+        out = ["horizontal_shift", *out] if across > abs(up) or not vertical else [*out, "horizontal_shift"]
+    return tuple(out)
+
+
+def _heights(
+    places: Places, up: float, sigma_m: float, frame: WorldFrame, ground_m: np.ndarray | None
+) -> tuple[str, ...]:
+    own = altitudes(frame, places.in_world)
+    if len(places) >= 2 and np.abs(own).max() < 0.5:
+        return ("altitude_zero",)
+    height, sea = float(np.mean(own)), float(np.median(places.sea_m))
+    true, out = height - up, []
+    common = np.sqrt(max(sigma_m**2 - sea**2, 0.0))
+    bar = 3 * sigma_m / FEET + 0.5 + 0.5 * float(np.std(own))
+    if abs(height - true / FEET) < bar < abs(up):
+        out.append("feet")
+    if set(places.kinds.tolist()) == {"photos"} and up < 0:
+        lowest, highest = (true - _FLOWN_M, true) if ground_m is None else (ground_m.min(), ground_m.max())
+        slack = _SITE_M + 3 * common
+        flown = -up > GEOID_M + 3 * common and -_FLOWN_M / 5 < height < _FLOWN_M
+        if flown or lowest - slack < -up < highest + slack:
+            out.append("above_takeoff")
+    if abs(up) <= GEOID_M + 3 * common:
+        out.append("height_system")
+    return tuple(dict.fromkeys(out)) or ("vertical_shift",)
+
+
+def contradiction(
+    places: Places, scenes: Sequence[str], shift: Shift, against: str, why: tuple[str, ...], kept: str
+) -> Contradiction:
+    """A group of places beside what it contradicts, in numbers and in words.
+
+    Args:
+        scenes: ids of the captures that the places are of.
+    """
+    group, n = str(places.kinds[0]), len(places)
+    size = [float(v) for v in shift.shift_m]
+    sigma = [float(v) for v in np.sqrt(np.diag(shift.covariance))]
+    across, up = float(np.linalg.norm(size[:2])), size[2]
+    way = f"{abs(up):.4g} m {'above' if up > 0 else 'below'}"
+    if across > abs(up):
+        way = f"{across:.4g} m beside"
+    known = sigma[2] if across <= abs(up) else max(sigma[:2])
+    of = f" of {len(set(scenes))} captures" if group == "photos" else ""
+    other = "where others of them put them" if group == against else f"where the {GROUPS[against]} put them"
+    text = f"{n} {GROUPS[group]}{of} lie {way} {other} (known to {known:.2g} m): {reason_of(why)}"
+    return Contradiction(
+        group, against, why[0], tuple(why[1:]), kept, tuple(size), tuple(sigma), None, n, tuple(sorted(set(scenes))),
+        text,
+    )  # fmt: skip
+
+
+def reason_of(why: Sequence[str]) -> str:
+    """The likely reasons as a question."""
+    return ", or ".join(_REASONS[one] for one in why) + ("" if why[0] in ("vertical_shift", "split") else "?")

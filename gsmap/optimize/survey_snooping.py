@@ -1,0 +1,94 @@
+"""Least squares of a chosen set of observations, without those that contradict the rest one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from gsmap.optimize.survey_report import world_covariance
+from gsmap.optimize.survey_system import Active, Factor, System, Tests
+from gsmap.optimize.survey_terms import Terms, Unknowns
+
+
+def first_points(system: System, x: Unknowns) -> np.ndarray:
+    """(K, 3) check points from photos, the others as they are."""
+    met, _, told = system.terms.triangulated(x, np.ones(len(system.terms.images), dtype=bool))
+    return np.where((told & system.is_check)[:, None], met, x.points)
+
+
+def without_outliers(system: System, x: Unknowns, allowed: Active, gross: Active) -> tuple[Unknowns, Active]:
+    """Graduated non-convexity (Geman-McClure) first; then data snooping: the worst out, what fits again in.
+
+    Args:
+        allowed: observations that may be solved from. gross: those of them that are left out to begin with.
+    """
+    active: Active = tuple(use & ~bad for use, bad in zip(allowed, gross, strict=True))  # type: ignore[assignment]
+    x = system.fit(replace(x, points=system.points_at(x, active)), system.as_weights(active), max_steps=3)
+    bars = [chi2.ppf(system.params.gate_probability, t.residuals.shape[1]) for t in system.terms.observations(x)]
+    wide = max((float((t.squares[a] / b).max(initial=0)) for t, a, b in _seen(system, x, active, bars)), default=1.0)
+    while True:
+        for _ in range(3):
+            weights: Active = tuple(  # type: ignore[assignment]
+                a * (wide * b / (wide * b + t.squares)) ** 2 for t, a, b in _seen(system, x, active, bars)
+            )
+            x = system.fit(x, weights, max_steps=2)
+        if wide <= 1:
+            break
+        wide = max(1.0, wide / 4)
+    active = tuple(a & (t.squares < 4 * b) & t.valid for t, a, b in _seen(system, x, active, bars))  # type: ignore[assignment]
+    failures = [np.zeros(len(a), dtype=np.int64) for a in active]
+    for _ in range(system.params.max_rounds):
+        x = system.fit(replace(x, points=system.points_at(x, active)), system.as_weights(active))
+        tests = system.tests(x, active, system.factor(x, system.as_weights(active)))
+        if not _exchange(system, active, allowed, tests, failures):
+            break
+    return x, active
+
+
+def _seen(system: System, x: Unknowns, active: Active, bars: Sequence[float]) -> list[tuple[Terms, np.ndarray, float]]:
+    return list(zip(system.terms.observations(x), active, bars, strict=True))
+
+
+def _exchange(system: System, active: Active, allowed: Active, tests: Tests, failures: list[np.ndarray]) -> bool:
+    """Leave out the observation that contradicts the others most, or take back one that does not; whether any."""
+    worst, place = 0.0, None
+    alpha = np.log(1 - system.params.gate_probability)
+    for kind, (use, log_p) in enumerate(zip(active, tests.log_p, strict=True)):
+        for k in np.flatnonzero(use & (log_p < alpha)).tolist():
+            # Of two that say the same the survey of the point is doubted first: it is named first.
+            if log_p[k] < worst - 1e-6 * abs(worst) - 1e-9 and not (kind == 1 and system.lone[k]):
+                worst, place = float(log_p[k]), (kind, k)
+    if place is not None:
+        active[place[0]][place[1]] = False
+        failures[place[0]][place[1]] += 1
+        return True
+    for kind, (use, log_p) in enumerate(zip(active, tests.log_p, strict=True)):
+        back = allowed[kind] & ~use & (log_p > alpha) & (failures[kind] < 2)
+        if back.any():
+            first = int(np.flatnonzero(back)[np.argmax(log_p[back])])
+            use[first] = True
+            failures[kind][first] += 1
+            return True
+    return False
+
+
+def weakness(system: System, factor: Factor) -> str:
+    """What an answer leaves open after all; empty where it leaves nothing open."""
+    covariance = world_covariance(system, factor)
+    values, axes = np.linalg.eigh(covariance[:3, :3])
+    turn = float(np.degrees(np.sqrt(max(0.0, values[-1]))))
+    if turn > system.params.max_rotation_sigma_deg:
+        axis = ", ".join(f"{v:.2f}" for v in axes[:, -1])
+        return (
+            f"rotation about the map's axis ({axis}) is not determined (known to {turn:.2g} deg): add control "
+            "points or positions far from the others, across that axis"
+        )
+    if np.sqrt(covariance[6, 6]) > system.params.max_log_scale_sigma:
+        return (
+            f"scale is not determined (known to {100 * np.sqrt(covariance[6, 6]):.2g} %): add control points or "
+            "positions further apart, or a scale bar"
+        )
+    return ""
