@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import Connection, Row, Text, delete, func, insert, select, true, type_coerce
@@ -19,6 +19,7 @@ from gsmap.store.columns import a_direction, corrupt
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
 from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
+from gsmap.store.row_maps import RowMaps
 from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import graphs, scenes
 from gsmap.types import SceneGraph
@@ -68,6 +69,7 @@ class Graphs:
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
+        self._rows = RowMaps(catalog, arrays)
         self._said: dict[tuple[str, str], GraphSays] = {}  # by key and arrays, which do not change
 
     def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
@@ -81,7 +83,7 @@ class Graphs:
         """
         if graph.scene_id not in key.inputs:
             raise InputError(f"the key of a graph must name its scene {graph.scene_id} among its inputs")
-        arrays, about = to_arrays(graph)
+        arrays, about = to_arrays(self._whole(graph))
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
         mine = graphs.c.key == key.digest
@@ -110,6 +112,9 @@ class Graphs:
     def load(self, ref: str, key: RecipeKey | str | None = None) -> SceneGraph | None:
         """Read the graph of a scene under a key (or its digest), or the newest one; None where there is none.
 
+        Its things have members among the scene's Gaussians as they are kept now. It has no things where these are of
+        Gaussians that cannot be told any more (`gsmap.store.row_maps`).
+
         Raises:
             CorruptError: bytes on disk are missing or differ.
             NotFoundError: no such scene, or others dropped and pruned the graph meanwhile.
@@ -126,7 +131,21 @@ class Graphs:
         only = None if shapes is None else list(shapes)
         with unless_pruned(self._catalog, row.group_id, f"the graph of scene {row.scene[:12]} was dropped or replaced"):
             arrays = self._arrays.read(KIND, row.group_id, files, only=only, shapes=shapes)
-        return from_arrays(row.scene, row.about, arrays)
+        return self._of_kept(from_arrays(row.scene, row.about, arrays))
+
+    def _whole(self, graph: SceneGraph) -> SceneGraph:
+        """A graph with things of the whole capture; see `gsmap.store.row_maps`."""
+        if graph.things is None:
+            return graph
+        members = self._rows.of(graph.scene_id).values_of_whole(graph.things.members, -1)
+        return replace(graph, things=replace(graph.things, members=members))
+
+    def _of_kept(self, graph: SceneGraph) -> SceneGraph:
+        """`_whole` undone."""
+        if graph.things is None:
+            return graph
+        members = self._rows.of(graph.scene_id).values_of_kept(graph.things.members)
+        return replace(graph, things=None if members is None else replace(graph.things, members=members))
 
     def num_bytes(self, ref: str) -> int:
         """Of the arrays of all graphs of a scene, as they were written."""

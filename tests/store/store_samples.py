@@ -38,13 +38,13 @@ def made_change(box, kind="moved", n=4, **more):
     return Change(kind, np.asarray(box, np.float64), **(fields | more))
 
 
-def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newer=None, notes=()):
+def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newer=None, notes=(), counted=None):
     """Keep what a comparison of two scenes (by id) found."""
     report = ChangeReport(tuple(found), 0.625, np.array([1.0, 0.5, 2.0]), tuple(notes))
     identity = Sim3.identity()
     made = key("change", older, newer, version=version)
     poses = {"S_newer_older": S or identity, "S_frame_newer": S_frame_newer or identity}
-    return store.changes.save(report, made, older=older, newer=newer, **poses)
+    return store.changes.save(report, made, older=older, newer=newer, counted=counted, **poses)
 
 
 JPEG = b"\xff\xd8\xff\xe0" + bytes(range(200))

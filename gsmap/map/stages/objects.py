@@ -92,11 +92,17 @@ def objects_of_components(
             f"nobody knows the things of {few(without)}: gsmap describe MAP SCENE tells them, where describe.things "
             "is on"
         )
-    thinned = [scene.name for scene in scenes.values() if scene.thinning is not None]
+    thinned = {scene.name: scene.thinning for scene in scenes.values() if scene.thinning is not None}
     if thinned:
         notes.append(
-            f"{few(thinned)} {'is' if len(thinned) == 1 else 'are'} thinned: the things they showed are told, and what "
-            "they were found to show of others before; they are asked no more"
+            f"{few(list(thinned))} {'is' if len(thinned) == 1 else 'are'} thinned: the things they showed are told, "
+            "and what they were found to show of others before; they are asked no more"
+        )
+    unmapped = [name for name, thinning in thinned.items() if not thinning.has_row_map]
+    if unmapped:
+        notes.append(
+            f"changes do not tell which things of {few(unmapped)} changed: an older gsmap thinned "
+            f"{'it' if len(unmapped) == 1 else 'them'} without a row map; ingest the capture again"
         )
     undated = [scene.name for scene in scenes.values() if scene.captured_at is None]
     if undated and len(scenes) > 1:
@@ -116,7 +122,11 @@ def _key(
         for one in store.changes.current()
         if one.changes and {one.older, one.newer} <= ids
     ]
-    seen = [f"{scene.id} {described[scene.id]}" for scene in captures]
+    unmapped = [scene.thinning is not None and not scene.thinning.has_row_map for scene in captures]
+    seen = [
+        f"{scene.id} {described[scene.id]}{' without row map' if lacks else ''}"
+        for scene, lacks in zip(captures, unmapped, strict=True)
+    ]
     return recipe_key(settings.objects).of(*seen, f"metres {unit!r}", *told)
 
 
