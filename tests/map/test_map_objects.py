@@ -218,6 +218,33 @@ def test_objects_are_the_same_whatever_the_unit_of_the_map(site: Map) -> None:
     np.testing.assert_allclose(box_m, 10 * box)
 
 
+def test_objects_of_a_component_that_comes_apart_have_numbers_of_their_own(site: Map, tmp_path: Path) -> None:
+    with gsmap.map.open(site.clone(tmp_path / "clone.gsmap").path) as m:
+        before = {row.id for row in m.objects().objects}
+        (cupboard,) = m.history(at(CUPBOARD)).objects
+        m.edit_object(cupboard.id, name="grandmother's cupboard")
+        placed = m.store.revisions.get()
+        assert placed is not None
+        june = m.store.scenes.get("june").id
+        m.store.revisions.save(
+            PoseGraph({s: replace(pose, component=int(s == june)) for s, pose in placed.poses.items()})
+        )
+        report = m.objects()
+        numbers = [row.id for row in report.objects]
+        assert len(set(numbers)) == len(numbers)
+        assert {row.component for row in report.objects} == {0, 1}
+        (named,) = (row for row in report.objects if row.name)
+        assert (named.id, named.component) == (cupboard.id, 0), "where more captures show it"
+        (other,) = (row for row in report.objects if row.split_from == cupboard.id)
+        assert (other.component, other.id in before) == (1, False)
+        assert m.history(other.id).objects[0].seen == 1
+        assert [hit.object for hit in m.find("cupboard").hits] == [cupboard.id]
+        m.store.revisions.save(placed)
+        again = m.objects().objects
+        assert {row.id for row in again} == before
+        assert all(row.split_from is None for row in again)
+
+
 def counted(patched: pytest.MonkeyPatch) -> list[str]:
     """What captures are opened from here on."""
     opened: list[str] = []

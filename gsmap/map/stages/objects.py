@@ -65,7 +65,7 @@ def objects_of_components(
         if scene.id in (described if graphs is None else graphs):
             mine.setdefault(placed.poses[scene.id].component, []).append(scene)
     sets = store.objects.sets() if graphs is None else []
-    parts = []
+    parts, given = [], set[str]()
     for i, component in enumerate(sorted(mine)):
 
         def told(fraction: float, text: str, part: int = i) -> None:
@@ -75,9 +75,12 @@ def objects_of_components(
         key = _key(store, settings, mine[component], described, unit) if graphs is None else None
         poses = {scene.id: placed.poses[scene.id].S_map_scene for scene in mine[component]}
         kept = None if key is None else next((one for one in sets if one.key == key.digest), None)
+        if kept is not None and given & {thing.id for thing in kept.objects}:
+            kept = None  # an older gsmap gave numbers twice
         still = {} if kept is None else _unmoved(kept.poses, poses, scenes, unit, settings)
         if kept is not None and still.keys() == poses.keys():
             parts.append(Part(component, kept, None, None))
+            given |= {thing.id for thing in kept.objects}
         elif not make:
             raise NotFoundError("the objects of the map are out of date: gsmap graph MAP makes them")
         else:
