@@ -49,11 +49,12 @@ class RowMap:
         None at all where the row map is not known.
         """
         if self.rows is None:
-            return whole if self.is_known else whole[:0]
+            return whole if self.is_known else _none(whole)
         place = np.full(self.num_whole, _GONE, whole.dtype)
         place[self.rows] = np.arange(self.num_kept, dtype=whole.dtype)
         found: np.ndarray = place[whole]
-        return found[found != _GONE]
+        found = found[found != _GONE]
+        return found
 
     def whole(self, rows: np.ndarray, counted: int | None = None) -> np.ndarray:
         """Whole rows of some rows; none at all where the row map is not known.
@@ -70,7 +71,7 @@ class RowMap:
         if counted != self.num_kept:
             raise InputError("the capture was thinned or ingested again meanwhile: run the same again")
         if self.rows is None:
-            return rows[:0]
+            return _none(rows)
         out: np.ndarray = self.rows[rows].astype(rows.dtype)
         return out
 
@@ -90,6 +91,10 @@ class RowMap:
         out = np.full(self.num_whole, missing, values.dtype)
         out[self.rows] = values
         return out
+
+
+def _none(rows: np.ndarray) -> np.ndarray:
+    return np.zeros(0, rows.dtype)
 
 
 class RowMaps:
