@@ -9,11 +9,11 @@ import os
 import sqlite3
 import threading
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, RootTransaction, create_engine
+from sqlalchemy import Column, ColumnElement, Connection, Engine, RootTransaction, create_engine, func, select
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
@@ -377,3 +377,26 @@ def url_without_password(url: str) -> str:
 def now() -> str:
     """The current time, ISO 8601, UTC."""
     return datetime.now(UTC).isoformat(timespec="microseconds")
+
+
+def after(moment: datetime) -> str:
+    """The first time after a moment that `now` may return."""
+    return (moment + timedelta(microseconds=1)).astimezone(UTC).isoformat(timespec="microseconds")
+
+
+def later(connection: Connection, created_at: Column[str], *among: ColumnElement[bool]) -> str:
+    """The current time, or the first after the newest row where that has a later one: the clock was ahead once.
+
+    Rows that are read in order of time are then in the order in which they were written.
+
+    Args:
+        created_at: the column with the time.
+        among: conditions on the rows that the new one is ordered among.
+    """
+    when, newest = now(), connection.execute(select(func.max(created_at)).where(*among)).scalar()
+    if newest is None or newest < when:
+        return when
+    try:
+        return after(datetime.fromisoformat(newest))
+    except (ValueError, OverflowError, TypeError):  # gsmap did not write that
+        return when

@@ -13,7 +13,7 @@ from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
-from gsmap.store.catalog import Catalog, now
+from gsmap.store.catalog import Catalog, later
 from gsmap.store.change_rows import (
     KIND,
     OPEN,
@@ -114,7 +114,7 @@ class Changes:
             made = {
                 "recipe": recipes.keep(connection, key),
                 "notes": [*report.notes, *carried_words(connection, pair_of(older, newer), told)],
-                "created_at": now(),
+                "created_at": later(connection, comparisons.c.created_at, comparisons.c.pair == pair_of(older, newer)),
             }
             number = connection.execute(insert(comparisons).returning(comparisons.c.number), row | made).scalar_one()
             lines = [
@@ -251,7 +251,8 @@ class Changes:
             if review == "withdraw" and self.get(number).status == OPEN:
                 raise InputError(f"nobody has reviewed c{number}: there is nothing to withdraw")
             self.get(number)
-            row = {"change": number, "review": review, "note": note, "created_at": now()}
+            when = later(connection, change_reviews.c.created_at, change_reviews.c.change == number)
+            row = {"change": number, "review": review, "note": note, "created_at": when}
             connection.execute(insert(change_reviews), row)
             return self.get(number)
 

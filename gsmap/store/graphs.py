@@ -8,13 +8,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import Connection, Row, Text, delete, func, insert, select, true, type_coerce
+from sqlalchemy import Connection, Row, Text, delete, insert, select, true, type_coerce
 
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
-from gsmap.store.catalog import Catalog, now
+from gsmap.store.catalog import Catalog, later
 from gsmap.store.columns import a_direction, corrupt
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
@@ -99,7 +99,8 @@ class Graphs:
             connection.execute(delete(graphs).where(mine))
             if old is not None and self._is_damaged(connection, old.group_id):
                 unname(connection, old.group_id)
-            made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": now()}
+            when = later(connection, graphs.c.created_at, graphs.c.scene == graph.scene_id)
+            made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": when}
             connection.execute(insert(graphs), row | made)
             return _stored(connection.execute(select(graphs).where(mine)).one())
 
@@ -177,15 +178,11 @@ class Graphs:
     def _is_damaged(self, connection: Connection, group_id: str) -> bool:
         return bool(self._arrays.problems(KIND, group_id, manifest(connection, group_id)))
 
-    def newest(self) -> str:
-        """When the newest graph was kept; empty where there is none."""
+    def groups(self) -> dict[str, str]:
+        """Scene by the group of each graph: names every graph as it is now."""
+        query = select(graphs.c.group_id, graphs.c.scene)
         with self._catalog.read() as connection:
-            return connection.execute(select(func.max(graphs.c.created_at))).scalar_one() or ""
-
-    def scenes_after(self, created_at: str) -> set[str]:
-        """Ids of the scenes of which a graph was kept after a time."""
-        with self._catalog.read() as connection:
-            return set(connection.execute(select(graphs.c.scene).where(graphs.c.created_at > created_at)).scalars())
+            return {row.group_id: row.scene for row in connection.execute(query)}
 
     def node_counts(self) -> dict[str, int]:
         """How many nodes the newest graph of each living scene has, by scene id."""

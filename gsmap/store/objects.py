@@ -292,7 +292,7 @@ class Objects:
     def facts(self) -> dict[str, list[ObjectFact]]:
         """Everything people ever said of objects, by id (``o12``), oldest first."""
         out: dict[str, list[ObjectFact]] = {}
-        query = select(object_facts).order_by(object_facts.c.created_at, object_facts.c.number)
+        query = select(object_facts).order_by(object_facts.c.number)
         with self._catalog.read() as connection:
             for row in connection.execute(query):
                 fact = ObjectFact(row.kind, row.value, row.author, row.created_at)
@@ -376,7 +376,7 @@ def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def standing(connection: Connection) -> dict[int, ObjectWords]:
     """What people say of objects now, by number."""
     said: dict[int, dict[str, str]] = {}
-    for row in connection.execute(select(object_facts).order_by(object_facts.c.created_at, object_facts.c.number)):
+    for row in connection.execute(select(object_facts).order_by(object_facts.c.number)):
         said.setdefault(row.object, {})[row.kind] = row.value
     return {number: ObjectWords(**values) for number, values in said.items() if any(values.values())}
 

@@ -194,3 +194,21 @@ def test_kinds_of_facts_are_checked(store, scenes):
     row = {"object": 1, "kind": "owner", "value": "x", "author": "", "created_at": "x"}
     with pytest.raises(InputError, match=r"object_facts\.kind"), store.catalog.write() as connection:
         connection.execute(insert(schema.object_facts), row)
+
+
+# --- clocks -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_word_counts_that_was_said_last_whatever_the_clock_said(store, scenes, tmp_path, monkeypatch):
+    keep_objects(store, {scenes[0]: A})
+    with monkeypatch.context() as patched:
+        patched.setattr("gsmap.store.objects.now", lambda: "2190-01-01T00:00:00.000000+00:00")
+        store.objects.edit(1, name="first")
+    store.objects.edit(1, name="second")
+    with Store.create(tmp_path / "other.gsmap") as other:
+        merging.merge(other, store)
+        other.objects.edit(1, label="seat")
+        merging.merge(store, other)
+        for one in (store, other):
+            assert (one.objects.words()["o1"].name, one.objects.words()["o1"].label) == ("second", "seat")
+            assert [fact.value for fact in one.objects.facts()["o1"]] == ["first", "second", "seat"]
