@@ -211,8 +211,11 @@ class Catalog:
             with self._advised(advisory.WRITER, self.patience_s, shared=True):
                 yield
 
-    def verify(self) -> None:
+    def verify(self, *, whole: bool = False) -> None:
         """Compare the catalog's pages with what was written, unless there are very many; `check` does it always.
+
+        Args:
+            whole: compare all of them, however many there are.
 
         Raises:
             CorruptError: they differ, or the file is not in WAL mode: what is written would go past its digests.
@@ -221,7 +224,7 @@ class Catalog:
             file = self.folder / sqlite.FILE
             if self.writable and not sqlite.has_log(file):
                 raise CorruptError(digests.damaged(file, ["another program changed its journal mode"]))
-            found = self.page_problems(at_most_bytes=digests.WHOLE_BYTES)
+            found = self.page_problems(at_most_bytes=None if whole else digests.WHOLE_BYTES)
             if found:
                 backup = digests.is_backup(file, sqlite.handle(self.engine))
                 if backup is None or read_log(log_of(file)).frames:
