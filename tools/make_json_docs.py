@@ -92,6 +92,8 @@ def json_type(hint: object) -> str:
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(json_type(part) for part in inner)
+    if origin is typing.Literal:
+        return json_type(type(inner[0]))
     if origin is tuple:
         return f"list of {json_type(inner[0])}"
     if origin is not None and issubclass(origin, Mapping):

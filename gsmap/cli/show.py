@@ -184,11 +184,11 @@ def _captured(scene: SceneReport) -> str | None:
 
 def _metre(scene: SceneReport) -> Metre | None:
     """Of the frame that it is placed in."""
-    from gsmap.types.metre import Metre
+    from gsmap.types.metre import Metre, as_known_by
 
     if not scene.metre_known_by:
         return None
-    return Metre(scene.metres_per_unit or 1.0, scene.metre_sigma or float("inf"), scene.metre_known_by)
+    return Metre(scene.metres_per_unit or 1.0, scene.metre_sigma or float("inf"), as_known_by(scene.metre_known_by))
 
 
 def _layers(scene: SceneReport) -> str:

@@ -18,7 +18,7 @@ from gsmap.durable import is_file, open_file, write_text_whole
 from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.texts import control_characters
 from gsmap.types import Sim3, Tile
-from gsmap.types.metre import Metre
+from gsmap.types.metre import Metre, as_known_by
 from gsmap.types.plain import plain
 
 FILE_NAME = "tiles.json"
@@ -166,7 +166,7 @@ def _metre(entry: Mapping[str, Any]) -> Metre:
     return Metre(
         float(entry["metres_per_unit"]),
         math.inf if sigma is None else float(sigma),
-        str(entry["metre_known_by"]),
+        as_known_by(str(entry["metre_known_by"])),
         str(entry["metre_note"]),
     )
 

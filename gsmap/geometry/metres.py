@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from gsmap.types import Gaussians, ScenePose, Sim3
-from gsmap.types.metre import Metre
+from gsmap.types.metre import KnownBy, Metre
 
 # Devices' metres are off by 1 to 3 percent, all captures of one device alike: many of them are no better than one.
 _TOLD_SIGMA = 0.01  # of what a person measured: a tape is that good, and so is a look at where it was laid
@@ -80,7 +80,7 @@ def _rounded(metres_per_unit: float, sigma: float) -> Metre:
     return Metre(float(f"{metres_per_unit:.4g}"), max(sigma, 5e-4), "surveyed", "")
 
 
-def _combined(units: Sequence[tuple[float, ScenePose]], own_sigma: float, known_by: str) -> Metre:
+def _combined(units: Sequence[tuple[float, ScenePose]], own_sigma: float, known_by: KnownBy) -> Metre:
     """Metres per unit of the frame from metres per unit of scenes that are good to ``own_sigma`` each."""
     logs = np.log([metres / pose.S_map_scene.scale for metres, pose in units])
     sigmas = np.sqrt([own_sigma**2 + _scale_variance(pose) for _, pose in units])

@@ -106,9 +106,14 @@ def register_scenes(
 
 def compare_scenes(
     path: str, older: tuple[str, Sim3, str], newer: tuple[str, Sim3, str], params: changing.Params
-) -> ChangeReport:
-    """What changed between two scenes of the map at ``path``; each is (scene id, S_map_scene, captured at)."""
-    return changing.compare(_placed(path, *older), _placed(path, *newer), params)
+) -> tuple[ChangeReport, tuple[int, int]]:
+    """What changed between two scenes of the map at ``path``, and how many Gaussians each had.
+
+    Args:
+        older, newer: scene id, S_map_scene and date.
+    """
+    before, after = _placed(path, *older), _placed(path, *newer)
+    return changing.compare(before, after, params), (len(before.gaussians), len(after.gaussians))
 
 
 def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> PlacedScene:

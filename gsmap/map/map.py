@@ -948,14 +948,18 @@ class Map(AbstractContextManager["Map"]):
         return ViewServer(doors, cache_folder(), settings.view, port=port)
 
     def write_site(self, folder: str | os.PathLike[str], *, tiles: str | os.PathLike[str] | None = None) -> ViewReport:
-        """``gsmap view MAP --export DIR``: the page as files that any web server can host, whole or not at all.
+        """``gsmap view MAP --export DIR``: the page as files that any web server can host.
+
+        In a new folder it appears whole or not at all. ``gsmap-site.json`` lists its files; others are never touched.
 
         Args:
-            folder: an empty or new one, or one that this map's page was written to before, which is replaced.
+            folder: an empty or new one, or one that this map's page was written to before, the files of which are
+                replaced, ``map.json`` and ``index.html`` last.
             tiles: as in `view`; they are copied.
 
         Raises:
-            ConfigError: the folder holds something else, the page was not built, or ``tiles`` are not this map's.
+            ConfigError: the folder holds something else, or a page of a gsmap that kept no list of its files; another
+                file lies where one has to go; the page was not built; or ``tiles`` are not this map's.
         """
         from gsmap.map.viewing_site import write_site
 

@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ from gsmap.geometry.directions import level_frame
 from gsmap.map.object_words import apart, with_words
 from gsmap.map.photos import with_photos
 from gsmap.map.settings import Settings
-from gsmap.map.stages.objects import objects_of_components
+from gsmap.map.stages.objects import Part, objects_of_components
 from gsmap.objects import graphml, object_graph, permanence, relations
 from gsmap.store import Store
-from gsmap.store.objects import ObjectFact, number_of
+from gsmap.store.objects import Computed, ObjectFact, number_of
+from gsmap.texts import few
 from gsmap.types import MapObject, Room, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
@@ -56,6 +58,7 @@ class Known:
         joined: id of the object that each is told as one with, where a person said so.
         facts: all that people ever said of objects, by id.
         rooms: of each component the rotation (3, 3) from its frame to a level one, and its rooms in that, in metres.
+        parted: id of the object that each was one with until their component came apart.
     """
 
     objects: list[MapObject]
@@ -66,6 +69,7 @@ class Known:
     joined: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, Sequence[ObjectFact]] = field(default_factory=dict)
     rooms: Mapping[int, tuple[np.ndarray, tuple[Room, ...]]] = field(default_factory=dict)
+    parted: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def dates(self) -> dict[str, str | None]:
@@ -155,19 +159,12 @@ def known_objects(
         NotFoundError: the map has no poses yet, or what is kept is out of date and is not to be made.
     """
     placed, scenes, metres, parts, notes = objects_of_components(store, settings, progress, graphs, make=make)
-    objects: list[MapObject] = []
-    for part in parts:
-        if part.key is not None and part.places is not None and store.catalog.writable:
-            made = store.objects.save(part.made, part.places, part.key)
-            objects += made.objects
-        elif part.places is not None:
-            numbers = store.objects.numbers(part.places)
-            objects += [
-                thing if number is None else replace(thing, id=f"o{number}")
-                for thing, number in zip(part.made.objects, numbers, strict=True)
-            ]
-        else:
-            objects += [replace(thing, component=part.component) for thing in part.made.objects]
+    objects = _numbered(store, parts)
+    shown = {number: [s.scene for s in one.sightings] for one in objects if (number := number_of(one.id))}
+    parted = {f"o{number}": f"o{other}" for number, other in store.objects.parted(shown).items()}
+    if parted:
+        told = few([f"{one} from {other}" for one, other in parted.items()])
+        notes = [*notes, f"components came apart, and objects with them: {told} were split"]
     rooms = {part.component: (level_frame(part.made.up), part.made.rooms) for part in parts}
     objects, joined, said = with_words(store, objects, scenes)
     kept = store.photos.list() if graphs is None else []
@@ -186,7 +183,28 @@ def known_objects(
         joined,
         store.objects.facts(),
         rooms,
+        parted,
     )
+
+
+def _numbered(store: Store, parts: Sequence[Part]) -> list[MapObject]:
+    """The objects of all components with their numbers; what was made now is kept, if it is to be and may be."""
+    new = [part for part in parts if part.places is not None]
+    made: dict[int, Sequence[MapObject]] = {
+        part.component: [replace(thing, component=part.component) for thing in part.made.objects] for part in parts
+    }
+    if store.catalog.writable and all(part.key is not None for part in new):
+        computed = [Computed(part.made, part.places or (), part.key) for part in new if part.key is not None]
+        saved = store.objects.save(computed) if computed else []
+        made |= {part.component: kept.objects for part, kept in zip(new, saved, strict=True)}
+    elif new:
+        numbers = iter(store.objects.numbers([one for part in new for one in part.places or ()]))
+        for part in new:
+            made[part.component] = [
+                thing if number is None else replace(thing, id=f"o{number}")
+                for thing, number in zip(part.made.objects, islice(numbers, len(part.made.objects)), strict=True)
+            ]
+    return [thing for part in parts for thing in made[part.component]]
 
 
 def kept_objects(store: Store, settings: Settings) -> Known:
@@ -357,6 +375,7 @@ def object_row(thing: MapObject, known: Known) -> ObjectRow:
         label=thing.words.label or None,
         note=thing.words.note or None,
         room=known.rooms_of.get(thing.id),
+        split_from=known.parted.get(thing.id),
     )
 
 

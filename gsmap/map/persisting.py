@@ -17,7 +17,7 @@ from gsmap.map.objects import Known
 from gsmap.methods import text_digest
 from gsmap.objects.changed import CHANGED
 from gsmap.store import Store
-from gsmap.types import MapObject
+from gsmap.types import MapObject, Scene
 from gsmap.types.plain import canonical
 
 _OF_THINGS = ("appeared", "disappeared", "moved", "replaced")
@@ -86,8 +86,7 @@ def what_passes(store: Store, known: Known) -> dict[str, Passing]:
                 (one.older, "before", change.num_before),
                 (one.newer, "after", change.num_after),
             ):
-                thinning = known.scenes[scene].thinning if scene in known.scenes else None
-                if count and scene in known.scenes and thinning is None:  # rows of what was thinned are of what it was
+                if count and scene in known.scenes and _has_rows(known.scenes[scene]):
                     changes.setdefault(scene, []).append((one.number, change.place, side))
                     told.setdefault(scene, []).append(f"{one.key} {one.created_at}")
     return {
@@ -99,6 +98,11 @@ def what_passes(store: Store, known: Known) -> dict[str, Passing]:
         )
         for scene in known.scenes
     }
+
+
+def _has_rows(scene: Scene) -> bool:
+    """Whether rows of changes are known among its Gaussians: not where an older gsmap thinned it."""
+    return scene.thinning is None or scene.thinning.has_row_map
 
 
 def rows(store: Store, scene: str, passing: Passing) -> np.ndarray:

@@ -207,8 +207,7 @@ def _gone(store: Store, scene: str) -> np.ndarray | bool:
             if kept.status != "rejected" and kept.kind in ("disappeared", "moved", "replaced"):
                 if out is False:
                     out = np.zeros(store.scenes.get(scene).num_gaussians, bool)
-                rows = change.before[change.before < len(out)]  # type: ignore[arg-type]
-                out[rows] = True  # type: ignore[index]
+                out[change.before] = True  # type: ignore[index]
     return out
 
 

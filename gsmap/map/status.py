@@ -21,6 +21,7 @@ from gsmap.store.set_aside import CAPTURE
 from gsmap.types import PoseGraph
 from gsmap.types.metre import Metre
 from gsmap.types.rows import AtWorkRow, MapStatus, MetreRow, TodoRow
+from gsmap.types.rows.maps import TodoKind
 
 
 @of_one_state
@@ -32,7 +33,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     newest, graph = store.revisions.newest(), PoseGraph(store.revisions.poses(), world=store.revisions.world())
     todo: list[TodoRow] = []
 
-    def add(what: str, count: int, verb: str, meaning: str) -> None:
+    def add(what: TodoKind, count: int, verb: str, meaning: str) -> None:
         if count:
             todo.append(TodoRow(what=what, count=count, verb=verb, meaning=meaning))
 
@@ -129,7 +130,7 @@ def at_work_rows(leases: Sequence[Lease]) -> tuple[AtWorkRow, ...]:
     )
 
 
-def _add_unsolved(store: Store, settings: Settings, add: Callable[[str, int, str, str], None], verb: str) -> None:
+def _add_unsolved(store: Store, settings: Settings, add: Callable[[TodoKind, int, str, str], None], verb: str) -> None:
     """Whether the newest poses are what these settings make of what the map knows now, and if not, why."""
     given = pose_basis(store, settings)
     newest = store.revisions.newest()

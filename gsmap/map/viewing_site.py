@@ -7,12 +7,26 @@ import logging
 import math
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from gsmap.durable import is_stream, make_folder, open_file, remove_tree, sync_folder, write_output
+from gsmap.durable import (
+    files_below,
+    is_file,
+    is_folder,
+    is_stream,
+    make_folder,
+    open_file,
+    refuse_links,
+    remove_empty_folder,
+    remove_file,
+    remove_tree,
+    sync_folder,
+    write_output,
+    write_whole,
+)
 from gsmap.errors import MALFORMED, ConfigError, CorruptError, NotFoundError
 from gsmap.map.pictures import note_target
 from gsmap.map.settings import Settings
@@ -29,8 +43,9 @@ from gsmap.view.tree_cache import TreeCache
 
 _log = logging.getLogger("gsmap.map")
 SITE = "gsmap-site.json"
-_VERSION = 1
-_MAX_BYTES = 1 << 16
+_WITHOUT_LIST, _VERSION = 1, 2
+_MAX_BYTES = 1 << 28
+_ENTRIES = ("map.json", "index.html")  # what a browser asks for first
 _SUFFIXES = (".html", ".htm")
 
 
@@ -45,18 +60,21 @@ def write_site(
     with _levels(doors, settings) as levels:
         try:
             staged.mkdir()
-            (staged / SITE).write_text(json.dumps({"version": _VERSION, "map_id": store.id, "gsmap": __version__}))
             told = partial(progress, "page")
             written = site.write_site(staged, doors, levels, settings.view, page, told)
+            made = _in_order(files_below(staged))
+            marker = _mark(store.id, made)
+            (staged / SITE).write_bytes(marker)
             notes = written.notes
             if (refused := note_target(store, folder, {"site": True})) is not None:
                 notes = (*notes, f"{refused}: a purge of a scene will not find this page")
             _check_folder(store, folder)  # again: it may have been filled meanwhile
-            _swap(staged, folder)
+            _put(staged, folder, store.id, made)
         finally:
             remove_tree(staged.parent, staged.name)
     progress("page", 1.0, "")
-    return ViewReport(path=str(folder), num_bytes=written.num_bytes, num_scenes=written.num_scenes, notes=notes)
+    num_bytes = written.num_bytes + len(marker)
+    return ViewReport(path=str(folder), num_bytes=num_bytes, num_scenes=written.num_scenes, notes=notes)
 
 
 def write_page(store: Store, settings: Settings, path: Path, megabytes: float, progress: StageProgress) -> ViewReport:
@@ -95,12 +113,66 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
 
 def site_owner(folder: Path) -> str | None:
     """The id of the map whose page a folder holds; None where it holds none."""
+    said = _marker(folder)
+    return None if said is None else said[0]
+
+
+def remove_site(folder: Path) -> int:
+    """Delete the files of a page, and the folders that are empty then; other files in them stay. How many files.
+
+    Raises:
+        ConfigError: it was written by a gsmap that kept no list of its files.
+        CorruptError: a folder on the way to one is a link.
+        OSError: the system refused.
+    """
+    files = site_files(folder)
+    _remove(folder, files)
+    remove_file(folder, SITE)  # last: an interrupted call finds the rest again
+    sync_folder(folder)
+    remove_empty_folder(folder.parent, folder.name)
+    return len(files) + 1
+
+
+def site_files(folder: Path) -> list[str]:
+    """The files of a page but `SITE`, relative to its folder; none where it holds no page.
+
+    Raises:
+        ConfigError: it was written by a gsmap that kept no list of its files.
+    """
+    said = _marker(folder)
+    if said is None:
+        return []
+    if said[1] is None:
+        raise ConfigError(
+            f"{folder} holds a page of an older gsmap, which kept no list of its files: move your own files out of it, "
+            "delete it, and export again"
+        )
+    return said[1]
+
+
+def _marker(folder: Path) -> tuple[str, list[str] | None] | None:
+    """The id of the map whose page a folder holds, and its files (None where there is no list); None for no page."""
     try:
         with open(open_file(folder / SITE), "rb") as file:
             said = json.loads(file.read(_MAX_BYTES))
-        return str(said["map_id"]) if said["version"] == _VERSION else None
+        map_id, version = str(said["map_id"]), said["version"]
+        if version == _WITHOUT_LIST:
+            return map_id, None
+        files = said["files"]
+        if version != _VERSION or not isinstance(files, list) or not all(isinstance(path, str) for path in files):
+            return None
+        return map_id, files
     except (OSError, CorruptError, *MALFORMED):
         return None
+
+
+def _mark(map_id: str, files: Sequence[str]) -> bytes:
+    """The bytes of `SITE`.
+
+    Args:
+        files: all that gsmap wrote beside it; it never touches another one.
+    """
+    return json.dumps({"version": _VERSION, "map_id": map_id, "gsmap": __version__, "files": files}).encode()
 
 
 def _check_folder(store: Store, folder: Path) -> None:
@@ -109,23 +181,66 @@ def _check_folder(store: Store, folder: Path) -> None:
         raise ConfigError(f"{folder} is no folder: give an empty or a new one")
     if folder.is_dir() and any(folder.iterdir()) and site_owner(folder) != store.id:
         raise ConfigError(f"{folder} holds other things than a page of this map: give an empty or a new folder")
+    site_files(folder)
 
 
-def _swap(staged: Path, folder: Path) -> None:
-    """Put a folder in the place of another; one of both is there at any time but for a moment."""
-    grave = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}"
-    is_there = folder.exists()
-    if is_there:
-        os.rename(folder, grave)
-    try:
+def _in_order(files: Iterable[str]) -> list[str]:
+    """Files of a page as they are put in place: what names others after these, `_ENTRIES` last."""
+    return sorted(files, key=lambda path: (_ENTRIES.index(path) if path in _ENTRIES else -1, path))
+
+
+def _put(staged: Path, folder: Path, map_id: str, made: Sequence[str]) -> None:
+    """Put a page where it belongs: a new folder at once, else file by file, and only files of a page are replaced.
+
+    Whenever that ends, the folder's list has every file of the earlier page and of this one that is there.
+
+    Args:
+        made: its files in ``staged``.
+
+    Raises:
+        ConfigError: something else lies where a file has to go; nothing was changed.
+        CorruptError: a folder on the way to one is a link.
+    """
+    if not folder.exists() or not any(folder.iterdir()):
+        if folder.exists():
+            folder.rmdir()
         os.rename(staged, folder)
-    except OSError:
-        if is_there:
-            os.rename(grave, folder)
-        raise
-    sync_folder(folder.parent)
-    if is_there:
-        remove_tree(grave.parent, grave.name)
+        sync_folder(folder.parent)
+        return
+    before = site_files(folder)
+    for path in made:
+        _check_free(folder, path, path in before)
+    write_whole(folder / SITE, lambda place: place.write_bytes(_mark(map_id, [*dict.fromkeys([*before, *made])])))
+    for path in made:
+        place = folder / path
+        make_folder(place.parent)
+        os.replace(staged / path, place)
+    for below in {(folder / path).parent for path in made}:
+        sync_folder(below)
+    _remove(folder, sorted(set(before) - set(made)))
+    write_whole(folder / SITE, lambda place: place.write_bytes(_mark(map_id, made)))
+
+
+def _check_free(folder: Path, path: str, is_ours: bool) -> None:
+    """Refuse to put a file where something else lies than a file of the page."""
+    *above, _ = path.split("/")
+    refuse_links(folder, *above)
+    for depth in range(1, len(above) + 1):
+        at = folder.joinpath(*above[:depth])
+        if os.path.lexists(at) and not is_folder(at):
+            raise ConfigError(f"{at} is not of the page, and a folder of it has to go there: move it away")
+    place = folder / path
+    if os.path.lexists(place) and not (is_ours and is_file(place)):
+        raise ConfigError(f"{place} is not of the page, and a file of it has to go there: move it away")
+
+
+def _remove(folder: Path, files: Sequence[str]) -> None:
+    """Delete files of a page, and the folders below ``folder`` that are empty then."""
+    for path in files:
+        remove_file(folder, *path.split("/"))
+    above = {tuple(path.split("/")[:depth]) for path in files for depth in range(1, path.count("/") + 1)}
+    for names in sorted(above, key=len, reverse=True):
+        remove_empty_folder(folder, *names)
 
 
 @contextmanager

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal, assert_never
 
 from gsmap.report.content import CHI2_999, EdgeEntry, Report
-from gsmap.types.metre import Metre
+from gsmap.types.metre import KnownBy, Metre
+from gsmap.types.rows.maps import TodoKind
 
 _SHOWN = 3  # names in a sentence
 
@@ -112,18 +114,30 @@ def cut_pair(pair: tuple[str, str], most: int = 22) -> str:
 
 def metre(one: Metre) -> str:
     """How lengths are known, in a sentence's half."""
-    how = {
-        "measured": "lengths are measured by captures that are in metres",
-        "told": "lengths follow metres that a person gave",
-        "assumed": "lengths assume that the captures' own unit is the metre, which nobody has said",
-        "guessed": "lengths are a guess, from how far cameras stand from what they see",
-        "unknown": "lengths have no known unit",
-    }[one.known_by]
+    how = _how(one.known_by)
     if not one.is_known or not math.isfinite(one.sigma):
         return how
     return (
         f"{how}, to {'a factor of ' + format(math.exp(one.sigma), '.2g') if one.sigma > 0.2 else _percent(one.sigma)}"
     )
+
+
+def _how(known_by: KnownBy) -> str:
+    match known_by:
+        case "surveyed":
+            return "lengths are surveyed, by control points, positions or scale bars"
+        case "measured":
+            return "lengths are measured by captures that are in metres"
+        case "told":
+            return "lengths follow metres that a person gave"
+        case "assumed":
+            return "lengths assume that the captures' own unit is the metre, which nobody has said"
+        case "guessed":
+            return "lengths are a guess, from how far cameras stand from what they see"
+        case "unknown":
+            return "lengths have no known unit"
+        case _:
+            assert_never(known_by)
 
 
 def _percent(share: float) -> str:
@@ -195,15 +209,23 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
             f"{'its' if len(strain) == 1 else 'their'} own error explains ({some([e.row.pair for e in strain])})."
         )
     sentences += _next_step(report)
-    whats = {row.what for row in status.todo}
-    if whats & _ACT or behind:
+    wants = {_wants(row.what) for row in status.todo}
+    if "act" in wants or behind:
         return "act", tuple(sentences)
-    return ("look" if whats & _LOOK or tentative or undecided else "good"), tuple(sentences)
+    return ("look" if "look" in wants or tentative or undecided else "good"), tuple(sentences)
 
 
-_ACT = {"undescribed", "unregistered", "unsolved", "set_aside", "contradicted_priors"}
-_LOOK = {"tentative", "undecided", "changes", "duplicates", "isolated", "stale_graphs", "stale_edges", "stale_poses"}
-_LOOK |= {"dirty_tiles"}
+def _wants(what: TodoKind) -> Literal["act", "look"]:
+    """Whether something to do is work, or a person's judgement."""
+    match what:
+        case "undescribed" | "unregistered" | "unsolved" | "set_aside" | "contradicted_priors":
+            return "act"
+        case "stale_graphs" | "stale_edges" | "stale_poses" | "dirty_tiles" | "tentative" | "undecided" | "changes":
+            return "look"
+        case "world_outliers" | "untied" | "duplicates" | "isolated":
+            return "look"
+        case _:
+            assert_never(what)
 
 
 def _next_step(report: Report) -> list[str]:

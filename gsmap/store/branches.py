@@ -33,6 +33,7 @@ from gsmap.store.schema import exports, files, groups, leases, models, revisions
 FOLDER = "branches"
 MARKER = "branch.json"
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")  # it becomes a folder's name
+_LEFTOVER = re.compile(rf"\.{_NAME.pattern}\.[0-9a-f]{{8}}")
 _log = logging.getLogger("gsmap.store")
 
 
@@ -120,6 +121,25 @@ def places(home: Path) -> list[Place]:
         if ours and is_file(folder / MARKER):
             found.append(Place(home, folder, folder.name, _told(folder)["kind"] == "tag"))
     return found
+
+
+def strangers(home: Path) -> list[str]:
+    """Paths below the map of what lies among its branches and is none, nor what a crash left of one.
+
+    Any of it may be a branch that lost a file or its name, and only that may know of some arrays.
+    """
+    root = home / FOLDER
+    if not os.path.lexists(root):
+        return []
+    if not is_folder(root):
+        return [FOLDER]
+    known = {place.branch for place in places(home)}
+    return [f"{FOLDER}/{name}" for name in sorted(os.listdir(root)) if name not in known and not _is_leftover(name)]
+
+
+def _is_leftover(name: str) -> bool:
+    """Whether a folder among the branches is one that is being made, or deleted, or that a crash left of that."""
+    return _LEFTOVER.fullmatch(name) is not None
 
 
 def other_places(home: Path, folder: Path) -> list[Place]:
@@ -269,6 +289,26 @@ class Others:
         self._home = home
         self._folder = folder
 
+    def verify(self) -> None:
+        """Compare every page of them with what was written: before arrays are deleted that none of them names.
+
+        Raises:
+            CorruptError: one is damaged.
+            StoreError: something lies among the branches that is none, and may have been one.
+        """
+        if strange := strangers(self._home):
+            raise StoreError(
+                f"{self._home / strange[0]} is no branch, and may be one that lost {MARKER} or its name: nothing is "
+                "reclaimed while it lies there; put back what it lacks, or move it out of the map"
+            )
+        for place in other_places(self._home, self._folder):
+            with explained(place.folder):
+                catalog = Catalog(place.folder, open_engine(place.folder, writable=False), writable=False)
+                try:
+                    catalog.verify(whole=True)
+                finally:
+                    catalog.close(fold=False)
+
     def groups(self) -> set[tuple[str, str]]:
         """(kind, id) of all groups that they name."""
         found: set[tuple[str, str]] = set()
@@ -299,8 +339,8 @@ class Others:
 def bury_leftovers(home: Path) -> None:
     """Delete what a crash left of making or deleting branches; only under the lock of the arrays."""
     root = home / FOLDER
-    for folder in root.glob(".*") if is_folder(root) else ():
-        if is_folder(folder):
+    for folder in root.iterdir() if is_folder(root) else ():
+        if _is_leftover(folder.name) and is_folder(folder):
             with contextlib.suppress(OSError):
                 remove_tree(home, FOLDER, folder.name)
 

@@ -9,11 +9,11 @@ import os
 import sqlite3
 import threading
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, RootTransaction, create_engine
+from sqlalchemy import Column, ColumnElement, Connection, Engine, RootTransaction, create_engine, func, select
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
@@ -211,8 +211,11 @@ class Catalog:
             with self._advised(advisory.WRITER, self.patience_s, shared=True):
                 yield
 
-    def verify(self) -> None:
+    def verify(self, *, whole: bool = False) -> None:
         """Compare the catalog's pages with what was written, unless there are very many; `check` does it always.
+
+        Args:
+            whole: compare all of them, however many there are.
 
         Raises:
             CorruptError: they differ, or the file is not in WAL mode: what is written would go past its digests.
@@ -221,7 +224,7 @@ class Catalog:
             file = self.folder / sqlite.FILE
             if self.writable and not sqlite.has_log(file):
                 raise CorruptError(digests.damaged(file, ["another program changed its journal mode"]))
-            found = self.page_problems(at_most_bytes=digests.WHOLE_BYTES)
+            found = self.page_problems(at_most_bytes=None if whole else digests.WHOLE_BYTES)
             if found:
                 backup = digests.is_backup(file, sqlite.handle(self.engine))
                 if backup is None or read_log(log_of(file)).frames:
@@ -377,3 +380,26 @@ def url_without_password(url: str) -> str:
 def now() -> str:
     """The current time, ISO 8601, UTC."""
     return datetime.now(UTC).isoformat(timespec="microseconds")
+
+
+def after(moment: datetime) -> str:
+    """The first time after a moment that `now` may return."""
+    return (moment + timedelta(microseconds=1)).astimezone(UTC).isoformat(timespec="microseconds")
+
+
+def later(connection: Connection, created_at: Column[str], *among: ColumnElement[bool]) -> str:
+    """The current time, or the first after the newest row where that has a later one: the clock was ahead once.
+
+    Rows that are read in order of time are then in the order in which they were written.
+
+    Args:
+        created_at: the column with the time.
+        among: conditions on the rows that the new one is ordered among.
+    """
+    when, newest = now(), connection.execute(select(func.max(created_at)).where(*among)).scalar()
+    if newest is None or newest < when:
+        return when
+    try:
+        return after(datetime.fromisoformat(newest))
+    except (ValueError, OverflowError, TypeError):  # gsmap did not write that
+        return when

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from sqlalchemy import insert, select
@@ -12,7 +13,7 @@ from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
-from gsmap.store.catalog import Catalog, now
+from gsmap.store.catalog import Catalog, later
 from gsmap.store.change_rows import (
     KIND,
     OPEN,
@@ -31,6 +32,7 @@ from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.groups import manifest, publish, unless_pruned
 from gsmap.store.layout import Shape
 from gsmap.store.matrices import from_array, from_pose
+from gsmap.store.row_maps import RowMaps
 from gsmap.store.scene_refs import living_ids, resolve, scene_name
 from gsmap.store.schema import change_reviews, changes, comparisons, scenes
 from gsmap.types import Sim3
@@ -50,9 +52,18 @@ class Changes:
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
+        self._rows = RowMaps(catalog, arrays)
 
     def save(
-        self, report: ChangeReport, key: RecipeKey, *, older: str, newer: str, S_newer_older: Sim3, S_frame_newer: Sim3
+        self,
+        report: ChangeReport,
+        key: RecipeKey,
+        *,
+        older: str,
+        newer: str,
+        S_newer_older: Sim3,
+        S_frame_newer: Sim3,
+        counted: tuple[int, int] | None = None,
     ) -> Comparison:
         """Keep what a comparison found; the same again mends damaged bytes.
 
@@ -60,16 +71,20 @@ class Changes:
             key: its recipe; its inputs begin with the two scenes, the older one first.
             older, newer: scene ids.
             S_newer_older, S_frame_newer: see `Comparison`.
+            counted: how many Gaussians the older and the newer scene had when they were compared, which the rows of
+                the report count; default: as many as they have now.
 
         Raises:
-            InputError: the key is of other scenes, or a scene with itself.
+            InputError: the key is of other scenes, or a scene with itself; or a scene was thinned, or ingested again,
+                since they were compared.
             NotFoundError: a scene that is not in the map.
         """
         if key.inputs[:2] != (older, newer) or older == newer:
             raise InputError(
                 f"the key of a comparison must have its two scenes {older} and {newer} as its first inputs"
             )
-        arrays = _to_arrays(report.changes)
+        whole = self._whole(report.changes, older, newer, counted)
+        arrays = _to_arrays(whole)
         text = f"{key.digest}{from_pose(S_newer_older)}{from_pose(S_frame_newer)}"
         group_id = digest(*arrays.values(), text=text) if report.changes else None
         row = {
@@ -99,7 +114,7 @@ class Changes:
             made = {
                 "recipe": recipes.keep(connection, key),
                 "notes": [*report.notes, *carried_words(connection, pair_of(older, newer), told)],
-                "created_at": now(),
+                "created_at": later(connection, comparisons.c.created_at, comparisons.c.pair == pair_of(older, newer)),
             }
             number = connection.execute(insert(comparisons).returning(comparisons.c.number), row | made).scalar_one()
             lines = [
@@ -112,7 +127,7 @@ class Changes:
                     "S_after_before": from_pose(change.S_after_before),
                     "symmetry": change.symmetry,
                     "confidence": float(change.confidence),
-                    **{f"num_{name}": len(getattr(change, name)) for name in _PARTS},
+                    **{f"num_{name}": len(getattr(whole[i], name)) for name in _PARTS},
                     "evidence": {name: float(value) for name, value in plain(dict(change.evidence)).items()},
                 }
                 for i, change in enumerate(report.changes)
@@ -142,7 +157,7 @@ class Changes:
             return read_comparison(connection, row)
 
     def load(self, comparison: int) -> ChangeReport:
-        """A comparison with its arrays.
+        """A comparison with its arrays; rows are those of the scenes' Gaussians as they are kept now.
 
         Raises:
             NotFoundError: no such comparison, or its arrays were pruned.
@@ -153,7 +168,7 @@ class Changes:
             group = select(comparisons.c.group_id).where(comparisons.c.number == comparison)
             group_id = connection.execute(group).scalar_one() or ""
             files = manifest(connection, group_id)
-            # Rows of a scene that was thinned since count what it had then.
+            # Kept rows count the whole capture (`gsmap.store.row_maps`).
             sizes = {
                 row.id: row.num_gaussians if row.thinned is None else row.thinned["num_gaussians"]
                 for row in connection.execute(select(scenes))
@@ -170,8 +185,23 @@ class Changes:
                 arrays = self._arrays.read(KIND, group_id, files, only=tuple(shapes), shapes=shapes)
             where = f"{KIND}/{group_id}"
             parts = _parts(arrays, found.changes, sizes[found.older], sizes[found.newer], where)
+            before, after = self._rows.of(found.older), self._rows.of(found.newer)
+            parts = [
+                part | {"before": before.kept(part["before"]), "after": after.kept(part["after"])} for part in parts
+            ]
         of_type = (_change(stored, part) for stored, part in zip(found.changes, parts, strict=True))
         return ChangeReport(tuple(of_type), found.seen_share, found.gains, found.notes)
+
+    def _whole(self, found: Sequence[Change], older: str, newer: str, counted: tuple[int, int] | None) -> list[Change]:
+        """Changes with rows of the whole captures; see `gsmap.store.row_maps`."""
+        if not found:
+            return []
+        before, after = self._rows.of(older), self._rows.of(newer)
+        of_older, of_newer = (None, None) if counted is None else counted
+        return [
+            replace(one, before=before.whole(one.before, of_older), after=after.whole(one.after, of_newer))
+            for one in found
+        ]
 
     def damaged(self, numbers: Iterable[int]) -> set[int]:
         """Those of the comparisons whose arrays differ from what was written; every byte of them is read."""
@@ -221,7 +251,8 @@ class Changes:
             if review == "withdraw" and self.get(number).status == OPEN:
                 raise InputError(f"nobody has reviewed c{number}: there is nothing to withdraw")
             self.get(number)
-            row = {"change": number, "review": review, "note": note, "created_at": now()}
+            when = later(connection, change_reviews.c.created_at, change_reviews.c.change == number)
+            row = {"change": number, "review": review, "note": note, "created_at": when}
             connection.execute(insert(change_reviews), row)
             return self.get(number)
 

@@ -293,6 +293,7 @@ def a_thinning(value: Any) -> bool:
         and isinstance(value.get("at"), str)
         and isinstance(value.get("num_gaussians"), int)
         and (value.get("up") is None or a_direction(value["up"]))
+        and isinstance(value.get("row_map", False), bool)
     )
 
 

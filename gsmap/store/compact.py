@@ -119,6 +119,29 @@ def shapes(n: int, sh_degree: int) -> dict[str, Shape]:
     }
 
 
+KEPT = "compact.kept"
+"""Name of the array of `pack_kept`."""
+
+
+def pack_kept(kept: np.ndarray) -> dict[str, np.ndarray]:
+    """The array that tells which Gaussians of the whole capture are kept.
+
+    Args:
+        kept: (N,) bool.
+    """
+    return {KEPT: np.packbits(kept)}
+
+
+def kept_shape(num_whole: int) -> Shape:
+    """The shape of the array of `pack_kept`."""
+    return (-(-num_whole // 8),)
+
+
+def unpack_kept(bits: np.ndarray, num_whole: int) -> np.ndarray:
+    """(n,) int64 rows of the whole capture that are kept, rising."""
+    return np.flatnonzero(np.unpackbits(bits, count=num_whole))
+
+
 WHOLE: Sequence[str] = ("compact.boxes", *(f"compact.{name}_range" for name in _VALUES))
 """Arrays that are read whole, whichever rows are wanted."""
 

@@ -5,20 +5,21 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import Connection, Row, Text, delete, func, insert, select, true, type_coerce
+from sqlalchemy import Connection, Row, Text, delete, insert, select, true, type_coerce
 
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
-from gsmap.store.catalog import Catalog, now
+from gsmap.store.catalog import Catalog, later
 from gsmap.store.columns import a_direction, corrupt
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
 from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
+from gsmap.store.row_maps import RowMaps
 from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import graphs, scenes
 from gsmap.types import SceneGraph
@@ -68,6 +69,7 @@ class Graphs:
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
+        self._rows = RowMaps(catalog, arrays)
         self._said: dict[tuple[str, str], GraphSays] = {}  # by key and arrays, which do not change
 
     def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
@@ -81,7 +83,7 @@ class Graphs:
         """
         if graph.scene_id not in key.inputs:
             raise InputError(f"the key of a graph must name its scene {graph.scene_id} among its inputs")
-        arrays, about = to_arrays(graph)
+        arrays, about = to_arrays(self._whole(graph))
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
         mine = graphs.c.key == key.digest
@@ -97,7 +99,8 @@ class Graphs:
             connection.execute(delete(graphs).where(mine))
             if old is not None and self._is_damaged(connection, old.group_id):
                 unname(connection, old.group_id)
-            made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": now()}
+            when = later(connection, graphs.c.created_at, graphs.c.scene == graph.scene_id)
+            made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": when}
             connection.execute(insert(graphs), row | made)
             return _stored(connection.execute(select(graphs).where(mine)).one())
 
@@ -109,6 +112,9 @@ class Graphs:
 
     def load(self, ref: str, key: RecipeKey | str | None = None) -> SceneGraph | None:
         """Read the graph of a scene under a key (or its digest), or the newest one; None where there is none.
+
+        Its things have members among the scene's Gaussians as they are kept now. It has no things where these are of
+        Gaussians that cannot be told any more (`gsmap.store.row_maps`).
 
         Raises:
             CorruptError: bytes on disk are missing or differ.
@@ -126,7 +132,21 @@ class Graphs:
         only = None if shapes is None else list(shapes)
         with unless_pruned(self._catalog, row.group_id, f"the graph of scene {row.scene[:12]} was dropped or replaced"):
             arrays = self._arrays.read(KIND, row.group_id, files, only=only, shapes=shapes)
-        return from_arrays(row.scene, row.about, arrays)
+        return self._of_kept(from_arrays(row.scene, row.about, arrays))
+
+    def _whole(self, graph: SceneGraph) -> SceneGraph:
+        """A graph with things of the whole capture; see `gsmap.store.row_maps`."""
+        if graph.things is None:
+            return graph
+        members = self._rows.of(graph.scene_id).values_of_whole(graph.things.members, -1)
+        return replace(graph, things=replace(graph.things, members=members))
+
+    def _of_kept(self, graph: SceneGraph) -> SceneGraph:
+        """`_whole` undone."""
+        if graph.things is None:
+            return graph
+        members = self._rows.of(graph.scene_id).values_of_kept(graph.things.members)
+        return replace(graph, things=None if members is None else replace(graph.things, members=members))
 
     def num_bytes(self, ref: str) -> int:
         """Of the arrays of all graphs of a scene, as they were written."""
@@ -158,15 +178,11 @@ class Graphs:
     def _is_damaged(self, connection: Connection, group_id: str) -> bool:
         return bool(self._arrays.problems(KIND, group_id, manifest(connection, group_id)))
 
-    def newest(self) -> str:
-        """When the newest graph was kept; empty where there is none."""
+    def groups(self) -> dict[str, str]:
+        """Scene by the group of each graph: names every graph as it is now."""
+        query = select(graphs.c.group_id, graphs.c.scene)
         with self._catalog.read() as connection:
-            return connection.execute(select(func.max(graphs.c.created_at))).scalar_one() or ""
-
-    def scenes_after(self, created_at: str) -> set[str]:
-        """Ids of the scenes of which a graph was kept after a time."""
-        with self._catalog.read() as connection:
-            return set(connection.execute(select(graphs.c.scene).where(graphs.c.created_at > created_at)).scalars())
+            return {row.group_id: row.scene for row in connection.execute(query)}
 
     def node_counts(self) -> dict[str, int]:
         """How many nodes the newest graph of each living scene has, by scene id."""

@@ -17,7 +17,7 @@ from gsmap.durable import is_file, is_folder, remove_file
 from gsmap.errors import ConfigError, DiskFullError, GsmapError, StoreError
 from gsmap.store import sqlite, staging
 from gsmap.store.arrays import Arrays, StoredFile
-from gsmap.store.branches import Others, bury_leftovers
+from gsmap.store.branches import Others, bury_leftovers, strangers
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.change_rows import KIND as CHANGES
 from gsmap.store.change_rows import newest_of_all
@@ -121,6 +121,9 @@ def check(
         if catalog.is_sqlite:
             problems += sqlite.integrity_problems(connection)
     problems += [f"{arrays.url}/{name} does not belong there: remove it" for name in arrays.strangers()]
+    problems += [
+        f"{home / name} is no branch: put back what it lacks, or move it out of the map" for name in strangers(home)
+    ]
     problems += _odd_models(home)
     if catalog.is_sqlite:
         problems += catalog.page_problems()
@@ -142,6 +145,8 @@ def check(
         named_by_any = named.items() | {(group, kind) for kind, group in Others(home, catalog.folder).groups()}
         orphans = tuple(f"{kind}/{name}" for kind, name in arrays.groups() if (name, kind) not in named_by_any)
     except StoreError:  # a branch that cannot be read may need any of them; who checks the map is told of it
+        orphans = ()
+    if strangers(home):
         orphans = ()
     num_bytes = sum(f.size_bytes for group in unread for f in manifests[group])
     if progress:
@@ -172,14 +177,13 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
 
 
 def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run: bool) -> Pruned:
-    others = Others(arrays.root.parent, catalog.folder)
-    others.groups()  # asked before anything is changed: a branch that cannot be read may need any of it
+    others = verified(catalog, arrays)  # before anything is changed
     with contextlib.nullcontext() if dry_run else catalog.lock():
         with catalog.read() as connection:
             waste = _waste(connection, keep_revisions)
             spare = _waste(connection, None).doomed
         # What no row names goes first: on a full disk that makes the room that rows need.
-        orphans = reclaim(catalog, arrays, dry_run=dry_run, besides=waste.doomed if dry_run else ())
+        orphans = _reclaim(catalog, arrays, others, dry_run=dry_run, besides=waste.doomed if dry_run else ())
         num_bytes = orphans.num_bytes
         if not dry_run:
             try:
@@ -191,7 +195,7 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
                         arrays.drop(*group)
                 _drop_rows(catalog, waste)
             # The rows are gone for good: a crash from here on leaves orphans for the next prune of any branch.
-            num_bytes += reclaim(catalog, arrays).num_bytes
+            num_bytes += _reclaim(catalog, arrays, others).num_bytes
             num_bytes += _give_back(catalog)
     return Pruned(
         scenes=tuple(name for name, _ in waste.scenes),
@@ -233,16 +237,44 @@ class Reclaimed:
     num_bytes: int
 
 
-def reclaim(
-    catalog: Catalog, arrays: Arrays, *, dry_run: bool = False, besides: Collection[tuple[str, str]] = ()
-) -> Reclaimed:
+def verified(catalog: Catalog, arrays: Arrays) -> Others:
+    """The other catalogs over the same arrays, every page of them and of this one compared with what was written.
+
+    Raises:
+        CorruptError: one of them is damaged, and may need arrays that it does not seem to name.
+        StoreError: one cannot be read, or something among the branches is none.
+    """
+    others = Others(arrays.root.parent, catalog.folder)
+    catalog.verify(whole=True)
+    others.verify()
+    others.groups()
+    return others
+
+
+def reclaim(catalog: Catalog, arrays: Arrays) -> Reclaimed:
     """Delete the arrays and models that no row of the map or of any of its branches names, and what crashes left.
+
+    Raises:
+        CorruptError, StoreError: as `verified`; nothing was deleted.
+    """
+    return _reclaim(catalog, arrays, verified(catalog, arrays))
+
+
+def _reclaim(
+    catalog: Catalog,
+    arrays: Arrays,
+    others: Others,
+    *,
+    dry_run: bool = False,
+    besides: Collection[tuple[str, str]] = (),
+) -> Reclaimed:
+    """See `reclaim`.
 
     Args:
         dry_run: only say what would go.
         besides: groups that rows name and that go all the same.
     """
-    home, others = arrays.root.parent, Others(arrays.root.parent, catalog.folder)
+    home = arrays.root.parent
     with explained(catalog.folder, _AGAIN), contextlib.nullcontext() if dry_run else arrays.lock():
         forgotten = _forgotten_models(catalog, others, home)
         # Asked under the lock of the arrays: nobody comes to name any of them from here on.

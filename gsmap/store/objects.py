@@ -10,8 +10,9 @@ from __future__ import annotations
 import base64
 import re
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,21 @@ class ObjectSet:
     rooms: tuple[Room, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Computed:
+    """What was computed of one component, to be kept.
+
+    Args:
+        made: its objects, the ids of which are replaced by numbers.
+        places: where captures show each of them.
+        key: what it is kept under.
+    """
+
+    made: ObjectSet
+    places: Sequence[Places]
+    key: RecipeKey
+
+
 def number_of(text: str) -> int | None:
     """The number of an object by what it is called (``o12``); None for anything else."""
     found = _NUMBER.fullmatch(text)
@@ -107,54 +123,110 @@ class Objects:
             rows = connection.execute(select(object_sets).order_by(object_sets.c.number)).all()
         return [_read(row) for row in rows]
 
-    def save(self, made: ObjectSet, places: Sequence[Places], key: RecipeKey) -> ObjectSet:
-        """Keep what was computed of a component, in the place of what knew any of its captures before.
+    def save(self, parts: Sequence[Computed]) -> list[ObjectSet]:
+        """Keep what was computed of components, in the place of what knew any of their captures before.
 
-        Args:
-            made: its objects, the ids of which are replaced by numbers.
-            places: where captures show each of them.
+        No number is given twice in the map. Where a component came apart, the part of which more captures show an
+        object keeps its number; the other part has a new object, see `parted`.
 
         Returns:
-            The same with the numbers that objects have, or have now.
+            The same with the numbers that objects have, or have now, instead of ids.
         """
         with self._catalog.write() as connection:
-            numbers = matched(connection, places)
+            forget_sets(connection, [scene for part in parts for scene in part.made.poses])
+            found = [places for part in parts for places in part.places]
+            given = _given(connection)
+            numbers = matched(connection, found, given)
             when = now()
-            for i, number in enumerate(numbers):
+            made: list[int] = []
+            for number in numbers:
                 if number is None:
-                    values = {"created_at": when}
-                    new = connection.execute(insert(objects).returning(objects.c.number), values).scalar_one()
-                    numbers[i] = int(new)
-            kept = replace(
-                made,
-                objects=tuple(
-                    replace(thing, id=f"o{number}") for thing, number in zip(made.objects, numbers, strict=True)
-                ),
-            )
-            of_found = object_places.c.object.in_([number for number in numbers if number is not None])
-            connection.execute(delete(object_places).where(of_found, object_places.c.scene.in_(list(made.poses))))
-            rows = [
-                {"object": number, "scene": scene, "box": from_array(box)}
-                for number, mine in zip(numbers, places, strict=True)
-                for scene, box in mine.items()
+                    new = connection.execute(insert(objects).returning(objects.c.number), {"created_at": when})
+                    number = int(new.scalar_one())
+                made.append(number)
+            rest = iter(made)
+            return [
+                self._save(connection, part, list(islice(rest, len(part.places))), given.union(made), when)
+                for part in parts
             ]
-            if rows:
-                connection.execute(insert(object_places), rows)
-            forget_sets(connection, made.poses)
-            value = {
-                "key": key.digest,
-                "recipe": recipes.keep(connection, key),
-                "poses": {scene: from_pose(pose) for scene, pose in made.poses.items()},
-                "value": _value(kept),
-                "created_at": when,
-            }
-            connection.execute(insert(object_sets), value)
+
+    def _save(
+        self, connection: Connection, part: Computed, numbers: Sequence[int], given: Collection[int], when: str
+    ) -> ObjectSet:
+        """Keep one component.
+
+        Args:
+            numbers: of its objects.
+            given: of all objects of the map.
+        """
+        made = part.made
+        kept = replace(
+            made,
+            objects=tuple(replace(thing, id=f"o{number}") for thing, number in zip(made.objects, numbers, strict=True)),
+        )
+        self._follow(connection, part, set(given) - set(numbers))
+        mine = object_places.c.object.in_(numbers)
+        connection.execute(delete(object_places).where(mine, object_places.c.scene.in_(list(made.poses))))
+        rows = [
+            {"object": number, "scene": scene, "box": from_array(box)}
+            for number, places in zip(numbers, part.places, strict=True)
+            for scene, box in places.items()
+        ]
+        if rows:
+            connection.execute(insert(object_places), rows)
+        value = {
+            "key": part.key.digest,
+            "recipe": recipes.keep(connection, part.key),
+            "poses": {scene: from_pose(pose) for scene, pose in made.poses.items()},
+            "value": _value(kept),
+            "created_at": when,
+        }
+        connection.execute(insert(object_sets), value)
         return kept
 
+    def _follow(self, connection: Connection, part: Computed, others: Collection[int]) -> None:
+        """Let an object of another component that was one with an object here until they came apart know its place.
+
+        The two are found at equal places then, so that each keeps its number, and they are one when the components are.
+        """
+        in_scenes = object_places.c.scene.in_(list(part.made.poses))
+        for row in connection.execute(select(object_places).where(in_scenes)).all():
+            if row.object in others:
+                here = np.array([places[row.scene] for places in part.places if row.scene in places])
+                share = _overlaps(here, np.array([row.box], np.float64)).ravel() if len(here) else np.zeros(1)
+                if share.max() >= _SAME_SHARE:
+                    same = (object_places.c.object == row.object) & (object_places.c.scene == row.scene)
+                    box = from_array(here[share.argmax()])
+                    connection.execute(update(object_places).where(same).values(box=box))
+
     def numbers(self, places: Sequence[Places]) -> list[int | None]:
-        """Which objects these are, by where captures show them; None for those that have no number. Nothing is kept."""
+        """The numbers of objects, by where captures show them; None for those that have none. Nothing is kept."""
+        captures = {scene for one in places for scene in one}
         with self._catalog.read() as connection:
-            return matched(connection, places)
+            return matched(connection, places, _given(connection, besides=captures))
+
+    def parted(self, shown: Mapping[int, Iterable[str]]) -> dict[int, int]:
+        """Objects that were one with another until their component came apart: the other's number, by number.
+
+        Args:
+            shown: captures of its component, by the number of each object of the map.
+        """
+        components = {number: set(captures) for number, captures in shown.items()}
+        with self._catalog.read() as connection:
+            rows = connection.execute(select(object_places).order_by(object_places.c.object)).all()
+        by_scene: dict[str, list[tuple[int, np.ndarray]]] = {}
+        for row in rows:
+            if row.object in components:
+                by_scene.setdefault(row.scene, []).append((row.object, np.array(row.box, np.float64)))
+        out: dict[int, int] = {}
+        for scene, places in by_scene.items():
+            here = [one for one in places if scene in components[one[0]]]
+            elsewhere = [one for one in places if scene not in components[one[0]]]
+            if here and elsewhere:
+                share = _overlaps(np.array([box for _, box in here]), np.array([box for _, box in elsewhere]))
+                for i, j in np.argwhere(share >= _SAME_SHARE):
+                    out.setdefault(here[i][0], elsewhere[j][0])
+        return out
 
     # --- what people say ---------------------------------------------------------------------------------------------
 
@@ -220,7 +292,7 @@ class Objects:
     def facts(self) -> dict[str, list[ObjectFact]]:
         """Everything people ever said of objects, by id (``o12``), oldest first."""
         out: dict[str, list[ObjectFact]] = {}
-        query = select(object_facts).order_by(object_facts.c.created_at, object_facts.c.number)
+        query = select(object_facts).order_by(object_facts.c.number)
         with self._catalog.read() as connection:
             for row in connection.execute(query):
                 fact = ObjectFact(row.kind, row.value, row.author, row.created_at)
@@ -237,11 +309,14 @@ class Objects:
 # --- which object is which -------------------------------------------------------------------------------------------
 
 
-def matched(connection: Connection, found: Sequence[Places]) -> list[int | None]:
+def matched(connection: Connection, found: Sequence[Places], given: Collection[int] = ()) -> list[int | None]:
     """The number of each object that is found, None for a new one; each number is given once.
 
     The more captures show two at one place, the surer they are one; of two that are as sure, the one whose places all
     take part, then the older one.
+
+    Args:
+        given: numbers of other objects, which are not given again.
     """
     known: dict[str, list[tuple[int, np.ndarray]]] = {}
     counts: dict[int, int] = {}
@@ -262,13 +337,22 @@ def matched(connection: Connection, found: Sequence[Places]) -> list[int | None]
             pair = mine[a][0], theirs[b][0]
             score[pair] = score.get(pair, 0.0) + float(share[a, b])
     numbers: list[int | None] = [None] * len(found)
-    taken: set[int] = set()
+    taken = set(given)
     order = sorted((-round(value, 6), -value / counts[number], number, i) for (i, number), value in score.items())
     for _, _, number, i in order:
         if numbers[i] is None and number not in taken:
             numbers[i] = number
             taken.add(number)
     return numbers
+
+
+def _given(connection: Connection, besides: Iterable[str] = ()) -> set[int]:
+    """Numbers of the objects that are kept as computed; of sets with any of the captures ``besides`` none."""
+    out, others = set(), set(besides)
+    for row in connection.execute(select(object_sets)):
+        if not others & set(row.poses):
+            out |= {number for thing in _read(row).objects if (number := number_of(thing.id)) is not None}
+    return out
 
 
 def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -292,7 +376,7 @@ def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def standing(connection: Connection) -> dict[int, ObjectWords]:
     """What people say of objects now, by number."""
     said: dict[int, dict[str, str]] = {}
-    for row in connection.execute(select(object_facts).order_by(object_facts.c.created_at, object_facts.c.number)):
+    for row in connection.execute(select(object_facts).order_by(object_facts.c.number)):
         said.setdefault(row.object, {})[row.kind] = row.value
     return {number: ObjectWords(**values) for number, values in said.items() if any(values.values())}
 

@@ -19,7 +19,7 @@ from sqlalchemy import Connection, Row, Table, delete, exists, func, insert, sel
 from gsmap.durable import files_below, is_file, is_folder, remove_file, sync_folder
 from gsmap.errors import BusyError
 from gsmap.store import integrity, objects, sqlite
-from gsmap.store.branches import Others, Place
+from gsmap.store.branches import Place
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import KINDS
 from gsmap.store.explained import explained
@@ -102,9 +102,8 @@ def begin(store: Store, scene: str) -> Purge:
     Args:
         scene: id of a scene that the catalog has, living or removed.
     """
-    shared = {
-        group for _, group in Others(store.home, store.folder).groups()
-    }  # these stay, and another purge takes them
+    # These stay, and another purge takes them.
+    shared = {group for _, group in integrity.verified(store.catalog, store.arrays).groups()}
     of_map = _backups_of_map(store)
     with store.catalog.write() as connection:
         row = connection.execute(select(scenes).where(scenes.c.id == scene)).one()

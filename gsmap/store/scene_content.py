@@ -55,7 +55,8 @@ def thinning_of(value: dict[str, Any] | None) -> Thinning | None:
     if value is None:
         return None
     up = value["up"]
-    return Thinning(value["at"], value["num_gaussians"], None if up is None else tuple(up))
+    up = None if up is None else tuple(up)
+    return Thinning(value["at"], value["num_gaussians"], up, value.get("row_map", False))
 
 
 def shapes_of(row: Row[Any]) -> dict[str, Shape]:

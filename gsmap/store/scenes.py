@@ -407,7 +407,7 @@ class Scenes:
             counts = f"{int(shown.sum())} of {len(shown)} Gaussians"
             raise InputError(f"cannot keep {counts} of scene {before.name}, which has {before.num_gaussians}")
         own = self.gaussians(before.id)[shown]
-        content = compact.pack(own) | camera_arrays(self.cameras(before.id))
+        content = compact.pack(own) | compact.pack_kept(shown) | camera_arrays(self.cameras(before.id))
         boxes = chunk_boxes(own, CHUNK_ROWS, sigmas=_SIGMAS)
         group_id = digest(*content.values(), text=f"compact {before.id}")
         staging = self._arrays.stage(content, KIND, group_id)
@@ -415,7 +415,12 @@ class Scenes:
             row = alive(connection, before.id)
             if row.thinned is None:
                 publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
-                about = {"at": now(), "num_gaussians": row.num_gaussians, "up": None if up is None else list(up)}
+                about = {
+                    "at": now(),
+                    "num_gaussians": row.num_gaussians,
+                    "up": None if up is None else list(up),
+                    "row_map": True,
+                }
                 values = {"group_id": group_id, "num_gaussians": len(own), "thinned": about}
                 connection.execute(update(scenes).where(scenes.c.id == row.id).values(**values))
                 put_boxes(connection, row.number, boxes)

@@ -10,6 +10,7 @@ from gsmap.store import facts, objects, photos, world
 from gsmap.store.change_rows import pair_of
 from gsmap.store.schema import comparisons, priors, scene_facts
 from gsmap.store.store import Store
+from gsmap.store.transfer import in_order
 from gsmap.types import PoseGraph
 
 
@@ -40,10 +41,10 @@ def inherit(store: Store, old: str, new: str) -> None:
 
 def _inherit_facts(connection: Connection, old: str, new: str) -> None:
     """All that was said of either, in the order of time."""
-    said = [*facts.said(connection, old), *facts.said(connection, new)]
+    said = facts.said(connection, old), facts.said(connection, new)
     rows = [
         {"scene": new, "kind": one.kind, "value": one.value, "author": one.author, "created_at": one.created_at}
-        for one in sorted(said, key=lambda fact: fact.created_at)
+        for one in in_order(*said, time=lambda fact: fact.created_at)
     ]
     connection.execute(delete(scene_facts).where(scene_facts.c.scene == new))
     if rows:

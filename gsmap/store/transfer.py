@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
@@ -41,6 +41,7 @@ from gsmap.store.store import Store
 from gsmap.types.plain import canonical
 
 Content = dict[str, Any]
+Item = TypeVar("Item")
 _MERGE = "merge"  # author of a name that a scene got because its own was taken: nobody's word
 
 
@@ -178,32 +179,35 @@ class Transfer:
         query = select(scene_facts).where(scene_facts.c.scene == scene).order_by(scene_facts.c.number)
         mine = [_content(row) for row in self.ours.execute(query)]
         theirs = [_content(row) for row in self.theirs.execute(query)]
-        new = _lacking(theirs, mine)
-        if new:
-            self.counts["facts"] += len(new)
+        known = {canonical(fact) for fact in mine}
+        joined = in_order(mine, theirs, time=_time, is_new=lambda fact: canonical(fact) not in known)
+        if len(joined) > len(mine):
+            self.counts["facts"] += len(joined) - len(mine)
             self.ours.execute(delete(scene_facts).where(scene_facts.c.scene == scene))
-            self.ours.execute(insert(scene_facts), sorted([*mine, *new], key=_time))
+            self.ours.execute(insert(scene_facts), joined)
             if not arrives:
-                self._take_later_words(scene, mine, new, arrived_at=min(fact["created_at"] for fact in theirs))
+                self._take_later_words(scene, mine, theirs)
         row = self.ours.execute(select(scenes).where(scenes.c.id == scene)).one()
         names = [row.value for row in self.ours.execute(query) if row.kind == "name"]
         if row.removed_at is None and names and names[-1] != row.name:
             facts.say(self.ours, scene, [("name", row.name)], _MERGE)
 
-    def _take_later_words(
-        self, scene: str, mine: Sequence[Content], theirs: Sequence[Content], arrived_at: str
-    ) -> None:
+    def _take_later_words(self, scene: str, mine: Sequence[Content], theirs: Sequence[Content]) -> None:
         """Name and date of a scene, where they were said in the other map after they were here.
 
         What it was called and dated by its files when it arrived there is no later word on what was said here.
         """
+        arrived_at = min(fact["created_at"] for fact in theirs)
         values: Content = {}
         for kind in ("name", "captured_at"):
-            of_kind = [[f for f in side if f["kind"] == kind and f["author"] != _MERGE] for side in (mine, theirs)]
-            last = max(of_kind[0], key=_time, default=None)
-            later = [f for f in of_kind[1] if last is None or _time(f) > max(_time(last), arrived_at)]
-            if later:
-                values[kind] = max(later, key=_time)["value"] or None
+            here, there = (
+                [(when, fact) for when, fact in timed(side, _time) if fact["kind"] == kind and fact["author"] != _MERGE]
+                for side in (mine, theirs)
+            )
+            new = [(when, fact) for when, fact in there if fact not in mine]
+            if not new or (here and not (new[-1][0] >= here[-1][0] and new[-1][0] > arrived_at)):
+                continue
+            values[kind] = new[-1][1]["value"] or None
         row = self.ours.execute(select(scenes).where(scenes.c.id == scene)).one()
         if values.get("name", row.name) == row.name or row.removed_at is not None:
             values.pop("name", None)
@@ -288,7 +292,13 @@ class Transfer:
         self.ours.execute(delete(reviews).where(of_review))
         self.ours.execute(delete(registrations).where(of_pair))
         numbers: dict[str, int] = {}
-        for side, row in sorted([*rows.values(), *new.values()], key=lambda item: str(item[1].created_at)):
+        joined = in_order(
+            rows.values(),
+            [("b", row) for row in theirs],
+            time=lambda item: str(item[1].created_at),
+            is_new=lambda item: names["b", item[1].number] in new,
+        )
+        for side, row in joined:
             content = _content(row)
             if side == "b":
                 self.recipe(row.recipe)
@@ -296,7 +306,13 @@ class Transfer:
                 content["adopts"] = numbers[names[side, row.adopts]]
             query = insert(registrations).returning(registrations.c.number)
             numbers[names[side, row.number]] = self.ours.execute(query, content).scalar_one()
-        for side, row in sorted([*words.values(), *new_words.values()], key=lambda item: str(item[1].created_at)):
+        told = in_order(
+            words.values(),
+            [("b", row) for row in said],
+            time=lambda item: str(item[1].created_at),
+            is_new=lambda item: _word(item[1]) in new_words,
+        )
+        for side, row in told:
             number = numbers[names[side, row.registration]]
             self.ours.execute(insert(reviews), _content(row) | {"registration": number})
 
@@ -460,13 +476,35 @@ def _word(row: Row[Any]) -> tuple[str, str, str]:
     return row.review, row.note, row.created_at
 
 
+def in_order(
+    mine: Iterable[Item],
+    theirs: Iterable[Item],
+    *,
+    time: Callable[[Item], str],
+    is_new: Callable[[Item], bool] = lambda item: True,
+) -> list[Item]:
+    """What was written in two maps as one sequence: by time, and each map's own in the order in which it was written.
+
+    Args:
+        mine, theirs: all that either map has, as it was written.
+        time: when an item was written.
+        is_new: whether an item of theirs is not among mine.
+    """
+    joined = [*timed(mine, time), *(one for one in timed(theirs, time) if is_new(one[1]))]
+    return [item for _, item in sorted(joined, key=lambda one: one[0])]
+
+
+def timed(items: Iterable[Item], time: Callable[[Item], str]) -> list[tuple[str, Item]]:
+    """Items with their times; where a clock went back, an item has the latest time before it."""
+    out, newest = [], ""
+    for item in items:
+        newest = max(newest, time(item))
+        out.append((newest, item))
+    return out
+
+
 def _time(fact: Mapping[str, Any]) -> str:
     return str(fact["created_at"])
-
-
-def _lacking(theirs: Sequence[Content], mine: Sequence[Content]) -> list[Content]:
-    known = {canonical(fact) for fact in mine}
-    return [fact for fact in theirs if canonical(fact) not in known]
 
 
 def _by_pair(rows: Iterable[Row[Any]]) -> dict[str, list[Row[Any]]]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
-from sqlalchemy import insert, select
+from sqlalchemy import delete, insert, select
 
 from gsmap.store.catalog import now
 from gsmap.store.objects import forget_sets, matched, number_of
 from gsmap.store.schema import object_facts, object_places, objects
-from gsmap.store.transfer import Transfer
+from gsmap.store.transfer import Transfer, in_order
 
 
 def objects_of(transfer: Transfer) -> None:
@@ -36,8 +39,23 @@ def objects_of(transfer: Transfer) -> None:
                 ours.execute(insert(object_places), {"object": number, "scene": scene, "box": box.tolist()})
     if found:
         forget_sets(ours, transfer.wanted)
-    known = {(f.object, f.kind, f.value, f.author, f.created_at) for f in ours.execute(select(object_facts))}
-    for row in theirs.execute(select(object_facts).order_by(object_facts.c.created_at, object_facts.c.number)).all():
+    _join_facts(transfer, numbers)
+
+
+def _join_facts(transfer: Transfer, numbers: Mapping[int, int]) -> None:
+    """Everything that was said of objects in either map; each map's own order stays.
+
+    Args:
+        numbers: of objects here, by their numbers there.
+    """
+    ours, theirs = transfer.ours, transfer.theirs
+    names = ("object", "kind", "value", "author", "created_at")
+    query = select(object_facts).order_by(object_facts.c.number)
+    mine: dict[int, list[tuple[Any, ...]]] = {}
+    for row in ours.execute(query):
+        mine.setdefault(row.object, []).append(tuple(getattr(row, name) for name in names))
+    said_there: dict[int, list[tuple[Any, ...]]] = {}
+    for row in theirs.execute(query).all():
         if row.object not in numbers:
             continue
         value = row.value
@@ -47,7 +65,11 @@ def objects_of(transfer: Transfer) -> None:
                 continue  # the other one stays behind, or is this one here
             value = f"o{other}"
         said = (numbers[row.object], row.kind, value, row.author, row.created_at)
-        if said not in known:
-            names = ("object", "kind", "value", "author", "created_at")
-            ours.execute(insert(object_facts), dict(zip(names, said, strict=True)))
-            transfer.counts["object_facts"] += 1
+        said_there.setdefault(numbers[row.object], []).append(said)
+    for number, said_of_it in said_there.items():
+        here = mine.get(number, [])
+        joined = in_order(here, said_of_it, time=lambda said: str(said[-1]), is_new=lambda said: said not in here)  # noqa: B023
+        if len(joined) > len(here):
+            transfer.counts["object_facts"] += len(joined) - len(here)
+            ours.execute(delete(object_facts).where(object_facts.c.object == number))
+            ours.execute(insert(object_facts), [dict(zip(names, said, strict=True)) for said in joined])

@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
 from gsmap.errors import InputError
 
-KNOWN_BY = ("surveyed", "measured", "told", "assumed", "guessed", "unknown")
+KnownBy = Literal["surveyed", "measured", "told", "assumed", "guessed", "unknown"]
+
+KNOWN_BY: tuple[KnownBy, ...] = get_args(KnownBy)
+
+
+def as_known_by(text: str) -> KnownBy:
+    """A word of `KNOWN_BY` that was read from somewhere.
+
+    Raises:
+        InputError: another word.
+    """
+    for known in KNOWN_BY:
+        if text == known:
+            return known
+    raise InputError(f"a metre is known by one of {', '.join(KNOWN_BY)}, got {text!r}")
 
 
 @dataclass(frozen=True)
@@ -27,14 +42,13 @@ class Metre:
 
     metres_per_unit: float = 1.0
     sigma: float = float("inf")
-    known_by: str = "unknown"
+    known_by: KnownBy = "unknown"
     note: str = ""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.metres_per_unit) and self.metres_per_unit > 0):
             raise InputError(f"metres per unit must be positive, got {self.metres_per_unit}")
-        if self.known_by not in KNOWN_BY:
-            raise InputError(f"a metre is known by one of {', '.join(KNOWN_BY)}, got {self.known_by!r}")
+        as_known_by(self.known_by)
 
     @property
     def is_known(self) -> bool:

@@ -13,8 +13,10 @@ class Thinning:
         thinned_at: ISO 8601 time with zone.
         num_gaussians: Gaussians it had before.
         up: (3,) against gravity in its frame, as its graph said; or None.
+        has_row_map: its arrays tell which of its Gaussians are kept; false where an older gsmap thinned it.
     """
 
     thinned_at: str
     num_gaussians: int
     up: tuple[float, ...] | None = None
+    has_row_map: bool = False

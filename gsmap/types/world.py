@@ -309,7 +309,8 @@ class WorldTie:
         problem: what is missing for ``S_world_map``; empty where it is there.
         notes: what a person should know.
         problem_code: ``undetermined`` (observations are missing), ``contradiction`` (groups of observations contradict
-            each other and none is to be preferred), ``unsolved`` (no finite solution), or empty where there is no problem.
+            each other and none is to be preferred), ``unsolved`` (no finite solution), or empty where there is no
+            problem.
         contradictions: groups of observations that contradict each other.
     """
 

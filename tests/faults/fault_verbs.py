@@ -88,7 +88,15 @@ BASES = {
         ),
     ),
     "compared": ("visited", ("*compared",)),
-    "seen-again": ("visited", ("settings MAP --set thin.min_seen_again=0.5 --set thin.min_fidelity_db=0",)),
+    # Described and compared: what thinning has to keep beside the Gaussians.
+    "seen-again": (
+        "compared",
+        (
+            "settings MAP --set describe.landmarks=false --set describe.objects=false",
+            "describe MAP",
+            "settings MAP --set thin.min_seen_again=0.5 --set thin.min_fidelity_db=0",
+        ),
+    ),
     "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""

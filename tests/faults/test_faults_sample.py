@@ -61,6 +61,12 @@ def test_a_commit_that_could_not_be_synchronised_is_not_folded_in(client, sound)
     sound([client.ask("point", verb="purge", n=commits[-1], mode="eio-once")])
 
 
+def test_a_thinned_capture_and_its_things_are_one_commit(client, sound):
+    ops = client.ask("ops", verb="thin")
+    commits = [n for n, op in enumerate(ops, 1) if op == "fsync site.gsmap/map.sqlite-wal"]
+    sound([client.ask("point", verb="thin", n=n, mode="kill-after") for n in commits])
+
+
 def test_what_an_export_had_begun_is_gone_though_nothing_is_to_be_done(client, sound):
     ops = client.ask("ops", verb="export")
     last = max(n for n, op in enumerate(ops, 1) if op == "rmdir out/.partial")

@@ -14,11 +14,11 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "describe"))
 from made_room import Room, looking_about
-from sqlalchemy import delete
+from sqlalchemy import delete, select, update
 
 import gsmap.map
 from gsmap import formats
-from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.errors import ConfigError, InputError, NotFoundError, StoreError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
@@ -156,43 +156,45 @@ def test_ids_stay_when_a_capture_comes_or_a_pose_moves(site: Map) -> None:
     site.store.revisions.save(placed)
 
 
-def test_a_change_of_kind_moved_makes_two_places_one_object(site: Map) -> None:
-    may, june = site.store.scenes.get("may"), site.store.scenes.get("june")
-    graphs = {s.name: site.store.graphs.load(s.id) for s in (may, june)}
-    (table,), (stool,) = site.history(at(TABLE)).objects, site.history(at(STOOL)).objects
-    thing = {row.id: row for row in (table, stool)}
-    assert len(thing) == 2
+def save_moved(m: Map, version: str) -> int:
+    """A change that says that the table of may is the stool of june; its number."""
+    may, june = m.store.scenes.get("may"), m.store.scenes.get("june")
 
-    def members(name: str, position: np.ndarray) -> np.ndarray:
-        found = graphs[name].things
-        there = FRAMES[name].inverse().apply(found.positions)
-        nearest = int(np.argmin(np.linalg.norm(there - position, axis=1)))
-        return np.flatnonzero(found.members == nearest).astype(np.int32)
+    def members(scene: str, name: str, place: list[float]) -> np.ndarray:
+        graph = m.store.graphs.load(scene)
+        assert graph is not None
+        assert graph.things is not None
+        there = FRAMES[name].inverse().apply(graph.things.positions)
+        nearest = int(np.argmin(np.linalg.norm(there - place, axis=1)))
+        return np.flatnonzero(graph.things.members == nearest).astype(np.int32)
 
-    cells = np.zeros((1, 3), np.float32)
     change = Change(
         "moved",
         np.array([[0.0, 0, 0], [1, 1, 1]]),
-        cells,
-        members("may", table.position),
-        members("june", stool.position),
+        np.zeros((1, 3), np.float32),
+        members(may.id, "may", TABLE),
+        members(june.id, "june", STOOL),
         Sim3.identity(),
         confidence=0.9,
     )
-    from gsmap.change import recipe_key
-
-    site.store.changes.save(
+    found = m.store.changes.save(
         ChangeReport((change,), 1.0, np.ones(3)),
-        recipe_key().of(may.id, june.id),
+        RecipeKey("change", version, {}).of(may.id, june.id),
         older=may.id,
         newer=june.id,
         S_newer_older=Sim3.identity(),
         S_frame_newer=Sim3.identity(),
     )
+    return found.changes[0].number
+
+
+def test_a_change_of_kind_moved_makes_two_places_one_object(site: Map) -> None:
+    (table,), (stool,) = site.history(at(TABLE)).objects, site.history(at(STOOL)).objects
+    assert table.id != stool.id
+    number = save_moved(site, "test")
     (one,) = site.history(at(TABLE)).objects
     assert one.id == site.history(at(STOOL)).objects[0].id
     assert one.seen == 2
-    number = site.store.changes.current()[0].changes[0].number
     site.store.changes.review(number, "reject")
     assert site.history(at(TABLE)).objects[0].seen == 1
 
@@ -214,6 +216,45 @@ def test_objects_are_the_same_whatever_the_unit_of_the_map(site: Map) -> None:
         np.testing.assert_allclose(10 * b.position, a.position, atol=1e-5)
     assert seen == states(site, CUPBOARD)
     np.testing.assert_allclose(box_m, 10 * box)
+
+
+def test_objects_of_a_component_that_comes_apart_have_numbers_of_their_own(site: Map, tmp_path: Path) -> None:
+    with gsmap.map.open(site.clone(tmp_path / "clone.gsmap").path) as m:
+        before = {row.id for row in m.objects().objects}
+        (cupboard,) = m.history(at(CUPBOARD)).objects
+        m.edit_object(cupboard.id, name="grandmother's cupboard")
+        placed = m.store.revisions.get()
+        assert placed is not None
+        june = m.store.scenes.get("june").id
+        m.store.revisions.save(
+            PoseGraph({s: replace(pose, component=int(s == june)) for s, pose in placed.poses.items()})
+        )
+        report = m.objects()
+        numbers = [row.id for row in report.objects]
+        assert len(set(numbers)) == len(numbers)
+        assert {row.component for row in report.objects} == {0, 1}
+        (named,) = (row for row in report.objects if row.name)
+        assert (named.id, named.component) == (cupboard.id, 0), "where more captures show it"
+        (other,) = (row for row in report.objects if row.split_from == cupboard.id)
+        assert (other.component, other.id in before) == (1, False)
+        assert m.history(other.id).objects[0].seen == 1
+        assert [hit.object for hit in m.find("cupboard").hits] == [cupboard.id]
+        give_twice(m, other.id, cupboard.id)
+        numbers = [row.id for row in m.objects().objects]
+        assert len(set(numbers)) == len(numbers), "though an older gsmap gave one twice"
+        m.store.revisions.save(placed)
+        again = m.objects().objects
+        assert {row.id for row in again} == before
+        assert all(row.split_from is None for row in again)
+
+
+def give_twice(m: Map, number: str, other: str) -> None:
+    """Let what was computed say of an object that it is another one."""
+    with m.store.catalog.write() as connection:
+        for row in connection.execute(select(schema.object_sets)).all():
+            things = [thing | {"id": other} if thing["id"] == number else thing for thing in row.value["objects"]]
+            mine = schema.object_sets.c.number == row.number
+            connection.execute(update(schema.object_sets).where(mine).values(value=row.value | {"objects": things}))
 
 
 def counted(patched: pytest.MonkeyPatch) -> list[str]:
@@ -457,6 +498,47 @@ def test_a_thinned_capture_still_tells_what_stood_there(site: Map, tmp_path: Pat
             assert [row.state for row in other.sightings] == [row.state for row in one.sightings]
         assert any("may is thinned" in note for note in after[0].notes)
         assert m.find(at=CUPBOARD).described == 2, "graphs of whole captures answer"
+
+
+def test_a_thing_that_moved_is_one_object_and_out_of_small_maps_after_thinning(site: Map, tmp_path: Path) -> None:
+    """The table of may is the stool of june: rows of the change count may as it was ingested."""
+    with gsmap.map.open(site.clone(tmp_path / "clone.gsmap").path) as m:
+        m.with_settings({"thin.min_seen_again": 0.2, "thin.min_fidelity_db": 0.0})
+        number = save_moved(m, "again")
+        if m.store.changes.get(number).status == "rejected":
+            m.store.changes.review(number, "withdraw")
+        before = m.history(at(TABLE)), m.history(at(STOOL))
+        assert before[0].objects[0].id == before[1].objects[0].id
+        (thinned,) = (row for row in m.thin(keep_days=1, now="2026-07-01T00:00:00+00:00").scenes if row.thinned)
+        after = m.history(at(TABLE)), m.history(at(STOOL))
+        for one, other in zip(before, after, strict=True):
+            assert [replace(row, colour=None) for row in other.objects] == [
+                replace(row, colour=None) for row in one.objects
+            ]
+            assert [row.state for row in other.sightings] == [row.state for row in one.sightings]
+        m.export_small(tmp_path / "small", 4_000_000)
+        held = SmallLocalizer(tmp_path / "small", m.settings).placed[thinned.scene]
+        means = FRAMES["may"].inverse().apply(held.gaussians.means)
+        assert num_near(means, *PLACES["table"]) <= 2
+        assert num_near(means, *PLACES["cupboard"]) > 100
+
+
+def test_a_thinning_that_ends_in_its_middle_changes_nothing(
+    site: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with gsmap.map.open(site.clone(tmp_path / "clone.gsmap").path) as m:
+        m.with_settings({"thin.min_seen_again": 0.2, "thin.min_fidelity_db": 0.0})
+        before = m.objects().objects
+        with monkeypatch.context() as patched:
+            patched.setattr(Graphs, "save", lambda *_: (_ for _ in ()).throw(OSError("the disk failed")))
+            with pytest.raises(StoreError, match="the disk failed"):
+                m.thin(keep_days=1, now="2026-07-01T00:00:00+00:00")
+        assert all(scene.thinning is None for scene in m.scenes())
+        assert m.objects().objects == before
+        assert [row.thinned for row in m.thin(keep_days=1, now="2026-07-01T00:00:00+00:00").scenes] == [True]
+        assert [(row.id, row.seen, row.looks) for row in m.objects().objects] == [
+            (row.id, row.seen, row.looks) for row in before
+        ]
 
 
 def test_captures_without_things_are_named(site: Map) -> None:

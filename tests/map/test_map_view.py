@@ -1,4 +1,5 @@
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -250,11 +251,9 @@ def test_a_site_replaces_its_own_and_nothing_else(folder, tmp_path):
         report = m.write_site(out)
         assert (report.num_scenes, report.path) == (2, str(out))
         assert report.num_bytes == sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-        (out / "left.txt").write_text("of the earlier page")
         m.edit("hall", name="atrium")
         m.write_site(out)
         assert json.loads((out / "map.json").read_bytes())["scenes"][0]["name"] == "atrium"
-        assert not (out / "left.txt").exists()
         assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
         for held in ("things", "other"):
             (tmp_path / held).mkdir()
@@ -269,6 +268,78 @@ def test_a_site_replaces_its_own_and_nothing_else(folder, tmp_path):
         with pytest.raises(NotFoundError, match="no folder of exported tiles"):
             m.write_site(tmp_path / "new", tiles=tmp_path / "nowhere")
         assert not (tmp_path / "new").exists()
+
+
+def keep_own(out):
+    """What a person who hosts a page puts beside it."""
+    own = {"CNAME": "map.example", ".git/HEAD": "ref", "scenes/notes.txt": "mine", "blog/index.html": "<p>"}
+    for name, text in own.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(text)
+    return own
+
+
+def told(out):
+    return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_files_of_others_beside_a_page_stay_when_it_is_written_again_and_purged(folder, tmp_path):
+    out = tmp_path / "www"
+    with gsmap.open(folder) as m:
+        m.write_site(out)
+        own, yard = keep_own(out), m.store.scenes.get("yard").id
+        m.remove("hall")
+        m.write_site(out)
+        m.write_site(tmp_path / "fresh")
+        assert {name: text.encode() for name, text in own.items()} | told(tmp_path / "fresh") == told(out)
+        assert not any(m.store.scenes.find_any("hall").id in name for name in told(out))
+        receipt = m.purge("yard")
+        assert told(out) == {name: text.encode() for name, text in own.items()}
+        assert not (tmp_path / "fresh").exists()
+        assert str(out) in json.dumps(receipt.to_json())
+        assert not any(yard in str(path) for path in out.rglob("*"))
+
+
+def test_a_page_that_was_put_in_place_by_half_is_finished_by_the_next(folder, tmp_path, monkeypatch):
+    out = tmp_path / "www"
+    with gsmap.open(folder) as m:
+        m.write_site(out)
+        own = keep_own(out)
+        m.remove("hall")
+        for number in (1, 2, 5, 9):
+            put, left = os.replace, [number]
+
+            def broken(source, target, put=put, left=left):
+                left[0] -= out in Path(target).parents
+                if not left[0]:
+                    raise OSError(5, "Input/output error")
+                put(source, target)
+
+            monkeypatch.setattr(os, "replace", broken)
+            with pytest.raises(OSError, match="Input/output"):
+                m.write_site(out)
+            monkeypatch.undo()
+            assert all((out / name).read_text() == text for name, text in own.items())
+        m.write_site(out)
+        m.write_site(tmp_path / "fresh")
+        assert {name: text.encode() for name, text in own.items()} | told(tmp_path / "fresh") == told(out)
+
+
+def test_a_page_is_not_written_over_files_of_others(folder, tmp_path):
+    out = tmp_path / "www"
+    with gsmap.open(folder) as m:
+        m.write_site(out)
+        (out / "map.json").unlink()
+        (out / "map.json").mkdir()
+        before = told(out)
+        with pytest.raises(ConfigError, match=r"map\.json is not of the page"):
+            m.write_site(out)
+        assert told(out) == before
+        (out / "map.json").rmdir()
+        (out / "gsmap-site.json").write_text(json.dumps({"version": 1, "map_id": m.store.id}))
+        with pytest.raises(ConfigError, match="older gsmap"):
+            m.write_site(out)
+        assert "older gsmap" in json.dumps(m.purge("yard").to_json())
 
 
 def test_a_site_is_whole_or_not_there(folder, tmp_path, monkeypatch):

@@ -71,6 +71,12 @@ def test_the_metre_is_the_survey_s(tied: Path) -> None:
         assert metre.metres_per_unit == pytest.approx(0.5, rel=1e-3)
 
 
+def test_a_surveyed_map_is_reported(tied: Path, tmp_path: Path) -> None:
+    with gsmap.map.open(tied) as m:
+        m.report(tmp_path / "report.html", pictures=False)
+    assert "surveyed" in (tmp_path / "report.html").read_text()
+
+
 def test_measuring(tied: Path, site: Site) -> None:
     from gsmap.world.frame import of_frame
 

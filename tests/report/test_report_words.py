@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
 from gsmap.report import EdgeEntry, Island, Report, SceneEntry, page
 from gsmap.report.words import angle, chi_square, cut_pair, length, number, probability, size, some, verdict
-from gsmap.types.metre import Metre
+from gsmap.types.metre import KNOWN_BY, KnownBy, Metre
 from gsmap.types.rows import EdgeRow, MapStatus, RevisionRow, SceneRow, TodoRow
+from gsmap.types.rows.maps import TodoKind
 
 
 def scene(name: str, status: str = "placed", component: int | None = 0) -> SceneEntry:
@@ -100,6 +101,20 @@ def test_the_verdict_says_how_a_map_stands(made: Report, standing: str, says: st
     assert found == standing
     assert says in " ".join(sentences)
     assert " ".join(sentences).replace("'", "&#x27;") in page(made)
+
+
+@pytest.mark.parametrize("known_by", KNOWN_BY)
+def test_every_way_to_know_a_metre_is_said(known_by: KnownBy) -> None:
+    made = report(scene("a"), scene("b"))
+    island = replace(made.islands[0], metre=Metre(0.5, 0.01, known_by))
+    said = " ".join(verdict(replace(made, islands=(island,)))[1])
+    assert ("lengths have no known unit" in said.lower()) == (known_by == "unknown")
+    assert ("to 1 %" in said) == (known_by != "unknown")
+
+
+@pytest.mark.parametrize("what", get_args(TodoKind))
+def test_a_map_with_something_to_do_is_not_in_order(what: TodoKind) -> None:
+    assert verdict(report(scene("a"), scene("b"), **{what: 1}))[0] in ("act", "look")
 
 
 def test_nothing_checks_edges_in_no_loop() -> None:

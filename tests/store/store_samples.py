@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsmap.methods import RecipeKey
-from gsmap.store.objects import ObjectSet
+from gsmap.store.objects import Computed, ObjectSet
 from gsmap.types import Cameras, Change, ChangeReport, Gaussians, MapObject, Sighting, Sim3
 from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
 
@@ -38,13 +38,13 @@ def made_change(box, kind="moved", n=4, **more):
     return Change(kind, np.asarray(box, np.float64), **(fields | more))
 
 
-def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newer=None, notes=()):
+def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newer=None, notes=(), counted=None):
     """Keep what a comparison of two scenes (by id) found."""
     report = ChangeReport(tuple(found), 0.625, np.array([1.0, 0.5, 2.0]), tuple(notes))
     identity = Sim3.identity()
     made = key("change", older, newer, version=version)
     poses = {"S_newer_older": S or identity, "S_frame_newer": S_frame_newer or identity}
-    return store.changes.save(report, made, older=older, newer=newer, **poses)
+    return store.changes.save(report, made, older=older, newer=newer, counted=counted, **poses)
 
 
 JPEG = b"\xff\xd8\xff\xe0" + bytes(range(200))
@@ -70,8 +70,13 @@ def kept_photo(scene: str, number: int = 0, **values) -> PhotoSighting:
     )
 
 
-def keep_objects(store, *places, seed="", **poses) -> list[str]:
+def keep_objects(store, *places, seed="") -> list[str]:
     """Keep objects that captures show in these boxes of their own frames; their ids."""
+    return [thing.id for thing in store.objects.save([computed(*places, seed=seed)])[0].objects]
+
+
+def computed(*places, seed="") -> Computed:
+    """Objects of a component that captures show in these boxes of their own frames."""
     boxes = [{scene: np.array(box, np.float64) for scene, box in one.items()} for one in places]
     scenes = list(dict.fromkeys(scene for one in boxes for scene in one))
     found = [
@@ -89,6 +94,6 @@ def keep_objects(store, *places, seed="", **poses) -> list[str]:
         for i, one in enumerate(boxes)
     ]
     recipe = key("objects", *scenes, seed)
-    known = {scene: poses.get(scene, Sim3.identity()) for scene in scenes}
+    known = dict.fromkeys(scenes, Sim3.identity())
     made = ObjectSet(recipe.digest, recipe.recipe, 1.0, known, dict.fromkeys(scenes, "0"), tuple(found))
-    return [thing.id for thing in store.objects.save(made, boxes, recipe).objects]
+    return Computed(made, boxes, recipe)

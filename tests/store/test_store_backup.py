@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from gsmap.store import Store
 from gsmap.store.backup import Backup, restore, save
 from gsmap.store.backup import saving as saving_module
 from gsmap.store.backup.repository import object_name
+from gsmap.store.backup.saving import sweep
 from gsmap.store.backup.sharing import EXPIRES_S, SAVE, SWEEP, Lease
 from gsmap.store.catalog import Catalog
 from gsmap.store.places import FolderPlace, place_of
@@ -331,6 +333,29 @@ def test_keep_deletes_old_snapshots_and_what_only_they_needed(filled, place, tmp
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
     with pytest.raises(ConfigError, match="at least 1"):
         save(filled, place, keep=0)
+
+
+def test_the_snapshot_just_made_stays_and_is_the_newest_though_a_clock_was_ahead(filled, place, tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr("gsmap.store.catalog.now", lambda: "2190-01-01T00:00:00.000000+00:00")
+        ahead = save(filled, place).snapshot
+    filled.scenes.add(make_gaussians(seed=7), make_cameras(), name="new")
+    second, third = save(filled, place), save(filled, place)
+    assert any("clock" in note for note in second.notes)
+    assert Backup.at(place).names() == [ahead.name, second.snapshot.name, third.snapshot.name]
+    last = save(filled, place, keep=1)
+    assert Backup.at(place).names() == [last.snapshot.name]
+    restore(place, tmp_path / "r")
+    assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
+
+
+def test_a_snapshot_that_another_dates_later_meanwhile_does_not_end_the_one_just_made(filled, place, monkeypatch):
+    made = save(filled, place).snapshot
+    later = replace(made, created_at="2190-01-01T00:00:00.000000+00:00")
+    name, packed = later.packed()
+    place.put(f"snapshots/{name}.json", [packed], len(packed))
+    assert sweep(Backup.at(place), 1, made=made.name)[0] == ()
+    assert Backup.at(place).names() == [made.name, name]
 
 
 def test_keep_deletes_nothing_when_a_snapshot_cannot_be_read(filled, place):

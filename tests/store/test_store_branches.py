@@ -1,6 +1,8 @@
 """Branches and tags: other catalogs over the same arrays."""
 
+import contextlib
 import os
+import re
 import shutil
 import threading
 
@@ -8,7 +10,7 @@ import pytest
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import ConfigError, NotFoundError, StoreError
-from gsmap.store import Store, migrate, schema
+from gsmap.store import Store, migrate, purging, schema
 from gsmap.store.catalog import Catalog, open_engine
 from gsmap.types import PoseGraph, SceneGraph, ScenePose, Sim3
 
@@ -183,6 +185,54 @@ def test_prune_refuses_while_a_branch_cannot_be_read(store):
     assert store.prune().scenes == ("scene0",)
 
 
+def flips(path, text):
+    """A file's bytes with one bit of each place flipped at which it has a text; and of its middle."""
+    whole = path.read_bytes()
+    places = [len(whole) // 2, *(found.start() + 5 for found in re.finditer(re.escape(text), whole))]
+    for place in places:
+        yield whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :]
+
+
+def test_nothing_that_a_branch_needs_is_reclaimed_whatever_became_of_its_files(store, tmp_path):
+    """Each file of a branch flipped or missing, and its folder under other names."""
+    store.branches.make("b")
+    with Store.open(at(store, "b")) as branch:
+        own = add(branch, 0)
+    folder, arrays = store.home / "branches" / "b", store.home / "arrays" / "scenes" / own
+    shutil.copytree(folder, tmp_path / "sound")
+    names = sorted(path.name for path in folder.iterdir() if path.name != "lock")
+    assert {"map.sqlite", "map.sqlite.digests", "branch.json"} <= set(names)
+
+    def reclaimed(what):
+        """Prune and purge as a person does who knows nothing of it, then put the branch back."""
+        for attempt in (store.prune, store.reclaim, lambda: store.prune(dry_run=True)):
+            with contextlib.suppress(StoreError):
+                attempt()
+        assert arrays.is_dir(), what
+        shutil.rmtree(store.home / "branches")
+        shutil.copytree(tmp_path / "sound", folder)
+
+    for name in names:
+        (folder / name).unlink()
+        reclaimed(f"without {name}")
+        for changed in list(flips(folder / name, own.encode())):
+            (folder / name).write_bytes(changed)
+            reclaimed(f"{name} with another bit")
+    for other in (".b", "b.old", ".b.rescue", "b~", ".b.0123456"):
+        folder.rename(folder.with_name(other))
+        assert other == "b.old" or not store.check().ok
+        reclaimed(f"called {other}")
+    folder.rename(store.home / "branches" / "b~")
+    with pytest.raises(StoreError, match="b~ is no branch"):
+        store.prune()
+    with pytest.raises(StoreError, match="b~ is no branch"):
+        purging.begin(store, add(store, 1))
+    assert store.scenes.get("scene1")
+    (store.home / "branches" / "b~").rename(folder)
+    assert store.check().ok
+    assert store.prune().num_orphans == 0
+
+
 def test_check_of_the_map_reads_what_only_branches_name(store):
     store.branches.make("b")
     with Store.open(at(store, "b")) as branch:
@@ -284,7 +334,7 @@ def test_a_branch_appears_whole_or_not_at_all(store, monkeypatch):
         store.branches.make("b")
     monkeypatch.undo()
     assert list((store.home / "branches").iterdir()) == []
-    leftover = store.home / "branches" / ".b.0123"
+    leftover = store.home / "branches" / ".b.01234567"
     leftover.mkdir()
     (leftover / "map.sqlite").touch()
     assert store.branches.list() == []

@@ -12,7 +12,7 @@ from gsmap.store.backup import clone, restore, save
 from gsmap.store.merging import merge, split
 from gsmap.store.places import FolderPlace
 from gsmap.store.superseding import inherit
-from gsmap.types import ChangeReport, PoseGraph, ScenePose, Sim3
+from gsmap.types import ChangeReport, PoseGraph, SceneGraph, ScenePose, Sim3
 
 CHAIR = np.array([[0.0, 0, 0], [1, 1, 1]])
 TABLE = np.array([[3.0, 0, 0], [4, 2, 1]])
@@ -308,3 +308,19 @@ def test_a_scene_that_supersedes_the_other_of_a_pair_is_not_compared_with_itself
     (kept,) = store.changes.current()
     assert (kept.older, kept.newer, numbers(kept)) == (older, newer, [1])
     assert store.check().ok
+
+
+def test_the_last_comparison_review_and_graph_count_whatever_the_clock_said(store, ids, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr("gsmap.store.catalog.now", lambda: "2190-01-01T00:00:00.000000+00:00")
+        save_comparison(store, *ids, made_change(CHAIR))
+        store.changes.review(1, "confirm")
+        store.graphs.save(SceneGraph(ids[0], notes=("first",)), key("describe", ids[0], version=1))
+    last = save_comparison(store, *ids, made_change(CHAIR), made_change(TABLE), version=2)
+    store.changes.review(1, "reject")
+    store.graphs.save(SceneGraph(ids[0], notes=("second",)), key("describe", ids[0], version=2))
+    (current,) = store.changes.current()
+    assert (current.number, len(current.changes)) == (last.number, 2)
+    assert store.changes.get(1).status == "rejected"
+    assert [one.review for one in store.changes.reviews(1)] == ["confirm", "reject"]
+    assert store.graphs.load(ids[0]).notes == ("second",)

@@ -5,15 +5,16 @@ import shutil
 
 import numpy as np
 import pytest
-from store_samples import key, make_cameras, make_gaussians
+from sqlalchemy import update
+from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 
 from gsmap.errors import CorruptError, InputError
 from gsmap.geometry.morton import morton_order
 from gsmap.geometry.rotations import quats_to_matrices
-from gsmap.store import Store, compact, purging
+from gsmap.store import Store, compact, purging, schema
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.merging import merge
-from gsmap.types import Gaussians, SceneGraph
+from gsmap.types import Gaussians, SceneGraph, Things
 
 
 def sorted_gaussians(n=500, degree=1, seed=0) -> Gaussians:
@@ -152,3 +153,94 @@ def test_a_merge_that_makes_a_scene_whole_brings_its_graph_instead_of_the_compac
     assert store.scenes.get("a").thinning is None
     assert store.graphs.load("a").notes == ("whole",)
     assert store.check().ok
+
+
+# --- rows that the map keeps ------------------------------------------------------------------------------------------
+
+BOX = [[0.0, 0, 0], [1, 1, 1]]
+
+
+def things_of(members) -> Things:
+    z = np.zeros
+    return Things(members, z((2, 3)), z((2, 2, 3)), z((2, 3)), z((0, 3)), z((0, 3)), z(2))
+
+
+def two_captures(store, n=60):
+    """Two scenes of which the first has things, and a change of known rows of both."""
+    ids = [store.scenes.add(make_gaussians(n, seed=i), make_cameras(), name="ab"[i])[0].id for i in range(2)]
+    members = np.arange(n, dtype=np.int32) % 3 - 1
+    store.graphs.save(SceneGraph(ids[0], things=things_of(members)), key("describe", ids[0]))
+    gone = made_change(BOX, before=np.array([3, 8, 40, 59], np.int32), after=np.array([7, 1], np.int32))
+    return ids, members, save_comparison(store, *ids, gone).number
+
+
+def keep_every_third_out(store, scene, n=60):
+    """Thin a scene, its graph of things with it; which rows stay."""
+    stays = np.arange(n) % 3 > 0
+    graph = store.graphs.load(scene)
+    store.scenes.thin(scene, stays)
+    store.graphs.save(graph, key("thin", scene))
+    return stays
+
+
+def rows_at(store, scene, rows):
+    return store.scenes.gaussians(scene).means[rows]
+
+
+def test_rows_of_changes_and_things_are_the_same_gaussians_after_thinning(store):
+    ids, members, number = two_captures(store)
+    before = store.scenes.gaussians(ids[0]).means
+    stays = keep_every_third_out(store, ids[0])
+    (change,) = store.changes.load(number).changes
+    np.testing.assert_allclose(rows_at(store, ids[0], change.before), before[[8, 40, 59]], atol=2e-4)
+    np.testing.assert_array_equal(change.after, [7, 1])
+    np.testing.assert_array_equal(store.graphs.load(ids[0]).things.members, members[stays])
+    store.scenes.add(make_gaussians(60, seed=0), make_cameras(), name="a")
+    (change,) = store.changes.load(number).changes
+    np.testing.assert_array_equal(change.before, [3, 8, 40, 59])
+
+
+def test_a_comparison_of_a_thinned_capture_is_of_the_same_gaussians_when_it_is_whole_again(store):
+    ids, _, _ = two_captures(store)
+    keep_every_third_out(store, ids[0])
+    wanted = np.array([0, 5, 39], np.int32)  # of 40
+    there = rows_at(store, ids[0], wanted)
+    number = save_comparison(store, *ids, made_change(BOX, before=wanted), version=2).number
+    np.testing.assert_array_equal(store.changes.load(number).changes[0].before, wanted)
+    store.scenes.add(make_gaussians(60, seed=0), make_cameras(), name="a")
+    (change,) = store.changes.load(number).changes
+    np.testing.assert_allclose(rows_at(store, ids[0], change.before), there, atol=2e-4)
+
+
+def test_rows_that_were_counted_before_a_thinning_are_mapped_and_others_refused(store):
+    ids, _, _ = two_captures(store)
+    keep_every_third_out(store, ids[0])
+    change = made_change(BOX, before=np.array([3, 8], np.int32))
+    number = save_comparison(store, *ids, change, version=2, counted=(60, 60)).number
+    np.testing.assert_array_equal(store.changes.load(number).changes[0].before, [5])
+    with pytest.raises(InputError):
+        save_comparison(store, *ids, change, version=3, counted=(50, 60))
+
+
+def test_things_of_a_thinned_capture_fit_the_whole_one_that_they_are_merged_into(store, tmp_path):
+    ids, members, number = two_captures(store)
+    with Store.create(tmp_path / "other.gsmap") as other:
+        merge(other, store)
+        keep_every_third_out(store, ids[0])
+        merge(other, store)
+        assert other.scenes.get(ids[0]).thinning is None
+        np.testing.assert_array_equal(other.graphs.load(ids[0], key("thin", ids[0])).things.members, members)
+        np.testing.assert_array_equal(other.changes.load(number).changes[0].before, [3, 8, 40, 59])
+
+
+def test_rows_of_a_capture_that_an_older_gsmap_thinned_are_not_guessed(store):
+    ids, members, number = two_captures(store)
+    stays = keep_every_third_out(store, ids[0])
+    with store.catalog.write() as connection:
+        about = {"at": "2026-01-01T00:00:00+00:00", "num_gaussians": 60, "up": None}
+        connection.execute(update(schema.scenes).where(schema.scenes.c.id == ids[0]).values(thinned=about))
+    (change,) = store.changes.load(number).changes
+    assert (len(change.before), len(change.after)) == (0, 2)
+    assert store.graphs.load(ids[0]).things is None
+    store.graphs.save(SceneGraph(ids[0], things=things_of(members[stays])), key("older", ids[0]))
+    np.testing.assert_array_equal(store.graphs.load(ids[0], key("older", ids[0])).things.members, members[stays])

@@ -484,3 +484,19 @@ def test_damaged_arrays_cannot_come_from_a_branch_of_the_same_map(store):
     damage(store, "scenes", a)
     with Store.open(f"{store.home}@b", "r") as branch, pytest.raises(CorruptError, match="the very same"):
         bring_scene(store, branch, a)
+
+
+def test_what_was_said_last_of_a_scene_counts_after_a_merge_though_a_clock_was_ahead(store, tmp_path, monkeypatch):
+    scene, _ = store.scenes.add(make_gaussians(20), make_cameras(), name="zero")
+    with monkeypatch.context() as patched:
+        patched.setattr("gsmap.store.facts.now", lambda: "2190-01-01T00:00:00.000000+00:00")
+        store.scenes.edit("zero", name="first")
+    with Store.create(tmp_path / "other.gsmap") as other:
+        merge(other, store)
+        store.scenes.edit("first", name="second", note="here")
+        merge(other, store)
+        assert other.scenes.get(scene.id).name == "second"
+        other.scenes.edit("second", name="third")
+        merge(store, other)
+    assert store.scenes.get(scene.id).name == "third"
+    assert [fact.value for fact in store.scenes.facts("third")] == ["zero", "first", "second", "here", "third"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from sqlalchemy import func, insert, select, update
-from store_samples import keep_objects, make_cameras, make_gaussians
+from store_samples import computed, keep_objects, make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.store import Store, merging, purging, schema, superseding
@@ -53,6 +53,22 @@ def test_two_that_become_one_and_part_again_have_their_numbers(store, scenes):
     assert keep_objects(store, {may: A}, {june: B}) == ["o1", "o2"]
     assert keep_objects(store, {may: A, june: B}) == ["o1"]
     assert keep_objects(store, {june: B}, {may: A}) == ["o2", "o1"]
+
+
+def test_numbers_are_unique_in_a_map_when_a_component_comes_apart(store):
+    a, b, c = (store.scenes.add(make_gaussians(9, i), make_cameras(), name=f"{i}")[0].id for i in range(3))
+    assert keep_objects(store, {a: A, b: A, c: A}, {a: B, b: B}) == ["o1", "o2"]
+    apart = computed({c: A}), computed({a: A, b: A}, {a: B, b: B})
+    assert [[thing.id for thing in made.objects] for made in store.objects.save(apart)] == [["o3"], ["o1", "o2"]]
+    shown = {1: [a, b], 2: [a, b], 3: [c]}
+    assert store.objects.parted(shown) == {3: 1}
+    # Each part is made again by itself, from boxes that differ a little: numbers stay.
+    for shift in (0.02, -0.01, 0.03):
+        assert keep_objects(store, {c: np.array(A) + shift}, seed=str(shift)) == ["o3"]
+        assert keep_objects(store, {a: np.array(A) + shift, b: A}, {a: B, b: B}, seed=str(shift)) == ["o1", "o2"]
+    assert store.objects.numbers([{c: A}, {a: A, b: A}, {a: B, b: B}]) == [3, 1, 2]
+    assert keep_objects(store, {a: A, b: A, c: np.array(A) + 0.03}, {a: B, b: B}) == ["o1", "o2"], "one again"
+    assert store.objects.parted({1: [a, b, c], 2: [a, b, c]}) == {}
 
 
 def test_words_are_kept_with_their_history(store, scenes):
@@ -178,3 +194,21 @@ def test_kinds_of_facts_are_checked(store, scenes):
     row = {"object": 1, "kind": "owner", "value": "x", "author": "", "created_at": "x"}
     with pytest.raises(InputError, match=r"object_facts\.kind"), store.catalog.write() as connection:
         connection.execute(insert(schema.object_facts), row)
+
+
+# --- clocks -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_word_counts_that_was_said_last_whatever_the_clock_said(store, scenes, tmp_path, monkeypatch):
+    keep_objects(store, {scenes[0]: A})
+    with monkeypatch.context() as patched:
+        patched.setattr("gsmap.store.objects.now", lambda: "2190-01-01T00:00:00.000000+00:00")
+        store.objects.edit(1, name="first")
+    store.objects.edit(1, name="second")
+    with Store.create(tmp_path / "other.gsmap") as other:
+        merging.merge(other, store)
+        other.objects.edit(1, label="seat")
+        merging.merge(store, other)
+        for one in (store, other):
+            assert (one.objects.words()["o1"].name, one.objects.words()["o1"].label) == ("second", "seat")
+            assert [fact.value for fact in one.objects.facts()["o1"]] == ["first", "second", "seat"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -101,17 +101,17 @@ def pose_change_rows(store: Store, before: int, after: int, settings: Settings) 
 
 @dataclass(frozen=True)
 class Mark:
-    """How far a map's history had come: its newest revision, registration (0 before the first) and graph (its time)."""
+    """How far a map's history had come: its newest revision and registration (0 before the first), and its graphs."""
 
     revision: int
     registration: int
-    graph: str
+    graphs: Collection[str]
 
 
 @of_one_state
 def mark(store: Store) -> Mark:
     """How far its history has come."""
-    return Mark(store.revisions.current() or 0, store.registrations.newest(), store.graphs.newest())
+    return Mark(store.revisions.current() or 0, store.registrations.newest(), store.graphs.groups().keys())
 
 
 @of_one_state
@@ -124,7 +124,8 @@ def update_report(
         metres: tells those of every component of the newest poses.
     """
     scenes, pairs = store.revisions.changed_after(since.revision)
-    scenes |= store.graphs.scenes_after(since.graph) | {row.scene for row in ingested if row.new or row.dated}
+    scenes |= {scene for group, scene in store.graphs.groups().items() if group not in since.graphs}
+    scenes |= {row.scene for row in ingested if row.new or row.dated}
     pairs |= store.registrations.pairs_after(since.registration)
     newest = store.revisions.current()
     return UpdateReport(

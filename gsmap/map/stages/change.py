@@ -111,7 +111,7 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
     results = shared.results(lambda arguments: run_jobs(compare_scenes, arguments, settings.engine))
     kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are compared and kept")
     with kept, closing(results):
-        for key, report in results:
+        for key, (report, counted) in results:
             older, newer = (asked.visits[scene] for scene in keys[key])
             found = store.changes.save(
                 report,
@@ -120,6 +120,7 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
                 newer=newer.scene,
                 S_newer_older=newer.S_map_scene.inverse() @ older.S_map_scene,
                 S_frame_newer=newer.S_map_scene,
+                counted=counted,
             )
             shared.saved(key, f"{names[older.scene]}-{names[newer.scene]}: {len(found.changes)} changes")
     return len(jobs)

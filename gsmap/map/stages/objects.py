@@ -65,7 +65,7 @@ def objects_of_components(
         if scene.id in (described if graphs is None else graphs):
             mine.setdefault(placed.poses[scene.id].component, []).append(scene)
     sets = store.objects.sets() if graphs is None else []
-    parts = []
+    parts, given = [], set[str]()
     for i, component in enumerate(sorted(mine)):
 
         def told(fraction: float, text: str, part: int = i) -> None:
@@ -75,9 +75,12 @@ def objects_of_components(
         key = _key(store, settings, mine[component], described, unit) if graphs is None else None
         poses = {scene.id: placed.poses[scene.id].S_map_scene for scene in mine[component]}
         kept = None if key is None else next((one for one in sets if one.key == key.digest), None)
+        if kept is not None and given & {thing.id for thing in kept.objects}:
+            kept = None  # an older gsmap gave numbers twice
         still = {} if kept is None else _unmoved(kept.poses, poses, scenes, unit, settings)
         if kept is not None and still.keys() == poses.keys():
             parts.append(Part(component, kept, None, None))
+            given |= {thing.id for thing in kept.objects}
         elif not make:
             raise NotFoundError("the objects of the map are out of date: gsmap graph MAP makes them")
         else:
@@ -92,11 +95,17 @@ def objects_of_components(
             f"nobody knows the things of {few(without)}: gsmap describe MAP SCENE tells them, where describe.things "
             "is on"
         )
-    thinned = [scene.name for scene in scenes.values() if scene.thinning is not None]
+    thinned = {scene.name: scene.thinning for scene in scenes.values() if scene.thinning is not None}
     if thinned:
         notes.append(
-            f"{few(thinned)} {'is' if len(thinned) == 1 else 'are'} thinned: the things they showed are told, and what "
-            "they were found to show of others before; they are asked no more"
+            f"{few(list(thinned))} {'is' if len(thinned) == 1 else 'are'} thinned: the things they showed are told, "
+            "and what they were found to show of others before; they are asked no more"
+        )
+    unmapped = [name for name, thinning in thinned.items() if not thinning.has_row_map]
+    if unmapped:
+        notes.append(
+            f"changes do not tell which things of {few(unmapped)} changed: an older gsmap thinned "
+            f"{'it' if len(unmapped) == 1 else 'them'} without a row map; ingest the capture again"
         )
     undated = [scene.name for scene in scenes.values() if scene.captured_at is None]
     if undated and len(scenes) > 1:
@@ -116,7 +125,11 @@ def _key(
         for one in store.changes.current()
         if one.changes and {one.older, one.newer} <= ids
     ]
-    seen = [f"{scene.id} {described[scene.id]}" for scene in captures]
+    unmapped = [scene.thinning is not None and not scene.thinning.has_row_map for scene in captures]
+    seen = [
+        f"{scene.id} {described[scene.id]}{' without row map' if lacks else ''}"
+        for scene, lacks in zip(captures, unmapped, strict=True)
+    ]
     return recipe_key(settings.objects).of(*seen, f"metres {unit!r}", *told)
 
 

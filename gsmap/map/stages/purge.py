@@ -28,7 +28,7 @@ from gsmap.export.write import leftovers
 from gsmap.map.pictures import FILE_NAME as PICTURES
 from gsmap.map.pictures import Pictures
 from gsmap.map.viewing import cache_folder
-from gsmap.map.viewing_site import SITE, site_owner
+from gsmap.map.viewing_site import SITE, remove_site, site_files, site_owner
 from gsmap.report import owner_of
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
@@ -106,8 +106,8 @@ def _finish(store: Store, begun: Purge) -> Purge:
                 begun = purging.note(store, begun, str(out), 1)
             elif os.path.lexists(out / SITE):
                 if site_owner(out) == store.id:  # it shows all scenes; gsmap view --export makes it anew
-                    begun = purging.note(store, begun, str(out), len(files_below(out)))
-                    remove_tree(out.parent, out.name)
+                    begun = purging.note(store, begun, str(out), len(site_files(out)) + 1)
+                    remove_site(out)
             elif os.path.lexists(out / PICTURES):
                 if gone := Pictures.load(out, store.id).forget(out, begun.scene):
                     begun = purging.note(store, begun, str(out), gone)

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
-import numpy as np
-
 from gsmap.compare import Looks
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.metres import in_metres
@@ -90,8 +88,9 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
             if not request.dry_run:
                 up = next((g.up for g in reversed(store.graphs.list()) if g.scene == scene.id), None)
                 described = store.graphs.load(scene.id)
-                store.scenes.thin(scene.id, stays, up=up)
-                _keep_things(store, described, stays)
+                with store.transaction():
+                    store.scenes.thin(scene.id, stays, up=up)
+                    _keep_things(store, described)
                 after = _num_bytes(store, scene.id)
             rows.append(_row(scene, sizes[scene.id], after, share, "", fidelity))
             sizes[scene.id] = after
@@ -111,13 +110,11 @@ THINGS = RecipeKey("thin", "things", {"things": 1})
 """Recipe of the graph of a thinned capture: the things that it showed when it was whole, and no layer."""
 
 
-def _keep_things(store: Store, graph: SceneGraph | None, stays: np.ndarray) -> None:
-    """Let a thinned capture still tell what stood there: its Gaussians are others now, its things are not."""
+def _keep_things(store: Store, graph: SceneGraph | None) -> None:
+    """Keep the things of a thinned capture, of which the graph that it was described by is dropped."""
     if graph is None or graph.things is None:
         return
-    things = replace(graph.things, members=graph.things.members[stays])
-    known = SceneGraph(graph.scene_id, {}, graph.up, graph.unit_m, graph.notes, things, graph.working_m)
-    store.graphs.save(known, THINGS.of(graph.scene_id))
+    store.graphs.save(replace(graph, layers={}), THINGS.of(graph.scene_id))
 
 
 def _superseded(

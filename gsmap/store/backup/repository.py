@@ -16,11 +16,13 @@ import os
 import re
 from collections.abc import Generator, Mapping
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.states import check_path, checked
+from gsmap.store.catalog import after
 from gsmap.store.places import Place, place_of
 from gsmap.version import __version__
 
@@ -29,6 +31,7 @@ MARKER = "gsmap-backup.json"
 OBJECTS = "objects/"
 SNAPSHOTS = "snapshots/"
 _NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-[0-9a-f]{16}")
+_TIME = "%Y%m%dT%H%M%S.%f"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _LINE = re.compile(r"([0-9a-f]{64}) (\d{1,18}) (.+)")
 _MAX_TEXT_BYTES = 1 << 30  # of a list of files: ten million of them
@@ -131,6 +134,28 @@ class Backup:
         """Names of the snapshots, oldest first."""
         listed = [name[len(SNAPSHOTS) :].removesuffix(".json") for name in self.place.list(SNAPSHOTS)]
         return sorted(name for name in listed if _NAME.fullmatch(name))
+
+    def time_of_next(self, now: str) -> str:
+        """The time of the next snapshot: ``now``, or the first after the newest one where the clock was wrong once.
+
+        So the order of names is the order in which snapshots were taken, whatever clocks said.
+
+        Args:
+            now: ISO 8601, UTC.
+
+        Raises:
+            StoreError: there is no time after the newest one.
+        """
+        names = self.names()
+        newest = names[-1].split("Z-")[0] if names else ""
+        if newest < _compact(now):
+            return now
+        try:
+            return after(datetime.strptime(newest, _TIME).replace(tzinfo=UTC))
+        except (ValueError, OverflowError) as error:
+            raise StoreError(
+                f"snapshot {names[-1]} of {self.place.url} has a time that nothing comes after: delete its file"
+            ) from error
 
     def snapshot(self, name: str) -> Snapshot:
         """One snapshot by its whole name.

@@ -79,7 +79,7 @@ def save(
         found = run.verify() if verify else None
         snapshot = run.save()
         problems = run.unmended(found) if found is not None else ()
-    notes = run.note(snapshot)
+    notes = (*run.notes, *run.note(snapshot))
     saved = Saved(
         place.url,
         snapshot,
@@ -90,14 +90,17 @@ def save(
     )
     if keep is None:
         return saved
-    deleted, freed, said = sweep(backup, keep)
+    deleted, freed, said = sweep(backup, keep, made=snapshot.name)
     return replace(saved, deleted=deleted, num_bytes_freed=freed, notes=(*notes, *said))
 
 
-def sweep(backup: Backup, keep: int) -> tuple[tuple[str, ...], int, tuple[str, ...]]:
+def sweep(backup: Backup, keep: int, *, made: str = "") -> tuple[tuple[str, ...], int, tuple[str, ...]]:
     """Delete all but the newest snapshots, then the objects that no remaining one names.
 
     Nothing is deleted while anybody else is at work there: a backup relies on objects that no snapshot names yet.
+
+    Args:
+        made: name of the snapshot that was just taken, which stays in any case.
 
     Returns:
         Names of the snapshots that went, the bytes of objects that went, and remarks.
@@ -110,7 +113,8 @@ def sweep(backup: Backup, keep: int) -> tuple[tuple[str, ...], int, tuple[str, .
         if lease.others():
             return (), 0, (f"others are at work in {place.url}: old snapshots go with the next --keep",)
         names = backup.names()
-        doomed, kept = names[:-keep], names[-keep:]
+        kept = [*names[-keep:], *(name for name in names[:-keep] if name == made)]
+        doomed = [name for name in names if name not in kept]
         needed = set()
         for name in kept:
             snapshot = backup.snapshot(name)
@@ -147,6 +151,7 @@ class _Run:
         self.lease = lease
         self.progress = progress
         self.num_sent = 0
+        self.notes: list[str] = []
         self._bytes_sent = 0
         self._counting = threading.Lock()
         self._bad: set[str] = set()  # objects that are there and damaged
@@ -264,10 +269,16 @@ class _Run:
             # A listing may lag behind; asking for each object alone is a request for each.
             if not listed_so and self.backup.place.size_bytes(name) != file.size_bytes:
                 raise StoreError(f"{self.backup.place.url} lost {name}: run it again")
+        created_at = self.backup.time_of_next(state.created_at)
+        if created_at != state.created_at:
+            self.notes.append(
+                f"the newest snapshot there is from {created_at}, later than this clock: one of the clocks was wrong; "
+                "this snapshot is dated right after it"
+            )
         snapshot = Snapshot(
             name="",
             map_id=state.map_id,
-            created_at=state.created_at,
+            created_at=created_at,
             schema=state.schema,
             gsmap_version=__version__,
             files=own.sha256,

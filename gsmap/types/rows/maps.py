@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from gsmap.types.rows.base import Row
 from gsmap.types.rows.exports import TileRow
@@ -12,6 +12,25 @@ from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.pairs import EdgeRow
 from gsmap.types.rows.scenes import SceneRow
 from gsmap.types.rows.truth import EvaluationReport
+
+TodoKind = Literal[
+    "undescribed",
+    "stale_graphs",
+    "unregistered",
+    "stale_edges",
+    "unsolved",
+    "stale_poses",
+    "dirty_tiles",
+    "tentative",
+    "undecided",
+    "changes",
+    "contradicted_priors",
+    "world_outliers",
+    "untied",
+    "duplicates",
+    "isolated",
+    "set_aside",
+]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,7 +53,7 @@ class TodoRow(Row):
 
     columns: ClassVar[Mapping[str, str]] = {"count": "count", "meaning": "what", "verb": "helps"}
 
-    what: str
+    what: TodoKind
     count: int
     verb: str
     meaning: str

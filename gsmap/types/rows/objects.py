@@ -22,6 +22,7 @@ class ObjectRow(Row):
         label: what kind of thing they say it is.
         note: the last one on it.
         room: id of the room that it stands in; null where that is not known.
+        split_from: id of the object that it was one with until their component came apart; else null.
         component: of the map, whose frame everything is in.
         position: mean of its Gaussians, where it was last seen as a thing of its own.
         size: of the box around it where it was last seen, along the map's axes.
@@ -65,6 +66,7 @@ class ObjectRow(Row):
     label: str | None = None
     note: str | None = None
     room: str | None = None
+    split_from: str | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
