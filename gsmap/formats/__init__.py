@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.formats.precision import about_origin, about_zero
 from gsmap.methods import family
 from gsmap.types import Cameras, FileInfo, Gaussians, GaussianSource
 
@@ -38,16 +39,18 @@ def suffix_of(path: str | os.PathLike[str]) -> str | None:
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read the Gaussians of a file of any known format.
 
+    Positions that float32 cannot hold, such as map coordinates, are about an origin (`Gaussians.origin`).
+
     Raises:
         NotFoundError: no such file.
-        InputError: unknown suffix, or a file that is not what its suffix says; values are checked by `gsmap.ingest`.
+        InputError: unknown suffix, a file that is not what its suffix says, or positions that its single precision has
+            rounded together; values are checked by `gsmap.ingest`.
     """
     path = Path(path)
     suffix = _suffix(path, "read")
     # NaN and overflow in a damaged file are for `gsmap.ingest` to name, not for numpy to warn of.
     with _explained(path, "read"), np.errstate(all="ignore"):
-        found: Gaussians = _load(_layout(path, suffix)).read(path)
-        return found
+        return about_origin(path, _load(_layout(path, suffix)).read(path)).load()
 
 
 def stream(path: str | os.PathLike[str]) -> GaussianSource:
@@ -61,7 +64,7 @@ def stream(path: str | os.PathLike[str]) -> GaussianSource:
     if not hasattr(module, "stream"):
         return read(path)
     with _explained(path, "read"), np.errstate(all="ignore"):
-        return _FileSource(path, module.stream(path))
+        return about_origin(path, _FileSource(path, module.stream(path)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +119,8 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
 
     Raises:
         NotFoundError: the folder does not exist; that of a ``tileset.json`` and its like is made.
-        InputError: unknown suffix, a format that is only read, or a path that cannot be written.
+        InputError: unknown suffix, a format that is only read, a path that cannot be written, or positions about an
+            origin in a format that holds no distances between neighbours there.
     """
     path = Path(path)
     suffix = _suffix(path, "write")
@@ -127,7 +131,10 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
     staged = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")  # a name that nobody can have put a link at
     try:
         with _explained(path, "write"):
-            module.write(staged, gaussians if hasattr(module, "stream") else gaussians.load(), **options)
+            content = gaussians if hasattr(module, "stream") else gaussians.load()
+            if isinstance(content, Gaussians) and not getattr(module, "HOLDS_ORIGIN", False):
+                content = about_zero(path, content, getattr(module, "position_step", None))
+            module.write(staged, content, **options)
             os.replace(staged, path)
     finally:
         with contextlib.suppress(OSError):
