@@ -29,12 +29,16 @@ def command(
     import numpy as np
 
     from gsmap import formats
+    from gsmap.formats.precision import rounded_to
     from gsmap.types.rows import ConvertReport
 
     gaussians = formats.read(source)
     offset = gaussians.origin if local else np.zeros(3)
     formats.write(target, replace(gaussians, origin=np.zeros(3)) if local else gaussians)
     say(f"wrote {len(gaussians)} Gaussians to {target}")
+    step = rounded_to(gaussians) if gaussians.origin.any() else 0.0
+    if step:
+        say(f"{source} has its positions in single precision, which rounds them to {step:g} there")
     if offset.any():
         say(f"its positions are those of {source} less {' '.join(f'{value:.15g}' for value in offset)}")
     if json:

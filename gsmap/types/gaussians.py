@@ -114,13 +114,13 @@ class Gaussians:
         """The Gaussians at a boolean mask, integer array or slice."""
         arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh)
         if not isinstance(index, np.ndarray):
-            return Gaussians(*(array[index] for array in arrays), origin=self.origin)
+            return Gaussians(*(array[index] for array in arrays), self.origin)
         if index.dtype == bool:
             if index.shape != (len(self),):
                 raise IndexError(f"a mask of shape {index.shape} for {len(self)} Gaussians")
             index = np.flatnonzero(index)
         taken = (array.take(index, axis=0) for array in arrays)  # five times as fast as by brackets
-        return Gaussians(*taken, origin=self.origin)
+        return Gaussians(*taken, self.origin)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:

@@ -29,7 +29,7 @@ def test_map_coordinates_are_held_to_a_millimetre(place: str, extent: float) -> 
 
 @pytest.mark.parametrize(("at", "extent"), [(0.0, 5.0), (300.0, 5.0), (8000.0, 0.1), (5e5, 6e4), (0.0, 1e7)])
 def test_positions_that_float32_holds_stay_as_they_are(at: float, extent: float) -> None:
-    assert not origin_of(cloud(1000, extent) + [at, 0, -at / 2]).any()
+    assert not origin_of(cloud(1000, extent) + np.array([at, 0, -at / 2])).any()
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -102,6 +102,7 @@ def row_of_scene(
         metres_per_unit=metre.metres_per_unit if metre and metre.is_known else None,
         metric=None if at is None else at[0],
         world=None if at is None else at[1],
+        offset=scene.origin,
     )
 
 
@@ -126,6 +127,7 @@ def pose_rows(store: Store, crs: str | None = None) -> list[PoseRow]:
             world=found[scene.id][1] if scene.id in found else None,
             crs=named if scene.id in found else None,
             covariance=poses[scene.id].covariance,
+            offset=scene.origin,
         )
         for scene in store.scenes.list()
         if scene.id in poses

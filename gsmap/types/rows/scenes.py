@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -49,6 +49,8 @@ class SceneRow(Row):
         metric: (3,) where its origin lies, metres east, north, up of the world frame; null where the map is not tied to
             the world (``gsmap georeference``).
         world: (3,) the same in the map's CRS; null as above.
+        offset: (3,) what was taken off the coordinates of its file, where these are too large for single precision, as
+            map coordinates are: a point of the scene's frame plus this is the file's own; else zeros.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -79,6 +81,7 @@ class SceneRow(Row):
     metres_per_unit: float | None = None
     metric: np.ndarray | None = None
     world: np.ndarray | None = None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def in_world(self) -> str | None:
@@ -365,6 +368,7 @@ class PoseRow(Row):
         crs: of that; null as above.
         covariance: (7, 7) over [rotation (3, rad), translation (3), log scale] on the scene side; null where it is not
             known.
+        offset: (3,) as in `SceneRow`: ``S_map_scene`` maps coordinates of the scene's file less this.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -385,6 +389,7 @@ class PoseRow(Row):
     covariance: np.ndarray | None = None
     world: np.ndarray | None = None
     crs: str | None = None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def position(self) -> np.ndarray:
