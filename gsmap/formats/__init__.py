@@ -22,6 +22,7 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats.precision import about_origin, about_zero
 from gsmap.methods import family
 from gsmap.types import Cameras, FileInfo, Gaussians, GaussianSource
+from gsmap.types.source import origin_of_source
 
 _Part = TypeVar("_Part")
 
@@ -132,8 +133,8 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
     try:
         with _explained(path, "write"):
             content = gaussians if hasattr(module, "stream") else gaussians.load()
-            if isinstance(content, Gaussians) and not getattr(module, "HOLDS_ORIGIN", False):
-                content = about_zero(path, content, getattr(module, "position_step", None))
+            if not getattr(module, "HOLDS_ORIGIN", False) and origin_of_source(content).any():
+                content = about_zero(path, content.load(), getattr(module, "position_step", None))
             module.write(staged, content, **options)
             os.replace(staged, path)
     finally:

@@ -57,7 +57,7 @@ def rounded_to(source: GaussianSource) -> float:
 def about_zero(
     path: str | os.PathLike[str], gaussians: Gaussians, step_of: Callable[[np.ndarray], float] | None = None
 ) -> Gaussians:
-    """Gaussians with their origin added to their positions, for a format that holds single precision at most.
+    """Gaussians about an origin with it added to their positions, for a format that holds single precision at most.
 
     Args:
         step_of: the step in which the format holds positions (N, 3); None for single precision.
@@ -65,8 +65,6 @@ def about_zero(
     Raises:
         InputError: the format does not hold the distances between neighbours there.
     """
-    if not gaussians.origin.any():
-        return gaussians
     positions = gaussians.positions
     step = (step_of or float32_step)(positions)
     is_exact = is_single(positions) if step_of is None else not np.remainder(positions, step).any()

@@ -112,15 +112,14 @@ class Gaussians:
 
     def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
         """The Gaussians at a boolean mask, integer array or slice."""
-        arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh)
         if not isinstance(index, np.ndarray):
-            return Gaussians(*(array[index] for array in arrays), self.origin)
+            return replace(self, **{name: getattr(self, name)[index] for name in FIELDS})
         if index.dtype == bool:
             if index.shape != (len(self),):
                 raise IndexError(f"a mask of shape {index.shape} for {len(self)} Gaussians")
             index = np.flatnonzero(index)
-        taken = (array.take(index, axis=0) for array in arrays)  # five times as fast as by brackets
-        return Gaussians(*taken, self.origin)
+        # Five times as fast as by brackets.
+        return replace(self, **{name: getattr(self, name).take(index, axis=0) for name in FIELDS})
 
     @classmethod
     def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:

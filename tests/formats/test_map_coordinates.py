@@ -69,6 +69,15 @@ def test_doubles_are_read_as_they_are(place: str, text: bool, tmp_path: Path) ->
     np.testing.assert_array_equal(np.concatenate(list(streamed.columns("means"))), back.means)
 
 
+def test_a_checkpoint_of_doubles(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    g, truth = at("ECEF")
+    own = {"quats": g.quats, "scales": g.log_scales, "opacities": g.logit_opacities, "sh0": g.sh[:, :1]}
+    tensors = {name: torch.from_numpy(np.array(values)) for name, values in own.items()}
+    torch.save({"splats": tensors | {"means": torch.from_numpy(truth)}}, tmp_path / "a.pt")
+    assert np.abs(formats.read(tmp_path / "a.pt").positions - truth).max() < 5e-6
+
+
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("name", HOLDING)
 def test_formats_that_hold_them(place: str, name: str, tmp_path: Path) -> None:
