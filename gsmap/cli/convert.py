@@ -12,18 +12,41 @@ from gsmap.cli.console import AsJson, print_rows, say
 def command(
     source: Annotated[str, typer.Argument(metavar="IN", help="A file of Gaussians.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="The file to write; its suffix names the format.")],
+    local: Annotated[
+        bool,
+        typer.Option(
+            "--local", help="Write map coordinates less an offset, which is printed, for formats of single precision."
+        ),
+    ] = False,
     json: AsJson = False,
 ) -> None:
     """Convert a file of Gaussians to another format.
 
     Example: `gsmap convert scan.ply scan.spz`
     """
+    from dataclasses import replace
+
+    import numpy as np
+
     from gsmap import formats
+    from gsmap.formats.precision import rounded_to
     from gsmap.types.rows import ConvertReport
 
     gaussians = formats.read(source)
-    formats.write(target, gaussians)
+    offset = gaussians.origin if local else np.zeros(3)
+    formats.write(target, replace(gaussians, origin=np.zeros(3)) if local else gaussians)
     say(f"wrote {len(gaussians)} Gaussians to {target}")
+    step = rounded_to(gaussians) if gaussians.origin.any() else 0.0
+    if step:
+        say(f"{source} has its positions in single precision, which rounds them to {step:g} there")
+    if offset.any():
+        say(f"its positions are those of {source} less {' '.join(f'{value:.15g}' for value in offset)}")
     if json:
-        report = ConvertReport(input=source, output=target, num_gaussians=len(gaussians), sh_degree=gaussians.sh_degree)
+        report = ConvertReport(
+            input=source,
+            output=target,
+            num_gaussians=len(gaussians),
+            sh_degree=gaussians.sh_degree,
+            offset=offset,
+        )
         print_rows("convert", report, json)

@@ -42,6 +42,7 @@ class Manifest:
         doomed: paths of files that are no longer a tile's and are still to be deleted.
         metres: how long a metre is in the frame of each component, as the tiles were made.
         world: where each component that is tied to the world lies in it, as JSON has it (docs/world.md).
+        offsets: what was taken off the coordinates of each scene's file, of scenes in map coordinates.
     """
 
     map_id: str
@@ -51,6 +52,7 @@ class Manifest:
     doomed: set[str] = field(default_factory=set)
     metres: dict[int, Metre] = field(default_factory=dict)
     world: dict[int, dict[str, Any]] = field(default_factory=dict)
+    offsets: dict[str, list[float]] = field(default_factory=dict)
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
     _save_took_s: float = field(default=0.0, repr=False)
 
@@ -82,6 +84,7 @@ class Manifest:
             doomed = {_checked_path(p) for p in content.get("doomed", ())}
             metres = {int(c["component"]): _metre(c) for c in content.get("components", ())}
             world = {int(c["component"]): dict(c["world"]) for c in content.get("components", ()) if c.get("world")}
+            offsets = {str(scene): [float(v) for v in at] for scene, at in content.get("offsets", {}).items()}
         except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
@@ -101,6 +104,7 @@ class Manifest:
             doomed,
             metres,
             world,
+            offsets,
         )
 
     def metres_per_unit(self, component: int) -> float:
@@ -131,6 +135,8 @@ class Manifest:
         content = {"version": _VERSION, "map_id": self.map_id, "tiles": entries}
         if self.metres:
             content["components"] = [_component(c, self.metres[c], self.world.get(c)) for c in sorted(self.metres)]
+        if self.offsets:
+            content["offsets"] = dict(sorted(self.offsets.items()))
         if self.doomed:
             content["doomed"] = sorted(self.doomed)
         began = time.process_time()

@@ -11,7 +11,10 @@ import numpy as np
 from gsmap.errors import ConfigError, InputError
 from gsmap.export import levels
 from gsmap.export.cells import Boxes, CellSet, Grid
+from gsmap.geometry.origins import float32_step, origin_of
 from gsmap.types import Sim3
+
+_MAX_ROUNDED_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,8 @@ def plan_tiles(
 
     Raises:
         ConfigError: a negative tile size, or one so small that there would be too many tiles.
-        InputError: no scenes, an empty box, or a box that no scene touches.
+        InputError: no scenes, an empty box, a box that no scene touches, or a component so far from zero that single
+            precision does not hold a millimetre there.
     """
     if not (np.isfinite(tile_size_m) and tile_size_m >= 0):
         raise ConfigError(f"tile size must be a positive number of metres, or 0 for one file, got {tile_size_m}")
@@ -94,6 +98,7 @@ def plan_tiles(
         members = [scene for scene in sorted(poses) if components[scene] == component]
         boxes = Boxes.of([poses[scene] for scene in members], [scene_bounds[scene] for scene in members])
         metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
+        _require_near(component, boxes.around, metres)
         reach = reach_m / metres
         for cell, bounds, reaching in (
             _in_cells(boxes, Grid(tile_size_m / metres, bbox, max_tiles), reach)
@@ -110,6 +115,18 @@ def plan_tiles(
             f"the box {_text(bbox)} lies outside the map, which spans {_text(whole)}: choose a box that touches it"
         )
     return tiles
+
+
+def _require_near(component: int, box: np.ndarray, metres_per_unit: float) -> None:
+    """Refuse a component that priors have put at map coordinates: its Gaussians would be rounded."""
+    offset = origin_of(box)
+    rounded_m = float32_step(box) / 2 * metres_per_unit
+    if offset.any() and rounded_m > _MAX_ROUNDED_M:
+        at = ", ".join(f"{value:.15g}" for value in offset)
+        raise InputError(
+            f"component {component} lies near ({at}), where single precision rounds by {rounded_m:.2g} m: take ({at}) "
+            "off the positions of its priors (gsmap prior), or tie it to the world instead (gsmap georeference)"
+        )
 
 
 _Tiles = Iterator[tuple[tuple[int, ...] | None, np.ndarray, list[int]]]

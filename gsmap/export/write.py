@@ -101,6 +101,7 @@ def export_tiles(
     recipe: TileRecipe,
     metres: Mapping[int, Metre] | None = None,
     world: Mapping[int, dict[str, Any]] | None = None,
+    offsets: Mapping[str, list[float]] | None = None,
     params: Params | None = None,
     run: Run = run_here,
     made: Callable[[Tile], None] | None = None,
@@ -121,6 +122,7 @@ def export_tiles(
         recipe: how tiles are made and written; where it differs from a tile's, that tile is made again.
         metres: how long a metre is in each component's frame, to be told in the manifest.
         world: where components lie in the world, to be told there, too.
+        offsets: what was taken off the coordinates of scenes' files, to be told there, too.
         params: from which movement on a tile is made again.
         run: makes tiles, here or elsewhere (`gsmap.engine.run_jobs`).
         made: told each new tile once its file is in place; called from the calling thread.
@@ -141,9 +143,9 @@ def export_tiles(
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
     reused = len(plan) - len(todo)
-    told = dict(metres or {}), dict(world or {})
-    retold = (manifest.metres, manifest.world) != told
-    manifest.metres, manifest.world = told
+    told = dict(metres or {}), dict(world or {}), dict(offsets or {})
+    retold = (manifest.metres, manifest.world, manifest.offsets) != told
+    manifest.metres, manifest.world, manifest.offsets = told
     report = _Report(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     aside: list[tuple[PlannedTile, str]] = []

@@ -19,9 +19,11 @@ import numpy as np
 
 from gsmap.durable import is_stream, write_output
 from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.formats.precision import about_origin, about_zero
 from gsmap.methods import family
 from gsmap.stream import clamped, clamped_column
 from gsmap.types import Cameras, FileInfo, Gaussians, GaussianSource
+from gsmap.types.source import origin_of_source
 
 _Part = TypeVar("_Part")
 
@@ -39,15 +41,18 @@ def suffix_of(path: str | os.PathLike[str]) -> str | None:
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read the Gaussians of a file of any known format; infinities that are values are clamped (`gsmap.stream`).
 
+    Positions that float32 cannot hold, such as map coordinates, are about an origin (`Gaussians.origin`).
+
     Raises:
         NotFoundError: no such file.
-        InputError: unknown suffix, or a file that is not what its suffix says; values are checked by `gsmap.ingest`.
+        InputError: unknown suffix, a file that is not what its suffix says, or positions that its single precision has
+            rounded together; values are checked by `gsmap.ingest`.
     """
     path = Path(path)
     suffix = _suffix(path, "read")
     # NaN and overflow in a damaged file are for `gsmap.ingest` to name, not for numpy to warn of.
     with _explained(path, "read"), np.errstate(all="ignore"):
-        return clamped(_load(_layout(path, suffix)).read(path))
+        return about_origin(path, clamped(_load(_layout(path, suffix)).read(path))).load()
 
 
 def stream(path: str | os.PathLike[str]) -> GaussianSource:
@@ -61,7 +66,7 @@ def stream(path: str | os.PathLike[str]) -> GaussianSource:
     if not hasattr(module, "stream"):
         return read(path)
     with _explained(path, "read"), np.errstate(all="ignore"):
-        return _FileSource(path, module.stream(path))
+        return about_origin(path, _FileSource(path, module.stream(path)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +125,8 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
 
     Raises:
         NotFoundError: the folder does not exist; that of a ``tileset.json`` and its like is made.
-        InputError: unknown suffix, a format that is only read, or a path that cannot be written.
+        InputError: unknown suffix, a format that is only read, a path that cannot be written, or positions about an
+            origin in a format that holds no distances between neighbours there.
     """
     path = Path(path)
     suffix = _suffix(path, "write")
@@ -132,6 +138,8 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
             raise InputError(f"cannot write {path}: a pipe or device holds one file, and {suffix} has others beside it")
     with _explained(path, "write"):
         content = gaussians if hasattr(module, "stream") else gaussians.load()
+        if not getattr(module, "HOLDS_ORIGIN", False) and origin_of_source(content).any():
+            content = about_zero(path, content.load(), getattr(module, "position_step", None))
         write_output(path, lambda staged: module.write(staged, content, **options))
 
 

@@ -40,6 +40,7 @@ def change_axes(gaussians: Gaussians, a: str, b: str) -> Gaussians:
         gaussians.log_scales[:, order],
         gaussians.logit_opacities,
         _turn_sh(gaussians.sh, M),
+        M @ gaussians.origin,
     )
 
 

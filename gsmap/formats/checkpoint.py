@@ -20,9 +20,10 @@ import numpy as np
 
 from gsmap.errors import MALFORMED, InputError, NotGaussiansError
 from gsmap.formats.quantise import check_size
+from gsmap.geometry.origins import centred
 from gsmap.types import FileInfo, Gaussians
 
-VERSION = 1
+VERSION = 2
 
 _MAX_PICKLE_BYTES = 32 << 20
 _MAX_DEPTH = 6  # of tables in tables that are looked through
@@ -62,7 +63,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         if rest.shape[1] not in (0, 3, 8, 15):
             raise InputError(f"{path}: {rest.shape[1]} SH coefficients; gsmap reads degrees 0 to 3 (0, 3, 8 or 15)")
         sh = np.concatenate([sh, rest], axis=1)
-    return Gaussians(arrays["means"], arrays["quats"], arrays["log_scales"], arrays["logit_opacities"], sh)
+    means, origin = centred(arrays["means"])
+    return Gaussians(means, arrays["quats"], arrays["log_scales"], arrays["logit_opacities"], sh, origin)
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
@@ -137,7 +139,7 @@ def _tensors(path: str | os.PathLike[str], loaded: Any) -> dict[str, Any]:
 def _array(
     path: str | os.PathLike[str], name: str, tensor: Any, n: int, shape: tuple[int, ...], size: int
 ) -> np.ndarray:
-    """(n, *shape) float32 of a tensor, where the file holds as many numbers; -1 in a shape is any."""
+    """(n, *shape) of a tensor, where the file holds as many numbers; -1 in a shape is any; positions are float64."""
     import torch
 
     if tensor.layout != torch.strided or not tensor.is_floating_point() or tensor.dtype.itemsize not in (2, 4, 8):
@@ -159,4 +161,4 @@ def _array(
     if tensor.numel() * tensor.dtype.itemsize > size:  # a stride of 0 makes a splat of any size out of one number
         check_size(path, tensor.numel() * 4, 0)
         raise InputError(f"{path}: {name} has {tensor.numel()} numbers, more than the file holds")
-    return tensor.detach().to(torch.float32).numpy().copy()
+    return tensor.detach().to(torch.float64 if name == "means" else torch.float32).numpy().copy()

@@ -1,8 +1,8 @@
 """Binary glTF 2.0 (``.glb``) with the ratified ``KHR_gaussian_splatting``, as float32 or packed as SPZ.
 
 Scales are linear, opacities in [0, 1], quaternions xyzw, and the axes left-up-front; colours are as trained (sRGB).
-A file is written with an identity transform and everything, SH included, turned into glTF's axes, so that viewers
-agree whether or not they turn SH with a node.
+A file is written with everything, SH included, turned into glTF's axes, so that viewers agree whether or not they turn
+SH with a node; the node's transform is the identity, but for the origin of Gaussians that have one.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from gsmap.formats.axes import GLTF, PLY, change_axes
 from gsmap.formats.quantise import check_size, opacity_bytes, require_writable
 from gsmap.geometry.boxes import box_around
 from gsmap.geometry.sh import rgb_of_sh0
-from gsmap.geometry.transforms import transform_gaussians
+from gsmap.geometry.transforms import placed
 from gsmap.types import Gaussians, Sim3
 
-VERSION = 1
+VERSION = 2
+HOLDS_ORIGIN = True
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
@@ -92,7 +93,7 @@ def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -
 
 def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.ndarray | None = None) -> None:
     """Write Gaussians as they are; ``matrix`` (4, 4) takes them to glTF's world, as the transform of their node."""
-    g = gaussians
+    g, matrix = gaussians, _from_origin(gaussians.origin, matrix)
     unit = g.quats / np.maximum(np.linalg.norm(g.quats, axis=1, keepdims=True), 1e-30)
     unit[~unit.any(1), 0] = 1
     arrays: dict[str, np.ndarray] = {
@@ -121,9 +122,8 @@ def write_packed(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.
     They are counted from the middle, which the node's transform gives back: SPZ has 24 bits for a position.
     """
     low, high = box_around(gaussians.means).astype(np.float64)
-    middle = np.eye(4)
-    middle[:3, 3] = (low + high) / 2
-    g = replace(gaussians, means=(gaussians.means - middle[:3, 3]).astype(np.float32))
+    middle = (low + high) / 2
+    g = replace(gaussians, means=(gaussians.means - middle).astype(np.float32))
     data = spz.pack(path, g)
     data += b"\0" * (-len(data) % 4)
     names = ["POSITION", "COLOR_0", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE"))]
@@ -134,12 +134,22 @@ def write_packed(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.
     shown |= {"POSITION": g.means, "COLOR_0": colour, f"{EXTENSION}:ROTATION": four}
     gltf = _gltf(
         {name: _accessor_of(name, values) for name, values in shown.items()},
-        middle if matrix is None else np.asarray(matrix, float) @ middle,
+        _from_origin(gaussians.origin + middle, matrix),
     )
     gltf["meshes"][0]["primitives"][0]["extensions"][EXTENSION]["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
     gltf["extensionsUsed"] = gltf["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
     gltf["bufferViews"] = [{"buffer": 0, "byteLength": len(data)}]
     _write_container(path, gltf, [data])
+
+
+def _from_origin(origin: np.ndarray, matrix: np.ndarray | None) -> np.ndarray | None:
+    """The transform of a node of positions about an origin, whose frame a matrix (4, 4) takes to glTF's world."""
+    if not origin.any():
+        return matrix
+    shift = np.eye(4)
+    shift[:3, 3] = origin
+    out: np.ndarray = shift if matrix is None else np.asarray(matrix, float) @ shift
+    return out
 
 
 def _gltf(accessors: dict[str, dict[str, Any]], matrix: np.ndarray | None) -> dict[str, Any]:
@@ -326,9 +336,10 @@ def _placed(path: str | os.PathLike[str], local: Gaussians, world: np.ndarray) -
     if np.array_equal(world, np.eye(4)):
         return local
     try:
-        return transform_gaussians(local, Sim3.from_matrix(world))
+        S_world_local = Sim3.from_matrix(world)
     except InputError as error:
         raise InputError(f"{path}: a node or tile is placed by more than a turn, shift and scale: {error}") from error
+    return placed(local, S_world_local)
 
 
 def _require_inside(path: str | os.PathLike[str], gltf: dict[str, Any], view: dict[str, Any]) -> None:

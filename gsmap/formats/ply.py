@@ -1,7 +1,8 @@
 """The INRIA ``.ply`` of 3D Gaussian Splatting, by property name.
 
-Any SH degree 0-3, any column order, any numeric type. The header reader is our own: those of the libraries hang or
-abort the process on a malformed header, or allocate whatever it claims.
+Any SH degree 0-3, any column order, any numeric type; positions that float32 cannot hold are written as doubles. The
+header reader is our own: those of the libraries hang or abort the process on a malformed header, or allocate whatever
+it claims.
 """
 
 from __future__ import annotations
@@ -14,14 +15,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.lib import recfunctions as rfn
 
 from gsmap.errors import InputError, NotGaussiansError
+from gsmap.geometry.origins import centred, origin_of
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.stream import loaded
 from gsmap.types import FileInfo, Gaussians, GaussianSource
 from gsmap.types.gaussians import CHUNK_ROWS, FIELDS
+from gsmap.types.source import origin_of_source
 
-VERSION = 1
+VERSION = 2
+HOLDS_ORIGIN = True
 
 HEADER_LIMIT_BYTES = 64 * 1024
 
@@ -107,7 +112,7 @@ def stream(path: str | os.PathLike[str]) -> PlySource:
         raise NotGaussiansError(
             f"{path} is not a 3DGS .ply: its vertices lack {', '.join(missing)} (a point cloud or mesh?)"
         )
-    return PlySource(rows, columns, tuple(rest), "filter_3D" in names)
+    return PlySource(rows, columns, tuple(rest), "filter_3D" in names, _origin(rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +124,14 @@ class PlySource:
         names: the properties that make each field of `Gaussians`.
         rest: those of the spherical harmonics above degree 0, channel by channel.
         filtered: there is a 3D filter to be folded in.
+        origin: (3,) that is taken off positions.
     """
 
     rows: Rows
     names: Mapping[str, list[str]]
     rest: tuple[str, ...]
     filtered: bool
+    origin: np.ndarray
 
     @property
     def num_gaussians(self) -> int:
@@ -136,7 +143,7 @@ class PlySource:
 
     def chunks(self) -> Iterator[Gaussians]:
         for part in self.rows.parts():
-            yield Gaussians(**{name: self._field(name, part) for name in FIELDS})
+            yield Gaussians(**{name: self._field(name, part) for name in FIELDS}, origin=self.origin)
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
         for part in self.rows.parts():
@@ -149,6 +156,8 @@ class PlySource:
         """One field of `Gaussians`, of some rows."""
         if name == "sh":
             return self._sh(part)
+        if name == "means" and self.origin.any():
+            return centred(_positions(part), self.origin)[0]
         if not self.filtered or name not in ("log_scales", "logit_opacities"):
             return self._raw(name, part)
         logits, log_scales = self._raw("logit_opacities", part)[:, None], self._raw("log_scales", part)
@@ -177,6 +186,21 @@ class PlySource:
         return out
 
 
+def _origin(rows: Rows) -> np.ndarray:
+    """What is to be taken off positions in double precision; zeros where float32 holds them."""
+    if all(rows.dtype[name] == np.float32 for name in "xyz"):
+        return np.zeros(3)  # nothing is lost yet
+    if not origin_of(_positions(next(rows.parts()))).any():  # the first rows lie near zero: so do all together
+        return np.zeros(3)
+    step = max(1, rows.count // CHUNK_ROWS)
+    return origin_of(np.concatenate([_positions(part[::step]) for part in rows.parts()]))
+
+
+def _positions(part: np.ndarray) -> np.ndarray:
+    """(n, 3) float64 of some rows."""
+    return np.stack([part[name].astype(np.float64) for name in "xyz"], axis=1)
+
+
 def info(path: str | os.PathLike[str]) -> FileInfo:
     """Whether it was trained antialiased, and what reading it changed."""
     header = read_header(path)
@@ -202,6 +226,8 @@ def write(
 ) -> None:
     """Write the INRIA layout (float32, little endian, normals of zero, quaternions as they are).
 
+    Positions about an origin are written in full, in double precision.
+
     Args:
         antialiased: note in a comment that it was trained with the 2D Mip filter.
         extra: further float properties by name, (N,) each, such as the index of the capture each came from.
@@ -215,22 +241,32 @@ def write(
     names += list(extra)
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += ["comment SplatRenderMode: mip"] if antialiased else []
-    lines += [f"element vertex {gaussians.num_gaussians}", *(f"property float {n}" for n in names), "end_header", ""]
+    origin = origin_of_source(gaussians)
+    doubles = "xyz" if origin.any() else ""
+    dtype = np.dtype([(n, "<f8" if n in doubles else "<f4") for n in names])
+    properties = (f"property {'double' if n in doubles else 'float'} {n}" for n in names)
+    lines += [f"element vertex {gaussians.num_gaussians}", *properties, "end_header", ""]
     with open(path, "wb") as file:
         file.write("\n".join(lines).encode())
         start = 0
         for g in gaussians.chunks():
-            rows = np.zeros((len(g), len(names)), "<f4")
-            rows[:, 0:3] = g.means
-            rows[:, 6:9] = g.sh[:, 0]
-            rows[:, 9 : inria - 8] = g.sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)
-            rows[:, inria - 8] = g.logit_opacities
-            rows[:, inria - 7 : inria - 4] = g.log_scales
-            rows[:, inria - 4 : inria] = g.quats
+            table = np.zeros((len(g), len(names)), "<f4")
+            table[:, 0:3] = g.means
+            table[:, 6:9] = g.sh[:, 0]
+            table[:, 9 : inria - 8] = g.sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)
+            table[:, inria - 8] = g.logit_opacities
+            table[:, inria - 7 : inria - 4] = g.log_scales
+            table[:, inria - 4 : inria] = g.quats
             for column, values in enumerate(extra.values(), start=inria):
-                rows[:, column] = values[start : start + len(g)]
-            file.write(rows.data)
+                table[:, column] = values[start : start + len(g)]
             start += len(g)
+            if not doubles:
+                file.write(table.data)
+                continue
+            rows = rfn.unstructured_to_structured(table, dtype)
+            for name, column in zip("xyz", (g.means + origin).T, strict=True):
+                rows[name] = column
+            file.write(rows.tobytes())
 
 
 def read_header(path: str | os.PathLike[str]) -> Header:

@@ -27,6 +27,7 @@ from gsmap.formats.quantise import (
     require_writable,
     smallest_three,
 )
+from gsmap.geometry.origins import neighbour_distance
 from gsmap.types import FileInfo, Gaussians
 
 VERSION = 1
@@ -41,6 +42,7 @@ _AXES_EXTENSION = 0xADBE0003
 _AXES = [x + y + z for z in "BF" for y in "DU" for x in "LR"] + [x + y + z for y in "FB" for z in "DU" for x in "LR"]
 _MAX_EXTENSION_BYTES = 1 << 20
 _MAX_FIXED = 2**23 - 1
+_USUAL_BITS = 12  # fractional, of a position
 
 
 @dataclass(frozen=True)
@@ -107,9 +109,11 @@ def write(
 
     Raises:
         ConfigError: another version or number of bits.
-        InputError: nothing to write, values that are not finite, or positions beyond 8388 km.
+        InputError: nothing to write, values that are not finite, or positions beyond 8388 km, or so far out that
+            neighbours fall together.
     """
     require_writable(path, gaussians)
+    _require_distances(path, gaussians)
     packed = pack(path, change_axes(gaussians, SPZ, PLY), version=version, sh_bits=sh_bits, antialiased=antialiased)
     Path(path).write_bytes(packed)
 
@@ -293,13 +297,29 @@ class _Inflater:
         return b"".join(parts)
 
 
+def position_step(positions: np.ndarray) -> float:
+    """The step that a file holds positions (N, 3) in."""
+    return float(2.0 ** -_fractional_bits("SPZ", positions))
+
+
+def _require_distances(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Refuse Gaussians that reach so far out that neighbours would fall together."""
+    bits = _fractional_bits(path, gaussians.means)
+    apart = np.inf if bits >= _USUAL_BITS else neighbour_distance(gaussians)
+    if apart < 2 * 2.0**-bits:
+        raise InputError(
+            f"{path}: positions reach {np.abs(gaussians.means).max():.6g}, where SPZ has steps of {2.0**-bits:g}, but "
+            f"neighbours are {apart:.2g} apart: move the origin closer, or remove what lies far out"
+        )
+
+
 def _fractional_bits(path: str | os.PathLike[str], means: np.ndarray) -> int:
     """12 bits (0.24 mm) as everybody writes, more for a small scene, fewer where the range asks for it."""
     extent = float(np.abs(means).max())
     if extent > _MAX_FIXED:
         raise InputError(f"{path}: positions reach {extent:.3g}, SPZ can hold {_MAX_FIXED}: move the origin closer")
     octaves = int(np.ceil(np.log2(max(extent, 1e-6) * (1 + 1e-6))))
-    return max(0, min(23 - octaves, max(12, 18 - octaves), 23))
+    return max(0, min(23 - octaves, max(_USUAL_BITS, 18 - octaves), 23))
 
 
 def _encode(header: _Header, g: Gaussians, sh_bits: tuple[int, int]) -> list[np.ndarray]:

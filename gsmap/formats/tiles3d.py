@@ -15,7 +15,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,8 @@ from gsmap.geometry.decimate import decimate
 from gsmap.geometry.voxels import reached_box
 from gsmap.types import Gaussians
 
-VERSION = 1
+VERSION = 2
+HOLDS_ORIGIN = True
 
 CONTENT_FOLDER = "tiles"
 _MAX_JSON_BYTES = 64 << 20
@@ -106,8 +107,9 @@ def write(
     if max_per_tile < 1:
         raise ConfigError(f"max_per_tile must be at least 1, got {max_per_tile}")
     require_writable(path, gaussians)
-    root, _ = _octree(path, gaussians, *cube_around(gaussians.means), max_per_tile, "0", compressed)
-    write_tileset(path, root, transform=transform, compressed=compressed)
+    local = replace(gaussians, origin=np.zeros(3))
+    root, _ = _octree(path, local, *cube_around(local.means), max_per_tile, "0", compressed)
+    write_tileset(path, root, transform=transform, compressed=compressed, origin=gaussians.origin)
 
 
 def write_content(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: bool = True) -> None:
@@ -119,19 +121,31 @@ def write_content(path: str | os.PathLike[str], gaussians: Gaussians, *, compres
 
 def read_content(path: str | os.PathLike[str]) -> Gaussians:
     """Read one tile's GLB back, in the frame it was written in."""
-    return glb.read_world(Path(path), _Y_UP_TO_Z_UP)
+    return glb.read_world(Path(path), _Y_UP_TO_Z_UP).about(np.zeros(3))
 
 
 def write_tileset(
-    path: str | os.PathLike[str], root: TileNode, *, transform: np.ndarray | None = None, compressed: bool = True
+    path: str | os.PathLike[str],
+    root: TileNode,
+    *,
+    transform: np.ndarray | None = None,
+    compressed: bool = True,
+    origin: np.ndarray | None = None,
 ) -> None:
     """Write ``tileset.json``; write it last, when the content that it names is there.
 
     Args:
         compressed: whether the content is packed as SPZ.
         transform: (4, 4) from the root's frame to the viewer's world; upright for right-down-front if None.
+        origin: (3,) in the root's frame that the nodes' boxes and content are about: a tile between the root and them
+            has it as its transform, in double precision.
     """
     tile = _tile_json(root) | {"refine": "REPLACE"}
+    if origin is not None and origin.any():
+        shift = np.eye(4)
+        shift[:3, 3] = origin
+        outer = TileNode(root.box + origin, float(np.linalg.norm(root.box[1] - root.box[0])))  # of drawing nothing
+        tile = _tile_json(outer) | {"refine": "REPLACE", "children": [tile | {"transform": shift.T.ravel().tolist()}]}
     matrix = _UPRIGHT if transform is None else np.asarray(transform, float)
     tile["transform"] = matrix.T.ravel().tolist()
     diagonal = float(np.linalg.norm(root.box[1] - root.box[0]))

@@ -22,10 +22,11 @@ from gsmap.formats.quantise import check_size, require_writable
 from gsmap.formats.scans.params import Params
 from gsmap.formats.scans.process import asked
 from gsmap.formats.tiles3d import box_of
-from gsmap.geometry.transforms import transform_gaussians
+from gsmap.geometry.transforms import placed
 from gsmap.types import Gaussians, Sim3
 
-VERSION = 1
+VERSION = 2
+HOLDS_ORIGIN = True
 
 _UP = {"Y": "RUB", "Z": "RFU"}
 _MAX_FILE_BYTES = 8 << 30
@@ -75,7 +76,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, half: bool = Fa
     path = Path(path)
     _require_usd(path)
     require_writable(path, gaussians)
-    from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 
     g = change_axes(gaussians, _UP["Y"], PLY)
     stage = Usd.Stage.CreateInMemory()
@@ -84,6 +85,8 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, half: bool = Fa
     splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Splats")
     prim = splat.GetPrim()
     stage.SetDefaultPrim(prim)
+    if g.origin.any():
+        splat.AddTranslateOp().Set(Gf.Vec3d(*g.origin.tolist()))
     unit = g.quats / np.maximum(np.linalg.norm(g.quats, axis=1, keepdims=True), 1e-30)
     unit[~unit.any(1), 0] = 1
     number = np.float16 if half else np.float32
@@ -149,7 +152,7 @@ def _splat(path: Path, told: dict[str, np.ndarray], i: int) -> Gaussians:
         log_scales = np.log(np.where(scales == 0, _TINY, scales))
     found = Gaussians(means, quats, log_scales, np.log(opacity / (1 - opacity)), sh)
     matrix = told[f"{i}.matrix"].astype(np.float64).T  # USD's vectors are rows
-    return found if np.array_equal(matrix, np.eye(4)) else transform_gaussians(found, _similarity(path, matrix))
+    return found if np.array_equal(matrix, np.eye(4)) else placed(found, _similarity(path, matrix))
 
 
 def _similarity(path: Path, matrix: np.ndarray) -> Sim3:

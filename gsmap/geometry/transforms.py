@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.directions import fibonacci_sphere
+from gsmap.geometry.origins import centred
 from gsmap.geometry.rotations import matrices_to_quats, multiply_quats
 from gsmap.geometry.sh import SH_C0
 from gsmap.types import Cameras, Gaussians, Sim3
@@ -18,15 +21,27 @@ def transform_gaussians(gaussians: Gaussians, S_a_b: Sim3) -> Gaussians:
 
     Exact: ``mean' = s R mean + t``, ``covariance' = s^2 R covariance R^T``, opacity unchanged, and spherical
     harmonics rotated band by band so that the colour seen along ``R d`` is the colour that was seen along ``d``.
+    Gaussians about an origin are about that origin's place in frame a.
     """
     quat = matrices_to_quats(S_a_b.rotation)
+    origin = np.zeros(3)
+    if gaussians.origin.any():
+        origin = S_a_b.apply(gaussians.origin)
+        S_a_b = Sim3(S_a_b.rotation, np.zeros(3), S_a_b.scale)
     return Gaussians(
         S_a_b.apply(gaussians.means),
         multiply_quats(quat.astype(np.float32), gaussians.quats),
         gaussians.log_scales + np.float32(np.log(S_a_b.scale)),
         gaussians.logit_opacities,
         rotate_sh(gaussians.sh, S_a_b.rotation),
+        origin,
     )
+
+
+def placed(gaussians: Gaussians, S_a_b: Sim3) -> Gaussians:
+    """As `transform_gaussians`, about an origin where float32 cannot hold positions in frame a."""
+    means, origin = centred(S_a_b.apply(gaussians.positions))
+    return replace(transform_gaussians(gaussians, S_a_b), means=means, origin=origin)
 
 
 def transform_cameras(cameras: Cameras, S_a_b: Sim3) -> Cameras:

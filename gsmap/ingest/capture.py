@@ -9,16 +9,21 @@ from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from gsmap import formats
 from gsmap.errors import ConfigError
+from gsmap.formats.precision import about_origin, rounded_to, told
+from gsmap.geometry.transforms import transform_cameras
 from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.find import Found, find_captures
 from gsmap.ingest.validate import validate_cameras, validate_gaussians
 from gsmap.stream import clamped
-from gsmap.types import Cameras, Gaussians, GaussianSource
+from gsmap.types import Cameras, Gaussians, GaussianSource, Sim3
 from gsmap.types.progress import Progress
 from gsmap.types.scene import SCALE_POLICIES
+from gsmap.types.source import origin_of_source
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +31,9 @@ class Capture:
     """One capture, checked, ready for the store.
 
     Args:
-        content: its Gaussians, in the capture's own frame; perhaps still in their file.
-        cameras: in the same frame; ``cameras.synthesised`` where the source had none.
+        content: its Gaussians, in the capture's own frame; perhaps still in their file. Where the coordinates of
+            their file are too large for single precision, they are about an origin, and so is the capture's frame.
+        cameras: in the same frame, less that origin; ``cameras.synthesised`` where the source had none.
         name: from the file or folder, or as given.
         source: the file it was read from.
         captured_at: ISO 8601 with zone, or None.
@@ -127,6 +133,9 @@ def take_capture(
 ) -> Capture:
     """Check one capture; cameras are synthesised where there are none.
 
+    Args:
+        gaussians, cameras: in one frame; see `Capture` on its origin.
+
     Raises:
         InputError: what makes no capture; see `gsmap.ingest.validate`.
         ConfigError: an unknown scale policy, or a date that is none.
@@ -136,8 +145,12 @@ def take_capture(
     date = given_date(captured_at)
     where = source or f"capture {name!r}"
     if isinstance(gaussians, Gaussians):
-        gaussians = clamped(gaussians)
+        gaussians = about_origin(where, clamped(gaussians))
     notes = list(validate_gaussians(gaussians, where))
+    origin = origin_of_source(gaussians)
+    if origin.any():
+        cameras = None if cameras is None else transform_cameras(cameras, Sim3(np.eye(3), -origin))
+        notes += _origin_notes(gaussians, origin)
     if cameras is None:
         cameras = synthesise_cameras(gaussians)
         notes.append(f"no cameras were found beside it: {len(cameras)} were synthesised in its free space")
@@ -145,3 +158,12 @@ def take_capture(
         notes += validate_cameras(cameras, gaussians, f"{where} with {cameras_source}" if cameras_source else where)
     notes += [date.note] if date.note else []
     return Capture(gaussians, cameras, name, source, date.when, scale_policy, notes=tuple(notes))
+
+
+def _origin_notes(gaussians: GaussianSource, origin: np.ndarray) -> list[str]:
+    """What a person should know of a capture whose coordinates are large."""
+    notes = [f"its coordinates are large: poses and positions in its frame are those of the file less {told(origin)}"]
+    step = rounded_to(gaussians)
+    if step:
+        notes.append(f"the file has its positions in single precision, which rounds them to {step:g} there")
+    return notes

@@ -226,7 +226,8 @@ class _Export:
         """A tile, in the frame of the map: leaves of a 3D Tiles tree have z up where other files have gsmap's axes."""
         file = self._folder / path
         is_tileset = (file.parent / tileset.FILE_NAME).exists() if self._format is None else self._format == "3dtiles"
-        return tiles3d.read_content(file) if is_tileset and file.suffix == ".glb" else formats.read(file)
+        content = tiles3d.read_content(file) if is_tileset and file.suffix == ".glb" else formats.read(file)
+        return content.about(np.zeros(3))
 
 
 def _pictures(scene: Scene, cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, Path]:

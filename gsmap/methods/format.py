@@ -26,6 +26,11 @@ class Format(Protocol):
 
     Attributes:
         VERSION: an int, raised whenever what is read from, or written to, a file changes.
+
+    A format whose files hold more than single precision returns Gaussians about an origin where they need one
+    (`gsmap.geometry.origins.centred`); one that writes them has ``HOLDS_ORIGIN = True``. To others, Gaussians are given
+    with their origin added, or are refused where single precision, or the steps that ``position_step`` of positions
+    (N, 3) returns, do not hold the distances between neighbours.
     """
 
     VERSION: int

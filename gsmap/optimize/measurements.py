@@ -170,7 +170,8 @@ def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
     if bad.any():
         raise InputError(
             f"edge {_name(edges[int(np.argmax(bad))])} has an information matrix that is not positive definite: "
-            "every direction needs some certainty"
+            "every direction needs some certainty; reject the edge, or remove and ingest its captures again where an "
+            "older gsmap took them in at map coordinates"
         )
 
 

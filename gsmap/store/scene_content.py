@@ -20,14 +20,20 @@ from gsmap.stream import blocks
 from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Thinning
 from gsmap.types.gaussians import CHUNK_ROWS as ROWS_AT_ONCE
 from gsmap.types.gaussians import FIELDS
+from gsmap.types.source import origin_of_source
 
 
 def scene_id(gaussians: GaussianSource, cameras: Cameras) -> str:
-    """32 hex digits of content: the same Gaussians and cameras have the same id in every map."""
+    """32 hex digits of content: the same Gaussians and cameras have the same id in every map.
+
+    Gaussians about an origin are others than those about zero; cameras are in the frame of the means.
+    """
     shapes = gaussian_shapes(gaussians.num_gaussians, gaussians.sh_degree)
     arrays = [Parts(shapes[name], np.dtype(np.float32), partial(gaussians.columns, name)) for name in FIELDS]
     views = [cameras.T_frame_camera, cameras.intrinsics_px, cameras.sizes_px]
-    return digest(*arrays, *views, text="\n".join(cameras.names))
+    origin = origin_of_source(gaussians)
+    more = [origin] if origin.any() else []
+    return digest(*arrays, *views, *more, text="\n".join(cameras.names))
 
 
 def scene_of(row: Row[Any], tags: tuple[str, ...]) -> Scene:
@@ -47,6 +53,7 @@ def scene_of(row: Row[Any], tags: tuple[str, ...]) -> Scene:
         antialiased=bool(row.antialiased),
         tags=tags,
         thinning=thinning_of(row.thinned),
+        origin=np.zeros(3) if row.origin is None else np.array(row.origin, np.float64),
     )
 
 

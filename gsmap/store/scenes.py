@@ -13,6 +13,7 @@ from sqlalchemy import Connection, Row, Text, insert, select, true, type_coerce,
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.boxes import inside
+from gsmap.geometry.transforms import transform_cameras
 from gsmap.store import compact, facts
 from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes, put_boxes, row_ranges, touching
@@ -33,11 +34,12 @@ from gsmap.store.scene_content import (
 )
 from gsmap.store.scene_refs import alive, by_id, find, find_removed, free_name, name_taken
 from gsmap.store.schema import scenes
+from gsmap.stream import about, in_morton_order
 from gsmap.stream import bounds as bounds_of
-from gsmap.stream import in_morton_order
-from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Thinning
+from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Sim3, Thinning
 from gsmap.types.gaussians import FIELDS
 from gsmap.types.progress import Progress
+from gsmap.types.source import origin_of_source
 
 KIND = "scenes"
 _SIGMAS = 3.0
@@ -82,8 +84,9 @@ class Scenes:
         """Add a scene; durable when it returns.
 
         Args:
-            gaussians, cameras: in the scene's own frame; validated before (`gsmap.ingest.validate`). Gaussians that
-                are not in memory need no more of it than `gsmap.stream.order.BUCKET_BYTES` and a few bytes each.
+            gaussians, cameras: in the scene's own frame, whose origin is that of the Gaussians; validated before
+                (`gsmap.ingest.validate`). Gaussians that are not in memory need no more of it than
+                `gsmap.stream.order.BUCKET_BYTES` and a few bytes each.
             captured_at: ISO 8601; UTC where it has no zone.
             dated_by: what the date was read from; empty where a person said it.
             rename: where another scene has the name, take ``name-2`` and so on; else refuse.
@@ -108,7 +111,14 @@ class Scenes:
         stored = bool(files) and not self._arrays.problems(KIND, new_id, files)
         if row is not None and row.removed_at is None and stored:
             return self._dated(row.id, captured_at, dated_by), False
-        box = bounds_of(gaussians)
+        box, origin = bounds_of(gaussians), origin_of_source(gaussians)
+        if origin.any() and row is None:
+            # What gsmap knew no origins of lies in the map as it came, rounded to single precision.
+            before = scene_id(about(gaussians, np.zeros(3)), transform_cameras(cameras, Sim3(np.eye(3), origin)))
+            with self._catalog.read() as connection:
+                row = by_id(connection, before)
+            if row is not None and row.removed_at is None:
+                return self._dated(before, captured_at, dated_by), False
         fields: dict[str, Any] = {
             "name": name,
             "num_gaussians": gaussians.num_gaussians,
@@ -121,6 +131,7 @@ class Scenes:
             "cameras_synthesised": int(cameras.synthesised),
             "antialiased": int(antialiased),
             "notes": list(notes),
+            "origin": origin.tolist() if origin.any() else None,
         }
         if stored:  # removed, but not yet pruned
             with self._catalog.write() as connection:

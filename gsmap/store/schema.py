@@ -58,7 +58,7 @@ from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 from gsmap.types.map_object import OBJECT_FACTS
 from gsmap.types.world import OBSERVATION_KINDS
 
-HEAD = "0010"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0011"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 REVISION_COUNTS = (
     "num_scenes",
@@ -144,6 +144,7 @@ scenes = _table(
     Column("group_id", Digest, ForeignKey("groups.id")),  # null once pruned
     Column("removed_at", Text),  # the tombstone
     Column("thinned", Json(a_thinning)),  # of a scene that is kept compact (`gsmap.store.compact`)
+    Column("origin", Json(a_direction)),  # of its frame in the coordinates of its file; null for zero
     CheckConstraint("scale_policy in ('auto', 'known', 'unknown')", name="scale_policy"),
 )
 Index(

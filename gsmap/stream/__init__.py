@@ -2,6 +2,6 @@
 
 from gsmap.stream.infinities import clamped, clamped_column, num_clamped
 from gsmap.stream.order import in_morton_order
-from gsmap.stream.rows import blocks, bounds, loaded
+from gsmap.stream.rows import about, blocks, bounds, loaded
 
-__all__ = ["blocks", "bounds", "clamped", "clamped_column", "in_morton_order", "loaded", "num_clamped"]
+__all__ = ["about", "blocks", "bounds", "clamped", "clamped_column", "in_morton_order", "loaded", "num_clamped"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsmap.types import Gaussians
@@ -19,7 +21,7 @@ def clamped(gaussians: Gaussians) -> Gaussians:
     log_scales = clamped_column("log_scales", gaussians.log_scales)
     if logits is gaussians.logit_opacities and log_scales is gaussians.log_scales:
         return gaussians
-    return Gaussians(gaussians.means, gaussians.quats, log_scales, logits, gaussians.sh)
+    return replace(gaussians, log_scales=log_scales, logit_opacities=logits)
 
 
 def clamped_column(name: str, column: np.ndarray) -> np.ndarray:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.geometry.boxes import box_around
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.gaussians import FIELDS
+from gsmap.types.source import origin_of_source
 
 
 def loaded(source: GaussianSource) -> Gaussians:
@@ -16,12 +18,14 @@ def loaded(source: GaussianSource) -> Gaussians:
     n, k = source.num_gaussians, (source.sh_degree + 1) ** 2
     shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, k, 3)}
     out = {name: np.empty(shapes[name], np.float32) for name in FIELDS}
+    origin = np.zeros(3)
     start = 0
     for chunk in source.chunks():
+        origin = chunk.origin
         for name in FIELDS:
             out[name][start : start + len(chunk)] = getattr(chunk, name)
         start += len(chunk)
-    return Gaussians(**out)
+    return Gaussians(**out, origin=origin)
 
 
 def blocks(source: GaussianSource, rows: int) -> Iterator[Gaussians]:
@@ -40,6 +44,40 @@ def blocks(source: GaussianSource, rows: int) -> Iterator[Gaussians]:
         held, count = [joined[whole:]], count - whole
     if count:
         yield Gaussians.concatenate(held)
+
+
+def about(source: GaussianSource, origin: np.ndarray) -> GaussianSource:
+    """The Gaussians of a source about another origin (3,)."""
+    return source.about(origin) if isinstance(source, Gaussians) else _About(source, origin)
+
+
+@dataclass(frozen=True, eq=False)
+class _About:
+    source: GaussianSource
+    origin: np.ndarray
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.source.num_gaussians
+
+    @property
+    def sh_degree(self) -> int:
+        return self.source.sh_degree
+
+    def chunks(self) -> Iterator[Gaussians]:
+        for chunk in self.source.chunks():
+            yield chunk.about(self.origin)
+
+    def columns(self, name: str) -> Iterator[np.ndarray]:
+        if name != "means":
+            yield from self.source.columns(name)
+            return
+        shift = origin_of_source(self.source) - self.origin
+        for means in self.source.columns(name):
+            yield (means + shift).astype(np.float32)
+
+    def load(self) -> Gaussians:
+        return self.source.load().about(self.origin)
 
 
 def bounds(source: GaussianSource) -> np.ndarray:

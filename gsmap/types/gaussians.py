@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,11 +19,14 @@ class Gaussians:
     """N 3D Gaussians in one frame, stored as a trainer stores them (float32, C-contiguous).
 
     Args:
-        means: (N, 3) centres, in the frame's unit.
+        means: (N, 3) centres about ``origin``, in the frame's unit.
         quats: (N, 4) rotations ``wxyz``; need not be normalised.
         log_scales: (N, 3) natural logarithm of the standard deviations along the rotated axes.
         logit_opacities: (N,) opacities before the sigmoid.
         sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour is ``max(0, SH + 0.5)``.
+        origin: (3,) float64 in the frame; ``means + origin`` are the centres. Zeros unless float32 cannot hold the
+            centres themselves, as in map coordinates (`gsmap.geometry.origins`). Only files, and scenes as they are
+            ingested, have another: within a map, a scene's frame is about its origin.
 
     Raises:
         InputError: shapes that do not fit together. Values are not checked here (`gsmap.ingest.validate` does).
@@ -34,11 +37,15 @@ class Gaussians:
     log_scales: np.ndarray
     logit_opacities: np.ndarray
     sh: np.ndarray
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         for name in FIELDS:
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
             object.__setattr__(self, name, array)
+        object.__setattr__(self, "origin", np.array(self.origin, dtype=np.float64))
+        if self.origin.shape != (3,) or not np.isfinite(self.origin).all():
+            raise InputError(f"Gaussians.origin must be three finite numbers, got {self.origin}")
         n = self.means.shape[0] if self.means.ndim else 0
         expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
         for name, shape in expected.items():
@@ -87,25 +94,40 @@ class Gaussians:
         return out
 
     @property
+    def positions(self) -> np.ndarray:
+        """(N, 3) float64 centres in the frame."""
+        out: np.ndarray = self.means + self.origin
+        return out
+
+    def about(self, origin: np.ndarray) -> Gaussians:
+        """The same Gaussians about another origin (3,), in the frame's coordinates."""
+        if np.array_equal(origin, self.origin):
+            return self
+        means = (self.means + (self.origin - origin)).astype(np.float32)
+        return replace(self, means=means, origin=np.asarray(origin, np.float64))
+
+    @property
     def nbytes(self) -> int:
         return sum(a.nbytes for a in (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh))
 
     def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
         """The Gaussians at a boolean mask, integer array or slice."""
-        arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh)
         if not isinstance(index, np.ndarray):
-            return Gaussians(*(array[index] for array in arrays))
+            return replace(self, **{name: getattr(self, name)[index] for name in FIELDS})
         if index.dtype == bool:
             if index.shape != (len(self),):
                 raise IndexError(f"a mask of shape {index.shape} for {len(self)} Gaussians")
             index = np.flatnonzero(index)
-        return Gaussians(*(array.take(index, axis=0) for array in arrays))  # five times as fast as by brackets
+        # Five times as fast as by brackets.
+        return replace(self, **{name: getattr(self, name).take(index, axis=0) for name in FIELDS})
 
     @classmethod
     def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:
-        """All Gaussians of ``parts`` in order; lower SH degrees are padded with zeros to the highest."""
+        """All Gaussians of ``parts`` in order, about the origin of the first; lower SH degrees are padded with zeros to
+        the highest."""
         if not parts:
             return cls.empty()
+        parts = [part.about(parts[0].origin) for part in parts]
         k = max(p.sh.shape[1] for p in parts)
         sh = [np.pad(p.sh, ((0, 0), (0, k - p.sh.shape[1]), (0, 0))) for p in parts]
         return cls(
@@ -114,6 +136,7 @@ class Gaussians:
             np.concatenate([p.log_scales for p in parts]),
             np.concatenate([p.logit_opacities for p in parts]),
             np.concatenate(sh),
+            parts[0].origin,
         )
 
     @classmethod

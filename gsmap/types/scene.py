@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,6 +29,8 @@ class Scene:
         antialiased: true when trained with the 2D Mip filter (noted, not yet rendered differently).
         tags: words that people gave it, sorted.
         thinning: how it is kept where newer captures supersede it; None for one that is kept as it came.
+        origin: (3,) float64 of its frame in the coordinates of its file: a point of the scene and this are the file's
+            own coordinates. Zeros unless these are too large for float32, as map coordinates are.
     """
 
     id: str
@@ -45,6 +47,7 @@ class Scene:
     antialiased: bool = False
     tags: tuple[str, ...] = ()
     thinning: Thinning | None = None
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def _repr_html_(self) -> str:
         facts = {

@@ -14,7 +14,8 @@ class GaussianSource(Protocol):
     """N Gaussians in one frame that are read a chunk at a time, as often as asked, and every time the same.
 
     `Gaussians` are one themselves. Who reads a source needs memory for a chunk (`gsmap.types.gaussians.CHUNK_ROWS`),
-    not for the scene; who needs all of it at once says ``load``.
+    not for the scene; who needs all of it at once says ``load``. All chunks are about one origin, and so are the means
+    among the columns (`origin_of_source`).
     """
 
     @property
@@ -42,6 +43,12 @@ class GaussianSource(Protocol):
     def load(self) -> Gaussians:
         """All of them in memory."""
         ...
+
+
+def origin_of_source(source: GaussianSource) -> np.ndarray:
+    """(3,) float64 origin that the means of a source are about."""
+    first = next(iter(source.chunks()), None)
+    return np.zeros(3) if first is None else first.origin
 
 
 def gathered(source: GaussianSource, name: str, rows: np.ndarray) -> np.ndarray:

@@ -105,6 +105,7 @@ def row_of_scene(
         world=None if at is None else at[1],
         crs=None if at is None or system is None else system[0],
         heights=None if at is None or system is None else system[1],
+        offset=scene.origin,
     )
 
 
@@ -130,6 +131,7 @@ def pose_rows(store: Store, crs: str | None = None) -> list[PoseRow]:
             crs=system[0] if system and scene.id in found else None,
             heights=system[1] if system and scene.id in found else None,
             covariance=poses[scene.id].covariance,
+            offset=scene.origin,
         )
         for scene in store.scenes.list()
         if scene.id in poses

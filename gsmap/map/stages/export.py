@@ -296,6 +296,7 @@ def _export(
             recipe=planned.recipe,
             metres=planned.metres,
             world={component: one.told() for component, one in planned.world.items()},
+            offsets={scene: found.origin.tolist() for scene, found in planned.scenes.items() if found.origin.any()},
             params=settings.export,
             run=lambda job, arguments: run_jobs(job, arguments, settings.engine),
             made=noted,

@@ -163,7 +163,8 @@ def _read(request: Request, settings: Settings) -> _Sought:
             raise ConfigError(f"{request.file} holds {len(captures)} captures: name one of them")
         capture = captures[0]
         notes = capture.notes
-        return _Sought(capture.gaussians, capture.cameras, "splat", capture.scale_policy, True, np.zeros(3), notes)
+        gaussians, cameras = capture.gaussians, capture.cameras
+        return _Sought(gaussians, cameras, "splat", capture.scale_policy, True, gaussians.origin, notes)
     policy = "auto" if request.file.suffix.lower() in _OF_NO_UNIT else "known"
     return _of_scan(scans.read(request.file, reading), request.scale or policy, settings)
 

@@ -11,6 +11,7 @@ from gsmap import describe as describing
 from gsmap import register as registering
 from gsmap.errors import InputError
 from gsmap.geometry.boxes import box_corners
+from gsmap.geometry.transforms import transform_cameras
 from gsmap.ingest import Capture
 from gsmap.map import models
 from gsmap.map.settings import Settings
@@ -72,6 +73,7 @@ def supersede(
     old = store.scenes.get(ref)
     if capture.scale_policy == "auto":
         capture = replace(capture, scale_policy=old.scale_policy)
+    capture = _about(capture, old)
     coming = replace(old, id=scene_id(capture.gaussians, capture.cameras), scale_policy=capture.scale_policy)
     if any(coming.id == scene.id for scene in store.scenes.list()):
         raise InputError(f"the capture to supersede {old.name} is in the map already: there is nothing to put in place")
@@ -108,6 +110,15 @@ def supersede(
     if held:
         notes.append(f"{held.count('accepted')} of {len(held)} edges hold: gsmap optimize {store.location} uses them")
     return Superseded(scene, tuple(notes))
+
+
+def _about(capture: Capture, old: Scene) -> Capture:
+    """The capture about the origin of the scene that it is to supersede, where both have one."""
+    shift = capture.gaussians.origin - old.origin
+    if not (capture.gaussians.origin.any() and old.origin.any() and shift.any()):
+        return capture
+    cameras = transform_cameras(capture.cameras, Sim3(np.eye(3), shift))
+    return replace(capture, content=capture.gaussians.about(old.origin), cameras=cameras)
 
 
 def _describe(store: Store, new_id: str, capture: Capture, settings: Settings) -> SceneGraph:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
+
+import numpy as np
 
 from gsmap.types.rows.base import Row
 from gsmap.types.rows.exports import TileRow
@@ -269,6 +271,7 @@ class ConvertReport(Row):
         output: the file written.
         num_gaussians: how many Gaussians it holds.
         sh_degree: degree of their spherical harmonics as they were read.
+        offset: (3,) what was taken off the coordinates (``--local``); else zeros.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"output": "file", "num_gaussians": "Gaussians", "sh_degree": "SH degree"}
@@ -277,6 +280,7 @@ class ConvertReport(Row):
     output: str
     num_gaussians: int
     sh_degree: int
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -51,6 +51,8 @@ class SceneRow(Row):
         world: (3,) the same in the map's CRS; null as above.
         crs: of that; null as above.
         heights: the unit and zero of the heights in it, such as metres above the ellipsoid; null as above.
+        offset: (3,) what was taken off the coordinates of its file, where these are too large for single precision, as
+            map coordinates are: a point of the scene's frame plus this is the file's own; else zeros.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -83,6 +85,7 @@ class SceneRow(Row):
     world: np.ndarray | None = None
     crs: str | None = None
     heights: str | None = None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def in_world(self) -> str | None:
@@ -370,6 +373,7 @@ class PoseRow(Row):
         heights: the unit and zero of the heights in it, such as metres above the ellipsoid; null as above.
         covariance: (7, 7) over [rotation (3, rad), translation (3), log scale] on the scene side; null where it is not
             known.
+        offset: (3,) as in `SceneRow`: ``S_map_scene`` maps coordinates of the scene's file less this.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -391,6 +395,7 @@ class PoseRow(Row):
     world: np.ndarray | None = None
     crs: str | None = None
     heights: str | None = None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def position(self) -> np.ndarray:

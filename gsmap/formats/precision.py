@@ -1,0 +1,83 @@
+"""What single precision loses of positions far from zero: an origin is taken off on reading, and is needed to write."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.geometry.origins import float32_step, is_single, neighbour_distance, origin_of
+from gsmap.stream import about
+from gsmap.types import Gaussians, GaussianSource
+from gsmap.types.source import gathered, origin_of_source
+
+_SAMPLE = 20_000
+_FINE = 100.0  # steps of a format between neighbours, at least: rounding then moves nothing that shows
+
+
+def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> GaussianSource:
+    """The Gaussians of a source about an origin, where they lie so far from zero that float32 needs one.
+
+    Args:
+        where: what to call the source in messages (its file).
+
+    Raises:
+        InputError: their positions were rounded to single precision before, and so coarsely that neighbours fall
+            together.
+    """
+    origin = origin_of_source(source)
+    if not origin.any():
+        first = next(source.chunks(), None)
+        if first is None or not origin_of(first.means).any():
+            return source
+        n = source.num_gaussians
+        rows = np.unique(np.linspace(0, n - 1, min(n, _SAMPLE)).astype(np.int64))
+        origin = origin_of(gathered(source, "means", rows))
+        if not origin.any():
+            return source
+        source = about(source, origin)
+    step = rounded_to(source)
+    apart = neighbour_distance(source) if step else np.inf
+    if apart <= 2 * step:
+        raise InputError(
+            f"{where}: its positions near {told(origin)} are in single precision, which rounds them to {step:g} there, "
+            f"but neighbours are {apart:.2g} apart: export it in double precision, or with {told(origin)} taken off"
+        )
+    return source
+
+
+def rounded_to(source: GaussianSource) -> float:
+    """The step that the positions of a source about an origin were rounded to by single precision; 0 by none."""
+    first = next(source.chunks()).positions
+    return float32_step(first) if is_single(first) else 0.0
+
+
+def about_zero(
+    path: str | os.PathLike[str], gaussians: Gaussians, step_of: Callable[[np.ndarray], float] | None = None
+) -> Gaussians:
+    """Gaussians about an origin with it added to their positions, for a format that holds single precision at most.
+
+    Args:
+        step_of: the step in which the format holds positions (N, 3); None for single precision.
+
+    Raises:
+        InputError: the format does not hold the distances between neighbours there.
+    """
+    positions = gaussians.positions
+    step = (step_of or float32_step)(positions)
+    is_exact = is_single(positions) if step_of is None else not np.remainder(positions, step).any()
+    apart = np.inf if is_exact else neighbour_distance(gaussians)
+    if apart < _FINE * step:
+        raise InputError(
+            f"{path} cannot hold positions near {told(gaussians.origin)}: it rounds them to {step:g} there, and "
+            f"neighbours are {apart:.2g} apart: write .ply, .glb, .usdc or tileset.json, or take the offset "
+            f"{told(gaussians.origin)} off (gsmap convert --local)"
+        )
+    return gaussians.about(np.zeros(3))
+
+
+def told(origin: np.ndarray) -> str:
+    """An origin in words."""
+    return "(" + ", ".join(f"{value:.15g}" for value in origin) + ")"

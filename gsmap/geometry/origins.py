@@ -1,0 +1,69 @@
+"""Origins of positions that float32 cannot hold, such as coordinates of a national grid or of the Earth's centre."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.geometry.neighbours import neighbours_of
+from gsmap.types import GaussianSource
+from gsmap.types.source import gathered
+
+_FAR, _LEAST_EXTENT = 16.0, 512.0  # from 8192 units on, where float32 begins to lose half a thousandth
+_ROUND = 100.0
+_SAMPLE = 20_000
+_QUERIES = 2_000
+
+
+def origin_of(positions: np.ndarray) -> np.ndarray:
+    """(3,) float64 origin for positions (N, 3): zeros where these lie near zero for their extent, so that float32 loses
+    less than half a thousandth of a unit or a millionth of the extent; else their middle in whole hundreds, which
+    float32 positions lose nothing by."""
+    found = positions[:: max(1, len(positions) // _SAMPLE)]
+    found = found[np.isfinite(found).all(1)].astype(np.float64)
+    if not len(found):
+        return np.zeros(3)
+    low, high = np.percentile(found, [5, 95], axis=0)
+    middle = (low + high) / 2
+    if np.abs(middle).max() < _FAR * max(_LEAST_EXTENT, float(np.linalg.norm(high - low))):
+        return np.zeros(3)
+    out: np.ndarray = np.round(middle / _ROUND) * _ROUND
+    return out
+
+
+def centred(positions: np.ndarray, origin: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 3) as float32 about an origin (3,), and the origin; `origin_of` them where None."""
+    origin = origin_of(positions) if origin is None else origin
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, which validation names
+        return (positions - origin).astype(np.float32), origin
+
+
+def float32_step(positions: np.ndarray) -> float:
+    """The step of float32 at the farthest of positions (N, 3) float64."""
+    found = np.abs(positions[np.isfinite(positions).all(1)]).max(initial=0.0)
+    return float(np.spacing(np.float32(found)))
+
+
+def is_single(positions: np.ndarray) -> bool:
+    """Whether float32 holds every one of positions (N, 3) float64 as it is: they were rounded to it before."""
+    found = positions[np.isfinite(positions).all(1)]
+    return bool((found == found.astype(np.float32)).all())
+
+
+def neighbour_distance(source: GaussianSource) -> float:
+    """The median distance from a Gaussian of a source to its nearest neighbour; infinite where there is one Gaussian.
+
+    Of a sample, to all others, of which a chunk at a time is in memory.
+    """
+    n = source.num_gaussians
+    rows = np.unique(np.linspace(0, n - 1, min(n, _QUERIES)).astype(np.int64))
+    at = gathered(source, "means", rows)
+    nearest = np.full(len(rows), np.inf)
+    start = 0
+    for means in source.columns("means"):
+        inside = np.isfinite(means).all(1)
+        points, k = np.where(inside[:, None], means, np.float32(3e38)), min(2, len(means))
+        apart = neighbours_of(points, at, k)[0].reshape(len(at), k)
+        own = (rows >= start) & (rows < start + len(means))  # finds itself first
+        nearest = np.minimum(nearest, np.where(own, apart[:, 1] if k > 1 else np.inf, apart[:, 0]))
+        start += len(means)
+    return float(np.median(nearest))
