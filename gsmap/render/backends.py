@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import importlib.util
+import os
 from typing import Literal
 
 from gsmap.errors import ConfigError
@@ -13,7 +15,7 @@ def backend(name: str = "auto") -> Literal["native", "gsplat"]:
     """The backend that a name stands for here: ``native`` or ``gsplat``.
 
     The two do not give the same bits, so the answer belongs to the recipe of whatever is rendered. torch is imported
-    only where gsplat is installed.
+    only where gsplat and NVIDIA's driver are installed.
 
     Args:
         name: ``native``, ``gsplat``, or ``auto``: gsplat where it is installed and torch sees a GPU, else native.
@@ -31,8 +33,18 @@ def backend(name: str = "auto") -> Literal["native", "gsplat"]:
 @functools.cache
 def gsplat_available() -> bool:
     """Whether gsplat is installed and torch sees a GPU."""
-    if importlib.util.find_spec("gsplat") is None:
-        return False  # without importing torch, which numpy callers may do without
+    # torch is slow to import, and naming a recipe can do without it where there is no gsplat or no driver.
+    if importlib.util.find_spec("gsplat") is None or not _has_driver():
+        return False
     import torch
 
     return bool(torch.cuda.is_available())
+
+
+def _has_driver() -> bool:
+    """Whether NVIDIA's driver is installed."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True

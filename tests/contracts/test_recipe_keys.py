@@ -102,7 +102,8 @@ IDLE = {
 def _modules() -> list[Any]:
     skip: Callable[[str], bool] = lambda name: name.endswith("__main__") or "_native" in name  # noqa: E731
     names = [m.name for m in pkgutil.walk_packages(gsmap.__path__, "gsmap.") if not skip(m.name)]
-    return [importlib.import_module(name) for name in names if ".cli" not in name and ".migrations" not in name]
+    left_out = (".cli", ".migrations", ".triton_kernels")  # the last needs Triton, and has no settings
+    return [importlib.import_module(name) for name in names if not any(part in name for part in left_out)]
 
 
 def keys(settings: Settings) -> dict[str, str]:

@@ -35,11 +35,12 @@ def test_what_is_told_is_what_renders(monkeypatch, tensors):
     assert len(asked) == 1
 
 
-def test_telling_the_backend_imports_no_torch_where_gsplat_is_missing():
+def test_telling_the_backend_imports_no_torch_where_gsplat_or_a_driver_is_missing():
     code = (
         "import sys, importlib.util as u\n"
         "import gsmap.render\n"
+        "from gsmap.render.backends import _has_driver\n"
         "print(gsmap.render.backend())\n"
-        "sys.exit('torch' in sys.modules and u.find_spec('gsplat') is None)"
+        "sys.exit('torch' in sys.modules and not (u.find_spec('gsplat') and _has_driver()))"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
