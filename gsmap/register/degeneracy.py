@@ -56,7 +56,8 @@ def held_motions(
 
     dim = len(system)
     points = points[:dim, :dim] + 1e-9 * np.diag(np.diag(points)[:dim])  # points on a line turn about it
-    noise = 2 * np.pi * (noise_m / (neighbours * resolution_m)) ** 2
+    # Distances beyond half a cell are those of a pose that is still off, not of noise.
+    noise = 2 * np.pi * (min(noise_m, resolution_m / 2) / (neighbours * resolution_m)) ** 2
     information, motions = eigh(system, points)
     free = motions[:, information < MIN_SIGNAL * noise]
     if not free.shape[1]:
