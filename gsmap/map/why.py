@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -109,6 +110,11 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
         words = f"{'at least' if at_least else 'at most'} {bar:g}{note}"
         return WhyStep(name=name, value=value, bar=words, passed=passed)
 
+    violation, allowed = float(figures.get("free_space_violation", np.nan)), bars.max_free_space_violation
+    free_space = held("free-space violation", "free_space_violation", allowed, note=", beyond chance")
+    if free_space.passed is False:
+        judged = float(figures.get("num_judged", np.nan))
+        free_space = replace(free_space, passed=not verdict.violates_free_space(violation, judged, allowed, bars))
     return [
         WhyStep(name="correspondences", value=pair.num_correspondences),
         WhyStep(name="clique", value=pair.num_inliers),
@@ -119,7 +125,7 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
         held("coinciding cells", "num_coinciding", bars.min_coinciding, at_least=True),
         held("colour correlation", "colour_correlation", bars.min_colour_correlation, at_least=True),
         WhyStep(name="colour significance", value=known("colour_t")),
-        held("free-space violation", "free_space_violation", bars.max_free_space_violation),
+        free_space,
         held("probability", "probability", bars.min_probability, at_least=True, note=", of all of these"),
         held("disagreement", "disagreement", max_disagreement, note=" of what both saw, or it is in doubt"),
     ]

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Protocol
 
+import numpy as np
+
 from gsmap.methods.surface import Surface
 from gsmap.types import Sim3
 
-__all__ = ["Refiner", "Surface"]
+__all__ = ["Correspondences", "Refiner", "Surface"]
+
+Correspondences = tuple[np.ndarray, np.ndarray]
+"""Points (K, 3) of the target and points (K, 3) of the source that are taken for the same, in metres."""
 
 
 class Refiner(Protocol):
@@ -23,6 +28,9 @@ class Refiner(Protocol):
         self, target: Surface, source: Surface, start: Sim3, params: Any = None, *, with_scale: bool = False
     ) -> Sim3:
         """A better pose than the start.
+
+        A refiner whose module or object has ``USES_CORRESPONDENCES = True`` takes one more keyword,
+        ``correspondences``: those that the start rests on (`Correspondences`), or None.
 
         Args:
             target, source: surfaces, both in metres.

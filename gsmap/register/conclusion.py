@@ -58,9 +58,16 @@ def conclude(
     accepted = [j for j in judged if not j.flaw]
     best = accepted[0] if accepted else min(judged, key=_rank)
     status, reason = ("accepted", "") if accepted else ("rejected", best.flaw)
-    rivals = [j for j in accepted if not _same(best, j, target, source, params.same_pose)]
-    if rivals:
-        status, reason = "no_match", f"ambiguous: {_apart(best, rivals[0], target, source)}, and both are accepted"
+    # A pose that is known too badly to be an edge is no less a rival.
+    others = [j for j in judged if not verdict.contradiction(j.proposal, j.evidence, params.verdict)]
+    others = [j for j in others if not _same(best, j, target, source, params.same_pose)]
+    rivals = [j for j in others if verdict.is_believable(j.proposal, j.evidence, params.verdict)]
+    probable = _probability_among(best, others, params.verdict)
+    if probable < params.verdict.min_probability:
+        rivals = rivals or sorted(others, key=lambda j: -_odds(j, params.verdict))
+    if accepted and rivals:
+        apart = _apart(best, rivals[0], target, source)
+        status, reason = "no_match", f"ambiguous: {apart}, and the first is right with {probable:.0%}"
     elif not accepted and not verdict.is_rare(best.proposal, params.verdict):
         status, reason = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
     information = None
@@ -79,7 +86,7 @@ def conclude(
         overlap=best.evidence.overlap,
         proposer=best.proposal.proposer,
         exact=best.proposal.exact,
-        evidence=_figures(best, params.verdict),
+        evidence=_figures(best, probable),
         notes=tuple(notes),
         **common,
     )
@@ -108,7 +115,19 @@ def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:
     return f"two poses lie {degrees:.0f} deg and {metres:.1f} m apart"
 
 
-def _figures(judged: Judged, params: verdict.Params) -> dict[str, float]:
+def _odds(judged: Judged, params: verdict.Params) -> float:
+    """That a pose is right, by its own evidence."""
+    p = probability(judged.proposal, judged.evidence, params.prior)
+    return p / (1.0 - p)
+
+
+def _probability_among(best: Judged, others: Sequence[Judged], params: verdict.Params) -> float:
+    """That a pose is right where one of the others may be instead: at most one of them all is."""
+    odds = _odds(best, params)
+    return odds / (1.0 + odds + sum(_odds(j, params) for j in others))
+
+
+def _figures(judged: Judged, probable: float) -> dict[str, float]:
     """The evidence as it is stored; `gsmap.types.Registration` explains each name."""
     p, e = judged.proposal, judged.evidence
     log_scale = log_scale_sigma = float("nan")
@@ -121,10 +140,11 @@ def _figures(judged: Judged, params: verdict.Params) -> dict[str, float]:
         "runner_up": p.runner_up,
         "free_space_violation": e.free_space_violation,
         "num_seen": float(e.num_seen),
+        "num_judged": float(e.num_judged),
         "num_coinciding": float(e.num_coinciding),
         "colour_correlation": e.colour_correlation,
         "colour_t": e.colour_t,
-        "probability": probability(p, e, params.prior) if e.num_coinciding else float("nan"),
+        "probability": probable if e.num_coinciding else float("nan"),
         "disagreement": e.disagreement,
         "seen_m2": e.seen_m2,
         "log_scale": log_scale,

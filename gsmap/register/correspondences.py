@@ -93,7 +93,57 @@ def correspondences(
         least = np.partition(similarity, -params.max_correspondences)[-params.max_correspondences]
         t, s, similarity = t[similarity >= least], s[similarity >= least], similarity[similarity >= least]
     order = np.lexsort((s, t, -similarity))[: params.max_correspondences]
-    t, s = t[order], s[order]
+    return _between(target, source, t[order], s[order], similarity[order], units_m, ups)
+
+
+def as_similar(
+    target: NodeLayer,
+    source: NodeLayer,
+    members: Correspondences,
+    quantile: float,
+    count: int,
+    *,
+    units_m: tuple[float, float],
+    ups: tuple[np.ndarray | None, np.ndarray | None],
+) -> Correspondences:
+    """Every pair of an end of some correspondences and a node that is as similar to it as these are to each other.
+
+    Args:
+        members: the correspondences.
+        quantile: of their similarities, which a pair must reach.
+        count: the most similar pairs that are kept at most.
+        units_m, ups: as in `correspondences`.
+    """
+    bar = float(np.quantile(members.similarity, quantile)) - 1e-6
+    ends_t, ends_s = np.unique(members.target_ids), np.unique(members.source_ids)
+    found_t, found_s = _similar_pairs(target, source, ends_t, np.arange(len(source)), bar)
+    other_t, other_s = _similar_pairs(target, source, np.arange(len(target)), ends_s, bar)
+    pairs = np.unique(np.column_stack([np.r_[found_t, other_t], np.r_[found_s, other_s]]), axis=0)
+    t, s = pairs.T
+    similarity = np.einsum("ij,ij->i", target.embeddings[t], source.embeddings[s])
+    order = np.lexsort((s, t, -similarity))[:count]
+    return _between(target, source, t[order], s[order], similarity[order], units_m, ups)
+
+
+def _similar_pairs(
+    target: NodeLayer, source: NodeLayer, t: np.ndarray, s: np.ndarray, bar: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs among rows of both layers that are of one type and at least so similar."""
+    similar = target.embeddings[t] @ source.embeddings[s].T >= bar
+    rows, columns = np.nonzero(similar & (target.types[t][:, None] == source.types[s]))
+    return t[rows], s[columns]
+
+
+def _between(
+    target: NodeLayer,
+    source: NodeLayer,
+    t: np.ndarray,
+    s: np.ndarray,
+    similarity: np.ndarray,
+    units_m: tuple[float, float],
+    ups: tuple[np.ndarray | None, np.ndarray | None],
+) -> Correspondences:
+    """The correspondences of rows of both layers, in metres."""
     points_t, points_s = target.positions[t] * units_m[0], source.positions[s] * units_m[1]
     level = ups[0] is not None and ups[1] is not None
     return Correspondences(
@@ -101,7 +151,7 @@ def correspondences(
         source=points_s,
         target_ids=t.astype(np.int32),
         source_ids=s.astype(np.int32),
-        similarity=similarity[order].astype(np.float32),
+        similarity=similarity.astype(np.float32),
         target_heights=points_t @ ups[0] if level else None,
         source_heights=points_s @ ups[1] if level else None,
     )

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import retract, skew
 from gsmap.geometry.similarities import Similarities
+from gsmap.methods.refiner import Correspondences
 from gsmap.register import error_field
+from gsmap.register.degeneracy import held_motions, point_information
 from gsmap.register.metres import Belief
 from gsmap.register.refiners import colored_icp
-from gsmap.register.surface import Surface
+from gsmap.register.surface import PLANE_NEIGHBOURS, Surface
 from gsmap.types import Sim3
 
 _FEWEST = 20  # cells that coincide
@@ -112,6 +114,18 @@ class Known:
     covariance: np.ndarray
     sigmas: tuple[float, float, float]
 
+    @classmethod
+    def about(cls, covariance: np.ndarray, centroid: np.ndarray, scale: float) -> Known:
+        """Of a (7, 7) covariance about the overlap's centroid (3,), of a pose of some scale."""
+        sigmas = (
+            float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+            float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * scale,
+            float(np.sqrt(covariance[6, 6])),
+        )
+        back = np.linalg.inv(_shift(centroid))
+        covariance = back @ covariance @ back.T
+        return cls(0.5 * (covariance + covariance.T), sigmas)
+
 
 @dataclass(frozen=True, eq=False)
 class Conditioning:
@@ -127,6 +141,8 @@ class Conditioning:
         radius_m: of the overlap.
         sway: (7,) motion about the centroid by which colours would move the pose; None where there are none.
         params: what is thought to be hidden.
+        loose: (7, 7) and (6, 6) what is added to ``scaled`` and to ``rigid`` where planes leave a motion free: the
+            errors of colours and correspondences, which hold it then, or of nothing.
     """
 
     scaled: np.ndarray
@@ -137,6 +153,7 @@ class Conditioning:
     radius_m: float
     sway: np.ndarray | None
     params: Params
+    loose: tuple[np.ndarray, np.ndarray]
 
     @property
     def hidden(self) -> Hidden:
@@ -152,7 +169,7 @@ class Conditioning:
         """(7, 7) covariance about the overlap's centroid of the pose with the scale that was refined along."""
         swell = hidden_log_scale(self.field_m, self.radius_m, self.sway, self.hidden)
         hidden = np.r_[self._hidden(swell, scale, self.sway), swell]
-        return self.hidden.shown**2 * self.scaled + np.diag(hidden**2)
+        return self.hidden.shown**2 * self.scaled + self.loose[0] + np.diag(hidden**2)
 
     def of_rigid(self, scale: float, swell: float, log_scale_sigma: float, sway: np.ndarray | None) -> np.ndarray:
         """(7, 7) the same of a pose whose scale is known otherwise.
@@ -165,7 +182,7 @@ class Conditioning:
         """
         out = np.zeros((7, 7))
         hidden = self._hidden(abs(swell), scale, sway)
-        out[:6, :6] = self.hidden.shown**2 * self.rigid + np.diag(hidden**2)
+        out[:6, :6] = self.hidden.shown**2 * self.rigid + self.loose[1] + np.diag(hidden**2)
         out += np.outer(self.tied, self.tied) * max(log_scale_sigma, _LEAST_LOG_SCALE_SIGMA) ** 2
         return out
 
@@ -176,14 +193,7 @@ class Conditioning:
             covariance = self.of_scaled(pose.scale)
         else:
             covariance = self.of_rigid(pose.scale, belief.log_scale, belief.log_scale_sigma, sway)
-        sigmas = (
-            float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
-            float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * pose.scale,
-            float(np.sqrt(covariance[6, 6])),
-        )
-        back = np.linalg.inv(_shift(self.centroid))
-        covariance = back @ covariance @ back.T
-        return Known(0.5 * (covariance + covariance.T), sigmas)
+        return Known.about(covariance, self.centroid, pose.scale)
 
     def rescaled(self, pose: Sim3, scale: float) -> Sim3:
         """The pose with another scale, and moved as that moves it."""
@@ -202,7 +212,13 @@ class Conditioning:
         return np.hypot(out, self.hidden.by_colour * np.repeat(told, 3))
 
 
-def condition(target: Surface, source: Surface, pose: Sim3, params: Params | None = None) -> Conditioning | None:
+def condition(
+    target: Surface,
+    source: Surface,
+    pose: Sim3,
+    params: Params | None = None,
+    correspondences: Correspondences | None = None,
+) -> Conditioning | None:
     """How well a refined pose (metres) is known with its scale and without; None where too little overlaps to tell.
 
     An ICP Hessian is overconfident 10 to 900 times on splats, for neighbouring points share their error. So the
@@ -210,6 +226,9 @@ def condition(target: Surface, source: Surface, pose: Sim3, params: Params | Non
     covariance is that of the pose under such errors: ``A K A^T``, where A is the pose's change by each block's error
     (implicit function theorem: the pull of the block over what a motion is pulled back by, `_pulled_back`). What leaves
     no residual is added by a model (`hidden_motion`, `hidden_log_scale`).
+
+    Along motions that planes leave free (`degeneracy`) the pose is known as well as colours and the ``correspondences``
+    hold it, as in refining; where these do not either, the overlap may lie anywhere along itself.
     """
     params = params or Params()
     blocks = _Blocks.of(target, source, pose, params)
@@ -217,6 +236,13 @@ def condition(target: Surface, source: Surface, pose: Sim3, params: Params | Non
         return None
     hessian = _pulled_back(target, source, pose, blocks, params)
     pull = (blocks.jacobian * blocks.weights[:, None]).T
+    loose = np.zeros((7, 7)), np.zeros((6, 6))
+    held = held_motions(blocks.hessian, blocks.points, blocks.noise_m, _resolution_m(target, source), PLANE_NEIGHBOURS)
+    if held is not None:
+        others, errors_of_others = _other_information(target, source, pose, blocks, params, correspondences)
+        hessian, pull = held @ hessian @ held.T + others, held @ pull
+        inverse, rigid = np.linalg.inv(hessian), np.linalg.inv(hessian[:6, :6])
+        loose = inverse @ errors_of_others @ inverse, rigid @ errors_of_others[:6, :6] @ rigid
     influence = np.concatenate([np.linalg.solve(hessian, pull), np.linalg.solve(hessian[:6, :6], pull[:6])])
     seen = error_field.Blocks(blocks.jacobian, blocks.residual, blocks.positions, blocks.directions, blocks.counts)
     errors = error_field.judge_errors(seen, influence, params.field)
@@ -231,7 +257,55 @@ def condition(target: Surface, source: Surface, pose: Sim3, params: Params | Non
         radius_m=blocks.radius_m,
         sway=swayed(target, source, pose, blocks.centroid, params, with_scale=True),
         params=params,
+        loose=loose,
     )
+
+
+def known_by_correspondences(correspondences: Correspondences, pose: Sim3, params: Params | None = None) -> Known:
+    """How well a pose (metres) is known that was fitted to correspondences alone, and not refined."""
+    params = params or Params()
+    target, source = correspondences
+    centroid = source.mean(0)
+    information = pose.scale**2 * point_information(source - centroid)
+    variance = ((pose.apply(source) - target) ** 2).mean() * _repeats(target, params.block_m)
+    return Known.about(np.linalg.pinv(information, hermitian=True) * variance, centroid, pose.scale)
+
+
+def _resolution_m(target: Surface, source: Surface) -> float:
+    return max(target.resolution_m, source.resolution_m)
+
+
+def _repeats(points: np.ndarray, block_m: float) -> float:
+    """How many of some points err together: those within a block."""
+    return len(points) / len(np.unique(np.floor(points / block_m), axis=0))
+
+
+def _other_information(
+    target: Surface,
+    source: Surface,
+    pose: Sim3,
+    blocks: _Blocks,
+    params: Params,
+    correspondences: Correspondences | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(7, 7) what holds a pose beside planes, about the overlap's centroid in the weights of `_Blocks`, and the
+    covariance (7, 7) of its pull: of colours, of correspondences, and that the overlap lies within its own radius."""
+    variance = max(blocks.noise_m, 1e-6) ** 2
+    anywhere = blocks.points / blocks.points[3, 3] * variance / blocks.radius_m**2
+    held, errors = anywhere.copy(), variance * anywhere
+    if all(np.ptp(surface.lightness) > 0 for surface in (target, source)):
+        colours = replace(params.colours, colour_weight=colored_icp.Params().colour_weight)
+        told = colored_icp.colour_information(target, source, pose, blocks.centroid, colours)
+        if told is not None:
+            # In these units a cell's colour is off by its weight; those of a block are, all together.
+            together = max(1.0, colours.colour_weight**2 * float(blocks.counts.mean()))
+            told = told * blocks.points[3, 3]
+            held, errors = held + told, errors + told * variance * together
+    if correspondences is not None:
+        ties = colored_icp.Ties(correspondences)
+        told, _ = ties.equations(pose, blocks.centroid, blocks.noise_m)
+        held, errors = held + told, errors + told * variance * _repeats(correspondences[0], params.block_m)
+    return held, errors
 
 
 def swayed(
@@ -348,7 +422,8 @@ def point_to_plane_jacobian(pose: Sim3, points: np.ndarray, normals: np.ndarray)
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Weighted means over B blocks of the pairs that a pose makes, and their (7, 7) Hessian.
+    """Weighted means over B blocks of the pairs that a pose makes, their (7, 7) Hessian, that of pairs whose points are
+    held in all directions (``points``), and the pairs' distance from the planes (robust standard deviation).
 
     ``radius_m`` is that of the overlap. Derivatives are about ``centroid``: rotation and translation then hardly mix,
     and the matrices are well scaled.
@@ -361,6 +436,8 @@ class _Blocks:
     counts: np.ndarray
     weights: np.ndarray
     hessian: np.ndarray
+    points: np.ndarray
+    noise_m: float
     centroid: np.ndarray
     radius_m: float
 
@@ -405,6 +482,8 @@ class _Blocks:
             counts=counts[kept],
             weights=total[kept],
             hessian=(jacobian * weights[:, None]).T @ jacobian,
+            points=pose.scale**2 * point_information(points - centroid, weights),
+            noise_m=1.4826 * float(np.median(np.abs(residual))),
             centroid=centroid,
             radius_m=max(float(np.sqrt(((moved - moved.mean(0)) ** 2).sum(1).mean())), 1e-6),
         )

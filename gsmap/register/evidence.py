@@ -61,6 +61,7 @@ class PoseEvidence:
             stands in front of what these saw, and is on it in no view; the larger of both directions. NaN where no
             cameras could judge. What lies behind is hidden, which proves nothing.
         num_seen: Gaussians so judged, the smaller of both directions; 0 where one could not be asked.
+        num_judged: Gaussians so judged in the direction that ``free_space_violation`` is of.
         colour_correlation: correlation of the colours of both scenes' renders where their depths agree, differences
             within a patch only, so neither exposure nor "floors are dark, walls are bright" counts; mean over lightness
             and two chromas, the smaller of both directions that could be asked. Where neither scene has cameras, that
@@ -81,6 +82,7 @@ class PoseEvidence:
     colour_t: float = 0.0
     disagreement: float = float("nan")
     seen_m2: float = 0.0
+    num_judged: int = 0
 
 
 Views = tuple[ViewCache, float] | None
@@ -126,15 +128,17 @@ def measure(
         camera_free.compare(_opponent(target.coarse[1][row[hit]]), _opponent(source.coarse[1][rows_s[hit]]), cell)
         colours = [camera_free.colour()]
     areas = np.sum([stats.areas_m2(params.pattern_correlation) for stats in judges], axis=0) if judges else np.zeros(3)
+    worst = max(judges, key=lambda stats: stats.free_space_violation, default=None)
     return PoseEvidence(
         overlap=overlap,
         num_coinciding=int(hit.sum()),
-        free_space_violation=max((stats.free_space_violation for stats in judges), default=float("nan")),
+        free_space_violation=float("nan") if worst is None else worst.free_space_violation,
         num_seen=min(stats.num_seen for stats in judges) if len(judges) == 2 else 0,
         colour_correlation=min((correlation for correlation, _ in colours), default=0.0),
         colour_t=min((t for _, t in colours), default=0.0),
         disagreement=float(areas[:2].sum() / areas[2]) if areas[2] > 0 else float("nan"),
         seen_m2=float(areas[2]),
+        num_judged=0 if worst is None else worst.num_seen,
     )
 
 

@@ -7,10 +7,12 @@ court is seen from 7 m, one is four, whether or not the scenes' unit is known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmap.methods.refiner import Correspondences
+from gsmap.register import verdict
 from gsmap.register.evidence import Views
 from gsmap.register.params import Params
 from gsmap.register.scene_view import SceneView
@@ -43,11 +45,15 @@ class MetricScene:
 
 @dataclass(frozen=True, eq=False)
 class MetricPair:
-    """Both scenes in the target's metres, the source with the proposed scale: what remains is nearly rigid."""
+    """Both scenes in the target's metres, the source with the proposed scale: what remains is nearly rigid.
+
+    ``ties``: the correspondences that the proposal rests on, in these metres; None where chance explains them.
+    """
 
     target: MetricScene
     source: MetricScene
     scale: float
+    ties: Correspondences | None = None
 
     @classmethod
     def of(cls, target: SceneView, source: SceneView, proposal: Proposal, params: Params) -> MetricPair:
@@ -56,12 +62,20 @@ class MetricPair:
         unit_m = working_unit_m(target, source, with_scale=proposal.with_scale)
         if proposal.with_scale and source.scale_policy == "known":
             unit_m = source.graph.working_m / scale  # the source knows what a metre is, the target only guesses
-        return cls(MetricScene(target, unit_m, params), MetricScene(source, unit_m * scale, params), scale)
+        pair = cls(MetricScene(target, unit_m, params), MetricScene(source, unit_m * scale, params), scale)
+        return replace(pair, ties=pair.tied(proposal)) if verdict.is_rare(proposal, params.verdict) else pair
 
     @property
     def policies(self) -> set[str]:
         """How the units of both are known: `SceneView.scale_policy`."""
         return {self.target.view.scale_policy, self.source.view.scale_policy}
+
+    def tied(self, proposal: Proposal) -> Correspondences | None:
+        """The correspondences that a proposal rests on, in metres; None where there are none."""
+        if proposal.support is None:
+            return None
+        target, source = proposal.support.points
+        return target * self.target.unit_m, source * self.source.unit_m
 
     def to_metres(self, S_target_source: Sim3) -> Sim3:
         """A pose of the proposed scale, between the scenes' own units, as one between metres."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from gsmap.register import covariance, refinement, verdict
@@ -33,18 +34,24 @@ def register_pair(
         it; ``no_match`` with the reason. Never raises for scenes that do not match.
     """
     params, report, watch = params or Params(), progress or silent, Stopwatch()
-    proposing, judged = Proposing(target, source, params, watch), list[Judged]()
+    proposing, judged, tried = Proposing(target, source, params, watch), list[Judged](), list[Proposal]()
     report(0.0, "matching")
     for proposals in proposing.rounds():  # candidates -> correspondences -> compatibility graph -> clique -> pose
+        before = len(judged)
         for proposal in proposals:
+            if len(judged) - before >= params.max_poses:
+                break
             if not _is_worth_judging(proposal, judged, target, source, params):
                 continue
-            report(0.2 + 0.7 * len(judged) / params.max_poses, f"judging a pose by {proposal.proposer}")
+            done = min(len(judged) / params.max_poses, 1.0)
+            report(0.2 + 0.7 * done, f"judging a pose by {proposal.proposer}")
+            tried.append(proposal)
             judged.append(_judge(proposal, target, source, params, watch))  # refine -> evidence -> decide
             if not judged[-1].flaw and verdict.is_significant(judged[-1].proposal, params.verdict):
                 break
         if any(not j.flaw for j in judged):
             break
+    judged += _rivals(judged, tried, target, source, params, watch)
     report(1.0, "done")
     found = conclude(target, source, judged, params, seconds=watch.seconds, notes=proposing.notes)
     same = same_capture(target, source, found)
@@ -70,11 +77,36 @@ def measured(target: SceneView, source: SceneView, proposal: Proposal, params: P
 def _is_worth_judging(
     proposal: Proposal, judged: list[Judged], target: SceneView, source: SceneView, params: Params
 ) -> bool:
-    """Neither explained by the background model, nor judged before, nor one too many."""
-    if proposal.log_nfa > params.prescreen_log_nfa or len(judged) >= params.max_poses:
+    """Neither explained by the background model, nor judged before."""
+    if proposal.log_nfa > params.prescreen_log_nfa:
         return False
     S, centre, unit_m = proposal.S_target_source, source.centre, own_working_m(target)
     return not any(is_same_pose(S, j.proposal.S_target_source, centre, unit_m, params.same_pose) for j in judged)
+
+
+def _rivals(
+    judged: Sequence[Judged],
+    tried: Sequence[Proposal],
+    target: SceneView,
+    source: SceneView,
+    params: Params,
+    watch: Stopwatch,
+) -> list[Judged]:
+    """Rivals of the accepted pose that its own nodes propose, judged until one is believed; none where it is sure."""
+    best = next((j for j in judged if not j.flaw), None)
+    if best is None or best.proposal.support is None or verdict.is_significant(best.proposal, params.verdict):
+        return []
+    support, S, found = best.proposal.support, best.proposal.S_target_source, list[Judged]()
+    known = [p.S_target_source for p in (*tried, *(j.proposal for j in judged)) if not p.flaw]
+    for _ in range(params.max_poses):
+        rival = support.rival(S, best.proposal.log_nfa, known)
+        if rival is None:
+            break
+        found.append(_judge(rival, target, source, params, watch))
+        if verdict.is_believable(found[-1].proposal, found[-1].evidence, params.verdict):
+            break
+        known += [rival.S_target_source, found[-1].proposal.S_target_source]
+    return found
 
 
 def _judge(
@@ -114,7 +146,25 @@ def _judge(
     S = pair.to_scene_units(pose)
     if belief is not None and belief.rigid:
         S = Sim3(S.rotation, S.translation)
-    proposal = replace(proposal, S_target_source=S, with_scale=belief is None or not belief.rigid)
+    refined = replace(proposal, S_target_source=S, with_scale=belief is None or not belief.rigid)
+    support = None if flaw else proposal.support
+    before, (after, log_nfa) = (0, (0, proposal.log_nfa))
+    if support is not None:
+        before, (after, log_nfa) = support.count(proposal.S_target_source)[0], support.count(S)
+    if after >= params.min_explained * before:
+        refined = replace(refined, log_nfa=log_nfa)
+    else:
+        # The surfaces pulled the pose away from what proposed it: what that was is judged, as it was proposed.
+        pose, belief = pair.to_metres(proposal.S_target_source), None
+        ties = pair.tied(proposal)
+        assert ties is not None
+        known = covariance.known_by_correspondences(ties, pose, params.covariance)
+        with watch.step("verdict"):
+            seen = measure(*surfaces, pose, views, params.evidence)
+        refined = proposal
+    if not flaw and refined is proposal and not verdict.is_rare(proposal, params.verdict):
+        flaw = "surfaces pull the pose away from its correspondences, which chance explains"
+    proposal = refined
     flaw = flaw or verdict.judge(proposal, seen, None if known is None else known.sigmas, params.verdict)
     in_units = None if known is None else covariance.in_scene_units(known.covariance, pair.source.unit_m)
     return Judged(proposal, seen, in_units, flaw, belief)

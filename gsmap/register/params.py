@@ -60,7 +60,10 @@ class Params:
         fallback: when: ``auto`` where a graph is poor, ``never``, ``always``.
         poor_nodes: a graph none of whose layers has this many nodes is poor.
         proposers: settings of each proposer.
-        max_poses: poses that are refined and judged at most.
+        max_poses: poses that are refined and judged at most in each round of proposals (rigid, scaled, without a
+            vertical, fallback), and rivals at most of an accepted pose that is not significant by itself.
+        min_explained: share, in [0, 1], of the correspondences that agree with a proposed pose that must agree with the
+            refined one; with fewer the proposed pose is judged in its place. 0 always judges the refined pose.
         prescreen_log_nfa: a clique that the background model explains this easily (log10 of the number of false
             alarms) is not looked into.
         coarse_refiner: brings a proposed pose near enough to be looked at (``none``: it stays as it is).
@@ -88,6 +91,7 @@ class Params:
     poor_nodes: int = 500
     proposers: MethodParams = field(default_factory=lambda: MethodParams("proposer"))
     max_poses: int = 3
+    min_explained: float = 0.5
     prescreen_log_nfa: float = 6.0
     coarse_refiner: str = "colored_icp"
     coarse_refiners: MethodParams = field(default_factory=_coarse)

@@ -12,7 +12,7 @@ from gsmap.register.params import Params
 from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
 
-VERSION = 12
+VERSION = 13
 
 _RENDER_BACKEND = "native"  # the one that all renders of this room are pinned to
 

@@ -35,7 +35,8 @@ def refiner_for(name: str, params: Params, with_scale: bool) -> str:
 
 def _refined(pair: MetricPair, pose: Sim3, name: str, settings: Mapping[str, Any], with_scale: bool) -> Sim3:
     refiner = family("refiner").get(name)
+    extra = {"correspondences": pair.ties} if getattr(refiner, "USES_CORRESPONDENCES", False) else {}
     found: Sim3 = refiner.refine(
-        pair.target.surface(), pair.source.surface(), pose, settings[name], with_scale=with_scale
+        pair.target.surface(), pair.source.surface(), pose, settings[name], with_scale=with_scale, **extra
     )
     return found

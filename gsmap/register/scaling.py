@@ -32,7 +32,7 @@ def scaled_or_rigid(
     surfaces = pair.target.surface(), pair.source.surface()
     start = pose if with_scale else refinement.coarse(pair, pose, params, with_scale=True)
     scaled = refinement.fine(pair, start, params, with_scale=True)
-    conditioned = condition(*surfaces, scaled, params.covariance)
+    conditioned = condition(*surfaces, scaled, params.covariance, pair.ties)
     if conditioned is None:
         return scaled, None, None
     if "unknown" in pair.policies:

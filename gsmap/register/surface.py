@@ -15,7 +15,7 @@ from gsmap.register import facing
 from gsmap.register.view_cache import ViewCache
 from gsmap.types import Cameras, Gaussians
 
-_PLANE_NEIGHBOURS = 20  # cells, itself included, that a plane is laid through, as small_gicp does
+PLANE_NEIGHBOURS = 20  # cells, itself included, that a plane is laid through, as small_gicp does
 _GRADIENT_NEIGHBOURS = 10
 
 
@@ -141,7 +141,7 @@ class Surface:
     @cached_property
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals at the cell means; signs mean nothing."""
-        normals: np.ndarray = self.tree.normals(_PLANE_NEIGHBOURS)
+        normals: np.ndarray = self.tree.normals(PLANE_NEIGHBOURS)
         return normals
 
     @cached_property

@@ -26,7 +26,10 @@ class Params:
         max_runner_up: ... and no disagreeing clique comes nearer to its size than this share of it.
         min_coinciding: source cells that must coincide with the target's surface.
         max_free_space_violation: share of a scene's surface in front of what the other scene's cameras saw: places
-            change (a door that was open is shut), but not by more.
+            change (a door that was open is shut), but not by more [0, 1].
+        free_space_level: a share that was measured on few Gaussians contradicts a pose only where so many of them would
+            violate free space with less than this probability if the share were the allowed one (binomial test)
+            (0, 0.5]; otherwise it counts in the probability alone. A smaller level lets more poses come so far.
         min_colour_correlation: local colours of both scenes' renders must agree this well: places are repainted, but
             not all of it.
         min_probability: that the pose is right, of all evidence together.
@@ -46,6 +49,7 @@ class Params:
     max_runner_up: float = 0.7
     min_coinciding: int = 300
     max_free_space_violation: float = 0.18
+    free_space_level: float = 0.01
     min_colour_correlation: float = 0.15
     min_probability: float = 0.9
     prior: float = 0.2
@@ -90,7 +94,9 @@ def fails_prescreen(evidence: PoseEvidence, params: Params | None = None) -> str
     pale = evidence.colour_correlation < params.prescreen_colour_correlation
     if pale and evidence.colour_t < params.prescreen_colour_t:
         return _colours_disagree(evidence, params.prescreen_colour_correlation)
-    if evidence.free_space_violation > params.prescreen_free_space_violation:
+    if violates_free_space(
+        evidence.free_space_violation, evidence.num_judged, params.prescreen_free_space_violation, params
+    ):
         return _violates(evidence, params.prescreen_free_space_violation)
     return ""
 
@@ -109,14 +115,9 @@ def judge(
         sigmas: standard deviations (rad, metres, log scale) of the least known directions; None without overlap.
     """
     params = params or Params()
-    if proposal.flaw:
-        return proposal.flaw
-    if evidence.num_coinciding < params.min_coinciding or sigmas is None:
-        return _too_little(evidence, params.min_coinciding)
-    if evidence.colour_correlation < params.min_colour_correlation:
-        return _colours_disagree(evidence, params.min_colour_correlation)
-    if evidence.free_space_violation > params.max_free_space_violation:
-        return _violates(evidence, params.max_free_space_violation)
+    against = contradiction(proposal, evidence, params)
+    if against or sigmas is None:
+        return against or _too_little(evidence, params.min_coinciding)
     degrees = np.degrees(sigmas[0])
     if (
         degrees > params.max_rotation_sigma_deg
@@ -126,6 +127,45 @@ def judge(
         return (
             f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * sigmas[1]:.0f} cm, {sigmas[2]:.1%} in scale"
         )
+    return improbable(proposal, evidence, params)
+
+
+def contradiction(proposal: Proposal, evidence: PoseEvidence, params: Params) -> str:
+    """What contradicts a pose whatever else speaks for it; empty where nothing does."""
+    if proposal.flaw:
+        return proposal.flaw
+    if evidence.num_coinciding < params.min_coinciding:
+        return _too_little(evidence, params.min_coinciding)
+    if evidence.colour_correlation < params.min_colour_correlation:
+        return _colours_disagree(evidence, params.min_colour_correlation)
+    if violates_free_space(evidence.free_space_violation, evidence.num_judged, params.max_free_space_violation, params):
+        return _violates(evidence, params.max_free_space_violation)
+    return ""
+
+
+def violates_free_space(share: float, num_judged: float, allowed: float, params: Params) -> bool:
+    """Whether a share of Gaussians violates free space by more than is allowed, and than so few of them explain.
+
+    Args:
+        share: NaN where no cameras could judge.
+        num_judged: Gaussians that it is of; 0 or NaN where that is not known.
+    """
+    from scipy.stats import binom
+
+    if not share > allowed:
+        return False
+    return not num_judged > 0 or bool(
+        binom.sf(round(share * num_judged) - 1, num_judged, allowed) < params.free_space_level
+    )
+
+
+def is_believable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> bool:
+    """Nothing contradicts the pose and all evidence together carries it, however well it is known."""
+    return not contradiction(proposal, evidence, params) and not improbable(proposal, evidence, params)
+
+
+def improbable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> str:
+    """Why all evidence together does not carry a pose; empty where it does."""
     probable = probability(proposal, evidence, params.prior)
     # Where the cameras of one scene could not judge, nothing was learnt of what a clique beyond chance is worth.
     if probable >= params.min_probability or (not evidence.num_seen and is_significant(proposal, params)):

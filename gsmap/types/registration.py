@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -10,6 +12,20 @@ from gsmap.errors import InputError
 from gsmap.types.sim3 import Sim3
 
 STATUSES = ("accepted", "rejected", "no_match")
+
+
+class Support(Protocol):
+    """The correspondences that a proposal rests on, and the candidates by which any pose of the pair can be counted."""
+
+    @property
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """(K, 3) points of the target and (K, 3) of the source that correspond, each in its scene's own unit."""
+
+    def count(self, S_target_source: Sim3) -> tuple[int, float]:
+        """How many candidates agree with a pose (scenes' own units), and its log10 number of false alarms."""
+
+    def rival(self, S_target_source: Sim3, log_nfa: float, others: Sequence[Sim3] = ()) -> Proposal | None:
+        """Another pose, none of the others, that about as many correspondences of nodes as similar propose, if any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +43,7 @@ class Proposal:
         runner_up: size of the best set of correspondences that disagrees, as a share of this one's; 0 where none comes
             near, NaN where none was sought.
         flaw: why the pose cannot be used, or empty.
+        support: the correspondences; None where there are none.
     """
 
     proposer: str
@@ -38,6 +55,7 @@ class Proposal:
     log_nfa: float = float("nan")
     runner_up: float = float("nan")
     flaw: str = ""
+    support: Support | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +80,7 @@ class Registration:
         evidence: the figures that the verdict rests on, those of the best pose; empty where no pose was proposed. By
             name, all of them floats:
 
-            ``log_nfa``: log10 of the number of false alarms of the correspondences under the pose (a-contrario; below
+            ``log_nfa``: log10 of the number of false alarms of the correspondences under this pose (a-contrario; below
             -2 the background model is no explanation); NaN where the proposer counts none.
             ``runner_up``: size of the largest clique that disagrees with the pose, as a share of the pose's own; NaN
             where none was sought.
@@ -70,11 +88,12 @@ class Registration:
             other could judge and that stand in front of what these saw; the larger of both directions; NaN without
             cameras.
             ``num_seen``: count of Gaussians so judged, the smaller of both directions.
+            ``num_judged``: count of Gaussians so judged in the direction that ``free_space_violation`` is of.
             ``num_coinciding``: count of cells of the source's surface that lie on the target's.
             ``colour_correlation``: correlation, in [-1, 1], of local colours where both scenes show the same surface.
             ``colour_t``: its significance, in standard deviations over patches.
-            ``probability``: that the pose is right, of all evidence together, as far as captures of made places tell
-            (`gsmap.register.probability`); NaN where nothing was measured.
+            ``probability``: that the pose is right, and not another that was judged, of all evidence together, as far
+            as captures of made places tell (`gsmap.register.probability`); NaN where nothing was measured.
             ``disagreement``: of the surface that both saw, as area, the share that is not the same in both: one looked
             through it, or shows another pattern on it; NaN without cameras.
             ``seen_m2``: that surface, in square metres.

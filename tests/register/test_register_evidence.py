@@ -236,6 +236,38 @@ def test_verdict(change, proposal, accepted):
     assert (reason == "") == accepted
 
 
+@pytest.mark.parametrize(
+    ("share", "num_judged", "contradicts"),
+    [
+        (0.182, 190, False),  # 35 of 190 where 34 are allowed: a binomial's standard deviation is 5
+        (0.24, 190, False),
+        (0.26, 190, True),
+        (0.182, 20_000, False),
+        (0.19, 20_000, True),
+        (0.17, 20_000, False),
+        (0.182, 0, True),  # of how many is not known
+        (np.nan, 0, False),
+    ],
+)
+def test_free_space_is_violated_only_beyond_what_so_few_gaussians_explain(share, num_judged, contradicts):
+    evidence = replace(_GOOD, free_space_violation=share, num_judged=num_judged)
+    reason = verdict.contradiction(_SURE, evidence, verdict.Params(max_free_space_violation=0.18))
+    assert ("free-space" in reason) == contradicts
+
+
+def test_the_direction_that_is_violated_says_of_how_many_gaussians():
+    """A screen before the wall: only the source's is seen through, and the target's cameras judge it."""
+    bare = _wall(3.0, width=3.0, height=2.0)
+    found = _measured(bare, Gaussians.concatenate([bare, _wall(2.0, width=0.6, height=1.0, seed=5)]))
+    whole = _measured(bare, bare)
+    assert found.free_space_violation > 0.05
+    assert found.num_judged >= found.num_seen > 0
+    assert round(found.free_space_violation * found.num_judged) == pytest.approx(
+        found.free_space_violation * found.num_judged, abs=1e-6
+    )
+    assert whole.num_judged > 0
+
+
 def test_verdict_refuses_what_is_known_too_loosely():
     assert "fixes the pose only" in verdict.judge(_SURE, _GOOD, (0.05, 0.011, 1e-6))
     assert "too little surface" in verdict.judge(_SURE, _GOOD, None)

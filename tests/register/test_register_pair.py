@@ -11,7 +11,12 @@ from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.vantage import synthesise_cameras
-from gsmap.register import Params, SceneView, register_pair
+from gsmap.register import Params, SceneView, refinement, register_pair
+from gsmap.register import pair as pair_module
+from gsmap.register.conclusion import Judged, conclude
+from gsmap.register.evidence import PoseEvidence
+from gsmap.register.metric import MetricScene
+from gsmap.register.probability import probability
 from gsmap.register.proposers import graph
 from gsmap.types import Cameras, Gaussians, NodeLayer, Proposal, SceneGraph, Sim3
 
@@ -250,6 +255,102 @@ def test_two_proposals_of_one_pose_are_not_ambiguous(monkeypatch):
     answer = register_pair(world.target, world.source, Params(fallback="never"))
     assert (answer.status, answer.reason) == ("accepted", "")
     assert _error(world, answer).rre_deg < 0.1
+
+
+def _moved(S: Sim3, metres: float) -> Sim3:
+    return Sim3(S.rotation, S.translation + np.array([metres, 0.0, 0.0]), S.scale)
+
+
+def test_every_round_of_proposals_has_places_of_its_own(monkeypatch):
+    """Three wrong rigid poses fill no place of a scaled one, as where two captures without metres are laid as if in
+    metres first."""
+    world = splat_world(3, scale=1.4)
+    S = world.S_target_source
+
+    def propose(target, source, params=None, *, with_scale=False):
+        if with_scale:
+            return [Proposal("graph:landmarks", S, True, 60, log_nfa=-60.0, runner_up=0.0)]
+        wrong = (Sim3(S.rotation, _moved(S, k).translation) for k in (2.0, 4.0, 6.0, 8.0))
+        return [Proposal("graph:landmarks", p, False, 10, log_nfa=-1.0, runner_up=0.9) for p in wrong]
+
+    monkeypatch.setattr(graph, "propose", propose)
+    found = register_pair(world.target, world.source, Params(fallback="never"))
+    assert found.status == "accepted"
+    assert _error(world, found).rse < 0.005
+    assert _error(world, found).centroid_m < 0.02
+
+
+@pytest.mark.parametrize("away_m", [0.0, 0.8])
+def test_a_refined_pose_that_leaves_its_clique_is_not_judged_for_it(away_m, monkeypatch):
+    """A refiner that slides by 80 cm, as along a front: what the clique proposed is judged, as it was proposed, and
+    known as well as the clique knows it."""
+    world = splat_world(0)
+    refine = refinement._refined
+
+    def slides(pair, pose, name, settings, with_scale):
+        return _moved(refine(pair, pose, name, settings, with_scale), away_m)
+
+    monkeypatch.setattr(refinement, "_refined", slides)
+    found = register_pair(world.target, world.source)
+    error = _error(world, found)
+    assert found.status == "accepted"
+    assert error.centroid_m < 0.03
+    sigma = np.sqrt(np.linalg.eigvalsh(np.linalg.inv(found.information)[3:6, 3:6])[-1])
+    assert (sigma > 0.01) == (away_m > 0)
+    off = (Similarities.stack([found.S_target_source]).inverse() @ Similarities.stack([world.S_target_source])).log()[0]
+    assert off @ found.information @ off < 24.3  # a chi-square with 7 degrees of freedom, at 0.999
+
+
+def test_a_refined_pose_that_leaves_correspondences_which_chance_explains_is_refused(monkeypatch):
+    world = splat_world(0)
+    refine, judge = refinement._refined, pair_module._judge
+    monkeypatch.setattr(refinement, "_refined", lambda *args: _moved(refine(*args), 0.4))
+    monkeypatch.setattr(pair_module, "_judge", lambda p, *args, **kw: judge(replace(p, log_nfa=-1.0), *args, **kw))
+    found = register_pair(world.target, world.source, Params(fallback="never"))
+    assert found.status != "accepted"
+
+
+def test_false_alarms_are_those_of_the_pose_that_is_judged(monkeypatch):
+    """A refiner that turns the pose by as much as leaves some of the clique: fewer agree, so chance explains more."""
+    world = splat_world(0)
+    found = register_pair(world.target, world.source)
+    (best, *_) = graph.propose(*(MetricScene(view, 1.0, Params()) for view in (world.target, world.source)))
+    assert found.evidence["log_nfa"] == best.support.count(found.S_target_source)[1]
+    refine = refinement._refined
+    monkeypatch.setattr(refinement, "_refined", lambda *args: _moved(refine(*args), 0.12))
+    worse = register_pair(world.target, world.source)
+    assert worse.evidence["log_nfa"] > found.evidence["log_nfa"] + 1
+
+
+def test_a_rival_that_is_known_too_loosely_to_be_an_edge_is_a_rival():
+    world = splat_world(0)
+    evidence = PoseEvidence(0.4, 3000, 0.01, 2000, 0.7, 8.0, disagreement=0.01, seen_m2=30.0, num_judged=2000)
+    best = Judged(
+        Proposal("graph", world.S_target_source, False, 60, log_nfa=-7.0, runner_up=0.9), evidence, np.eye(7), ""
+    )
+    moved = replace(best.proposal, S_target_source=_moved(world.S_target_source, 3.0))
+
+    def status(rival: Judged) -> tuple[str, float]:
+        found = conclude(world.target, world.source, [best, rival], Params(), seconds={})
+        return found.status, found.evidence["probability"]
+
+    alone = conclude(world.target, world.source, [best], Params(), seconds={}).evidence["probability"]
+    loose = replace(best, proposal=moved, flaw="the overlap fixes the pose only to 8 cm")
+    assert status(loose) == ("no_match", pytest.approx(0.5, abs=0.01))
+    near = replace(loose, proposal=_nearly(best.proposal))
+    assert status(near) == ("accepted", pytest.approx(alone))
+    contradicted = replace(loose, evidence=replace(evidence, colour_correlation=0.05))
+    assert status(contradicted) == ("accepted", pytest.approx(alone))
+    # At most one of both is right: odds of each against neither and against the other.
+    weaker = replace(loose, evidence=replace(evidence, colour_correlation=0.16, overlap=0.05), flaw="not probable")
+    odds = [p / (1 - p) for p in (alone, probability(moved, weaker.evidence, Params().verdict.prior))]
+    assert odds[1] > 0.2
+    assert status(weaker)[1] == pytest.approx(odds[0] / (1 + sum(odds)))
+
+
+def _nearly(proposal: Proposal) -> Proposal:
+    """The same pose, a centimetre off."""
+    return replace(proposal, S_target_source=_moved(proposal.S_target_source, 0.01))
 
 
 def test_scenes_with_nothing_in_them_do_not_match():

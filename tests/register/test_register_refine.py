@@ -10,10 +10,18 @@ from scipy.stats import norm
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.geometry.similarities import Similarities
-from gsmap.register import Params, error_field, metres
+from gsmap.geometry.umeyama import umeyama
+from gsmap.register import Params, degeneracy, error_field, metres
 from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, agreeing
 from gsmap.register.correspondences import Correspondences
-from gsmap.register.covariance import Hidden, condition, in_scene_units, point_to_plane_jacobian, swayed
+from gsmap.register.covariance import (
+    Hidden,
+    condition,
+    in_scene_units,
+    known_by_correspondences,
+    point_to_plane_jacobian,
+    swayed,
+)
 from gsmap.register.covariance import Params as CovarianceParams
 from gsmap.register.metric import MetricPair
 from gsmap.register.refiners import colored_icp, gicp, icp
@@ -178,9 +186,112 @@ def test_noise_of_walls_does_not_hold_what_slides_along_them():
         return Surface(points + rng.normal(0, 0.006, points.shape), np.full(points.shape, 0.5), 0.05)
 
     found = condition(corridor(0), corridor(1), Sim3.identity(), NOTHING_HIDDEN)
-    along, across, up = np.sqrt(np.diag(found.rigid)[3:6])
-    assert max(across, up) < 0.003
-    assert along > 5 * across
+    variances, axes = np.linalg.eigh(found.of_rigid(1.0, 0.0, 0.0, None)[3:6, 3:6])
+    assert np.sqrt(variances[1]) < 0.003
+    assert np.sqrt(variances[2]) > 0.5  # anywhere within the overlap: nothing holds it
+    assert abs(axes[0, 2]) > 0.99
+
+
+def _front(rng: np.random.Generator, along: tuple[float, float], *, textured: bool = False) -> Surface:
+    """A flat front and the ground before it, x along the front: nothing of them holds x, nor the scale."""
+    n = int(400 * (along[1] - along[0]))
+    x, other = rng.uniform(*along, 2 * n), np.r_[rng.uniform(0, 2.5, n), rng.uniform(0, 2.5, n)]
+    zero = np.zeros(n)
+    points = np.c_[x, np.r_[zero, other[n:]], np.r_[other[:n], zero]] + rng.normal(0, 0.004, (2 * n, 3))
+    tone = 0.5 + 0.2 * np.sin(3 * x) + 0.15 * np.sin(5.3 * x + 2 * other) if textured else np.full(2 * n, 0.5)
+    return Surface(points, np.repeat(tone[:, None], 3, axis=1).astype(np.float32), 0.05)
+
+
+def _same_points(rng: np.random.Generator, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """Landmarks on the part of two fronts that both show, each 3 cm off in either."""
+    points = np.c_[rng.uniform(2, 6, count), rng.uniform(0, 2, count), rng.uniform(0, 2, count)]
+    return points + rng.normal(0, 0.03, points.shape), points + rng.normal(0, 0.03, points.shape)
+
+
+def test_motions_that_planes_leave_free_are_told_from_those_that_they_hold():
+    """A front and the ground leave one translation of six motions free, and with the scale one more; a room none."""
+    rng = np.random.default_rng(0)
+    points = np.c_[rng.uniform(-2, 2, 3000), rng.uniform(-1, 1, 3000), rng.uniform(-1, 1, 3000)]
+    for normals, free in ((np.eye(3)[rng.integers(1, 3, 3000)], True), (np.eye(3)[rng.integers(0, 3, 3000)], False)):
+        on = points * (1 - normals) + normals * (1 if free else rng.choice([-1, 1], (3000, 1)))
+        noisy = normals + rng.normal(0, 0.01, normals.shape)
+        slope = point_to_plane_jacobian(Sim3.identity(), on, noisy / np.linalg.norm(noisy, axis=1, keepdims=True))
+        for dim in (6, 7):
+            system = (slope.T @ slope)[:dim, :dim]
+            held = degeneracy.held_motions(system, degeneracy.point_information(on), 0.004, 0.05, 20)
+            assert (held is not None) == free
+            if free:
+                assert round(np.trace(held)) == 5
+                gradient = np.zeros(dim)
+                gradient[3] = 1.0  # a pull along the front
+                assert abs((held @ gradient)[3]) < 0.01
+                if dim == 6:  # one away from it stays
+                    assert (held @ np.eye(6)[4])[4] == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_pose_does_not_slide_along_a_bare_front():
+    """Overlap of four metres of eight: pairs at its ends would pull either front over the other, by metres."""
+    rng = np.random.default_rng(1)
+    target, source = _front(rng, (-2.0, 6.0)), _front(rng, (2.0, 10.0))
+    start = Sim3(exp_so3([0.0, 0.004, 0.0]), [0.03, 0.02, -0.02])
+    for with_scale in (False, True):
+        found = colored_icp.refine(target, source, start, with_scale=with_scale)
+        on_both = np.array([[4.0, 0.0, 0.0]])
+        moved = found.apply(on_both)[0] - on_both[0]
+        assert abs(moved[0]) < 0.1  # nothing says where; it started 3 cm off
+        assert np.abs(moved[1:]).max() < 0.005
+
+
+def test_correspondences_hold_what_planes_leave_free_and_planes_the_rest():
+    rng = np.random.default_rng(2)
+    target, source = _front(rng, (-2.0, 6.0)), _front(rng, (2.0, 10.0))
+    start = Sim3(exp_so3([0.0, 0.004, 0.0]), [0.3, 0.02, -0.02])
+    ties = _same_points(rng)
+    found = colored_icp.refine(target, source, start, correspondences=ties)
+    moved = found.apply(np.array([[4.0, 1.0, 1.0]]))[0] - [4.0, 1.0, 1.0]
+    alone = (ties[0] - ties[1]).mean(0)
+    assert abs(moved[0] - alone[0]) < 0.003  # as correspondences have it
+    assert np.abs(moved[1:]).max() < 0.002  # as planes have it, better than they
+
+
+def test_what_planes_leave_free_is_known_as_well_as_correspondences_know_it():
+    """Errors along the front over what the covariance says, over many draws of the correspondences."""
+    rng = np.random.default_rng(3)
+    target, source = _front(rng, (-2.0, 6.0)), _front(rng, (2.0, 10.0))
+    ratios = []
+    for _ in range(8):
+        ties = _same_points(rng)
+        pose = colored_icp.refine(target, source, Sim3.identity(), correspondences=ties)
+        found = condition(target, source, pose, NOTHING_HIDDEN, ties)
+        sigma = np.sqrt(found.of_rigid(1.0, 0.0, 0.0, None)[3, 3])
+        ratios.append((pose.apply(found.centroid[None])[0] - found.centroid)[0] / sigma)
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 2.0
+    without = condition(target, source, pose, NOTHING_HIDDEN)
+    assert np.sqrt(without.of_rigid(1.0, 0.0, 0.0, None)[3, 3]) > 0.5 > 50 * sigma
+
+
+def test_colours_hold_what_planes_leave_free():
+    rng = np.random.default_rng(4)
+    target, source = (_front(rng, along, textured=True) for along in ((-2.0, 6.0), (2.0, 10.0)))
+    pose = colored_icp.refine(target, source, Sim3(np.eye(3), [0.03, 0.01, 0.0]))
+    found = condition(target, source, pose, NOTHING_HIDDEN)
+    off = abs((pose.apply(found.centroid[None])[0] - found.centroid)[0])
+    sigma = np.sqrt(found.of_rigid(1.0, 0.0, 0.0, None)[3, 3])
+    assert off < 0.01
+    assert off / 3 < sigma < 0.05
+
+
+def test_a_pose_of_correspondences_alone_is_known_as_well_as_they_fit():
+    rng, values = np.random.default_rng(5), []
+    for _ in range(60):
+        ties = _same_points(rng, 40)
+        pose = umeyama(*ties)
+        covariance = known_by_correspondences(ties, pose, replace(CovarianceParams(), block_m=0.01)).covariance
+        off = Similarities.stack([pose]).inverse().log()[0, :6]
+        values.append(off @ np.linalg.solve(covariance[:6, :6], off))
+    assert 5.35 / 1.5 < np.median(values) < 5.35 * 1.5  # a chi-square with 6 degrees of freedom
+    together = known_by_correspondences(ties, pose, replace(CovarianceParams(), block_m=100.0)).covariance
+    assert np.allclose(together, 40 * covariance, rtol=1e-6)  # one block: one measurement
 
 
 def _warped(surface: Surface, sigma_m: float, seed: int, cell_m: float = 1.0) -> Surface:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -13,7 +15,7 @@ from gsmap.register.clique import maximum_clique
 from gsmap.register.correspondences import Correspondences
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 
-VERSION = 2
+VERSION = 3
 SCALES = True
 PACKAGES = ()
 
@@ -42,6 +44,10 @@ class Params:
         min_inlier_radius_m: ... and within this distance whatever the standard deviation.
         rival_share: a clique that disagrees with the best is a rival from this share of its size on.
         rival_distance_m: correspondences that the best pose leaves farther apart than this disagree with it.
+        twin_quantile: nodes are alike, and may be taken for each other by a rival, where they are as similar as all but
+            this share of the best pose's own correspondences [0, 1]; smaller finds more rivals.
+        rival_searches: cliques among them that are looked at until one implies a pose [1, ...].
+        max_twins: pairs of nodes that are alike, of which so many, the most similar, take part in that search.
         pose: which cliques imply a pose.
         background: what correspondences would do of themselves, for the number of false alarms.
     """
@@ -64,6 +70,9 @@ class Params:
     min_inlier_radius_m: float = 0.15
     rival_share: float = 0.6
     rival_distance_m: float = 1.0
+    twin_quantile: float = 0.1
+    rival_searches: int = 3
+    max_twins: int = 2400
     pose: pose.Params = field(default_factory=pose.Params)
     background: a_contrario.Params = field(default_factory=a_contrario.Params)
 
@@ -102,10 +111,14 @@ def propose_by_kind(
             best = again
     # The rival: the best clique once everything that agrees with this pose is out of the way.
     at_least = int(np.ceil(params.rival_share * best.num_inliers))
-    rival = matching.pose_of_largest_clique(matching.disagreeing(best.S_target_source), s, at_least)
+    rival = matching.pose_of_largest_clique(matching.disagreeing(best.S_target_source, matching.matches), s, at_least)
+    share = 0.0 if rival is None else rival.num_inliers / best.num_inliers
+    assert best.support is not None
+    twin = best.support.rival(best.S_target_source, best.log_nfa)
+    if twin is not None and 1.0 / twin.runner_up > share:
+        rival, share = twin, 1.0 / twin.runner_up
     if rival is None:
         return [replace(best, runner_up=0.0)]
-    share = rival.num_inliers / best.num_inliers
     return [replace(best, runner_up=share), replace(rival, runner_up=1.0 / share)]
 
 
@@ -219,12 +232,28 @@ class Matching:
             exact=clique.exact,
             log_nfa=self.background.log10_nfa(S, self.radius_m),
             flaw=fit.flaw,
+            support=CliqueSupport(self, inliers if len(inliers) > len(clique) else among[clique.members], at_scale),
         )
 
-    def disagreeing(self, S_target_source: Sim3) -> Correspondences:
-        """The correspondences that a pose leaves farther apart than a rival's may be."""
-        moved = S_target_source.apply(self.matches.source / self.units_m[1]) * self.units_m[0]
-        return self.matches[np.linalg.norm(moved - self.matches.target, axis=1) > self.params.rival_distance_m]
+    def with_twins(self, members: Correspondences) -> Matching:
+        """The same layers with other candidates: all pairs as similar as some correspondences, that share an end."""
+        params, out = self.params, copy(self)
+        out.__dict__.pop("background", None)
+        out.matches = correspondences.as_similar(
+            self.a,
+            self.b,
+            members,
+            params.twin_quantile,
+            params.max_twins,
+            units_m=self.units_m,
+            ups=self.ups,
+        )
+        return out
+
+    def disagreeing(self, S_target_source: Sim3, among: Correspondences) -> Correspondences:
+        """Those of some correspondences that a pose leaves farther apart than a rival's may be."""
+        moved = S_target_source.apply(among.source / self.units_m[1]) * self.units_m[0]
+        return among[np.linalg.norm(moved - among.target, axis=1) > self.params.rival_distance_m]
 
     def _fit(self, members: Correspondences) -> pose.PoseFit:
         return pose.fit_pose(
@@ -235,7 +264,85 @@ class Matching:
             params=self.params.pose,
         )
 
+    def in_metres(self, S_target_source: Sim3) -> Sim3:
+        """A pose between the scenes' own units as one between metres."""
+        target_m, source_m = self.units_m
+        S = S_target_source
+        return Sim3(S.rotation, S.translation * target_m, S.scale * target_m / source_m)
+
     def _in_scene_units(self, S: Sim3) -> Sim3:
         """A pose between metres as one between the scenes' own units."""
         own = S.scale * self.units_m[1] / self.units_m[0] if self.with_scale else 1.0
         return Sim3(S.rotation, S.translation / self.units_m[0], own)
+
+
+@dataclass(frozen=True, eq=False)
+class CliqueSupport:
+    """The correspondences that agree with a clique's pose, and the candidates that they were found among.
+
+    Implements `gsmap.types.registration.Support`.
+
+    Args:
+        scale: of the source, at which the clique was found.
+        equal: another pose's log10 number of false alarms and how many candidates agree with it, where the candidates
+            are pairs of nodes as similar as that pose's: chance explains as many of them as well.
+    """
+
+    matching: Matching
+    members: Correspondences
+    scale: float
+    equal: tuple[float, int] | None = None
+
+    @property
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """(K, 3) points of the target and (K, 3) of the source, each in its scene's own unit."""
+        target_m, source_m = self.matching.units_m
+        return self.members.target / target_m, self.members.source / source_m
+
+    def count(self, S_target_source: Sim3) -> tuple[int, float]:
+        """How many candidates agree with a pose (scenes' own units), and its log10 number of false alarms."""
+        matching, S = self.matching, self.matching.in_metres(S_target_source)
+        inliers = int(a_contrario.agreeing(matching.matches, S, matching.radius_m).sum())
+        if self.equal is None:
+            return inliers, matching.background.log10_nfa(S, matching.radius_m)
+        log_nfa, others = self.equal
+        return inliers, log_nfa * min(inliers / others, 1.0) if log_nfa < 0 else log_nfa
+
+    def rival(self, S_target_source: Sim3, log_nfa: float, others: Sequence[Sim3] = ()) -> Proposal | None:
+        """The largest rival of a pose among its own nodes; its ``runner_up`` is one over its share of the pose's
+        correspondences.
+
+        A scene that repeats itself (a front, a corridor, a stair) has many nodes that are alike. Candidates keep the
+        most similar of them alone, so a rival that is one period off has no correspondences among what the pose leaves.
+        So nodes of either end are paired anew with all that are as similar as they are to their partners.
+
+        Args:
+            log_nfa: of the pose.
+            others: poses that are known already.
+
+        Returns:
+            None where no rival has ``rival_share`` of the pose's correspondences.
+        """
+        params = self.matching.params
+        twins = self.matching.with_twins(self.members)
+        own = int(a_contrario.agreeing(twins.matches, twins.in_metres(S_target_source), twins.radius_m).sum())
+        left = twins.matches
+        for S in (S_target_source, *others):
+            left = twins.disagreeing(S, left)
+        for _ in range(params.rival_searches if own else 0):
+            rival = twins.pose_of_largest_clique(left, self.scale)
+            if rival is None or not isinstance(rival.support, CliqueSupport):
+                return None
+            members = rival.support.members
+            if not rival.flaw:
+                support = replace(rival.support, equal=(log_nfa, own))
+                inliers, equal_nfa = support.count(rival.S_target_source)
+                share = inliers / own
+                return (
+                    replace(rival, log_nfa=equal_nfa, runner_up=1.0 / share, support=support)
+                    if share >= params.rival_share
+                    else None
+                )
+            # Fronts are flat, and a mirrored set of their nodes may be larger than one that implies a pose.
+            left = left[~np.isin(left.target_ids, members.target_ids)]
+        return None
