@@ -73,7 +73,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     undecided = [pair for pair in judged if living.issuperset(pair)]
     add("undecided", len(undecided), f"gsmap list {at} edges", "edges that nothing could decide: confirm or reject")
     todo += set_aside_rows(store)
-    add("changes", num_open(store, settings.change.min_confidence), f"gsmap changes {at}", "changes nobody looked at")
+    add("changes", num_open(store, settings), f"gsmap changes {at}", "changes nobody looked at")
     outweighed = [scene for scene in (newest.provenance.contradicted_priors if newest else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
     contrary = sum(row.use == "outlier" for tie in graph.world for row in tie.residuals)
