@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gsmap.cli.app import VERBS
+from gsmap.cli.app import PANELS, VERBS
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -22,6 +22,17 @@ def gsmap(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_readme_names_every_verb() -> None:
     text = README.read_text()
     assert [verb for verb in VERBS if f"gsmap {verb}" not in text] == []
+
+
+def test_help_lists_every_verb_once_in_a_panel() -> None:
+    listed: dict[str, list[str]] = {}
+    for line in gsmap("-h").stdout.splitlines():
+        if line.startswith("╭─"):
+            panel = listed.setdefault(line.strip("╭─╮ "), [])
+        elif line.startswith("│ ") and line[2] not in " -":
+            panel.append(line[2:].split()[0])
+    assert listed.pop("Options") == []
+    assert listed == {name: list(verbs) for name, verbs in PANELS.items()}
 
 
 @pytest.mark.parametrize("arguments", [["nonsense"], ["export"], ["list", "a.gsmap", "nonsense"], ["init"]])
