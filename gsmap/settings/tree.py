@@ -6,7 +6,9 @@ a tuple of them, or None where nothing is chosen.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import re
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -16,6 +18,9 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from gsmap.errors import ConfigError
 from gsmap.methods import MethodParams
 from gsmap.settings.docs import field_docs, unit_of
+
+_BARE_DOT = re.compile(r"(?<![\w.])\.(?=\d)")
+"""The point of a number without a digit before it, which TOML refuses."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ def differences(tree: Any, base: Any) -> dict[str, Any]:
 
 
 def parse(text: str) -> tuple[str, Any]:
-    """Name and value of ``a.b=value``, as ``--set`` takes them; the value is TOML, or plain text.
+    """Name and value of ``a.b=value``, as ``--set`` takes them; the value is TOML (but ``.3`` will do), or plain text.
 
     Raises:
         ConfigError: no ``=``, or nothing before it.
@@ -79,10 +84,10 @@ def parse(text: str) -> tuple[str, Any]:
     name, value = name.strip(), value.strip()
     if not equals or not name:
         raise ConfigError(f"a setting is given as name=value, such as register.verdict.max_log_nfa=-6, got {text!r}")
-    try:
-        return name, tomllib.loads(f"value = {value}")["value"]
-    except (ValueError, RecursionError):
-        return name, None if value.lower() == "none" else value
+    for text in (value, _BARE_DOT.sub(r"0.", value)):
+        with contextlib.suppress(ValueError, RecursionError):
+            return name, tomllib.loads(f"value = {text}")["value"]
+    return name, None if value.lower() == "none" else value
 
 
 def _is_node(value: Any) -> bool:
