@@ -47,7 +47,7 @@ def test_failures_are_one_line_and_1(tmp_path: Path) -> None:
     for arguments in (
         ["list", str(tmp_path / "missing.gsmap"), "scenes"],
         ["list", str(tmp_path), "scenes"],
-        ["ingest", str(tmp_path / "missing.gsmap"), "a.ply"],
+        ["ingest", str(tmp_path / "missing.gsmap"), str(tmp_path / "a.ply")],
         ["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.spz")],
     ):
         done = gsmap(*arguments)
