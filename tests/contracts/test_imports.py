@@ -231,7 +231,7 @@ def one_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("poses MAP", 170),
         ("show MAP hall", 215),
         ("edit MAP hall --note wet", 215),
-        ("status MAP", 325),
+        ("status MAP", 290),
     ],
 )
 def test_verbs_that_only_read_start_quickly(one_scene: Path, verb: str, most: int) -> None:
