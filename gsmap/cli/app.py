@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -17,55 +18,44 @@ from gsmap.errors import ConfigError, GsmapError
 from gsmap.texts import escaped
 from gsmap.version import __version__
 
-VERBS = (
-    "init",
-    "ingest",
-    "describe",
-    "register",
-    "optimize",
-    "update",
-    "status",
-    "confirm",
-    "reject",
-    "edge",
-    "prior",
-    "changes",
-    "graph",
-    "history",
-    "find",
-    "edit",
-    "localize",
-    "export",
-    "list",
-    "show",
-    "why",
-    "report",
-    "diff",
-    "poses",
-    "georeference",
-    "measure",
-    "settings",
-    "convert",
-    "models",
-    "evaluate",
-    "branch",
-    "tag",
-    "merge",
-    "split",
-    "remove",
-    "restore-scene",
-    "check",
-    "prune",
-    "thin",
-    "migrate",
-    "backup",
-    "restore",
-    "clone",
-    "trust",
-    "view",
-    "demo",
-)
-"""In the order a newcomer meets them. ``gsmap/cli/<verb>.py`` holds ``command`` (or ``app`` where it has sub-verbs),
+PANELS = {
+    "Map": (
+        "init",
+        "ingest",
+        "update",
+        "describe",
+        "register",
+        "optimize",
+        "status",
+        "list",
+        "show",
+        "settings",
+        "demo",
+        "models",
+    ),
+    "Scenes and edges": (
+        "why",
+        "confirm",
+        "reject",
+        "edge",
+        "prior",
+        "edit",
+        "poses",
+        "georeference",
+        "measure",
+        "remove",
+        "restore-scene",
+    ),
+    "Time": ("changes", "history", "diff", "thin"),
+    "Ask": ("view", "report", "graph", "find", "localize", "evaluate"),
+    "Export": ("export", "convert"),
+    "Share and keep": ("branch", "tag", "merge", "split", "clone", "backup", "restore"),
+    "Admin": ("check", "prune", "migrate", "trust"),
+}
+"""The verbs by the panel of ``gsmap -h`` that lists them, in the order a newcomer meets them."""
+
+VERBS = tuple(verb for panel in PANELS.values() for verb in panel)
+"""``gsmap/cli/<verb>.py`` holds ``command`` (or ``app`` where it has sub-verbs),
 and ``TAKES_POINTS`` where an argument may be ``X,Y,Z``."""
 
 
@@ -87,8 +77,8 @@ def _root(
     start_logging(verbose, quiet)
 
 
-def build() -> typer.Typer:
-    """The typer application with every verb attached."""
+def build(verbs: Sequence[str] = VERBS) -> typer.Typer:
+    """The typer application with these verbs attached."""
     app = typer.Typer(
         name="gsmap",
         help="The map-management database for 3D Gaussian Splatting: many captures in, one maintained map out.",
@@ -98,14 +88,15 @@ def build() -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_root)
-    for verb in VERBS:
+    panels = {verb: panel for panel, members in PANELS.items() for verb in members}
+    for verb in verbs:
         module = importlib.import_module(f"gsmap.cli.{verb.replace('-', '_')}")
         if hasattr(module, "app"):
-            app.add_typer(module.app, name=verb)
+            app.add_typer(module.app, name=verb, rich_help_panel=panels[verb])
         else:
             # A point may begin with a minus: what is no option of the verb is one of its arguments.
             points = {"ignore_unknown_options": True} if getattr(module, "TAKES_POINTS", False) else None
-            app.command(name=verb, context_settings=points)(module.command)
+            app.command(name=verb, context_settings=points, rich_help_panel=panels[verb])(module.command)
     return app
 
 
@@ -116,8 +107,10 @@ def run(arguments: list[str] | None = None) -> None:
         arguments: in place of those of the process.
     """
     left()
+    # Attaching all verbs takes longer than most of them do.
+    first = next((one for one in (sys.argv[1:] if arguments is None else arguments) if not one.startswith("-")), "")
     try:
-        build()(arguments)
+        build((first,) if first in VERBS else VERBS)(arguments)
     except SystemExit as ended:
         if ended.code or not (message := left()):
             raise

@@ -20,6 +20,9 @@ CapturedAt = Annotated[
 Scale = Annotated[
     str, typer.Option("--scale", help="`known` (metres), `unknown` (any unit) or `auto` (registration finds out).")
 ]
+NoCreate = Annotated[
+    bool, typer.Option("--no-create", help="Fail if MAP is missing. For scripts: its disk may not be mounted.")
+]
 
 
 def command(
@@ -37,9 +40,11 @@ def command(
             help="The one capture given was trained again of this scene's frames: it takes its place.",
         ),
     ] = None,
+    no_create: NoCreate = False,
     json: AsJson = False,
 ) -> None:
-    """Add scenes: Gaussians with the cameras found beside them. The same content twice is a no-op that says so.
+    """Make MAP if it is missing, and add scenes: Gaussians with the cameras found beside them. The same content twice
+    is a no-op that says so.
 
     Example: `gsmap ingest site.gsmap monday.ply tuesday/`
     """
@@ -48,12 +53,40 @@ def command(
     refuse_capture_as_map("ingest", map, paths or [])
     if not paths:
         raise ConfigError(f"name the files or folders of captures: gsmap ingest {shlex.quote(map)} FILE_OR_FOLDER...")
-    with opened(map, bars=True) as m:
+    create = False
+    if supersedes is None and not no_create:
+        create = makes_map(map, paths, captured_at, cameras=cameras, name=name, scale=scale)
+    with opened(map, create=create, bars=True) as m:
+        if create:
+            say(f"created {map}")
         rows = m.ingest(*paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, supersedes=supersedes)
     for row in rows:
         for note in row.notes:
             say(f"{row.scene_name}: {note}")
     print_rows("ingest", rows, json)
+
+
+def makes_map(
+    map: str,
+    paths: Sequence[str],
+    captured_at: str | None,
+    *,
+    cameras: str | None = None,
+    name: str | None = None,
+    scale: str = "auto",
+) -> bool:
+    """Return whether MAP is missing and these captures make one; those that would be refused make none.
+
+    Raises:
+        GsmapError: see `gsmap.map.Map.ingest`.
+    """
+    from gsmap.map.stages.ingest import check_captures
+    from gsmap.store import Store
+
+    if Store.exists(map):
+        return False
+    check_captures(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
+    return True
 
 
 def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:

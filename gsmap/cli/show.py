@@ -164,14 +164,13 @@ def _pose(pose: Sim3 | None) -> str | None:
         return None
     import numpy as np
 
-    from gsmap.geometry.rotations import matrices_to_quats
+    from gsmap.geometry.rotations import rotation_vector
 
-    w, *xyz = matrices_to_quats(pose.rotation[None])[0]
-    sine = float(np.linalg.norm(xyz))
-    angle = 2.0 * float(np.degrees(np.arctan2(sine, abs(w))))
-    axis = f" about {shown(np.round(np.copysign(1.0, w) * np.array(xyz) / sine, 3))}" if sine > 1e-9 else ""
+    turned = rotation_vector(pose.rotation)
+    angle = float(np.linalg.norm(turned))
+    axis = f" about {shown(np.round(turned / angle, 3))}" if angle > 2e-9 else ""
     scale = "" if pose.is_rigid else f", scale {pose.scale:.5g}"
-    return f"at {shown(np.round(pose.translation, 4))}, turned {angle:.2f} deg{axis}{scale}"
+    return f"at {shown(np.round(pose.translation, 4))}, turned {np.degrees(angle):.2f} deg{axis}{scale}"
 
 
 def _captured(scene: SceneReport) -> str | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets, opened, print_rows, print_table, say
-from gsmap.cli.ingest import CapturedAt, refuse_capture_as_map
+from gsmap.cli.ingest import CapturedAt, NoCreate, makes_map, refuse_capture_as_map
 
 if TYPE_CHECKING:
     from gsmap.types.rows import EdgeRow, SceneRow
@@ -20,9 +20,7 @@ def command(
         list[str] | None, typer.Argument(metavar="[FILE_OR_FOLDER...]", help="Captures to ingest first.")
     ] = None,
     captured_at: CapturedAt = None,
-    no_create: Annotated[
-        bool, typer.Option("--no-create", help="Fail if MAP is missing. For scripts: its disk may not be mounted.")
-    ] = False,
+    no_create: NoCreate = False,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
@@ -35,16 +33,13 @@ def command(
     """
     from gsmap.errors import NotFoundError
     from gsmap.ingest import given_date
-    from gsmap.map.stages.ingest import check_captures
     from gsmap.store import Store
 
     given_date(captured_at)  # refuses what is none before a map is made
     refuse_capture_as_map("update", map, paths or [])
-    create = not no_create and not Store.exists(map)
-    if create and not paths:
+    if not no_create and not paths and not Store.exists(map):
         raise NotFoundError(f"no map at {map}: name captures to make one of, or run gsmap init {map}")
-    if create:
-        check_captures(paths or [], captured_at)
+    create = not no_create and makes_map(map, paths or [], captured_at)
     with opened(map, create=create, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         if create:
             say(f"created {map}")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities, without_scale
 from gsmap.types import Sim3
 from gsmap.types.rows import NeesRow
@@ -107,8 +108,6 @@ def _is_held(covariance: np.ndarray) -> bool:
 
 def nees_rows(of: str, found: Sequence[Nees]) -> tuple[NeesRow, ...]:
     """A row for each number of degrees of freedom: what was measured beside what an honest covariance would show."""
-    from scipy.stats import chi2
-
     rows = []
     for dof in sorted({one.dof for one in found}):
         values = np.array([one.value for one in found if one.dof == dof])
@@ -118,8 +117,8 @@ def nees_rows(of: str, found: Sequence[Nees]) -> tuple[NeesRow, ...]:
                 dof=dof,
                 num=len(values),
                 median=float(np.median(values)),
-                expected_median=float(chi2.ppf(0.5, dof)),
-                within_3_sigma=float((values <= chi2.ppf(_THREE_SIGMA, dof)).mean()),
+                expected_median=float(chi2_quantile(0.5, dof)),
+                within_3_sigma=float((values <= chi2_quantile(_THREE_SIGMA, dof)).mean()),
                 expected_within_3_sigma=_THREE_SIGMA,
             )
         )

@@ -52,7 +52,7 @@ class TileRecipe:
     photos: Mapping[tuple[int, str], str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.format not in _TREES and f".{self.format}" not in formats.known("write"):
+        if self.format not in _TREES and not formats.can_write(f".{self.format}"):
             suffixes = [name[1:] for name in formats.known("write") if name.startswith(".")]
             known = ", ".join([*suffixes, *_TREES])
             raise ConfigError(f"cannot write {self.format!r}: choose one of {known}")

@@ -156,6 +156,11 @@ def known(verb: str) -> list[str]:
     return [suffix for suffix in _suffixes(tuple(sys.path)) if _can(suffix, verb)]
 
 
+def can_write(suffix: str) -> bool:
+    """Return whether files of this suffix can be written; unlike `known`, import that format alone."""
+    return _can(suffix, "write")
+
+
 @lru_cache(maxsize=4)
 def _suffixes(places: tuple[str, ...]) -> tuple[str, ...]:
     """All suffixes; ``places`` (`sys.path`) are looked through for other packages' once, as that takes milliseconds."""

@@ -12,7 +12,6 @@ tried, and draws worse pictures, as the same few places grow coarse.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsmap._native import merged_pairs
 from gsmap.errors import ConfigError
@@ -50,6 +49,8 @@ def decimate(gaussians: Gaussians, max_count: int, pixels: np.ndarray | None = N
 
 def _looked_at(gaussians: Gaussians, pixels: np.ndarray) -> np.ndarray:
     """(N,) pixels in which Gaussians show for their area, about each, as a multiple of the median."""
+    from scipy.spatial import cKDTree  # naming a recipe does without
+
     near = cKDTree(gaussians.means).query(gaussians.means, np.arange(1, min(_ABOUT, len(gaussians)) + 1))[1]
     density = pixels[near].sum(1) / projected_areas(gaussians.scales)[near].sum(1)
     known = density > 0

@@ -39,6 +39,26 @@ def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
     return out
 
 
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    """Return (3,) axis times angle, in radians of [0, pi], of one rotation matrix; SciPy is not imported.
+
+    The quaternion is the eigenvector that belongs to the largest eigenvalue (Bar-Itzhack, 2000), at any angle.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64)
+    K = np.array(
+        [
+            [a - e - i, d + b, g + c, h - f],
+            [d + b, e - a - i, h + f, c - g],
+            [g + c, h + f, i - a - e, d - b],
+            [h - f, c - g, d - b, a + e + i],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(K)[1][:, -1]
+    axis = np.array([x, y, z]) * (1.0 if w >= 0 else -1.0)
+    sine = float(np.linalg.norm(axis))
+    return axis * (2.0 * np.arctan2(sine, abs(w)) / sine) if sine > 0 else np.zeros(3)
+
+
 def conjugate_quats(quats: np.ndarray) -> np.ndarray:
     """(..., 4) the reverse rotations of unit ``wxyz`` quaternions."""
     out: np.ndarray = np.asarray(quats) * np.array([1.0, -1.0, -1.0, -1.0])

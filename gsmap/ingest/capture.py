@@ -140,8 +140,7 @@ def take_capture(
         InputError: what makes no capture; see `gsmap.ingest.validate`.
         ConfigError: an unknown scale policy, or a date that is none.
     """
-    if scale_policy not in SCALE_POLICIES:
-        raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
+    check_scale(scale_policy)
     date = given_date(captured_at)
     where = source or f"capture {name!r}"
     if isinstance(gaussians, Gaussians):
@@ -167,3 +166,13 @@ def _origin_notes(gaussians: GaussianSource, origin: np.ndarray) -> list[str]:
     if step:
         notes.append(f"the file has its positions in single precision, which rounds them to {step:g} there")
     return notes
+
+
+def check_scale(policy: str) -> None:
+    """Refuse what is no scale policy.
+
+    Raises:
+        ConfigError: not ``auto``, ``known`` or ``unknown``.
+    """
+    if policy not in SCALE_POLICIES:
+        raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {policy!r}")

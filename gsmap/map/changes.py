@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,12 +17,14 @@ from gsmap.map.metres import map_metres, metre_notes
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports import scenes_by_id
 from gsmap.map.settings import Settings
-from gsmap.map.stages.change import Wanted, lacking
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison, StoredChange
 from gsmap.types import Change, PoseGraph, Scene
 from gsmap.types.metre import Metre
 from gsmap.types.rows import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow, PairEventRow
+
+if TYPE_CHECKING:
+    from gsmap.map.stages.change import Wanted
 
 _ID = re.compile(r"c(\d{1,9})")
 
@@ -75,6 +77,8 @@ def changes_report(
     min_confidence: float,
 ) -> ChangesReport:
     """What is known of the pairs asked for."""
+    from gsmap.map.stages.change import lacking  # with the comparison, which looking at a change does without
+
     known, (placed, metres) = scenes_by_id(store), _placed(store, settings)
     missing = set(lacking(store, asked, settings))
     pairs = set(asked.pairs)
@@ -144,10 +148,10 @@ def change_detail(store: Store, settings: Settings, number: int) -> ChangeDetail
     )
 
 
-def num_open(store: Store, min_confidence: float) -> int:
+def num_open(store: Store, settings: Settings) -> int:
     """How many changes nobody has looked at yet."""
-    every = (change for one in store.changes.current() for change in one.changes)
-    return sum(change.status == "open" and change.confidence >= min_confidence for change in every)
+    found = [change.confidence for one in store.changes.current() for change in one.changes if change.status == "open"]
+    return sum(confidence >= settings.change.min_confidence for confidence in found)
 
 
 def _find(store: Store, number: int) -> tuple[Comparison, StoredChange]:

@@ -7,27 +7,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image
 
-from gsmap import change as changing
-from gsmap import describe as describing
-from gsmap import localize as localizing
-from gsmap import register as registering
 from gsmap.errors import CorruptError
-from gsmap.export import PlannedTile
 from gsmap.geometry.metres import in_metres, resized
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.localize.localizing import sigmas_of
-from gsmap.map import persisting
-from gsmap.map.persisting import Passing
-from gsmap.merge.placed import pulled_inside
-from gsmap.merge.sights import SightStore
-from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.methods import family
-from gsmap.register import SceneView
 from gsmap.store import Store, branches, homes, sqlite
 from gsmap.store.photos import StoredPhoto
 from gsmap.types import (
@@ -44,6 +31,17 @@ from gsmap.types import (
 from gsmap.types.localization import SceneFeatures
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress
+
+# A job imports its room when it runs: who only names what is missing does without.
+if TYPE_CHECKING:
+    from gsmap import change as changing
+    from gsmap import describe as describing
+    from gsmap import localize as localizing
+    from gsmap import register as registering
+    from gsmap.export import PlannedTile
+    from gsmap.map.persisting import Passing
+    from gsmap.merge.sights import SightStore
+    from gsmap.register import SceneView
 
 _LARGEST_PX = 4096  # of a kept photo's longer side
 
@@ -71,6 +69,8 @@ def _catalog_file(path: str) -> tuple[str, int]:
 @lru_cache(maxsize=4)
 def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
     """Pairs come ordered by scene, so a few views kept save most of the reading; the key names their content."""
+    from gsmap.register import SceneView
+
     store = _store(path)
     scenes, graphs = store.scenes, store.graphs
     graph = graphs.load(scene_id, graph_key)
@@ -81,6 +81,8 @@ def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
 
 def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec], params: describing.Params) -> SceneGraph:
     """The graph of one scene of the map at ``path`` (`Store.location`)."""
+    from gsmap import describe as describing
+
     scenes = _store(path).scenes
     policy = scenes.get(scene_id).scale_policy
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
@@ -91,6 +93,8 @@ def features_of_scene(
     path: str, scene_id: str, models: Mapping[str, ModelSpec], params: localizing.Params
 ) -> SceneFeatures:
     """What the views of one scene of the map at ``path`` show."""
+    from gsmap import localize as localizing
+
     scenes = _store(path).scenes
     extractor = family("extractor").get(params.extractor).make(models, params.extractors[params.extractor])
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
@@ -101,6 +105,8 @@ def register_scenes(
     path: str, target: tuple[str, str], source: tuple[str, str], params: registering.Params
 ) -> Registration:
     """The registration of one pair of the map at ``path``; target and source are (scene id, key of its graph)."""
+    from gsmap import register as registering
+
     return registering.register_pair(_view(path, *target), _view(path, *source), params)
 
 
@@ -112,6 +118,8 @@ def compare_scenes(
     Args:
         older, newer: scene id, S_map_scene and date.
     """
+    from gsmap import change as changing
+
     before, after = _placed(path, *older), _placed(path, *newer)
     return changing.compare(before, after, params), (len(before.gaussians), len(after.gaussians))
 
@@ -141,11 +149,15 @@ def _left_out(path: str, scene_id: str, passing: Passing | None) -> np.ndarray |
 @lru_cache(maxsize=8)
 def _without(path: str, scene_id: str, passing: Passing) -> np.ndarray:
     """Tiles of one place ask for the same captures."""
+    from gsmap.map import persisting
+
     return persisting.rows(_store(path), scene_id, passing)
 
 
 def _kept(path: str, photo: StoredPhoto) -> KeptPhoto:
     """A photo in the frame of its scene."""
+    from gsmap.localize.localizing import sigmas_of
+
     one = photo.sighting
     camera = Cameras(one.T_scene_camera[None], one.intrinsics_px[None], np.array([one.size_px]))
     return KeptPhoto(camera, partial(_picture, path, photo.number), *sigmas_of(one.covariance))
@@ -153,6 +165,8 @@ def _kept(path: str, photo: StoredPhoto) -> KeptPhoto:
 
 def _picture(path: str, number: int) -> np.ndarray:
     """(H, W, 3) uint8 of a photo as it is kept."""
+    from PIL import Image
+
     try:
         with Image.open(io.BytesIO(_store(path).photos.jpeg(number))) as picture:
             if max(picture.size) > _LARGEST_PX:  # so few bytes can claim any number of pixels
@@ -194,6 +208,9 @@ class TileMaker:
 
     def __call__(self, progress: Progress) -> MergeResult:
         """Merged in metres, in the map's unit when it is done."""
+        from gsmap.merge.placed import pulled_inside
+        from gsmap.merge.tile import LazyScene, merge_tile
+
         scenes, metres = _store(self.location).scenes, self.tile.metres_per_unit
         lazy = [
             LazyScene(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from gsmap import localize, retrieve
+from gsmap import retrieve
 from gsmap.errors import CorruptError, NotFoundError
 from gsmap.map.indexing import AT_ONCE, PATIENCE, SceneIndex
 from gsmap.methods import RecipeKey
@@ -97,6 +97,8 @@ def _index(
     Args:
         read: takes what was read of those that ask, while they are put in.
     """
+
+    from gsmap import localize  # naming an edge does without
 
     def make(scenes: Sequence[str]) -> InMemory:
         new = [_voters(store, graphs[scene], params) for scene in scenes]

@@ -325,9 +325,7 @@ class Map(AbstractContextManager["Map"]):
         return reports.edge_row(self.store, a, b)
 
     def _pair(self, pair: str) -> tuple[Scene, Scene]:
-        from gsmap.map.stages.register import pair_of
-
-        return pair_of(self.store, pair)
+        return reports.pair_of(self.store, pair)
 
     def optimize(self) -> RevisionRow:
         """Solve for all scene poses and keep the answer as a new revision."""

@@ -9,16 +9,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmap.errors import NotFoundError
-from gsmap.map.objects import Known
 from gsmap.methods import text_digest
-from gsmap.objects.changed import CHANGED
 from gsmap.store import Store
 from gsmap.types import MapObject, Scene
 from gsmap.types.plain import canonical
+
+if TYPE_CHECKING:
+    from gsmap.map.objects import Known
 
 _OF_THINGS = ("appeared", "disappeared", "moved", "replaced")
 """Kinds of changes that are of things; what was repainted stays, and so does what is lit otherwise."""
@@ -120,6 +122,8 @@ def rows(store: Store, scene: str, passing: Passing) -> np.ndarray:
     if passing.graph and graph is None:
         raise NotFoundError(f"the things of scene {scene[:12]} were dropped meanwhile: run the same export again")
     if graph is not None and graph.things is not None and len(graph.things):
+        from gsmap.objects.changed import CHANGED  # naming what passes does without
+
         members = graph.things.members
         of = np.bincount(members[members >= 0], minlength=len(graph.things))
         changed = np.bincount(members[out & (members >= 0)], minlength=len(graph.things))

@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from gsmap import (
-    change,
-    describe,
-    engine,
-    export,
-    localize,
-    merge,
-    objects,
-    optimize,
-    register,
-    report,
-    retrieve,
-    thin,
-    view,
-    world,
-)
 from gsmap.errors import ConfigError
-from gsmap.evaluate import judge
-from gsmap.localize import scan
-from gsmap.map import visits
-from gsmap.register import by_shape
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
+
+if TYPE_CHECKING:
+    from gsmap import (
+        change,
+        describe,
+        engine,
+        export,
+        localize,
+        merge,
+        objects,
+        optimize,
+        register,
+        report,
+        retrieve,
+        thin,
+        view,
+        world,
+    )
+    from gsmap.evaluate import judge
+    from gsmap.localize import scan
+    from gsmap.map import visits
+    from gsmap.register import by_shape
 
 _log = logging.getLogger("gsmap.settings")
 
@@ -67,9 +70,35 @@ PRESETS: dict[str, dict[str, Any]] = {
 """Settings by the name of a preset; what a preset does not name has its default."""
 
 
+class _Section:
+    """A field of `Settings` whose default is made, and whose module is imported, on first use."""
+
+    def __init__(self, module: str) -> None:
+        self._module = module
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: object, owner: type) -> Any:
+        if instance is None:
+            return self
+        if self._name not in vars(instance):
+            vars(instance)[self._name] = importlib.import_module(self._module).Params()
+        return vars(instance)[self._name]
+
+    def __set__(self, instance: object, value: Any) -> None:
+        if value is not self:
+            vars(instance)[self._name] = value
+
+
+def _params_of(module: str) -> Any:
+    """Return a field that holds the ``Params`` of a module."""
+    return _Section(module)
+
+
 @dataclass(frozen=True)
 class Settings:
-    """All parameters of a map.
+    """All parameters of a map. Rooms whose parameters nobody asks for are not imported.
 
     Args:
         describe: how captures become scene graphs.
@@ -92,24 +121,24 @@ class Settings:
         engine: where jobs run.
     """
 
-    describe: describe.Params = field(default_factory=describe.Params)
-    retrieve: retrieve.Params = field(default_factory=retrieve.Params)
-    register: register.Params = field(default_factory=register.Params)
-    optimize: optimize.Params = field(default_factory=optimize.Params)
-    world: world.Params = field(default_factory=world.Params)
-    thin: thin.Params = field(default_factory=thin.Params)
-    merge: merge.Params = field(default_factory=merge.Params)
-    export: export.Params = field(default_factory=export.Params)
-    visits: visits.Params = field(default_factory=visits.Params)
-    change: change.Params = field(default_factory=change.Params)
-    objects: objects.Params = field(default_factory=objects.Params)
-    localize: localize.Params = field(default_factory=localize.Params)
-    scan: scan.Params = field(default_factory=scan.Params)
-    by_shape: by_shape.Params = field(default_factory=by_shape.Params)
-    evaluate: judge.Params = field(default_factory=judge.Params)
-    report: report.Params = field(default_factory=report.Params)
-    view: view.Params = field(default_factory=view.Params)
-    engine: engine.Params = field(default_factory=engine.Params)
+    describe: describe.Params = field(default=_params_of("gsmap.describe"))
+    retrieve: retrieve.Params = field(default=_params_of("gsmap.retrieve"))
+    register: register.Params = field(default=_params_of("gsmap.register"))
+    optimize: optimize.Params = field(default=_params_of("gsmap.optimize"))
+    world: world.Params = field(default=_params_of("gsmap.world"))
+    thin: thin.Params = field(default=_params_of("gsmap.thin"))
+    merge: merge.Params = field(default=_params_of("gsmap.merge"))
+    export: export.Params = field(default=_params_of("gsmap.export"))
+    visits: visits.Params = field(default=_params_of("gsmap.map.visits"))
+    change: change.Params = field(default=_params_of("gsmap.change"))
+    objects: objects.Params = field(default=_params_of("gsmap.objects"))
+    localize: localize.Params = field(default=_params_of("gsmap.localize"))
+    scan: scan.Params = field(default=_params_of("gsmap.localize.scan"))
+    by_shape: by_shape.Params = field(default=_params_of("gsmap.register.by_shape"))
+    evaluate: judge.Params = field(default=_params_of("gsmap.evaluate.judge"))
+    report: report.Params = field(default=_params_of("gsmap.report"))
+    view: view.Params = field(default=_params_of("gsmap.view"))
+    engine: engine.Params = field(default=_params_of("gsmap.engine"))
 
 
 def settings_of(values: Mapping[str, Any], preset: str | None = None) -> Settings:

@@ -11,7 +11,6 @@ from gsmap.map.metres import map_metres
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, unthinned, without_graph
-from gsmap.map.stages.export import dirty_tiles
 from gsmap.map.stages.optimize import pose_basis
 from gsmap.map.stages.register import num_stale
 from gsmap.register.duplicate import SAME_CAPTURE
@@ -63,9 +62,12 @@ def status(store: Store, settings: Settings) -> MapStatus:
         "edges made by other settings or versions",
     )
     _add_unsolved(store, settings, add, f"gsmap optimize {at}")
-    for target, (count, request) in dirty_tiles(store, settings).items():
-        verb = " ".join(["gsmap export", at, shlex.quote(target), *request.options()])
-        add("dirty_tiles", count, verb, f"tiles in {target} that are out of date")
+    if store.exports.targets():
+        from gsmap.map.stages.export import dirty_tiles  # with merging, which a map that nobody exported does without
+
+        for target, (count, request) in dirty_tiles(store, settings).items():
+            verb = " ".join(["gsmap export", at, shlex.quote(target), *request.options()])
+            add("dirty_tiles", count, verb, f"tiles in {target} that are out of date")
     poses = [pose for scene, pose in graph.poses.items() if scene in living]
     tentative = [pose for pose in poses if pose.status == "tentative"]
     add("tentative", len(tentative), f"gsmap list {at} scenes --status tentative", "scenes on edges no cycle confirms")
@@ -73,7 +75,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     undecided = [pair for pair in judged if living.issuperset(pair)]
     add("undecided", len(undecided), f"gsmap list {at} edges", "edges that nothing could decide: confirm or reject")
     todo += set_aside_rows(store)
-    add("changes", num_open(store, settings.change.min_confidence), f"gsmap changes {at}", "changes nobody looked at")
+    add("changes", num_open(store, settings), f"gsmap changes {at}", "changes nobody looked at")
     outweighed = [scene for scene in (newest.provenance.contradicted_priors if newest else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
     contrary = sum(row.use == "outlier" for tie in graph.world for row in tie.residuals)

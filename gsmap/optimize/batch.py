@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from gsmap.errors import InputError
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.contradictions import contested, part_contradicted
 from gsmap.optimize.cycles import Vote, vote
@@ -43,7 +43,7 @@ def solve_batch(
     check_priors(scene_ids, priors)
     # Rows are numbered by id: where the solve starts, and what it does first among equals, is the same in any order.
     m = measurements(sorted(scene_ids), edges, rigid=all_rigid(edges, priors, previous))
-    gate = float(chi2.ppf(params.gate_probability, m.dim))
+    gate = float(chi2_quantile(params.gate_probability, m.dim))
 
     terms = PriorTerms.stack(m.scene_ids, priors)
     doubtful = find_doubtful(m, params.aliasing.max_disagreement)

@@ -6,8 +6,8 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.drift import DriftModel
 from gsmap.optimize.measurements import Measurements
@@ -23,7 +23,7 @@ def consistent_with_component(
     Args:
         gates: an edge agrees up to this many times the chi-square of ``probability``.
     """
-    limit = gates * chi2.ppf(probability, edges.dim)
+    limit = gates * chi2_quantile(probability, edges.dim)
     out = drift.labels[edges.targets[rows]] == drift.labels[edges.sources[rows]]
     r = residuals(edges[rows], drift.poses)
     for hops in (drift.bound, drift.hops):
@@ -66,7 +66,7 @@ class DirectedEdges:
         """(P,) bool: edges ``first`` and ``second`` say the same, within their noise and that of the map between."""
         poses, dim = drift.poses, self.covariance.shape[1]
         a, b, measured, covariance = self.near, self.far, self.measured, self.covariance
-        limit = chi2.ppf(probability, dim)
+        limit = chi2_quantile(probability, dim)
         there = poses[b[second]].inverse() @ poses[b[first]]
         across = poses[a[first]].inverse() @ poses[a[second]]
         r = (measured[first].inverse() @ across @ measured[second] @ there).log()[:, :dim]
@@ -91,7 +91,7 @@ def agreeing_pairs(
     directed = DirectedEdges.of(edges, rows, labels[edges.targets[rows]] > labels[edges.sources[rows]])
     flat = (poses[directed.near] @ directed.measured @ poses[directed.far].inverse()).rotations.reshape(-1, 9)
     spread = 2 * edges.covariance[rows][:, :3, :3].trace(axis1=1, axis2=2).max(initial=0)
-    limit = chi2.ppf(probability, edges.dim)
+    limit = chi2_quantile(probability, edges.dim)
     firsts, seconds = [], []
     counts = ends - np.arange(len(rows)) - 1
     block = np.searchsorted(np.cumsum(counts), np.arange(0, counts.sum() + 1, 2_000_000), side="left")

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.stats import chi2
 
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.structure import ranges
@@ -64,7 +64,7 @@ def vote(edges: Measurements, probability: float) -> Vote:
     to one frame, is below the quantile ``probability``. All triangles at once; no loop over edges.
     """
     triangles, signs = list_triangles(edges.targets, edges.sources, edges.num_scenes)
-    agrees = cycle_chi2(edges, triangles, signs) < chi2.ppf(probability, edges.dim)
+    agrees = cycle_chi2(edges, triangles, signs) < chi2_quantile(probability, edges.dim)
     return Vote.of(edges, np.bincount(triangles[agrees].ravel(), minlength=len(edges)))
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.contradictions import contested, contradicting
 from gsmap.optimize.cycles import Vote
@@ -163,7 +163,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
         state.poses = descent.fit(state.poses, max_steps=5)
         components[-1] = components[first[0]]
         covariances[-1] = _covariance(len(near), rows, m, state.poses, [previous.poses[s] for s in near])
-        gate = float(chi2.ppf(params.gate_probability, m.dim))
+        gate = float(chi2_quantile(params.gate_probability, m.dim))
         bad = chi_squares(m, state.poses) > gate
         if (bad & state.accepted)[: len(around)].any():
             return None

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.cycles import Vote
 from gsmap.optimize.measurements import Measurements
@@ -62,7 +62,7 @@ def _outcomes(
     votes: Vote,
     params: Params,
 ) -> dict[tuple[str, str], EdgeOutcome]:
-    gate = float(chi2.ppf(params.gate_probability, m.dim))
+    gate = float(chi2_quantile(params.gate_probability, m.dim))
     chi = chi_squares(m, poses)
     together = component[m.targets] == component[m.sources]
     out: dict[tuple[str, str], EdgeOutcome] = {}

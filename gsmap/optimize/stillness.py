@@ -6,8 +6,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.params import Params
@@ -134,6 +132,9 @@ class _Both:
         """All poses then, and the rows of those that are neither as they were nor as the answer has them."""
         ends, n = np.stack([self.targets, self.sources]), len(self.scenes)
         moved = ~still[ends].any(0)
+        import scipy.sparse as sp  # naming a recipe does without
+        from scipy.sparse.csgraph import connected_components
+
         tied = sp.coo_matrix((np.ones(moved.sum()), ends[:, moved]), shape=(n, n))
         group = connected_components(tied, directed=False)[1]
         seam = still[ends[0]] ^ still[ends[1]]

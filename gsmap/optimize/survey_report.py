@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.optimize.survey_system import Active, Factor, System, Tests
 from gsmap.optimize.survey_terms import Terms, Unknowns
 from gsmap.types.world import Contradiction, Residual, Survey, WorldFrame, WorldTie
@@ -115,7 +115,7 @@ def lengths_only(system: System, index: int, survey: Survey, refusal: Refusal) -
     sigma = float(weights.sum() ** -0.5)
     free = int(use.sum()) - 1
     off = float((weights * (np.array(logs) - log) ** 2).sum())
-    if free > 0 and off > chi2.ppf(system.params.gate_probability, free):
+    if free > 0 and off > chi2_quantile(system.params.gate_probability, free):
         sigma *= float(np.sqrt(off / free))
     for bar, one, variance, used in zip(terms.bars, logs, variances, use, strict=True):
         error = bar.length_m * (np.exp(log - one) - 1)
@@ -149,7 +149,7 @@ def _variance_factor(system: System, x: Unknowns, active: Active, tests: Tests) 
     )
     unknown = 7 + 3 * len({int(k) for k in system.terms.image_points[active[1]]})
     free = count - unknown
-    if free <= 0 or total <= chi2.ppf(system.params.gate_probability, free):
+    if free <= 0 or total <= chi2_quantile(system.params.gate_probability, free):
         return 1.0
     return total / free
 
@@ -262,7 +262,7 @@ def _agreed(logs: np.ndarray, variances: np.ndarray, probability: float) -> tupl
     """The mean of those that agree, and which do: where three or more are there, those far from the median go."""
     use = np.ones(len(logs), dtype=bool)
     if len(logs) >= 3:
-        use = (logs - np.median(logs)) ** 2 <= chi2.ppf(probability, 1) * (variances + np.median(variances))
+        use = (logs - np.median(logs)) ** 2 <= chi2_quantile(probability, 1) * (variances + np.median(variances))
     weights = use / variances
     return float((weights * logs).sum() / weights.sum()), use
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from gsmap.geometry.chi_square import chi2_log_survival, chi2_quantile
 from gsmap.optimize.survey_places import Places
 from gsmap.optimize.survey_system import Factor, System
 from gsmap.optimize.survey_terms import Terms
@@ -76,7 +76,7 @@ def shift_of(system: System, all_terms: Sequence[Terms], factor: Factor, places:
     b = -(W * r).sum(0)
     if not used:
         shift, covariance = b / own, (np.diag(own) + V) / own / own[:, None]
-        log_p = float(chi2.logsf(shift @ np.linalg.solve(covariance, shift), 3))
+        log_p = float(chi2_log_survival(shift @ np.linalg.solve(covariance, shift), 3))
         return Shift(shift, covariance, log_p, agree, _shaped(system, factor, terms, mine, apart[agree], W, own))
     root = np.sqrt(own)
     values, axes = np.linalg.eigh((np.diag(own) - V) / root / root[:, None])
@@ -86,7 +86,7 @@ def shift_of(system: System, all_terms: Sequence[Terms], factor: Factor, places:
     spread = np.where(checked, 1 / np.maximum(values, 1e-300), 1e12)
     covariance = (axes * spread) @ axes.T / root / root[:, None]
     statistic = float((along[checked] ** 2 / values[checked]).sum())
-    log_p = float(chi2.logsf(statistic, int(checked.sum()))) if checked.any() else 0.0
+    log_p = float(chi2_log_survival(statistic, int(checked.sum()))) if checked.any() else 0.0
     return Shift(shift, covariance, log_p, agree)
 
 
@@ -106,7 +106,7 @@ def _shaped(
     system: System, factor: Factor, terms: Terms, rows: np.ndarray, apart: np.ndarray, W: np.ndarray, own: np.ndarray
 ) -> bool:
     """Whether places lie beside each other as the map has them, within their own errors and the map's."""
-    gate = chi2.ppf(system.params.gate_probability, 3)
+    gate = chi2_quantile(system.params.gate_probability, 3)
     mean = (W**2 * apart).sum(0) / own
     if len(rows) < 3 or np.median((((apart - mean) * W) ** 2).sum(1)) <= gate:
         return True
@@ -140,7 +140,7 @@ def is_unmeasured(places: Places, frame: WorldFrame) -> bool:
 def clusters(shifts: Sequence[Shift], probability: float) -> list[np.ndarray]:
     """Rows of shifts that agree with each other, the largest set first."""
     left, out = list(range(len(shifts))), []
-    gate = chi2.ppf(probability, 3)
+    gate = chi2_quantile(probability, 3)
     while left:
         best: list[int] = []
         for k in left:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.optimize.survey_report import world_covariance
 from gsmap.optimize.survey_system import Active, Factor, System, Tests
 from gsmap.optimize.survey_terms import Terms, Unknowns
@@ -27,7 +27,7 @@ def without_outliers(system: System, x: Unknowns, allowed: Active, gross: Active
     """
     active: Active = tuple(use & ~bad for use, bad in zip(allowed, gross, strict=True))  # type: ignore[assignment]
     x = system.fit(replace(x, points=system.points_at(x, active)), system.as_weights(active), max_steps=3)
-    bars = [chi2.ppf(system.params.gate_probability, t.residuals.shape[1]) for t in system.terms.observations(x)]
+    bars = [chi2_quantile(system.params.gate_probability, t.residuals.shape[1]) for t in system.terms.observations(x)]
     wide = max((float((t.squares[a] / b).max(initial=0)) for t, a, b in _seen(system, x, active, bars)), default=1.0)
     while True:
         for _ in range(3):

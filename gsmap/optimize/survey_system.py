@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
-from scipy.stats import chi2
 
+from gsmap.geometry.chi_square import chi2_log_survival
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import SurveyParams
@@ -262,7 +262,9 @@ class System:
             T[~terms.valid] = np.inf
             statistics.append(T)
             dofs.append(dof)
-            log_p.append(np.where(dof > 0, chi2.logsf(np.where(np.isfinite(T), T, 1e9), np.maximum(dof, 1)), 0.0))
+            log_p.append(
+                np.where(dof > 0, chi2_log_survival(np.where(np.isfinite(T), T, 1e9), np.maximum(dof, 1)), 0.0)
+            )
             log_p[-1][~terms.valid] = -1e12
             redundancies.append(np.where(use, redundancy, 0.0))
         return Tests(tuple(statistics), tuple(dofs), tuple(log_p), tuple(redundancies))

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsmap.types import NodeLayer
 
@@ -59,6 +58,8 @@ def neighbourhood(positions: np.ndarray, max_distance: float, hops: int) -> np.n
 
     Edges join nodes nearer than ``max_distance``: the paper's local graph.
     """
+    from scipy.spatial import cKDTree  # naming a recipe does without
+
     count = len(positions)
     step = np.eye(count, dtype=bool)
     for i, j in cKDTree(positions).query_pairs(max_distance) if count else ():

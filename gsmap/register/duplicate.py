@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsmap.geometry.umeyama import umeyama
 from gsmap.register.scene_view import SceneView
 from gsmap.types import Registration, Sim3
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 SAME_CAPTURE = "the same capture"
 _MIN_OVERLAP = 0.5  # of the surface; below, neither scene is the other
@@ -37,6 +41,8 @@ def same_capture(target: SceneView, source: SceneView, found: Registration) -> s
 
 def _coinciding_gaussians(target: SceneView, source: SceneView, S_target_source: Sim3) -> float:
     """The share of the smaller scene's Gaussians that lie where one of the other's does."""
+    from scipy.spatial import cKDTree  # naming a recipe does without
+
     means, moved = target.gaussians.means.astype(float), S_target_source.apply(source.gaussians.means)
     large, small = (means, moved) if len(means) >= len(moved) else (moved, means)
     small = small[np.linspace(0, len(small) - 1, min(len(small), _POINTS)).astype(int)]
@@ -59,6 +65,8 @@ def _laid_exactly(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _coinciding_cameras(target: SceneView, source: SceneView, S_target_source: Sim3) -> tuple[int, int]:
     """How many cameras of the scene with fewer stand and look as one of the other's, and how many those are."""
+    from scipy.spatial import cKDTree
+
     ours, theirs = target.cameras, source.cameras
     if not ours or not theirs or ours.synthesised or theirs.synthesised or min(len(ours), len(theirs)) < _MIN_CAMERAS:
         return 0, 0

@@ -6,16 +6,21 @@ a tuple of them, or None where nothing is chosen.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import re
 import types
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from gsmap.errors import ConfigError
 from gsmap.methods import MethodParams
 from gsmap.settings.docs import field_docs, unit_of
+
+_BARE_DOT = re.compile(r"(?<![\w.])\.(?=\d)")
+"""The point of a number without a digit before it, which TOML refuses."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ def differences(tree: Any, base: Any) -> dict[str, Any]:
 
 
 def parse(text: str) -> tuple[str, Any]:
-    """Name and value of ``a.b=value``, as ``--set`` takes them; the value is TOML, or plain text.
+    """Name and value of ``a.b=value``, as ``--set`` takes them; the value is TOML (but ``.3`` will do), or plain text.
 
     Raises:
         ConfigError: no ``=``, or nothing before it.
@@ -79,10 +84,10 @@ def parse(text: str) -> tuple[str, Any]:
     name, value = name.strip(), value.strip()
     if not equals or not name:
         raise ConfigError(f"a setting is given as name=value, such as register.verdict.max_log_nfa=-6, got {text!r}")
-    try:
-        return name, tomllib.loads(f"value = {value}")["value"]
-    except (ValueError, RecursionError):
-        return name, None if value.lower() == "none" else value
+    for text in (value, _BARE_DOT.sub(r"0.", value)):
+        with contextlib.suppress(ValueError, RecursionError):
+            return name, tomllib.loads(f"value = {text}")["value"]
+    return name, None if value.lower() == "none" else value
 
 
 def _is_node(value: Any) -> bool:
@@ -97,15 +102,25 @@ def _children(tree: Any) -> Iterator[tuple[str, Any, Any, str]]:
         return
     cls: type = type(tree)
     docs = field_docs(cls)
-    for name, annotation in _annotations(cls).items():
-        yield name, getattr(tree, name), annotation, docs.get(name, "")
+    for name in _names(cls):
+        value = getattr(tree, name)
+        yield name, value, _annotation(cls, name, value), docs.get(name, "")
 
 
 @lru_cache(maxsize=512)
-def _annotations(cls: type) -> dict[str, Any]:
-    """The annotation of each field that can be set."""
-    hints = get_type_hints(cls)
-    return {field.name: hints[field.name] for field in fields(cls) if field.init}
+def _names(cls: type) -> tuple[str, ...]:
+    """Names of the fields that can be set."""
+    return tuple(field.name for field in fields(cls) if field.init)
+
+
+def _annotation(cls: type, name: str, value: Any) -> Any:
+    """Return the annotation of a leaf; None for a node, whose class need not be imported where it is declared."""
+    return None if _is_node(value) else _hints(cls)[name]
+
+
+@lru_cache(maxsize=512)
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
 
 
 def _child(tree: Any, name: str) -> tuple[Any, Any]:
@@ -119,8 +134,10 @@ def _child(tree: Any, name: str) -> tuple[Any, Any]:
             raise KeyError(name)
         return tree[name], None
     cls: type = type(tree)
-    annotation = _annotations(cls)[name]
-    return getattr(tree, name), annotation
+    if name not in _names(cls):
+        raise KeyError(name)
+    value = getattr(tree, name)
+    return value, _annotation(cls, name, value)
 
 
 def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:
@@ -139,7 +156,9 @@ def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:
         new = _of_type(value, annotation, name)
     if isinstance(tree, MethodParams):
         return tree.with_params(path[0], new)
-    return replace(tree, **{path[0]: new})
+    cls: type = type(tree)
+    made = {key: vars(tree)[key] for key in _names(cls) if key in vars(tree)}  # `replace` would make the others, too
+    return cls(**made | {path[0]: new})
 
 
 def _unknown(name: str, root: Any) -> ConfigError:

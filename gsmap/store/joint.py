@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from gsmap.geometry.boxes import box_corners
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
 from gsmap.types import PoseGraph, ScenePose, Sim3
@@ -121,7 +121,7 @@ def _between(common: list[tuple[ScenePose, ScenePose]], bounds: Mapping[str, np.
 
 def _agree(common: list[tuple[ScenePose, ScenePose]], S_ours_theirs: Sim3) -> bool:
     off = [mine.S_map_scene.inverse() @ S_ours_theirs @ other.S_map_scene for mine, other in common]
-    bar = float(chi2.ppf(_QUANTILE, 7))
+    bar = float(chi2_quantile(_QUANTILE, 7))
     for (mine, other), xi in zip(common, Similarities.stack(off).log(), strict=True):
         covariance = np.diag(_FLOOR**2)
         for pose in (mine, other):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gsmap.cli.app import VERBS
+from gsmap.cli.app import PANELS, VERBS
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -24,6 +24,17 @@ def test_readme_names_every_verb() -> None:
     assert [verb for verb in VERBS if f"gsmap {verb}" not in text] == []
 
 
+def test_help_lists_every_verb_once_in_a_panel() -> None:
+    listed: dict[str, list[str]] = {}
+    for line in gsmap("-h").stdout.splitlines():
+        if line.startswith("╭─"):
+            panel = listed.setdefault(line.strip("╭─╮ "), [])
+        elif line.startswith("│ ") and line[2] not in " -":
+            panel.append(line[2:].split()[0])
+    assert listed.pop("Options") == []
+    assert listed == {name: list(verbs) for name, verbs in PANELS.items()}
+
+
 @pytest.mark.parametrize("arguments", [["nonsense"], ["export"], ["list", "a.gsmap", "nonsense"], ["init"]])
 def test_wrong_usage_is_2(arguments: list[str]) -> None:
     done = gsmap(*arguments)
@@ -36,7 +47,7 @@ def test_failures_are_one_line_and_1(tmp_path: Path) -> None:
     for arguments in (
         ["list", str(tmp_path / "missing.gsmap"), "scenes"],
         ["list", str(tmp_path), "scenes"],
-        ["ingest", str(tmp_path / "missing.gsmap"), "a.ply"],
+        ["ingest", str(tmp_path / "missing.gsmap"), str(tmp_path / "a.ply")],
         ["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.spz")],
     ):
         done = gsmap(*arguments)

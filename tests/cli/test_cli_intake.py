@@ -344,6 +344,30 @@ def test_a_new_map_is_said_to_be_created(cli: Run, captures: Path, tmp_path: Pat
     assert "created" not in again.stderr
 
 
+def test_ingest_makes_a_map_as_update_does(cli: Run, captures: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site.gsmap"
+    refused = [
+        (captures / "left.ply", "--no-create"),
+        (captures / "left.ply", "--supersedes", "left"),
+        (captures / "left.ply", "--scale", "feet"),
+        (captures, "--scale", "feet"),
+        (captures, "--name", "hall"),
+        (captures / "left.ply", "--captured-at", "soon"),
+        (tmp_path / "gone.ply",),
+    ]
+    for arguments in refused:
+        assert cli("ingest", site, *arguments).code in (1, 2), arguments
+        assert not site.exists(), arguments
+    first = cli("ingest", site, captures / "left.ply", "--name", "hall")
+    assert first.code == 0
+    assert f"created {site}" in first.stderr.splitlines()
+    again = cli("ingest", site, captures / "right.ply")
+    assert again.code == 0
+    assert "created" not in again.stderr
+    with gsmap.map.open(site) as m:
+        assert [scene.name for scene in m.scenes()] == ["hall", "right"]
+
+
 def test_a_missing_folder_makes_no_map(cli: Run, tmp_path: Path) -> None:
     assert cli("update", tmp_path / "site.gsmap", tmp_path / "gone").code == 1
     assert not (tmp_path / "site.gsmap").exists()

@@ -1,14 +1,22 @@
 """The documents: links lead somewhere, what they tell to type exists, and (slow) they build with their pictures."""
 
 import re
+import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import make_docs
 import pytest
+import typer.main
+from test_families import _outside_package  # noqa: F401  # which docs/extending.md configures
 
-from gsmap.cli.app import VERBS
+from gsmap.cli.app import build
+from gsmap.map.settings import settings_of
+from gsmap.settings import parse
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -22,11 +30,84 @@ def test_links_lead_to_files_that_are_there(page: Path) -> None:
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
+def commands_in(text: str) -> Iterator[tuple[str, bool]]:
+    """Each command line of a page, and whether it is whole: one of a block, rather than named in a sentence."""
+    blocks = re.findall(r"^```(?:sh|bash|console|text)?\n(.*?)^```$", text, re.M | re.S)
+    for block in blocks:
+        for line in block.replace("\\\n", " ").splitlines():
+            if found := re.match(r"(?:\$ )?(gsmap [a-z-].*)", line):
+                yield found[1], True
+    for found in re.findall(r"`(gsmap [a-z-][^`]*)`", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S)):
+        if found != "gsmap page digests 1":  # how a file begins (docs/storage.md)
+            yield " ".join(found.split()), False
+
+
+@cache
+def program() -> Any:
+    return typer.main.get_command(build())
+
+
+def refusal(line: str, *, whole: bool) -> str:
+    """Why the command line takes no such command; empty where it does. Nothing is run.
+
+    Args:
+        whole: else it may lack arguments and values, ``A/B`` stands for one of several words, ``[A]`` may be left out,
+            and words in capitals stand for others.
+    """
+    if not whole:
+        line = re.sub(r"[\[\]]", "", line)
+    words = shlex.split(line, comments=True)[1:]
+    words = words[: next((i for i, word in enumerate(words) if word in ("|", ">", "&&", "&", ";", "2>")), len(words))]
+    if not whole:
+        words = [re.sub(r"^([a-z]+)/.*", r"\1", word) if not word.startswith("-") else word for word in words]
+        words = ["1" if re.fullmatch(r"[A-Z][A-Z0-9]*(\.\.\.)?", word) else word for word in words]
+    command = program()
+    while words and hasattr(command, "commands") and not words[0].startswith("-"):
+        if words[0] not in command.commands:
+            return f"there is no {words[0]}"
+        command, words = command.commands[words[0]], words[1:]
+    if hasattr(command, "commands"):
+        return ""  # options of the program, or all verbs of a group
+    try:
+        with command.make_context("gsmap", list(words)):
+            return ""
+    except Exception as error:  # of click, which typer holds a copy of
+        open_ended = type(error).__name__ in ("MissingParameter", "BadParameter") or "requires an argument" in str(
+            error
+        )
+        return "" if open_ended and not whole else f"{type(error).__name__}: {error}"
+    except SystemExit:
+        return ""  # --help
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_that_are_told_exist(page: Path) -> None:
-    for block in re.findall(r"^```(?:sh|bash|console|text)?\n(.*?)^```$", page.read_text(), re.M | re.S):
-        for verb in re.findall(r"^(?:\$ )?gsmap ([a-z][a-z-]+)", block, re.M):
-            assert verb in VERBS, f"{page.name} tells to type gsmap {verb}"
+def test_commands_are_taken_by_the_command_line(page: Path) -> None:
+    refused = {line: why for line, whole in commands_in(page.read_text()) if (why := refusal(line, whole=whole))}
+    assert refused == {}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_settings_that_are_told_are_taken(page: Path) -> None:
+    for told in re.findall(r"--set[ =]([a-z_]+\.[\w.]+=[^\s`]+)", page.read_text()):
+        settings_of(dict([parse(told.rstrip(").,;"))]))
+
+
+@pytest.mark.parametrize(
+    ("line", "whole", "taken"),
+    [
+        ("gsmap export MAP OUT --merge voxel", True, True),
+        ("gsmap export MAP OUT --method voxel", True, False),
+        ("gsmap export MAP OUT --method voxel", False, False),
+        ("gsmap exprot MAP OUT", False, False),
+        ("gsmap export MAP", True, False),
+        ("gsmap export MAP", False, True),
+        ("gsmap thin site.gsmap --keep-days many", True, False),
+        ("gsmap list MAP scenes/edges", False, True),
+        ("gsmap list site.gsmap everything", True, False),
+    ],
+)
+def test_a_command_is_refused_where_the_command_line_would(line: str, whole: bool, taken: bool) -> None:
+    assert (refusal(line, whole=whole) == "") == taken
 
 
 def test_every_page_is_in_the_table_of_contents() -> None:

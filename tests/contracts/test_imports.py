@@ -10,9 +10,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import networkx as nx
+import numpy as np
 import pytest
 
 import gsmap
+import gsmap.map
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = {"gsmap": ROOT / "gsmap", "gsmap_synthetic": ROOT / "synthetic" / "gsmap_synthetic"}
@@ -194,5 +196,52 @@ def test_light_start(arguments: list[str]) -> None:
     report = subprocess.run(
         [sys.executable, "-X", "importtime", *arguments], capture_output=True, text=True, check=True, timeout=60
     ).stderr
-    loaded = {line.split("|")[-1].strip().split(".")[0] for line in report.splitlines() if "|" in line}
-    assert not loaded & set(heavy)
+    assert not {name.split(".")[0] for name in imported_by(report)} & set(heavy)
+
+
+def imported_by(report: str) -> set[str]:
+    """The modules that a run with ``-X importtime`` imported, by what it wrote to stderr."""
+    return {line.split("|")[-1].strip() for line in report.splitlines() if line.startswith("import time:")}
+
+
+@pytest.fixture(scope="module")
+def one_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of one small scene, which has a pose."""
+    path = tmp_path_factory.mktemp("maps") / "site.gsmap"
+    means = np.random.default_rng(0).uniform(size=(50, 3)).astype(np.float32)
+    count = len(means)
+    gaussians = gsmap.Gaussians(
+        means,
+        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        np.full((count, 3), -4, np.float32),
+        np.zeros(count, np.float32),
+        np.zeros((count, 1, 3), np.float32),
+    )
+    with gsmap.map.create(path) as m:
+        m.ingest(gaussians, name="hall", scale="known")
+        m.optimize()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("verb", "most"),
+    [
+        ("list MAP scenes", 200),
+        ("list MAP edges", 170),
+        ("poses MAP", 170),
+        ("show MAP hall", 215),
+        ("edit MAP hall --note wet", 215),
+        ("status MAP", 290),
+    ],
+)
+def test_verbs_that_only_read_start_quickly(one_scene: Path, verb: str, most: int) -> None:
+    """They import neither solvers, renderers and picture readers nor most of gsmap: importing is what they cost."""
+    arguments = [str(one_scene) if word == "MAP" else word for word in verb.split()]
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "gsmap", *arguments], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-300:]
+    loaded = imported_by(done.stderr)
+    allowed = {"typer", "rich", "sqlalchemy"} | ({"PIL"} if verb.startswith("edit") else set())
+    assert not {name.split(".")[0] for name in loaded} & ({*HOMES, "scipy", "pandas", "matplotlib", "PIL"} - allowed)
+    assert len({name for name in loaded if name.split(".")[0] == "gsmap"}) <= most

@@ -13,6 +13,7 @@ from gsmap.geometry.rotations import (
     multiply_quats,
     quats_to_matrices,
     retract,
+    rotation_vector,
     skew,
 )
 from gsmap.geometry.similarities import rotation_vectors
@@ -104,3 +105,12 @@ def test_umeyama_refuses_what_has_no_answer() -> None:
         umeyama(np.zeros((2, 3)), np.zeros((2, 3)))
     with pytest.raises(InputError, match="coincide"):
         umeyama(RNG.normal(size=(5, 3)), np.ones((5, 3)), with_scale=True)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.3, 2.0, np.pi - 1e-9, np.pi])
+def test_rotation_vector_turns_as_the_matrix_does(angle: float) -> None:
+    for axis in np.vstack([np.eye(3), np.random.default_rng(5).normal(size=(20, 3))]):
+        matrix = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+        found = rotation_vector(matrix)
+        assert np.linalg.norm(found) <= np.pi + 1e-12
+        assert np.allclose(Rotation.from_rotvec(found).as_matrix(), matrix, atol=1e-12)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from PIL import Image
 
 from gsmap.errors import InputError
 from gsmap.networks.session import misfit, open_session, run
@@ -133,6 +132,8 @@ def crop(rgb: np.ndarray, pixels: np.ndarray, size: tuple[int, int], params: Par
     part = np.where(outside, params.background * part + (1 - params.background) * mean, part)
     at_row, at_column = row.start - low[0], column.start - low[1]
     square[at_row : at_row + part.shape[0], at_column : at_column + part.shape[1]] = part
+    from PIL import Image  # naming a recipe does without
+
     image = Image.fromarray(np.clip(square + 0.5, 0, 255).astype(np.uint8))
     image = image.resize((size[1], size[0]), Image.Resampling.BICUBIC)
     return np.asarray(image, np.float32) / 255

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 _BIN_M = 0.02  # of a histogram of heights: finer than a floor is flat, coarser than a surface is noisy
 _STEP_M = 0.1  # of a histogram along a wall
@@ -62,6 +60,9 @@ class Structure:
 
 def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(count,) which nodes edges a-b join."""
+    from scipy.sparse import coo_matrix  # naming a recipe does without
+    from scipy.sparse.csgraph import connected_components
+
     joined = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(count, count))
     labels: np.ndarray = connected_components(joined, directed=False)[1]
     return labels

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from gsmap._native import graph_parts
 from gsmap.describe.cloud import downsample, local_planes
@@ -61,6 +60,8 @@ class BuiltinSegmenter:
 
     def segment(self, view: View) -> list[Mask]:
         """Pixels dominated by each part's Gaussians; one mask per connected blob of them."""
+        from scipy import ndimage  # naming a recipe does without
+
         parts = self.part_of_gaussian[view.dominant_id]
         parts[view.alpha < 0.5] = -1
         masks = []

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image
 
 from gsmap.networks.session import misfit, open_session, run
 from gsmap.types.model import ModelSpec
@@ -122,6 +121,8 @@ class SamSegmenter:
         height, width = rgb.shape[:2]
         scale = SAM_SIDE_PX / max(height, width)
         size = (round(width * scale), round(height * scale))
+        from PIL import Image  # naming a recipe does without
+
         large = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BILINEAR), np.float32)
         tensor = self.encoder_spec.inputs[0]
         if len(tensor.shape) == 3:  # exports that normalise and pad inside

@@ -1,6 +1,6 @@
 """What the map answers, as typed rows (`gsmap.types.rows`), read from the store."""
 
-from gsmap.map.reports.common import names, scenes_by_id
+from gsmap.map.reports.common import checked_pair, names, pair_of, scenes_by_id
 from gsmap.map.reports.notebook import map_html
 from gsmap.map.reports.one_scene import graph_row, prior_row, scene_report
 from gsmap.map.reports.pairs import EDGE_STATUSES, edge_row, edge_rows, pair_report, rows_of_edges
@@ -13,6 +13,7 @@ __all__ = [
     "EDGE_STATUSES",
     "SCENE_STATUSES",
     "check_report",
+    "checked_pair",
     "edge_row",
     "edge_rows",
     "export_report",
@@ -23,6 +24,7 @@ __all__ = [
     "mark",
     "model_rows",
     "names",
+    "pair_of",
     "pair_report",
     "pose_change_rows",
     "pose_rows",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
-from gsmap.errors import ConfigError, CorruptError
+from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.map.one_state import of_one_state
 from gsmap.store import Store
 from gsmap.types import Scene
@@ -37,3 +37,29 @@ def refs(scenes: Iterable[str], name_of: Mapping[str, str]) -> tuple[SceneRef, .
 def one_of(value: str | None, known: Sequence[str]) -> None:
     if value is not None and value not in known:
         raise ConfigError(f"there is no status {value!r}: choose one of {', '.join(known)}")
+
+
+def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
+    """The scenes of ``A:B``; a name may itself hold a colon.
+
+    Raises:
+        NotFoundError: no two scenes are called so.
+        ConfigError: a scene with itself.
+    """
+    for at in (i for i, character in enumerate(pair) if character == ":"):
+        try:
+            return checked_pair(store.scenes.get(pair[:at]), store.scenes.get(pair[at + 1 :]))
+        except NotFoundError:
+            continue
+    raise NotFoundError(f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows")
+
+
+def checked_pair(a: Scene, b: Scene) -> tuple[Scene, Scene]:
+    """Return two scenes.
+
+    Raises:
+        ConfigError: they are one.
+    """
+    if a.id == b.id:
+        raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
+    return a, b

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from gsmap.geometry.transforms import transform_cameras
 from gsmap.map.dates import is_until, last_of, undated_note
 from gsmap.map.jobs import TileMaker
 from gsmap.map.metres import map_metres, metre_notes
-from gsmap.map.objects import Known, kept_objects
 from gsmap.map.persisting import Passing, what_passes
 from gsmap.map.persisting import notes as persisting_notes
 from gsmap.map.settings import Settings
@@ -40,6 +39,9 @@ from gsmap.types import Cameras, PoseGraph, Scene, ScenePose, Tile
 from gsmap.types.metre import Metre
 from gsmap.types.plain import canonical, plain
 from gsmap.types.progress import Progress
+
+if TYPE_CHECKING:
+    from gsmap.map.objects import Known
 
 _log = logging.getLogger("gsmap.export")
 
@@ -158,6 +160,8 @@ def plan(store: Store, request: Request, settings: Settings, known: Known | None
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
     passing: dict[str, Passing] = {}
     if request.static:
+        from gsmap.map.objects import kept_objects
+
         known = kept_objects(store, settings) if known is None else known
         passing = {scene: one for scene, one in what_passes(store, known).items() if scene in scenes}
         recipe = replace(recipe, without={scene: one.digest for scene, one in passing.items() if one.digest})

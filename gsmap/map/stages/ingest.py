@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.errors import ConfigError, GsmapError, NotGaussiansError, StoreError
-from gsmap.ingest import Capture, LeftOut, Search, given_date, read_capture, search_captures, take_capture
+from gsmap.ingest import Capture, LeftOut, Search, check_scale, given_date, read_capture, search_captures, take_capture
 from gsmap.map.sharing import noting
 from gsmap.store import Store
 from gsmap.store.set_aside import CAPTURE
@@ -130,13 +130,20 @@ def _what(path: Path) -> str:
     return f"{CAPTURE} {hashlib.sha256(os.fsencode(path.absolute())).hexdigest()[:32]}"
 
 
-def check_captures(paths: Sequence[str | os.PathLike[str]], captured_at: str | None = None) -> None:
+def check_captures(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    cameras: str | os.PathLike[str] | None = None,
+    name: str | None = None,
+    captured_at: str | None = None,
+    scale: str = "auto",
+) -> None:
     """Refuse what `ingest` would refuse, before a map is made for it.
 
     Raises:
         NotFoundError, InputError, ConfigError: see `gsmap.map.Map.ingest`.
     """
-    found, search = readers(paths, cameras=None, name=None, captured_at=captured_at, scale="auto")
+    found, search = readers(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
     if len(found) == 1 and not search.unreadable and _is_named(found[0], paths):
         found[0].read()
 
@@ -151,6 +158,7 @@ def readers(
 ) -> tuple[list[Reader], Search]:
     """A reader of each capture found, and the search that found them; see `gsmap.map.Map.ingest`."""
     given_date(captured_at)  # refuses what is none before anything is searched
+    check_scale(scale)
     memory = [source for source in sources if isinstance(source, Gaussians)]
     if memory and len(sources) > 1:
         raise ConfigError("Gaussians in memory are ingested one capture at a time")

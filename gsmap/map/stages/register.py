@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.engine import run_jobs
-from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.errors import InputError, NotFoundError
 from gsmap.map.jobs import register_scenes
 from gsmap.map.looking_up import ask, keys_of_lookups
+from gsmap.map.reports import checked_pair, pair_of
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import SharedJobs, noting
 from gsmap.map.stages.describe import graph_keys, without_graph
@@ -284,27 +285,6 @@ def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np
     store.registrations.save(edge)
 
 
-def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
-    """The scenes of ``A:B``; a name may itself hold a colon.
-
-    Raises:
-        NotFoundError: no two scenes are called so.
-        ConfigError: a scene with itself.
-    """
-    for at in (i for i, character in enumerate(pair) if character == ":"):
-        try:
-            return _two(store.scenes.get(pair[:at]), store.scenes.get(pair[at + 1 :]))
-        except NotFoundError:
-            continue
-    raise NotFoundError(f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows")
-
-
-def _two(a: Scene, b: Scene) -> tuple[Scene, Scene]:
-    if a.id == b.id:
-        raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
-    return a, b
-
-
 def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
     """Pairs of a text file, one a line: ``A B`` or ``A:B``; ``#`` begins a remark. A name with spaces needs the colon.
 
@@ -353,7 +333,7 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> lis
         named = [(store.scenes.get(a), store.scenes.get(b)) for a, b in pairs]
     chosen: list[Pair] = []
     for a, b in named:
-        for scene in _two(a, b):
+        for scene in checked_pair(a, b):
             if scene.id not in work.graphs:
                 raise NotFoundError(f"scene {scene.name} was removed: ingest it again first")
             if scene.id in work.lacking:
