@@ -50,6 +50,10 @@ class NotGaussiansError(InputError):
     """A sound file that holds something other than Gaussians, such as a point cloud or a mesh."""
 
 
+class NotPinholesError(InputError):
+    """Cameras of lenses that no pinhole stands for, such as panoramas and wide fisheyes."""
+
+
 class ConfigError(GsmapError, ValueError):
     """An option, or a combination of options, makes no sense."""
 

@@ -19,6 +19,7 @@ def read(path: str | os.PathLike[str]) -> Cameras:
 
     Raises:
         NotFoundError: no such file or folder.
+        NotPinholesError: no pinhole stands for any of its cameras (panoramas, wide fisheyes).
         InputError: neither of the three, or damaged.
     """
     path = Path(path)

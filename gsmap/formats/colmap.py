@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import unique
+from gsmap.formats.lenses import Lens, keep_pinholes, lens_of
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.types import Cameras
 
@@ -34,9 +36,11 @@ def find_model(folder: Path) -> Path | None:
 def read(folder: str | os.PathLike[str]) -> Cameras:
     """Read the images of a model, sorted by name; poses are in COLMAP's world frame.
 
-    Distortion is left out: splats are trained on undistorted images.
+    Cameras with distortion are read as pinholes, and those that no pinhole stands for are left out: ``notes`` say so
+    (`gsmap.formats.lenses`).
 
     Raises:
+        NotPinholesError: no pinhole stands for any of its cameras.
         InputError: damaged, or without images.
     """
     from scipy.spatial.transform import Rotation
@@ -45,7 +49,7 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
     binary = (folder / "images.bin").is_file() and (folder / "cameras.bin").is_file()
     try:
         if binary:
-            calibrations = dict(_binary_cameras((folder / "cameras.bin").read_bytes()))
+            calibrations: dict[int, Lens] = dict(_binary_cameras((folder / "cameras.bin").read_bytes()))
             images = sorted(_binary_images((folder / "images.bin").read_bytes()))
         else:
             calibrations = dict(_text_cameras((folder / "cameras.txt").read_text(errors="replace")))
@@ -55,17 +59,19 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
         names = unique([name for name, _, _ in images])
         quats, translations = np.split(np.array([pose for _, pose, _ in images]), [4], axis=1)
         R_frame_camera = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).inv().as_matrix()
-        chosen = np.array([calibrations[camera] for _, _, camera in images])
+        chosen = [calibrations[camera] for _, _, camera in images]
     except KeyError as error:
         raise InputError(f"{folder}: an image names camera {error}, which the model does not have") from error
     except (ValueError, RuntimeError, struct.error) as error:  # RuntimeError: pycolmap does not know the model
         if isinstance(error, InputError):
             raise
         raise InputError(f"{folder} is not a readable COLMAP model (truncated?): {error}") from error
+    kept, notes = keep_pinholes(chosen, folder)
     pose = np.tile(np.eye(4), (len(images), 1, 1))
     pose[:, :3, :3] = R_frame_camera
     pose[:, :3, 3] = -np.einsum("cij,cj->ci", R_frame_camera, translations)
-    return Cameras(pose, chosen[:, :4], chosen[:, 4:].astype(np.int64), names)
+    intrinsics, sizes = np.array([lens.intrinsics_px for lens in chosen]), np.array([lens.size_px for lens in chosen])
+    return Cameras(pose[kept], intrinsics[kept], sizes[kept], tuple(compress(names, kept)), notes=notes)
 
 
 def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
@@ -107,20 +113,7 @@ def _write_lines(path: Path, lines: list[str]) -> None:
     write_text_output(path, text)
 
 
-def _calibration(model: object, width: int, height: int, params: list[float]) -> tuple[float, ...]:
-    """``fx fy cx cy width height`` of any camera model."""
-    import pycolmap
-
-    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
-    if not camera.verify_params():
-        raise ValueError(f"{len(params)} parameters do not fit the camera model {camera.model_name}")
-    if not camera.focal_length_idxs():  # asking such a camera for its focal length ends the process
-        raise ValueError(f"camera model {camera.model_name} is no pinhole: undistort the images first")
-    focal = camera.focal_length_x, camera.focal_length_y
-    return *focal, camera.principal_point_x, camera.principal_point_y, width, height
-
-
-def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[float, ...]]]:
+def _binary_cameras(data: bytes) -> Iterator[tuple[int, Lens]]:
     import pycolmap
 
     (count,) = struct.unpack_from("<Q", data)
@@ -131,7 +124,7 @@ def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[float, ...]]]:
         num_params = len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
         params = struct.unpack_from(f"<{num_params}d", data, offset + 24)
         offset += 24 + 8 * num_params
-        yield camera_id, _calibration(model, width, height, list(params))
+        yield camera_id, lens_of(model, width, height, params)
 
 
 def _binary_images(data: bytes) -> Iterator[tuple[str, tuple[float, ...], int]]:
@@ -147,11 +140,11 @@ def _binary_images(data: bytes) -> Iterator[tuple[str, tuple[float, ...], int]]:
             raise ValueError(f"images.bin ends before its {count} images do")
 
 
-def _text_cameras(text: str) -> Iterator[tuple[int, tuple[float, ...]]]:
+def _text_cameras(text: str) -> Iterator[tuple[int, Lens]]:
     for line in text.splitlines():
         if line.strip() and not line.startswith("#"):
             camera_id, model, width, height, *params = line.split()
-            yield int(camera_id), _calibration(model, int(width), int(height), [float(p) for p in params])
+            yield int(camera_id), lens_of(model, int(width), int(height), tuple(float(p) for p in params))
 
 
 def _text_images(text: str) -> Iterator[tuple[str, tuple[float, ...], int]]:

@@ -19,6 +19,7 @@ from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.geometry.similarities import without_scale
+from gsmap.texts import escaped
 from gsmap.types import Edge, Sim3
 
 # Certainty of the log scale of a rigid edge: stiff beside any measurement.
@@ -83,11 +84,20 @@ def read_graph(path: str | os.PathLike[str], *, confirmed: bool = True) -> G2o:
 
 
 def write_graph(
-    path: str | os.PathLike[str], poses: Mapping[str, Sim3], edges: Sequence[Edge], fixed: Sequence[str] = ()
+    path: str | os.PathLike[str],
+    poses: Mapping[str, Sim3],
+    edges: Sequence[Edge],
+    fixed: Sequence[str] = (),
+    names: Mapping[str, str] | None = None,
+    remarks: Sequence[str] = (),
 ) -> dict[str, int]:
     """Write poses and edges; g2o wants integers, so scenes are numbered in the order of ``poses``.
 
     Ids that are whole numbers already are kept where all are. The scale row of the information is left out.
+
+    Args:
+        names: of scenes by id, each a comment line before its vertex.
+        remarks: on the whole file, comment lines before the vertices.
 
     Returns:
         The number of each scene.
@@ -97,8 +107,10 @@ def write_graph(
     """
     numeric = all(s.isascii() and s.isdigit() and str(int(s)) == s for s in poses)
     numbers = {scene: int(scene) if numeric else k for k, scene in enumerate(poses)}
-    lines = []
+    lines = [f"# {escaped(remark)}" for remark in remarks]
     for scene, pose in poses.items():
+        if names is not None:
+            lines.append(f"# {escaped(names[scene])}")
         lines.append(f"VERTEX_SE3:QUAT {numbers[scene]} {_values(pose, f'scene {scene}')}")
     lines += [f"FIX {numbers[scene]}" for scene in fixed]
     for edge in edges:

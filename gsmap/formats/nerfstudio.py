@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
+from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,10 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import load_json, unique
+from gsmap.formats.lenses import Lens, keep_pinholes, lens_of
 from gsmap.types import Cameras, Sim3
 
+_PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 DATAPARSER = "dataparser_transforms.json"
 
 
@@ -27,6 +31,13 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
 
     Nerfstudio trains in ``scale * (transform @ x)`` of the *original* coordinates, while the poses of
     ``transforms.json`` already had ``applied_transform`` and ``applied_scale`` done to them: both are taken back first.
+
+    Cameras with distortion are read as pinholes, and those that no pinhole stands for are left out: ``notes`` say so
+    (`gsmap.formats.lenses`).
+
+    Raises:
+        NotPinholesError: no pinhole stands for any of its cameras.
+        InputError: without cameras, sizes or focal lengths.
     """
     frames = content["frames"]
     if not frames:
@@ -48,9 +59,11 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
         pose[:, :3, 3] = scale * S.apply(pose[:, :3, 3])
         pose[:, :3, :3] = S.rotation @ pose[:, :3, :3]
 
-    intrinsics, sizes = zip(*(_intrinsics(content, f, path) for f in frames), strict=True)
+    lenses = [_lens(content | f, path) for f in frames]
+    kept, notes = keep_pinholes(lenses, path)
+    intrinsics, sizes = np.array([lens.intrinsics_px for lens in lenses]), np.array([lens.size_px for lens in lenses])
     names = unique([str(f.get("file_path", i)) for i, f in enumerate(frames)])
-    return Cameras(pose, np.array(intrinsics), np.array(sizes), names)
+    return Cameras(pose[kept], intrinsics[kept], sizes[kept], tuple(compress(names, kept)), notes=notes)
 
 
 def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
@@ -83,11 +96,25 @@ def _rows_to_matrix(rows: list[list[float]]) -> np.ndarray:
     return out
 
 
-def _intrinsics(
-    content: dict[str, Any], frame: dict[str, Any], path: Path
-) -> tuple[tuple[float, ...], tuple[int, int]]:
-    """Of one frame; each figure may stand in the frame or once for all."""
-    both = content | frame
+def _lens(both: dict[str, Any], path: Path) -> Lens:
+    """The lens of one frame, of which each figure may stand in the frame or once for all."""
+    fisheye = "OPENCV_FISHEYE"
+    model = fisheye if both.get("is_fisheye") else str(both.get("camera_model") or "OPENCV").upper()
+    if model not in (*_PERSPECTIVE, fisheye):
+        return Lens(model, (1, 1))
+    (fx, fy, cx, cy), (width, height) = _intrinsics(both, path)
+    k1, k2, k3, k4, p1, p2 = (float(both.get(name) or 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if model == fisheye:
+        return lens_of(fisheye, width, height, (fx, fy, cx, cy, k1, k2, k3, k4))
+    if not any((k1, k2, k3, k4, p1, p2)):
+        return Lens(model, (width, height), (fx, fy, cx, cy), 0.0)
+    if k4:  # the fourth term of a polynomial here, and of a quotient in COLMAP's models
+        return Lens(f"{model} with k4", (width, height))
+    lens = lens_of("FULL_OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    return replace(lens, model=model)
+
+
+def _intrinsics(both: dict[str, Any], path: Path) -> tuple[tuple[float, float, float, float], tuple[int, int]]:
     width, height = (both.get("w"), both.get("h"))
     if width is None or height is None:
         width, height = _image_size(path.parent / both["file_path"], path)
@@ -98,9 +125,10 @@ def _intrinsics(
         fy = 0.5 * height / math.tan(0.5 * both["camera_angle_y"])
     fx = fy if fx is None else fx
     if fx is None:
-        raise InputError(f"{path}: frame {frame.get('file_path')} has no focal length (fl_x or camera_angle_x)")
+        raise InputError(f"{path}: frame {both.get('file_path')} has no focal length (fl_x or camera_angle_x)")
     fy = fx if fy is None else fy
-    return (fx, fy, both.get("cx", width / 2), both.get("cy", height / 2)), (int(width), int(height))
+    cx, cy = both.get("cx", width / 2), both.get("cy", height / 2)
+    return (float(fx), float(fy), float(cx), float(cy)), (int(width), int(height))
 
 
 def _image_size(image: Path, path: Path) -> tuple[int, int]:

@@ -9,23 +9,24 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.lib import recfunctions as rfn
 
 from gsmap.errors import InputError, NotGaussiansError
-from gsmap.geometry.origins import centred, origin_of
+from gsmap.geometry.origins import centred, neighbour_distance, origin_of
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.stream import loaded
 from gsmap.types import FileInfo, Gaussians, GaussianSource
 from gsmap.types.gaussians import CHUNK_ROWS, FIELDS
 from gsmap.types.source import origin_of_source
 
-VERSION = 2
+VERSION = 3
 HOLDS_ORIGIN = True
 
 HEADER_LIMIT_BYTES = 64 * 1024
@@ -48,6 +49,12 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
+_SPLAT_NAME = re.compile(r"scalar_((f_dc|f_rest|scale|rot)_\d+|opacity|filter_3D|n[xyz])")
+_ANTIALIASED = re.compile(r"(?<!\w)(not |non[- ]?)?antialiased\W*((0|false|no|off)(?!\S))?", re.IGNORECASE)
+_FEW = 20  # Gaussians are too few for their values to show how opacities and scales are meant
+_WIDE = 10.0  # distances between neighbours: a median Gaussian that wide would cover hundreds of others
+_COVERED = (0.1, 0.9)  # opacities reach below and above
+_PADDING = b"\0 \t\r\n"
 _ENCODINGS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -67,12 +74,16 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """A parsed PLY header; the data begins ``data_offset`` bytes into the file."""
+    """A parsed PLY header; the data begins ``data_offset`` bytes into the file.
+
+    ``renamed``: the properties of a splat had the prefix that CloudCompare gives to scalar fields, which was taken off.
+    """
 
     encoding: str
     elements: dict[str, Element]
     comments: tuple[str, ...]
     data_offset: int
+    renamed: bool = False
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
@@ -89,9 +100,11 @@ def stream(path: str | os.PathLike[str]) -> PlySource:
 
     A file without ``f_dc`` but with ``red green blue`` takes its colours from those, one without ``scale_2`` (2DGS)
     gets flat Gaussians, and the 3D filter of Mip-Splatting (``filter_3D``) is folded into scales and opacities.
+    Opacities in 0 to 1 and scales as lengths become logits and logarithms where both are without doubt so.
 
     Raises:
-        InputError: not a PLY, truncated, or not a splat.
+        InputError: not a PLY, truncated, longer than its header promises, not a splat, or one of opacities and scales
+            is as trained and the other is not.
     """
     header = read_header(path)
     if is_compressed(header):
@@ -112,7 +125,8 @@ def stream(path: str | os.PathLike[str]) -> PlySource:
         raise NotGaussiansError(
             f"{path} is not a 3DGS .ply: its vertices lack {', '.join(missing)} (a point cloud or mesh?)"
         )
-    return PlySource(rows, columns, tuple(rest), "filter_3D" in names, _origin(rows))
+    source = PlySource(rows, columns, tuple(rest), "filter_3D" in names, _origin(rows))
+    return replace(source, activated=_is_activated(path, source))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +139,7 @@ class PlySource:
         rest: those of the spherical harmonics above degree 0, channel by channel.
         filtered: there is a 3D filter to be folded in.
         origin: (3,) that is taken off positions.
+        activated: opacities are in 0 to 1 and scales are lengths, in place of logits and logarithms.
     """
 
     rows: Rows
@@ -132,6 +147,7 @@ class PlySource:
     rest: tuple[str, ...]
     filtered: bool
     origin: np.ndarray
+    activated: bool = False
 
     @property
     def num_gaussians(self) -> int:
@@ -168,6 +184,9 @@ class PlySource:
         names = self.names[name]
         out = np.empty((len(part), 3 if name == "log_scales" else len(names)), "f4")
         _take(part, names, out[:, : len(names)])
+        if self.activated and name in ("log_scales", "logit_opacities"):
+            with np.errstate(divide="ignore"):  # 0 and 1 become infinities, which every reader clamps
+                out = np.log(out) if name == "log_scales" else np.log(out) - np.log1p(-out)
         if name == "log_scales" and len(names) == 2:
             out[:, 2] = out[:, :2].min(1) + np.log(1e-3)  # 2DGS
         return out[:, 0] if name == "logit_opacities" else out
@@ -184,6 +203,54 @@ class PlySource:
             _take(part, list(self.rest), channel_major)
             out[:, 1:] = channel_major.reshape(len(part), 3, k - 1).transpose(0, 2, 1)
         return out
+
+
+def _is_activated(path: str | os.PathLike[str], source: PlySource) -> bool:
+    """Whether opacities are in 0 to 1 and scales are lengths, as some programs write them.
+
+    Logits of a capture do not all lie in 0 to 1, which are opacities of 0.5 to 0.73, and its logarithms of scales are
+    not all positive unless its unit is small beside its Gaussians.
+
+    Raises:
+        InputError: one of the two is without doubt activated and the other is not.
+    """
+    opacity, scale = [np.inf, -np.inf], np.inf
+    medians: list[float] = []
+    if source.num_gaussians < _FEW:
+        return False
+    for part in source.rows.parts():
+        opacities, scales = source._raw("logit_opacities", part), source._raw("log_scales", part)
+        scales = scales[:, : len(source.names["log_scales"])]
+        opacities, scales = opacities[~np.isnan(opacities)], scales[~np.isnan(scales)]
+        if not len(opacities) or not len(scales):
+            continue
+        opacity = [min(opacity[0], float(opacities.min())), max(opacity[1], float(opacities.max()))]
+        scale = min(scale, float(scales.min()))
+        if scale < 0 and (opacity[0] < 0 or opacity[1] > 1):
+            return False
+        medians.append(float(np.median(scales)))
+    if not medians:
+        return False
+    is_opacity = 0 <= opacity[0] < _COVERED[0] and _COVERED[1] < opacity[1] <= 1
+    if scale < 0:
+        if is_opacity:
+            raise InputError(
+                f"{path}: its opacities lie in {opacity[0]:.3g} to {opacity[1]:.3g} as opacities do, and its scales "
+                "are logarithms: a .ply of splats has both as trained; write the opacities as logits, log(a / (1 - a))"
+            )
+        return False
+    if is_opacity:
+        return True
+    apart, median = neighbour_distance(source), float(np.median(medians))
+    if not median < _WIDE * apart < math.exp(min(median, 700.0)):
+        return False
+    if opacity[0] >= 0 and opacity[1] <= 1:
+        return True
+    raise InputError(
+        f"{path}: its scales are lengths ({median:.3g} where neighbours are {apart:.3g} apart), and its opacities are "
+        f"logits ({opacity[0]:.3g} to {opacity[1]:.3g}): a .ply of splats has both as trained; write the scales as "
+        "logarithms"
+    )
 
 
 def _origin(rows: Rows) -> np.ndarray:
@@ -213,7 +280,14 @@ def info(path: str | os.PathLike[str]) -> FileInfo:
         notes.append("the 3D filter of Mip-Splatting was folded into scales and opacities")
     if names and "f_dc_0" not in names and "red" in names:
         notes.append("colours from red green blue: no view dependence")
-    antialiased = "splatrendermode: mip" in text or "antialiased" in text or "filter_3D" in names
+    if header.renamed:
+        notes.append("its columns are named as CloudCompare does (scalar_f_dc_0), and read as those of a splat")
+    if {"x", "opacity", "scale_0", "rot_3"} <= set(names) and stream(path).activated:
+        notes.append(
+            "its opacities lie in 0 to 1 and its scales are lengths: read as such, not as logits and logarithms"
+        )
+    antialiased = "splatrendermode: mip" in text or "filter_3D" in names
+    antialiased |= any(not m[1] and not m[2] for m in map(_ANTIALIASED.search, header.comments) if m)
     return FileInfo(antialiased, tuple(notes))
 
 
@@ -309,22 +383,27 @@ def read_header(path: str | os.PathLike[str]) -> Header:
             raise InputError(f"{path}: line {number} of the PLY header means nothing: {line[:80]!r}")
     if not encoding:
         raise InputError(f"{path}: the PLY header has no 'format' line; the file is damaged")
-    elements = {}
+    elements: dict[str, Element] = {}
+    renamed = False
     for name, count, columns in blocks:
         if name in elements or len({c for c, _ in columns}) < len(columns):
             raise InputError(f"{path}: the PLY header names element {name!r} or one of its properties twice")
+        if name == "vertex":
+            own = {c for c, _ in columns}
+            given = [(m[1] if (m := _SPLAT_NAME.fullmatch(c)) and m[1] not in own else c, kind) for c, kind in columns]
+            renamed, columns = given != columns, given
         byte_order = _ENCODINGS[encoding]
         fixed = [(c, byte_order + kind) for c, kind in columns if kind is not None]
         has_list = len(fixed) < len(columns)
         elements[name] = Element(name, count, np.dtype([] if has_list else fixed), has_list)
-    return Header(encoding, elements, tuple(comments), offset)
+    return Header(encoding, elements, tuple(comments), offset, renamed)
 
 
 def read_element(path: str | os.PathLike[str], header: Header, name: str) -> np.ndarray:
     """The rows of one element as a structured array, mapped from the file where it is binary.
 
     Raises:
-        InputError: no such element, a list property in the way, or fewer bytes than the header promises.
+        InputError: no such element, a list property in the way, or fewer or more bytes than the header promises.
     """
     element, offset, skip = _located(path, header, name)
     if header.encoding == "ascii":
@@ -394,13 +473,32 @@ def _located(path: str | os.PathLike[str], header: Header, name: str) -> tuple[E
         raise InputError(f"{path}: element {name!r} has no properties: not a 3DGS .ply")
     # The smallest an ASCII value can be is one digit and one separator.
     stride = 2 * len(element.names) if header.encoding == "ascii" else element.dtype.itemsize
-    present = Path(path).stat().st_size - offset
+    size = Path(path).stat().st_size
+    present = size - offset
     if element.count * stride > present + (header.encoding == "ascii"):
+        at_most = "at most " if header.encoding == "ascii" else ""
         raise InputError(
             f"{path} is truncated: its header promises {element.count} {name} rows of at least {stride} bytes, "
-            f"but {max(0, present)} bytes follow"
+            f"but {max(0, present)} bytes follow, {at_most}{max(0, present) // stride} rows: copy or export it again"
         )
+    if header.encoding != "ascii" and not any(e.has_list and e.count for e in header.elements.values()):
+        end = header.data_offset + sum(e.count * e.dtype.itemsize for e in header.elements.values())
+        if size - end >= stride or _tail(path, end).strip(_PADDING):
+            raise _too_long(path, element, f"{size - end} more bytes, {(size - end) / stride:.6g} rows")
     return element, offset, skip
+
+
+def _tail(path: str | os.PathLike[str], start: int) -> bytes:
+    with open(path, "rb") as file:
+        file.seek(start)
+        return file.read()
+
+
+def _too_long(path: str | os.PathLike[str], element: Element, more: str) -> InputError:
+    return InputError(
+        f"{path}: its header promises {element.count} {element.name} rows, but {more}, follow: export it again, or "
+        "correct the counts in its header"
+    )
 
 
 def is_compressed(header: Header) -> bool:
@@ -412,12 +510,17 @@ def _read_ascii(path: str | os.PathLike[str], header: Header, element: Element, 
     with open(path, "rb") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of lines without data, which are left out
         file.seek(header.data_offset)
+        lines = iter(file)
         try:
-            rows = np.loadtxt(file, element.dtype, comments=None, skiprows=skip, max_rows=element.count, ndmin=1)
+            rows = np.loadtxt(lines, element.dtype, comments=None, skiprows=skip, max_rows=element.count, ndmin=1)
         except ValueError as error:
             raise InputError(f"{path}: its ASCII rows cannot be read: {error}") from error
+        left = sum(1 for line in lines if line.strip())
     if len(rows) < element.count:
         raise InputError(f"{path} is truncated: {element.count} rows promised, {len(rows)} found")
+    later = sum(e.count for e in header.elements.values()) - skip - element.count
+    if left > later:
+        raise _too_long(path, element, f"{element.count + left - later} rows")
     return rows
 
 

@@ -247,5 +247,13 @@ def _finest(path: Path, root: dict[str, Any]) -> Iterator[tuple[str, np.ndarray]
         children = tile.get("children", [])
         if not children or refine == "ADD":
             for content in tile.get("contents", [tile["content"]] if "content" in tile else []):
-                yield content["uri"], matrix
+                yield _file_of(path, content), matrix
         todo += [(child, matrix, refine, depth + 1) for child in reversed(children)]
+
+
+def _file_of(path: Path, content: dict[str, Any]) -> str:
+    """The uri of a tile's content (``url`` before 3D Tiles 1.0) without what is for a server: query and fragment."""
+    uri = content.get("uri", content.get("url"))
+    if not isinstance(uri, str) or not uri:
+        raise InputError(f"{path} is not a 3D Tiles tileset: the content of a tile names no file (uri)")
+    return uri.split("#", 1)[0].split("?", 1)[0]

@@ -12,6 +12,7 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
+from gsmap.texts import escaped
 from gsmap.types import Sim3
 
 
@@ -45,14 +46,27 @@ def read_trajectory(path: str | os.PathLike[str]) -> list[tuple[float, Sim3]]:
 
 
 def write_trajectory(
-    path: str | os.PathLike[str], poses: Sequence[Sim3], timestamps_s: Sequence[float] | None = None
+    path: str | os.PathLike[str],
+    poses: Sequence[Sim3],
+    timestamps_s: Sequence[float] | None = None,
+    names: Sequence[str] | None = None,
+    remarks: Sequence[str] = (),
 ) -> None:
-    """Write poses in order, at ``timestamps_s`` or at 0, 1, 2, ...; a scale is left out, as the format has none."""
+    """Write poses in order, at ``timestamps_s`` or at 0, 1, 2, ...; a scale is left out, as the format has none.
+
+    Args:
+        names: of the poses, each a comment line before its pose.
+        remarks: on the whole file, comment lines before the poses.
+    """
     times = range(len(poses)) if timestamps_s is None else timestamps_s
     if len(times) != len(poses):
         raise InputError(f"{len(poses)} poses but {len(times)} timestamps")
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for time_s, pose in zip(times, poses, strict=True):
+    if names is not None and len(names) != len(poses):
+        raise InputError(f"{len(poses)} poses but {len(names)} names")
+    lines = ["# timestamp tx ty tz qx qy qz qw", *(f"# {escaped(remark)}" for remark in remarks)]
+    for i, (time_s, pose) in enumerate(zip(times, poses, strict=True)):
+        if names is not None:
+            lines.append(f"# {escaped(names[i])}")
         w, x, y, z = matrices_to_quats(pose.rotation[None])[0].tolist()
         lines.append(" ".join(repr(v) for v in [float(time_s), *pose.translation.tolist(), x, y, z, w]))
     write_text_output(Path(path), "\n".join(lines) + "\n")

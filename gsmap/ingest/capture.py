@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap import formats
-from gsmap.errors import ConfigError
+from gsmap.errors import ConfigError, NotPinholesError
 from gsmap.formats.precision import about_origin, rounded_to, told
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.geometry.vantage import synthesise_cameras
@@ -103,20 +103,27 @@ def read_capture(
     gaussians = formats.stream(found.path)
     about = formats.info(found.path)
     source = Path(cameras) if cameras is not None else found.cameras
+    lens_note = ""
+    try:
+        given = None if source is None else formats.read_cameras(source)
+    except NotPinholesError as error:
+        if cameras is not None:
+            raise
+        given, lens_note = None, str(error)
     capture = take_capture(
         gaussians,
-        None if source is None else formats.read_cameras(source),
+        given,
         name=name or found.name,
         captured_at=captured_at,
         scale_policy=scale_policy,
         source=str(found.path),
         cameras_source="" if source is None else str(source),
     )
-    notes = (*about.notes, *([found.note] if found.note else []), *capture.notes)
+    notes = (*about.notes, *(note for note in (found.note, lens_note) if note), *capture.notes)
     capture = replace(capture, antialiased=about.antialiased, notes=notes)
     if captured_at is not None:
         return capture
-    date = find_date(found, source, () if source is None else capture.cameras.names)
+    date = find_date(found, source, () if given is None else capture.cameras.names)
     notes = (*notes, *([date.note] if date.note else []))
     return replace(capture, captured_at=date.when, dated_by=date.source, notes=notes)
 
@@ -146,13 +153,14 @@ def take_capture(
     if isinstance(gaussians, Gaussians):
         gaussians = about_origin(where, clamped(gaussians))
     notes = list(validate_gaussians(gaussians, where))
+    notes += [] if cameras is None else cameras.notes
     origin = origin_of_source(gaussians)
     if origin.any():
         cameras = None if cameras is None else transform_cameras(cameras, Sim3(np.eye(3), -origin))
         notes += _origin_notes(gaussians, origin)
     if cameras is None:
         cameras = synthesise_cameras(gaussians)
-        notes.append(f"no cameras were found beside it: {len(cameras)} were synthesised in its free space")
+        notes.append(f"no cameras for it were found: {len(cameras)} were synthesised in its free space")
     else:
         notes += validate_cameras(cameras, gaussians, f"{where} with {cameras_source}" if cameras_source else where)
     notes += [date.note] if date.note else []

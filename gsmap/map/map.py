@@ -1037,7 +1037,7 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); the files written."""
         from gsmap.map.poses import write_poses
 
-        return write_poses(self.store, Path(out), format, crs)
+        return write_poses(self.store, Path(out), format, crs, settings=self._settings_to_look_by())
 
     # --- the world ---------------------------------------------------------------------------------------------------
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from datetime import datetime
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,31 +17,51 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats import colmap, g2o, nerfstudio, tum
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.map import reports
+from gsmap.map.dates import NO_DATE, parsed
+from gsmap.map.metres import map_metres
 from gsmap.map.one_state import of_one_state
 from gsmap.store import Store
-from gsmap.types import Cameras, Edge, Scene, ScenePose
+from gsmap.texts import few
+from gsmap.types import Cameras, Edge, Scene, ScenePose, Sim3
+from gsmap.types.metre import Metre
 from gsmap.types.rows import SCHEMA
+
+if TYPE_CHECKING:
+    from gsmap.map.settings import Settings
 
 FORMATS = ("tum", "g2o", "colmap", "nerfstudio", "json")
 
+_log = logging.getLogger("gsmap.map")
+
 
 @of_one_state
-def write_poses(store: Store, out: Path, format: str, crs: str | None = None) -> list[Path]:
+def write_poses(
+    store: Store, out: Path, format: str, crs: str | None = None, *, settings: Settings | None = None
+) -> list[Path]:
     """Write the newest poses of all placed scenes; returns the files or folders written.
 
-    - ``tum``: a line per scene, ``T_map_scene`` (a scale is left out: the format has none), at the time of capture in
-      Unix seconds where all scenes have a date, else at 0, 1, 2, ...
+    - ``tum``: a line per scene after a comment with its name, ``T_map_scene`` (a scale is left out: the format has
+      none), at the time of capture in Unix seconds where all scenes have a date, else at 0, 1, 2, ... in the order of
+      names; scenes of one date are spread over the time to the next, at most a second apart.
     - ``g2o``: a vertex per scene and an edge per edge in use, with its information; rigid components only.
-    - ``colmap``, ``nerfstudio``: every camera of every scene in the map frame, named ``scene/camera``.
+    - ``colmap``, ``nerfstudio``: every camera of every scene in the map frame and unit, named ``scene/camera``.
     - ``json``: what ``gsmap poses MAP --json`` prints.
 
+    ``tum`` and ``g2o`` are in metres where the metre of the component is known to better than a factor, else in the
+    map's unit. Times and units that are not what a reader takes them for are logged, and noted in the file.
+
     Components share no frame: where there are several, each gets a file of its own, ``NAME_component_K``.
+
+    Args:
+        settings: of the map, by which its metre is known; None for the defaults.
 
     Raises:
         ConfigError: another format.
         NotFoundError: no scene has a pose yet.
         InputError: a pose that the format cannot say, or several components for one pipe.
     """
+    from gsmap.map.settings import Settings
+
     if format not in FORMATS:
         raise ConfigError(f"poses are written as {', '.join(FORMATS)}, got {format!r}")
     graph = store.revisions.get()
@@ -58,31 +81,93 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
     components = sorted({pose.component for pose in placed})
     if len(components) > 1 and is_stream(out):
         raise InputError(f"{out} takes one file, and each of {len(components)} components gets its own: name a file")
+    metres = map_metres(store, settings or Settings(), graph)
+    placed.sort(key=lambda pose: scenes[pose.scene].name)
     written = []
     for component in components:
         members = [pose for pose in placed if pose.component == component]
+        metre = metres.get(component, Metre())
         path = out if len(components) == 1 else out.with_name(f"{out.stem}_component_{component}{out.suffix}")
         if format == "tum":
-            _write_tum(path, members, scenes)
+            _write_tum(path, members, scenes, metre)
         elif format == "g2o":
             used = {pair for pair, outcome in graph.outcomes.items() if outcome.use != "unused"}
-            g2o.write_graph(path, {pose.scene: pose.S_map_scene for pose in members}, _edges(store, members, used))
+            _write_g2o(path, members, _edges(store, members, used), scenes, metre)
         elif format == "colmap":
             colmap.write(path, _cameras(store, members, scenes))
         else:
             nerfstudio.write(path, _cameras(store, members, scenes))
+        if format in ("colmap", "nerfstudio") and (metre.is_rough or metre.metres_per_unit != 1.0):
+            _log.warning("%s: cameras are in the unit of the map, as exports are: %s", path, metre.text())
         written.append(path)
     return written
 
 
-def _write_tum(path: Path, members: Sequence[ScenePose], scenes: dict[str, Scene]) -> None:
-    dates = [scenes[pose.scene].captured_at for pose in members]
-    times = None
-    if all(date is not None for date in dates):
-        times = [datetime.fromisoformat(date).timestamp() for date in dates if date is not None]
-        order = np.argsort(times, kind="stable")
-        members, times = [members[i] for i in order], [times[i] for i in order]
-    tum.write_trajectory(path, [pose.S_map_scene for pose in members], times)
+def _write_tum(path: Path, members: Sequence[ScenePose], scenes: Mapping[str, Scene], metre: Metre) -> None:
+    undated = [scenes[pose.scene].name for pose in members if scenes[pose.scene].captured_at is None]
+    times, remarks = None, []
+    if undated:
+        have = "has no date" if len(undated) == 1 else "have no date"
+        remarks.append(f"times are made up, 0, 1, 2, ... in the order of names: {few(undated)} {have} ({NO_DATE})")
+    else:
+        dates = [parsed(scenes[pose.scene].captured_at or "").timestamp() for pose in members]
+        order = np.argsort(dates, kind="stable")
+        members, dates = [members[i] for i in order], [dates[i] for i in order]
+        times = _distinct(dates)
+        moved = [scenes[pose.scene].name for pose, a, b in zip(members, dates, times, strict=True) if a != b]
+        if moved:
+            remarks.append(f"made-up parts of a time: {few(moved)} of the same date as another scene, written after it")
+    for remark in remarks:
+        _log.warning("%s: %s", path, remark)
+    factor, unit = _unit(path, metre)
+    tum.write_trajectory(
+        path,
+        [_moved(pose.S_map_scene, factor) for pose in members],
+        times,
+        [scenes[pose.scene].name for pose in members],
+        [unit, *remarks],
+    )
+
+
+def _distinct(times_s: Sequence[float]) -> list[float]:
+    """Times in order, of which the equal ones are spread before the next one, at most a second apart."""
+    groups = [(time_s, len(list(same))) for time_s, same in groupby(times_s)]
+    out: list[float] = []
+    for i, (time_s, count) in enumerate(groups):
+        step = min(1.0, (groups[i + 1][0] - time_s) / count) if i + 1 < len(groups) else 1.0
+        out += [time_s + k * step for k in range(count)]
+    return out
+
+
+def _write_g2o(
+    path: Path, members: Sequence[ScenePose], edges: Sequence[Edge], scenes: Mapping[str, Scene], metre: Metre
+) -> None:
+    factor, unit = _unit(path, metre)
+    in_factor = np.array([1.0] * 3 + [1 / factor] * 3 + [1.0])  # of the tangent, [rot_rad, trans, log_scale]
+    moved = [
+        replace(
+            edge,
+            S_target_source=_moved(edge.S_target_source, factor),
+            information=edge.information * np.outer(in_factor, in_factor),
+        )
+        for edge in edges
+    ]
+    poses = {pose.scene: _moved(pose.S_map_scene, factor) for pose in members}
+    g2o.write_graph(path, poses, moved, names={scene: scenes[scene].name for scene in poses}, remarks=[unit])
+
+
+def _unit(path: Path, metre: Metre) -> tuple[float, str]:
+    """By what lengths of a component are multiplied before they are written, and a remark on their unit."""
+    if not metre.is_rough:
+        return metre.metres_per_unit, f"lengths in metres ({metre.text()} of the map)"
+    remark = f"lengths in the unit of the map: {metre.text()}"
+    _log.warning("%s: %s (gsmap edit MAP SCENE --metres-per-unit X tells)", path, remark)
+    return 1.0, remark
+
+
+def _moved(S: Sim3, factor: float) -> Sim3:
+    """A pose with its lengths in another unit, on both sides."""
+    return Sim3(S.rotation, S.translation * factor, S.scale)
 
 
 def _edges(store: Store, members: Sequence[ScenePose], used: set[tuple[str, str]]) -> list[Edge]:
@@ -97,7 +182,7 @@ def _edges(store: Store, members: Sequence[ScenePose], used: set[tuple[str, str]
     return edges
 
 
-def _cameras(store: Store, members: Sequence[ScenePose], scenes: dict[str, Scene]) -> Cameras:
+def _cameras(store: Store, members: Sequence[ScenePose], scenes: Mapping[str, Scene]) -> Cameras:
     """The cameras of all members, map frame, under names that tell the scenes apart."""
     moved = [(pose, transform_cameras(store.scenes.cameras(pose.scene), pose.S_map_scene)) for pose in members]
     return Cameras(

@@ -20,6 +20,8 @@ class Cameras:
         sizes_px: (C, 2) int64 ``width height``.
         names: C image names, unique; ids as text where the source has none.
         synthesised: true when gsmap invented the cameras because the source had none.
+        notes: what a person should know about how they were read, such as that their lenses are no pinholes; not of
+            cameras that are made from these.
 
     Raises:
         InputError: wrong shapes, NaN, a pose that is not rigid, a focal length or image size that is not positive.
@@ -30,6 +32,7 @@ class Cameras:
     sizes_px: np.ndarray
     names: tuple[str, ...] = ()
     synthesised: bool = False
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         pose = np.ascontiguousarray(self.T_frame_camera, dtype=np.float64)

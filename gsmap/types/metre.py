@@ -11,6 +11,8 @@ from gsmap.errors import InputError
 
 KnownBy = Literal["surveyed", "measured", "told", "assumed", "guessed", "unknown"]
 
+_ROUGH_SIGMA = 0.2  # beyond it an error is told as a factor, not in percent
+
 KNOWN_BY: tuple[KnownBy, ...] = get_args(KnownBy)
 
 
@@ -55,10 +57,15 @@ class Metre:
         """Whether anything at all tells, be it a guess."""
         return self.known_by != "unknown"
 
+    @property
+    def is_rough(self) -> bool:
+        """Whether it is good to a factor only, or unknown."""
+        return self.sigma > _ROUGH_SIGMA
+
     def text(self) -> str:
         """As people read it: ``0.3 m a unit, told, to 1 %``."""
         if not self.is_known:
             return "not known, 1 m a unit is taken"
-        if self.sigma > 0.2:
+        if self.is_rough:
             return f"{self.metres_per_unit:.2g} m a unit, {self.known_by}, to a factor of {np.exp(self.sigma):.2g}"
         return f"{self.metres_per_unit:.4g} m a unit, {self.known_by}, to {100 * self.sigma:.2g} %"

@@ -2,10 +2,12 @@ import json
 import struct
 
 import numpy as np
+import pycolmap
 import pytest
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from gsmap.errors import InputError, NotFoundError
+from gsmap.errors import InputError, NotFoundError, NotPinholesError
 from gsmap.formats import cameras_json, read_cameras
 from gsmap.types import Cameras
 
@@ -40,7 +42,6 @@ def test_inria_real(shared_data):
 
 
 def write_colmap(folder, cameras: Cameras, *, text: bool, model: str = "PINHOLE") -> None:
-    pycolmap = pytest.importorskip("pycolmap")
     out = pycolmap.Reconstruction()
     fx, fy, cx, cy = cameras.intrinsics_px[0]
     params = {"PINHOLE": [fx, fy, cx, cy], "OPENCV": [fx, fy, cx, cy, 0.01, 0, 0, 0]}[model]
@@ -187,5 +188,125 @@ def test_a_camera_without_a_focal_length_is_refused(tmp_path, text):
         (folder / "cameras.txt").write_text("7 EQUIRECTANGULAR 640 480 640 480\n")
     else:
         (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 7, 17, 640, 480, 640, 480))
-    with pytest.raises(InputError, match="not a readable COLMAP model"):
+    with pytest.raises(InputError, match="EQUIRECTANGULAR"):
         read_cameras(folder)
+
+
+SIZE = (800, 600)
+LENSES = {
+    "SIMPLE_RADIAL": [700, 400, 300, -0.12],
+    "OPENCV": [700, 710, 410, 290, -0.15, 0.05, 0.001, -0.002],
+    "FULL_OPENCV": [700, 710, 410, 290, -0.15, 0.05, 0.001, -0.002, 0.01, 0.02, 0.0, 0.0],
+    "OPENCV_FISHEYE": [900, 900, 400, 300, 0.02, 0.0, 0.0, 0.0],
+    "EUCM": [900, 900, 400, 300, 0.3, 1.0],
+}
+WIDE = {
+    "OPENCV_FISHEYE": [300, 300, 400, 300, 0.0, 0.0, 0.0, 0.0],  # 95 degrees from the axis at a corner
+    "SIMPLE_FISHEYE": [400, 400, 300],  # 72 degrees
+    "EUCM": [400, 400, 400, 300, 0.6, 1.1],
+    "SIMPLE_RADIAL": [300, 400, 300, -0.9],  # a corner is no pixel of any ray
+    "EQUIRECTANGULAR": [800, 600],
+}
+
+
+def write_text_model(folder, models: list[tuple[str, list[float]]]) -> Cameras:
+    """Cameras in a circle, the i-th with the i-th model."""
+    cameras = some(len(models))
+    folder.mkdir(parents=True)
+    params = [f"{i + 1} {model} 800 600 {' '.join(map(str, values))}" for i, (model, values) in enumerate(models)]
+    (folder / "cameras.txt").write_text("\n".join(params) + "\n")
+    lines = []
+    for i, T in enumerate(cameras.T_camera_frame):
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        lines += [f"{i + 1} {w} {x} {y} {z} {' '.join(map(str, T[:3, 3]))} {i + 1} {cameras.names[i]}", ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    return cameras
+
+
+def shift_at_corners(model: str, params: list[float]) -> float:
+    """How far the pinhole projects the ray of a corner from it, the ray being solved for by forward projection."""
+    camera = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=params)
+    f = np.array([camera.focal_length_x, camera.focal_length_y])
+    c = np.array([camera.principal_point_x, camera.principal_point_y])
+    found = []
+    for corner in np.array([[0, 0], [800, 0], [0, 600], [800, 600]], float):
+        ray = least_squares(lambda uv, at=corner: camera.img_from_cam(np.array([*uv, 1.0])) - at, (corner - c) / f).x
+        found.append(np.linalg.norm(ray * f + c - corner))
+    return float(max(found))
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_distortion_is_noted_with_its_pixels_at_a_corner(tmp_path, model):
+    want = write_text_model(tmp_path / "sparse", [(model, LENSES[model]), ("PINHOLE", [700, 700, 400, 300])])
+    cameras = read_cameras(tmp_path / "sparse")
+    np.testing.assert_allclose(cameras.T_frame_camera, want.T_frame_camera, atol=1e-9)
+    (note,) = cameras.notes
+    assert f"1 of 2 cameras have distortion ({model})" in note
+    assert f"{shift_at_corners(model, LENSES[model]):.3g} px" in note
+
+
+@pytest.mark.parametrize("model", WIDE)
+def test_what_no_pinhole_stands_for_is_left_out_by_camera(tmp_path, model):
+    pinhole = ("PINHOLE", [700, 700, 400, 300])
+    want = write_text_model(tmp_path / "sparse", [pinhole, (model, WIDE[model]), pinhole])
+    cameras = read_cameras(tmp_path / "sparse")
+    assert cameras.names == (want.names[0], want.names[2])
+    np.testing.assert_allclose(cameras.T_frame_camera, want.T_frame_camera[[0, 2]], atol=1e-9)
+    assert len(cameras.notes) == 1
+    assert f"({model}): undistort" in cameras.notes[0]
+    write_text_model(tmp_path / "alone", [(model, WIDE[model])])
+    with pytest.raises(NotPinholesError, match=model):
+        read_cameras(tmp_path / "alone")
+
+
+def transforms(path, shared: dict, frames: list[dict]) -> None:
+    frames = [
+        {"file_path": f"{i}.jpg", "transform_matrix": np.eye(4).tolist()} | frame for i, frame in enumerate(frames)
+    ]
+    path.write_text(json.dumps({"w": 800, "h": 600, "fl_x": 700, "cx": 400, "cy": 300} | shared | {"frames": frames}))
+
+
+@pytest.mark.parametrize(
+    ("shared", "model", "params"),
+    [
+        ({"k1": -0.12}, "SIMPLE_RADIAL", [700, 400, 300, -0.12]),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": -0.12}, "SIMPLE_RADIAL", [700, 400, 300, -0.12]),
+        (
+            {"camera_model": "OPENCV", "k1": -0.1, "k2": 0.05, "k3": 0.02, "p1": 1e-3, "p2": -2e-3},
+            "FULL_OPENCV",
+            [700, 700, 400, 300, -0.1, 0.05, 1e-3, -2e-3, 0.02, 0, 0, 0],
+        ),
+        ({"is_fisheye": True, "fl_x": 900, "k1": 0.02}, "OPENCV_FISHEYE", [900, 900, 400, 300, 0.02, 0, 0, 0]),
+    ],
+)
+def test_distortion_of_transforms_is_noted(tmp_path, shared, model, params):
+    transforms(tmp_path / "t.json", shared, [{}, {}])
+    (note,) = read_cameras(tmp_path / "t.json").notes
+    assert note.startswith("2 of 2 cameras")
+    assert f"{shift_at_corners(model, params):.3g} px" in note
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"camera_model": "EQUIRECTANGULAR", "fl_x": None},
+        {"camera_model": "OPENCV_FISHEYE", "fl_x": 300},
+        {"camera_model": "FISHEYE624"},
+        {"k1": 0.1, "k4": 0.1},
+    ],
+)
+def test_transforms_without_a_pinhole_are_left_out_by_frame(tmp_path, lens):
+    transforms(tmp_path / "t.json", {}, [{}, lens, {}])
+    cameras = read_cameras(tmp_path / "t.json")
+    assert cameras.names == ("0.jpg", "2.jpg")
+    assert len(cameras.notes) == 1
+    transforms(tmp_path / "t.json", lens, [{}])
+    with pytest.raises(NotPinholesError):
+        read_cameras(tmp_path / "t.json")
+
+
+def test_undistorted_cameras_have_no_note(tmp_path):
+    transforms(tmp_path / "t.json", {"camera_model": "OPENCV", "k1": 0.0, "p1": 0}, [{}])
+    assert not read_cameras(tmp_path / "t.json").notes
+    write_text_model(tmp_path / "sparse", [("OPENCV", [700, 700, 400, 300, 0, 0, 0, 0]), ("SIMPLE_PINHOLE", [7, 4, 3])])
+    assert not read_cameras(tmp_path / "sparse").notes

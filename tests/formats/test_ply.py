@@ -1,10 +1,12 @@
 import os
+import re
 
 import numpy as np
 import pytest
 
 from gsmap.errors import InputError
 from gsmap.formats import info, ply, read, stream, write
+from gsmap.formats.scans import holds_splat
 from gsmap.geometry.sh import SH_C0
 from gsmap.types import Gaussians
 
@@ -145,6 +147,19 @@ def test_antialiased_is_noted(tmp_path, comment):
     assert info(tmp_path / "c.ply").antialiased
 
 
+@pytest.mark.parametrize(
+    "comment",
+    ["antialiased 0", "Postshot antialiased: 0", "antialiased=false", "Antialiased off", "not antialiased", "sh 0"],
+)
+def test_what_is_said_not_to_be_antialiased_is_not(tmp_path, comment):
+    assert not info(save(tmp_path / "a.ply", columns(some(2, 0)), comments=[comment])).antialiased
+
+
+@pytest.mark.parametrize("comment", ["antialiased 1", "antialiased: true", "antialiased 0.3", "antialiased=yes, v 0"])
+def test_what_is_said_to_be_antialiased_is(tmp_path, comment):
+    assert info(save(tmp_path / "a.ply", columns(some(2, 0)), comments=[comment])).antialiased
+
+
 def test_other_elements_around_the_vertices(tmp_path):
     g = some(5, 0)
     rows = np.stack(list(columns(g).values()), 1).astype("<f4")
@@ -204,6 +219,34 @@ def test_malformed_is_refused_in_one_line(tmp_path, case):
         read(path)
     assert "\n" not in str(caught.value)
     assert "bad.ply" in str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize(("promised", "found"), [("7", "13"), ("20", "13")])
+def test_a_header_that_promises_another_number_of_rows_is_refused(tmp_path, encoding, promised, found):
+    path = save(tmp_path / "a.ply", columns(some(13, 0)), encoding=encoding)
+    path.write_bytes(path.read_bytes().replace(b"element vertex 13", b"element vertex " + promised.encode()))
+    with pytest.raises(InputError) as refused:
+        read(path)
+    more = int(found) - int(promised)
+    assert re.search(rf"\b{promised} (vertex )?rows", str(refused.value))
+    assert re.search(rf"\b({found}|{more}) (rows|found)", str(refused.value))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_rows_may_end_in_white_space_and_other_elements_may_follow(tmp_path, encoding):
+    g = some(13, 0)
+    path = save(tmp_path / "a.ply", columns(g), encoding=encoding)
+    path.write_bytes(path.read_bytes() + b"\n\n")
+    assert_same(read(path), g)
+    path = save(tmp_path / "a.ply", columns(g), encoding=encoding)
+    later = b"1\n2\n" if encoding == "ascii" else b"\1\2"
+    data = path.read_bytes().replace(b"end_header", b"element version 2\nproperty uchar number\nend_header")
+    path.write_bytes(data + later)
+    assert_same(read(path), g)
+    path.write_bytes(data + later + later)
+    with pytest.raises(InputError):
+        read(path)
 
 
 def test_every_truncation_is_refused(tmp_path):
@@ -304,3 +347,67 @@ def test_a_ply_is_copied_chunk_by_chunk(tmp_path, monkeypatch):
     monkeypatch.setattr(ply.PlySource, "load", None)
     write(tmp_path / "b.ply", stream(tmp_path / "a.ply"))
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def trained(n: int = 5_000, degree: int = 1) -> Gaussians:
+    """Gaussians over a floor of 10 by 10 units, as trainers leave them: half of them faint, all a few cm wide."""
+    rng = np.random.default_rng(3)
+    return Gaussians(
+        rng.uniform(0, 10, (n, 3)) * [1, 1, 0.01],
+        rng.normal(size=(n, 4)),
+        rng.normal(np.log(0.03), 0.5, (n, 3)),
+        rng.normal(0, 4, n),
+        rng.normal(size=(n, (degree + 1) ** 2, 3)),
+    )
+
+
+def test_columns_named_as_cloudcompare_names_them_are_those_of_a_splat(tmp_path):
+    g = trained()
+    table = {name if name in "xyz" else f"scalar_{name}": values for name, values in columns(g).items()}
+    table["scalar_intensity"] = g.means[:, 0]
+    kinds = dict.fromkeys("xyz", "double")
+    for encoding in ("ascii", "binary_little_endian"):
+        path = save(tmp_path / "a.ply", table, kinds=kinds, encoding=encoding)
+        assert_same(read(path), g)
+        assert any("CloudCompare" in note for note in info(path).notes)
+    assert holds_splat(path)
+    assert not any("CloudCompare" in note for note in info(save(tmp_path / "b.ply", columns(g))).notes)
+
+
+def activated(g: Gaussians) -> dict[str, np.ndarray]:
+    table = columns(g)
+    table["opacity"] = 1 / (1 + np.exp(-g.logit_opacities.astype(np.float64)))
+    return table | {f"scale_{i}": np.exp(g.log_scales[:, i].astype(np.float64)) for i in range(3)}
+
+
+def test_activated_opacities_and_scales_are_read_as_such(tmp_path):
+    g = trained()
+    path = save(tmp_path / "a.ply", activated(g), kinds={"opacity": "double"})
+    back = read(path)
+    np.testing.assert_allclose(back.log_scales, g.log_scales, atol=1e-5)
+    seen = np.abs(g.logit_opacities) < 8
+    np.testing.assert_allclose(back.logit_opacities[seen], g.logit_opacities[seen], atol=1e-2)
+    assert any("lengths" in note for note in info(path).notes)
+    solid = activated(g) | {"opacity": np.ones(len(g))}  # no evidence but that of the scales
+    assert read(save(tmp_path / "b.ply", solid)).logit_opacities.min() > 5
+
+
+def test_opacities_and_scales_of_two_conventions_are_refused(tmp_path):
+    g = trained()
+    for names in (["opacity"], [f"scale_{i}" for i in range(3)]):
+        with pytest.raises(InputError, match="as trained"):
+            read(save(tmp_path / "a.ply", columns(g) | {name: activated(g)[name] for name in names}))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e5, 1e-3])
+def test_trained_values_stay_whatever_the_unit(tmp_path, unit):
+    """In millimetres every logarithm of a scale is positive, and so is it of one capture in a small unit."""
+    g = trained()
+    log_scales = np.maximum(g.log_scales, -4) + np.float32(np.log(unit))
+    other = Gaussians(g.means * unit, g.quats, log_scales, g.logit_opacities, g.sh)
+    path = save(tmp_path / "a.ply", columns(other))
+    assert_same(read(path), other)
+    assert not info(path).notes
+    for logit in (0.0, 0.5, 1.0):  # none of which is the opacity of a capture, but of what tests are made of
+        plain = Gaussians(other.means, other.quats, log_scales, np.full(len(g), logit), other.sh)
+        assert_same(read(save(tmp_path / "b.ply", columns(plain))), plain)

@@ -244,6 +244,15 @@ def test_damage_is_named(tmp_path, root, says):
         formats.read(tmp_path / "tileset.json")
 
 
+@pytest.mark.parametrize("content", [{"url": "a.glb"}, {"uri": "a.glb?v=2#lod"}, {"url": "a%20b.glb?token=x%2Fy"}])
+def test_content_of_older_versions_and_with_a_query_is_the_file(tmp_path, content):
+    g = random_gaussians(5)
+    for name in ("a.glb", "a b.glb"):
+        tiles3d.write_content(tmp_path / name, g, compressed=False)
+    (tmp_path / "tileset.json").write_text(json.dumps({"asset": {"version": "1.0"}, "root": {"content": content}}))
+    np.testing.assert_allclose(formats.read(tmp_path / "tileset.json").means, g.means, atol=1e-6)
+
+
 def test_not_a_tileset(tmp_path):
     for text in ("", "[]", "{}", '{"root": 3}', "[" * 100_000):
         (tmp_path / "tileset.json").write_text(text)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import gsmap.formats
-from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.errors import ConfigError, InputError, NotFoundError, NotPinholesError
 from gsmap.formats import cameras_json, write
 from gsmap.ingest import find_captures, read_captures, take_capture, validate
 from gsmap.types import Cameras, Gaussians
@@ -202,6 +202,32 @@ def test_options(tmp_path):
     assert capture.scale_policy == "known"
     (capture,) = read_captures(tmp_path / "a.ply", captured_at="2026-05-31T14:00+02:00")
     assert capture.captured_at == "2026-05-31T14:00:00+02:00"
+
+
+def nerfstudio_capture(folder, frames: list[dict]) -> None:
+    """Frames in the middle of the room, looking along z; each may have another lens."""
+    write(folder / "splat.ply", box())
+    pose = np.diag([1.0, -1, -1, 1]).tolist()
+    frames = [{"file_path": f"{i}.jpg", "transform_matrix": pose} | frame for i, frame in enumerate(frames)]
+    content = {"w": 64, "h": 48, "fl_x": 50, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_lenses_that_are_no_pinholes_are_noted_and_left_out_one_by_one(tmp_path):
+    nerfstudio_capture(tmp_path, [{}, {"k1": -0.1}, {"camera_model": "EQUIRECTANGULAR"}])
+    (capture,) = read_captures(tmp_path)
+    assert capture.cameras.names == ("0.jpg", "1.jpg")
+    assert sum("OPENCV" in note and " px" in note for note in capture.notes) == 1
+    assert sum("EQUIRECTANGULAR" in note and "undistort" in note for note in capture.notes) == 1
+
+
+def test_a_capture_of_panoramas_alone_is_ingested_without_their_cameras(tmp_path):
+    nerfstudio_capture(tmp_path, [{"camera_model": "EQUIRECTANGULAR"}] * 2)
+    (capture,) = read_captures(tmp_path)
+    assert capture.cameras.synthesised
+    assert any("EQUIRECTANGULAR" in note and "2 of 2" in note for note in capture.notes)
+    with pytest.raises(NotPinholesError):  # the person asked for just these
+        read_captures(tmp_path / "splat.ply", cameras=tmp_path / "transforms.json")
 
 
 def test_house_finds_its_cameras(shared_data):
