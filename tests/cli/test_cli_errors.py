@@ -14,6 +14,7 @@ import pytest
 
 import gsmap.map
 from gsmap.map import Map
+from gsmap.methods import families
 
 Run = Callable[..., Any]
 
@@ -43,6 +44,19 @@ def broken_list(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ZeroDivisionError("one\ntwo\x1b[31m")
 
     monkeypatch.setattr(Map, "scene_rows", fail)
+
+
+@pytest.fixture
+def broken_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installed package that adds a method to every family, none of which can be imported."""
+    about = tmp_path / "site" / "torn-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: torn\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(
+        "\n".join(f"[{family.group}]\n.torn = torn_package" for family in families().values())
+    )
+    (tmp_path / "site" / "torn_package.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(tmp_path / "site")
 
 
 def test_measure_without_poses_is_refused(empty: Path, cli: Run, logs: Path) -> None:
@@ -96,3 +110,36 @@ def test_an_error_that_cannot_be_logged_is_printed(empty: Path, cli: Run, monkey
     assert done.code == 1
     assert "test_cli_errors.py" in done.stderr
     assert "ZeroDivisionError" in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.usefixtures("broken_package")
+def test_a_broken_plug_in_that_is_not_chosen_is_a_warning(tmp_path: Path, captures: Path, cli: Run) -> None:
+    path = tmp_path / "new.gsmap"
+    done = cli("update", path, captures / "left.ply")
+    assert done.code == 0, done.stderr
+    assert done.stderr.count("embedder '.torn' of the package torn cannot be loaded (ZeroDivisionError") == 1
+    assert done.stderr.count("Traceback") == 0
+    assert len(cli("list", path, "scenes", "--json").json["scenes"]) == 1
+    for line in ("status", "settings", "changes", "models list"):
+        verb, *rest = line.split()
+        done = cli(verb, *rest, path, "--json")
+        assert done.code == 0, done.stderr
+    assert not [row for row in cli("settings", path, "--json").json["settings"] if ".torn" in row["name"]]
+
+
+@pytest.mark.usefixtures("broken_package")
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "describe.object.embedder=.torn",
+        "describe.object.segmenter=.torn",
+        "register.refiner=.torn",
+        "localize.extractor=.torn",
+        "merge.method=.torn",
+    ],
+)
+def test_a_broken_plug_in_that_is_chosen_is_an_error(empty: Path, cli: Run, setting: str) -> None:
+    done = cli("settings", empty, "--set", setting)
+    assert done.code == 2
+    assert "cannot be loaded" in done.stderr.splitlines()[-1]
+    assert not (empty / "settings.toml").exists()
