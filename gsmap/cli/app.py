@@ -7,7 +7,11 @@ Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 done but for jobs or captures that 
 from __future__ import annotations
 
 import importlib
+import logging
+import platform
 import sys
+import tempfile
+import traceback
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -122,5 +126,25 @@ def run(arguments: list[str] | None = None) -> None:
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
         code, message = 1, f"the system refused{where}: {error.strerror or error}"
+    except Exception as error:
+        code, message = 1, _internal_error(error)
     print(escaped(f"gsmap: {message}"), file=sys.stderr)
     sys.exit(code)
+
+
+def _internal_error(error: Exception) -> str:
+    """Describe an error that gsmap did not raise on purpose in one line, and write its traceback to a log file."""
+    logging.getLogger("gsmap.cli").info("internal error", exc_info=error)  # shown with -v
+    said = str(error).strip().partition("\n")[0]
+    about = f"gsmap {__version__}, Python {platform.python_version()}, {platform.platform()}\n"
+    trace = "".join(traceback.format_exception(error))
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="gsmap-error-", suffix=".log", encoding="utf-8", errors="backslashreplace", delete=False
+        ) as log:
+            log.write(about + trace)
+    except OSError:
+        print(escaped(trace, lines=True), file=sys.stderr, end="")
+        return str(GsmapError(f"internal error: {type(error).__name__}: {said}"))
+    where = f"Traceback: {log.name} (gsmap -v prints it)"
+    return f"{GsmapError(f'internal error: {type(error).__name__}: {said}')}. {where}"

@@ -30,7 +30,10 @@ def command(
         int | None,
         typer.Option("--component", "--island", help="Only scenes, edges and tiles of this connected component."),
     ] = None,
-    status: Annotated[str | None, typer.Option("--status", help="Only scenes or edges of this status.")] = None,
+    status: Annotated[
+        str | None,
+        typer.Option("--status", help="Only scenes or edges of this status; of edges also used, tentative, undecided."),
+    ] = None,
     after: Annotated[
         str | None,
         typer.Option(

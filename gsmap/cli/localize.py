@@ -146,7 +146,7 @@ def _tell(report: LocalizeReport, json: bool) -> None:
     print_table("localize", report.results[0].columns, report.results)
     for row in report.results:
         if row.changes:
-            print_table(f"{row.file} differs", row.changes[0].columns, row.changes)
+            print_table(f"{row.file} differs, component {row.component}", row.changes[0].columns, row.changes)
         elif row.changes is not None:
             say(f"{row.file} shows what the map does, as far as it could be compared ({row.compared:.0%} of it)")
         if row.picture is not None:

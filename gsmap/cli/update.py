@@ -9,6 +9,7 @@ import typer
 
 from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets, opened, print_rows, print_table, say
 from gsmap.cli.ingest import CapturedAt, NoCreate, makes_map, refuse_capture_as_map
+from gsmap.texts import escaped
 
 if TYPE_CHECKING:
     from gsmap.types.rows import EdgeRow, SceneRow
@@ -44,6 +45,7 @@ def command(
         if create:
             say(f"created {map}")
         report = m.update(*(paths or ()), captured_at=captured_at)
+        status = None if json else m.status()
     for row in report.ingested:
         for note in row.notes:
             say(f"{row.scene_name}: {note}")
@@ -60,6 +62,10 @@ def command(
                 f"the map has {newest.scenes} scenes in {newest.components} component{'s' * (newest.components != 1)}; "
                 f"{newest.edges_used} edges used, {newest.edges_tentative} tentative, {newest.edges_refused} refused"
             )
+    if status is not None:
+        for todo in status.todo:
+            if todo.wants_person and (todo.what != "isolated" or status.scenes > 1):
+                print(escaped(f"next: {todo.meaning} ({todo.count}): {todo.verb}"))
 
 
 def print_map(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:

@@ -29,6 +29,7 @@ def end_with_parent(parent: int) -> None:
 
 def work(socket: int) -> None:
     """Answer jobs until the parent ends or closes the socket. The first message says what to import."""
+    import logging
     import pickle
     import queue
     import threading
@@ -52,6 +53,7 @@ def work(socket: int) -> None:
     current._inheriting = True  # type: ignore[attr-defined]
     spawn.prepare(pickle.loads(received.get()))
     del current._inheriting  # type: ignore[attr-defined]
+    logging.getLogger("gsmap.methods").setLevel(logging.ERROR)  # the parent has warned of methods that do not load
     parent.send_bytes(b"")  # it has begun: what ends it from now on is a job
     while True:
         parent.send_bytes(answer(received.get()))

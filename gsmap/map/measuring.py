@@ -47,11 +47,14 @@ def measure(
 
     Raises:
         ConfigError: a point that is none, or a map of several components of which none was named.
-        NotFoundError: a scene without a pose, or points that no frame joins.
+        NotFoundError: a scene without a pose, a component that does not exist, or points that no frame joins.
     """
     graph = store.revisions.get()
-    if graph is None:
-        raise NotFoundError("no scene has a place in the map yet: run gsmap update first")
+    if graph is None or not graph.poses:
+        raise NotFoundError("the map has no poses to measure with: run gsmap update first")
+    components = _components(graph)
+    if component is not None and component not in components:
+        raise NotFoundError(f"the map has no component {component}: it has {', '.join(map(str, components))}")
     solved = _Solved(store, settings, graph)
     said = [place(store, text, settings) for text in (a, b)]
     placed = [_where(store, one, graph, component) for one in said]
@@ -97,6 +100,10 @@ def measure(
     )
 
 
+def _components(graph: PoseGraph) -> list[int]:
+    return sorted({pose.component for pose in graph.poses.values()})
+
+
 def _where(store: Store, one: Place, graph: PoseGraph, component: int | None) -> _Placed:
     if one.crs is not None:
         tied = [tie for tie in graph.world if tie.S_world_map is not None and tie.frame is not None]
@@ -117,7 +124,7 @@ def _where(store: Store, one: Place, graph: PoseGraph, component: int | None) ->
             raise NotFoundError(f"scene {store.scenes.get(one.scene).name} has no place in the map: run gsmap update")
         at, of = pose.S_map_scene.apply(one.point), pose.component
     else:
-        components = sorted({pose.component for pose in graph.poses.values()})
+        components = _components(graph)
         if component is None and len(components) > 1:
             raise ConfigError(
                 f"{one.said} is in the map's frame, of which there are {len(components)}: name one with --component"

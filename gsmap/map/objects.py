@@ -316,6 +316,7 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
             box=sighting.box,
             box_m=None if sighting.box is None else sighting.box * known.metres[thing.component],
             looked=sighting.looked,
+            component=thing.component,
         )
         for thing in chosen
         for sighting in thing.sightings

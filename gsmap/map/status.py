@@ -70,10 +70,11 @@ def status(store: Store, settings: Settings) -> MapStatus:
             add("dirty_tiles", count, verb, f"tiles in {target} that are out of date")
     poses = [pose for scene, pose in graph.poses.items() if scene in living]
     tentative = [pose for pose in poses if pose.status == "tentative"]
-    add("tentative", len(tentative), f"gsmap list {at} scenes --status tentative", "scenes on edges no cycle confirms")
+    unconfirmed = [pair for pair in store.revisions.tentative() if living.issuperset(pair)]
+    add("tentative", len(tentative), _look(store, unconfirmed), "scenes that rest on edges no cycle confirms")
     judged = store.revisions.undecided(newest.number).get(newest.number, []) if newest else []
     undecided = [pair for pair in judged if living.issuperset(pair)]
-    add("undecided", len(undecided), f"gsmap list {at} edges", "edges that nothing could decide: confirm or reject")
+    add("undecided", len(undecided), _look(store, undecided), "edges that nothing could decide: confirm or reject")
     todo += set_aside_rows(store)
     add("changes", num_open(store, settings), f"gsmap changes {at}", "changes nobody looked at")
     outweighed = [scene for scene in (newest.provenance.contradicted_priors if newest else ()) if scene in living]
@@ -99,6 +100,15 @@ def status(store: Store, settings: Settings) -> MapStatus:
         metres=tuple(metre_row(component, one) for component, one in metres.items()),
         at_work=at_work_rows(store.leases.others()),
     )
+
+
+def _look(store: Store, pairs: Sequence[tuple[str, str]]) -> str:
+    """The command with which a person judges some pairs of scenes (ids)."""
+    at = shlex.quote(store.location)
+    if len(pairs) != 1:
+        return f"gsmap view {at}"
+    target, source = (store.scenes.get(scene).name for scene in pairs[0])
+    return f"gsmap why {at} {shlex.quote(f'{target}:{source}')}"
 
 
 def set_aside_rows(store: Store) -> list[TodoRow]:

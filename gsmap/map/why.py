@@ -147,7 +147,10 @@ def _advice(pair: PairReport, settings: Settings, steps: Mapping[str, WhyStep], 
             f"(gsmap edit {at} SCENE --captured-at DATE); where you know it: gsmap confirm or reject {at} {pair.pair}"
         )
     if pair.status == "accepted":
-        return f"a further capture that overlaps both {a} and {b} closes a loop that bears it out or contradicts it"
+        return (
+            f"a further capture that overlaps both {a} and {b} closes a loop that bears it out or "
+            f"contradicts it; where you know it: gsmap confirm or reject {at} {pair.pair}"
+        )
     if "coinciding cells" in failed or pair.status == "no_match":
         return f"a capture of the way from {a} to {b} that shares about a third of either"
     if "free-space violation" in failed or in_doubt:

@@ -64,8 +64,8 @@ class Params:
 
 
 def methods() -> list[str]:
-    """Names of the merging methods there are."""
-    return list(family("merger").names())
+    """Return the names of the merging methods that load."""
+    return list(family("merger").usable())
 
 
 def merger(method: str) -> Merger:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import logging
 import pkgutil
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, get_type_hints
 
 from gsmap.errors import ConfigError
+
+_log = logging.getLogger("gsmap.methods")
 
 _DECLARED: dict[str, Family] = {}
 
@@ -60,6 +63,10 @@ class Family:
         """All methods of the family that can be asked for, in alphabetical order."""
         return tuple(sorted({**self._added(), **self._built_in()}))
 
+    def usable(self) -> tuple[str, ...]:
+        """Return the names of the methods that load and keep the contract; warn once of each other one."""
+        return _usable(self, tuple(sys.path))
+
     def get(self, name: str) -> Any:
         """A method by name.
 
@@ -94,7 +101,7 @@ class Family:
         elif name in added:
             try:
                 method = added[name].load()
-            except Exception as error:  # another package's code may fail in any way
+            except (Exception, SystemExit) as error:  # another package's code may fail in any way
                 raise ConfigError(
                     f"{self.name} {name!r} of the package {_package(added[name])} cannot be loaded "
                     f"({type(error).__name__}: {error}): mend or uninstall that package"
@@ -114,6 +121,15 @@ class Family:
             )
         if self.has_params and not _is_frozen(method.Params):
             raise ConfigError(f"{self.name} {name!r}: its Params must be a frozen dataclass")
+        if self.has_params and name not in built_in:
+            try:
+                get_type_hints(method.Params)
+                method.Params()
+            except Exception as error:
+                raise ConfigError(
+                    f"{self.name} {name!r}: its Params cannot be made without arguments or read "
+                    f"({type(error).__name__}: {error})"
+                ) from error
         return method
 
 
@@ -138,10 +154,14 @@ class MethodParams(Mapping[str, Any]):
         return _family(self.family).params_type(name)()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(_family(self.family).names())
+        return iter(_family(self.family).usable())
 
     def __len__(self) -> int:
-        return len(_family(self.family).names())
+        return len(_family(self.family).usable())
+
+    def __contains__(self, name: object) -> bool:
+        """Whether a method has this name; nothing is imported, so it may fail to load."""
+        return name in _family(self.family).names()
 
     def __hash__(self) -> int:
         return hash((self.family, self.changed))
@@ -182,6 +202,20 @@ def _modules_in(places: tuple[str, ...]) -> tuple[str, ...]:
 def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """What other packages add; reading what is installed takes milliseconds, so once for a search path."""
     return tuple(entry_points(group=group))
+
+
+@lru_cache(maxsize=64)
+def _usable(family: Family, path: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the methods that load; once for a search path, so that a broken one is reported once."""
+    found = []
+    for name in family.names():
+        try:
+            family.get(name)
+        except ConfigError as error:
+            _log.warning("%s; gsmap goes on without it", error)
+        else:
+            found.append(name)
+    return tuple(found)
 
 
 @lru_cache(maxsize=256)

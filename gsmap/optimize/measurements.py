@@ -11,6 +11,7 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities, without_scale
 from gsmap.types import Edge, PoseGraph, Prior
+from gsmap.types.sim3 import check_sim3
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +137,7 @@ def check_priors(scene_ids: Sequence[str], priors: Sequence[Prior]) -> None:
     """Raise `InputError` naming the first prior that is unusable."""
     known = set(scene_ids)
     for prior in priors:
+        check_sim3(prior.S_map_scene, f"S_map_scene of the prior of scene {prior.scene!r}")
         sigmas = np.asarray(prior.sigmas, dtype=np.float64)
         if prior.scene not in known:
             raise InputError(f"prior names scene {prior.scene!r}, which is not in the map")

@@ -130,7 +130,7 @@ def _child(tree: Any, name: str) -> tuple[Any, Any]:
         KeyError: no such child.
     """
     if isinstance(tree, MethodParams):
-        if name not in iter(tree):
+        if name not in tree:
             raise KeyError(name)
         return tree[name], None
     cls: type = type(tree)

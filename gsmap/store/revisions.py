@@ -197,6 +197,12 @@ class Revisions:
             judged = select(edges.c.target, edges.c.source).where(edges.c.until.is_(None), edges.c.since > number)
             return set(placed.scalars()), {(row.target, row.source) for row in connection.execute(judged)}
 
+    def tentative(self) -> tuple[tuple[str, str], ...]:
+        """Return (target, source) of the newest revision's edges that hold scenes though no cycle confirms them."""
+        newest = edges.c.until.is_(None) & (edges.c.use == "tentative")
+        with self._catalog.read() as connection:
+            return tuple(_outcomes(connection, newest))
+
     def undecided(self, number: int | None = None) -> PairsByRevision:
         """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""
         query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)

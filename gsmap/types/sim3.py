@@ -117,3 +117,12 @@ class Sim3:
 
     def __repr__(self) -> str:
         return f"Sim3(t={np.round(self.translation, 4).tolist()}, scale={self.scale:.6g})"
+
+
+def check_sim3(value: object, name: str) -> None:
+    """Raise `InputError` naming an argument that is not a `Sim3`."""
+    if not isinstance(value, Sim3):
+        raise InputError(
+            f"{name} must be a gsmap.types.Sim3, got {type(value).__name__}; of a (4, 4) matrix M pass "
+            "Sim3.from_matrix(M)"
+        )

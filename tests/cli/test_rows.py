@@ -149,3 +149,20 @@ def test_an_empty_table_has_its_headings(capsys: pytest.CaptureFixture[str]) -> 
 )
 def test_values_read_as_people_write_them(value: object, expected: str) -> None:
     assert shown(value) == expected
+
+
+@pytest.mark.parametrize("row", TYPES, ids=lambda row: row.__name__)
+def test_coordinates_name_their_frame_and_unit(row: type[Row]) -> None:
+    """Components share no frame, so positions under each other say which component and unit they are in."""
+    units = {"map units", "scene units", "m", "deg, map units"}
+    lengths = ("position", "size", "sigma", "map", "at_m", "size_m", "box_m")
+    shown = {name for name in row.columns if getattr(row, "__annotations__", {}).get(name) != "str"}
+    for name in shown:
+        if name in lengths:
+            heading = row.columns[name]
+            unit = heading.partition("(")[2].removesuffix(")") or heading.partition(", ")[2]
+            assert unit in units, heading
+    of_map = {"position", "map", "at_m", "box_m"} & shown
+    in_scene = any("scene units" in row.columns[name] for name in of_map)
+    in_a_titled_table = row.__name__ == "PhotoChangeRow"  # of one photo, whose component is in the title
+    assert not of_map or in_scene or in_a_titled_table or "component" in row.columns

@@ -146,7 +146,9 @@ def test_changes_are_told_and_drawn(copy, capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         run(["-q", "localize", str(folder / "c.gsmap"), str(folder / "changed.jpg"), "--intrinsics", lens, "--changes"])
     assert not ended.value.code
-    assert "changed.jpg differs" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert f"changed.jpg differs, component {row.component}" in out
+    assert "component" in out.partition("differs")[0]
 
 
 def test_a_photo_is_kept_once_and_follows_its_scene(copy) -> None:

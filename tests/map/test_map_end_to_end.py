@@ -323,6 +323,8 @@ def test_an_anchor_and_a_survey_hold_the_map(copy: Path) -> None:
         ids = {s.name: s.id for s in m.scenes()}
         with pytest.raises(InputError, match="up direction"):
             m.set_prior(Prior(names[1], Sim3.identity(), np.full(7, np.inf), np.zeros(3)))
+        with pytest.raises(InputError, match=r"S_map_scene .* must be a .*Sim3, got ndarray"):
+            m.set_prior(Prior(names[1], np.eye(4), np.full(7, np.inf)))
         assert m.store.priors.list() == []
     cli("prior", copy, names[1], "--anchor")
     cli("update", copy)

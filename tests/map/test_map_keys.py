@@ -292,6 +292,8 @@ def test_ones_own_edge_is_used_until_it_is_withdrawn(watched: Watched) -> None:
     for bad in (SIGMAS[:6], -SIGMAS, SIGMAS * np.nan):
         with pytest.raises(InputError, match="7 positive"):
             m.add_edge(PAIR, mine, bad)
+    with pytest.raises(InputError, match=r"S_target_source must be a .*Sim3, got ndarray"):
+        m.add_edge(PAIR, mine.matrix(), SIGMAS)
     assert watched.edge().proposer != "manual"
 
 

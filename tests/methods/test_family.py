@@ -1,5 +1,6 @@
 """Methods are found in a folder and in installed packages, and are held to their contract."""
 
+import logging
 import sys
 
 import pytest
@@ -40,6 +41,41 @@ def test_what_does_not_keep_the_contract_is_named(toys, name, message):
         toys.get(name)
 
 
+def test_methods_that_do_not_load_are_left_out_with_one_warning_each(toys, caplog):
+    with caplog.at_level(logging.WARNING, "gsmap.methods"):
+        assert toys.usable() == ("glass", "stone", "wood")
+        assert toys.usable() == ("glass", "stone", "wood")
+    warned = [record.getMessage() for record in caplog.records]
+    assert len(warned) == 3
+    assert [name for name in ("bare", "loose", "torn") if sum(f"toy '{name}'" in line for line in warned) == 1] == [
+        "bare",
+        "loose",
+        "torn",
+    ]
+    params = MethodParams("toy")
+    assert len(params) == 3
+    assert "torn" in params  # it exists, so naming it says why it does not load
+    assert "rubble" not in params
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("size_m: float = 7.0", "size_m: float"),  # no default
+        ("size_m: float = 7.0", "size_m: Length = 7.0"),  # a type that does not exist
+        ("VERSION = 12", "raise SystemExit(3)"),
+    ],
+)
+def test_any_way_to_fail_of_another_package_is_a_clear_error(toys, tmp_path, old, new):
+    added = tmp_path / "site" / "toy_added.py"
+    text = added.read_text()
+    assert old in text
+    added.write_text("from __future__ import annotations\n" + text.replace(old, new))
+    with pytest.raises(ConfigError, match="toy 'glass'"):
+        toys.get("glass")
+    assert toys.usable() == ("stone", "wood")
+
+
 def test_a_method_without_a_version_is_refused(toys, tmp_path):
     wood = tmp_path / "site" / "toy_blocks" / "wood.py"
     (wood.parent / "clay.py").write_text(wood.read_text().replace("VERSION = 3", ""))
@@ -63,7 +99,7 @@ def test_params_of_a_family_hold_what_was_changed_and_defaults_for_the_rest(toys
     assert changed != params
     assert hash(changed) == hash(params.with_params("wood", wood(size_m=0.25)))
     assert changed.with_params("wood", wood()) == params
-    assert list(params) == list(toys.names())
+    assert list(params) == ["glass", "stone", "wood"]
     with pytest.raises(ConfigError, match=r"toy 'wood' takes toy_blocks.wood.Params, got toy_blocks.stone.Params"):
         params.with_params("wood", toys.params_type("stone")())
 

@@ -29,7 +29,7 @@ def kinds() -> dict[str, list[Any]]:
     """
     found: dict[str, list[Any]] = {}
     for methods in (family("segmenter"), family("embedder"), family("extractor")):
-        for name in methods.names():
+        for name in methods.usable():
             method = methods.get(name)
             if method.MODELS and not hasattr(method, "probe"):
                 raise ConfigError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from gsmap.map.dates import is_after, parsed
@@ -17,6 +17,12 @@ from gsmap.types.rows import EdgeRow, PairEventRow, PairReport
 Outcomes = Mapping[tuple[str, str], EdgeOutcome]
 _FEW = 1000  # scenes that one query names; beyond, all outcomes are read
 EDGE_STATUSES = ("accepted", "rejected", "no_match")
+EDGE_USES: Mapping[str, Callable[[EdgeRow], bool]] = {
+    "used": lambda row: row.used is True,
+    "tentative": lambda row: row.used == "tentative",
+    "undecided": lambda row: row.undecided,
+}
+"""Words for what the last optimize made of an edge; edges are filtered by them, too."""
 
 
 @of_one_state
@@ -33,14 +39,14 @@ def edge_rows(
 
     Args:
         component, tag: only those both of whose scenes are in it, or have it.
-        status: only those of this one.
+        status: only those of this status or use: one of `EDGE_STATUSES` or `EDGE_USES`.
         after: ISO 8601; only those registered after it.
         as_of: ISO 8601; only those both of whose scenes are dated at or before it.
 
     Raises:
         ConfigError: no such status, or a date that is none.
     """
-    one_of(status, EDGE_STATUSES)
+    one_of(status, (*EDGE_STATUSES, *EDGE_USES))
     since = None if after is None else parsed(after)
     inside = None
     if component is not None or tag is not None or as_of is not None:
@@ -49,7 +55,7 @@ def edge_rows(
         row
         for row in _edge_rows(store, store.registrations.current(brief=True))
         if (inside is None or {row.target, row.source} <= inside)
-        and (status is None or row.status == status)
+        and (status is None or (EDGE_USES[status](row) if status in EDGE_USES else row.status == status))
         and (since is None or is_after(row.registered_at, since))
     ]
 
@@ -98,8 +104,10 @@ def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[s
     edge = stored.registration
     outcome = outcomes.get((edge.target, edge.source))
     status, reason = edge.status, edge.reason or (outcome.reason if outcome else "")
+    used = _USED[outcome.use] if outcome else False
     if stored.review == "confirm":
         status, reason = "accepted", "confirmed by a person"
+        used = bool(used)  # a tentative edge holds its scenes; the person now confirms it in place of a cycle
     elif stored.review == "reject":
         status, reason = "rejected", "rejected by a person"
     return EdgeRow(
@@ -116,7 +124,7 @@ def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[s
         num_correspondences=edge.num_correspondences,
         overlap=edge.overlap,
         seconds={step: edge.seconds.get(step, 0.0) for step in ("match", "refine", "verdict")},
-        used=_USED[outcome.use] if outcome else False,
+        used=used,
         undecided=outcome is not None and outcome.undecided,
         review=stored.review,
         proposer=edge.proposer,

@@ -27,6 +27,7 @@ from gsmap.store.registrations import Standing
 from gsmap.store.scenes import BriefScene
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
+from gsmap.types.sim3 import check_sim3
 
 Pair = tuple[str, str]
 Pairs = str | Path | Sequence[Pair]
@@ -268,8 +269,9 @@ def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np
         sigmas: (7,) standard deviations [rot_rad (3), trans (3), log_scale] on the source side, in the source's unit.
 
     Raises:
-        InputError: sigmas that are not 7 positive finite numbers.
+        InputError: a pose that is not a `Sim3`, or sigmas that are not 7 positive finite numbers.
     """
+    check_sim3(S_target_source, "S_target_source")
     sigmas = np.asarray(sigmas, dtype=np.float64)
     if sigmas.shape != (7,) or not np.isfinite(sigmas).all() or not (sigmas > 0).all():
         raise InputError(f"a measured edge needs 7 positive standard deviations, got {sigmas.tolist()}")

@@ -67,8 +67,9 @@ class ChangeRow(VisitPairRef):
         "id": "id",
         "kind": "kind",
         "pair": "pair",
-        "at_m": "at",
-        "size_m": "size",
+        "component": "component",
+        "at_m": "at (m)",
+        "size_m": "size (m)",
         "confidence": "confidence",
         "status": "status",
     }

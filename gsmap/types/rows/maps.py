@@ -35,6 +35,18 @@ TodoKind = Literal[
 ]
 
 
+_FOR_A_PERSON: tuple[TodoKind, ...] = (
+    "tentative",
+    "undecided",
+    "changes",
+    "contradicted_priors",
+    "world_outliers",
+    "untied",
+    "duplicates",
+    "isolated",
+)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TodoRow(Row):
     """Something that is stale or wants a person.
@@ -59,6 +71,11 @@ class TodoRow(Row):
     count: int
     verb: str
     meaning: str
+
+    @property
+    def wants_person(self) -> bool:
+        """Whether a person has to judge or decide; the rest is work that the command does."""
+        return self.what in _FOR_A_PERSON
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -41,8 +41,9 @@ class ObjectRow(Row):
         "name": "name",
         "label": "label",
         "room": "room",
-        "position": "position",
-        "size": "size",
+        "component": "component",
+        "position": "position (map units)",
+        "size": "size (map units)",
         "seen": "seen",
         "looks": "of looks",
         "there": "there",
@@ -103,7 +104,8 @@ class RoomRow(Row):
 
     columns: ClassVar[Mapping[str, str]] = {
         "id": "room",
-        "position": "position",
+        "component": "component",
+        "position": "position (map units)",
         "size_m": "size (m)",
         "area_m2": "m2",
         "doors": "doors to",
@@ -153,6 +155,7 @@ class SightingRow(Row):
         box: lowest and highest corner around it, map frame and unit; null where it was not seen.
         box_m: the same in metres.
         looked: share of its place that the capture looked at.
+        component: index of the component whose frame the box is in.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -160,7 +163,8 @@ class SightingRow(Row):
         "captured_at": "captured",
         "scene_name": "scene",
         "state": "state",
-        "box_m": "box",
+        "component": "component",
+        "box_m": "box (m)",
         "looked": "looked at",
     }
 
@@ -172,6 +176,7 @@ class SightingRow(Row):
     box: np.ndarray | None
     box_m: np.ndarray | None
     looked: float
+    component: int
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

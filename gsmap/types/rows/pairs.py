@@ -52,7 +52,8 @@ class EdgeRow(PairRef):
         num_correspondences: candidates it was chosen from.
         overlap: share of the smaller scene's surface that coincides, in [0, 1].
         seconds: wall seconds spent in ``match``, ``refine`` and ``verdict``.
-        used: whether the last optimize used it: true, false, or ``"tentative"`` (no cycle confirms it).
+        used: whether the last optimize used it: true, false, or ``"tentative"`` (neither a cycle nor a
+            person confirms it).
         undecided: whether nothing could tell if it is right: another group of edges contradicts it.
         review: a person's standing word: ``confirm`` or ``reject``; null where there is none.
         proposer: what proposed the pose (``graph:landmarks``, ``graph:objects``, ``kiss_matcher``), or ``manual`` where

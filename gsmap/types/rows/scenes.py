@@ -134,8 +134,8 @@ class NodeRow(Row):
     columns: ClassVar[Mapping[str, str]] = {
         "layer": "layer",
         "index": "index",
-        "position": "position",
-        "size": "size",
+        "position": "position (scene units)",
+        "size": "size (scene units)",
         "type": "type",
         "weight": "weight",
         "num_views": "views",
@@ -380,7 +380,7 @@ class PoseRow(Row):
         "scene_name": "scene",
         "component": "component",
         "status": "status",
-        "position": "position",
+        "position": "position (map units)",
         "scale": "scale",
         "in_world": "world",
     }

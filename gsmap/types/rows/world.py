@@ -218,7 +218,13 @@ class PlaceRow(Row):
         sigma_m: (3,) standard deviations of ``metric`` east, north, up; null where they are not known.
     """
 
-    columns: ClassVar[Mapping[str, str]] = {"said": "point", "scene_name": "scene", "map": "map", "in_world": "world"}
+    columns: ClassVar[Mapping[str, str]] = {
+        "said": "point",
+        "scene_name": "scene",
+        "component": "component",
+        "map": "map (map units)",
+        "in_world": "world",
+    }
 
     said: str
     scene: str | None
