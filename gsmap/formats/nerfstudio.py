@@ -13,6 +13,7 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import load_json, unique
+from gsmap.formats.pictures import open_picture
 from gsmap.types import Cameras, Sim3
 
 DATAPARSER = "dataparser_transforms.json"
@@ -104,10 +105,8 @@ def _intrinsics(
 
 
 def _image_size(image: Path, path: Path) -> tuple[int, int]:
-    from PIL import Image
-
     for candidate in (image, image.with_name(image.name + ".png")):
         if candidate.is_file():
-            with Image.open(candidate) as opened:
+            with open_picture(candidate) as opened:
                 return opened.size
     raise InputError(f"{path} gives no image size (w, h) and {image} is not there to tell it")

@@ -90,7 +90,7 @@ def test_nothing_is_begun_where_a_file_is_no_picture(made) -> None:
     folder, _, _ = made
     (folder / "text.jpg").write_text("none")
     with gsmap.map.open(folder / "m.gsmap") as m:
-        with pytest.raises(InputError, match="not a picture"):
+        with pytest.raises(InputError, match="cannot be read"):
             m.localize(folder / "photo.png", folder / "text.jpg")
         with pytest.raises(NotFoundError):
             m.localize(folder / "none.jpg")
