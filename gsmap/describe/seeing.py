@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from gsmap.describe.objects.layer import Params, resolved
-from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.errors import ConfigError, InputError
+from gsmap.formats.pictures import open_picture
 from gsmap.methods import family
 from gsmap.types.model import ModelSpec
 from gsmap.types.views import Cloud, SceneContext
@@ -27,7 +26,7 @@ def embedded_picture(
 
     Raises:
         NotFoundError: no such file.
-        InputError: no picture, or one too small to show anything.
+        InputError, MissingDependencyError: no picture that gsmap reads, or one too small to show anything.
         ConfigError: the embedder reads no pictures by themselves, or its model is missing.
     """
     rgb = _picture(Path(path))
@@ -68,17 +67,10 @@ def embedded_text(text: str, params: Params, models: Mapping[str, ModelSpec]) ->
 
 def _picture(path: Path) -> np.ndarray:
     """(H, W, 3) uint8, no larger than is of use."""
-    if not path.exists():
-        raise NotFoundError(f"cannot read {path}: no such file")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path) as image:
-                picture = image.convert("RGB")
-                picture.thumbnail((_MOST_PX, _MOST_PX))
-                rgb = np.asarray(picture)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise InputError(f"{path} is not a picture that can be read: {error}") from error
+    with open_picture(path) as image:
+        picture = image.convert("RGB")
+        picture.thumbnail((_MOST_PX, _MOST_PX))
+        rgb = np.asarray(picture)
     if min(rgb.shape[:2]) < _LEAST_PX:
         raise InputError(f"{path} has {rgb.shape[1]} x {rgb.shape[0]} pixels: too few to show a thing")
     return rgb

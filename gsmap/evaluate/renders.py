@@ -11,6 +11,7 @@ import numpy as np
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.evaluate.images import psnr, ssim
+from gsmap.formats.pictures import open_picture
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.progress import Progress
 
@@ -62,13 +63,8 @@ def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, P
 
 def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """A picture as (H, W, 3) float32 in [0, 1]."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{path} is not an image that can be read: {error}") from error
+    with open_picture(path) as image:
+        return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
 
 
 def compare_renders(

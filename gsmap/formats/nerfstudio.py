@@ -16,6 +16,7 @@ from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import load_json, unique
 from gsmap.formats.lenses import Lens, keep_pinholes, lens_of
+from gsmap.formats.pictures import open_picture
 from gsmap.types import Cameras, Sim3
 
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
@@ -132,10 +133,8 @@ def _intrinsics(both: dict[str, Any], path: Path) -> tuple[tuple[float, float, f
 
 
 def _image_size(image: Path, path: Path) -> tuple[int, int]:
-    from PIL import Image
-
     for candidate in (image, image.with_name(image.name + ".png")):
         if candidate.is_file():
-            with Image.open(candidate) as opened:
+            with open_picture(candidate) as opened:
                 return opened.size
     raise InputError(f"{path} gives no image size (w, h) and {image} is not there to tell it")

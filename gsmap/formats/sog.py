@@ -26,6 +26,7 @@ import numpy as np
 from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.formats.inside import file_inside
 from gsmap.formats.palettes import codebook, palette
+from gsmap.formats.pictures import open_picture
 from gsmap.formats.quantise import (
     check_size,
     from_smallest_three,
@@ -311,17 +312,10 @@ def _member(path: str | os.PathLike[str], archive: zipfile.ZipFile, name: str, l
 
 def _image(path: str | os.PathLike[str], files: Files, name: str, most: int) -> np.ndarray:
     """(H, W, 4) uint8 of a lossless WebP of at most as many pixels, and some to spare."""
-    from PIL import Image
-
     most += _SPARE_PIXELS
     data = files(name, 4 * most)
-    try:
-        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-            if image.width * image.height > most:
-                raise InputError(f"{path}: {name} has {image.width} x {image.height} pixels, more than {most:,}")
-            return np.asarray(image.convert("RGBA"))
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: {name} is not a WebP image: {error}") from error
+    with open_picture(f"{path}: {name}", data=data, formats=["WEBP"], max_pixels=most) as image:
+        return np.asarray(image.convert("RGBA"))
 
 
 def _codebook(path: str | os.PathLike[str], part: dict[str, Any]) -> np.ndarray:

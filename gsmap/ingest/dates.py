@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsmap.errors import ConfigError, InputError
+from gsmap.formats.pictures import open_picture
 from gsmap.ingest.find import Found
 
 MAX_FRAMES = 32
@@ -21,7 +22,7 @@ MAX_FRAMES = 32
 _T = TypeVar("_T")
 _MAX_SIDECAR_BYTES = 1 << 20  # what is larger is something else that happens to have the name
 _FIRST_YEAR = 1990  # a digital camera that says less lost its clock
-_PHOTOGRAPHS = ("JPEG", "MPO", "TIFF", "WEBP")
+_PHOTOGRAPHS = ("JPEG", "TIFF", "WEBP")
 _SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 _EXIF_IFD, _TAKEN, _TAKEN_OFFSET = 0x8769, 0x9003, 0x9011
 # Compact dates stand alone, since eight digits are often a number or part of a digest; those with their time follow a
@@ -251,12 +252,10 @@ def _from_frames(pictures: Sequence[Path], latest: datetime, notes: list[str]) -
 
 def _exif_date(path: Path) -> tuple[datetime, bool] | None:
     """When a photograph was taken, and whether its zone is known; None where there is no date, or that of no clock."""
-    from PIL import Image
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large pictures and of damaged tags: only the header is read
-            with Image.open(path, formats=_PHOTOGRAPHS) as picture:
+            with open_picture(path, formats=_PHOTOGRAPHS) as picture:
                 tags = picture.getexif().get_ifd(_EXIF_IFD)
         said = str(tags.get(_TAKEN, "")).strip("\0 ")
         offset = str(tags.get(_TAKEN_OFFSET, "")).strip("\0 ")

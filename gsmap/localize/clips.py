@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,8 @@ from gsmap.errors import InputError, MissingDependencyError, NotFoundError
 from gsmap.localize.photos import Lens, taken_with
 from gsmap.types.localization import Photo
 
+_MAX_FRAME_PX = 35_651_584  # of H.264, H.265 and AV1 at level 6.2, their largest: 8192 x 4352
+
 
 @dataclass(frozen=True)
 class Params:
@@ -20,7 +21,7 @@ class Params:
 
     Args:
         every_s: one of each stretch of so many seconds, the sharpest.
-        max_frames: at most; stretches are longer where a clip is.
+        max_frames: at most; stretches are longer where a clip is, and double where its header does not say how long.
         longest_side_px: larger frames are reduced as they are read.
     """
 
@@ -37,7 +38,7 @@ def read_clip(
     Raises:
         MissingDependencyError: PyAV is not installed.
         NotFoundError: no such file.
-        InputError: not a clip that FFmpeg reads, or one without frames.
+        InputError: not a clip that FFmpeg reads, frames of more than 36 million pixels, or none.
     """
     try:
         import av
@@ -51,32 +52,51 @@ def read_clip(
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise InputError(f"{path} holds no pictures: give a clip")
-            length = float(container.duration or 0) / 1e6
-            every = max(params.every_s, length / params.max_frames)
-            chosen = list(_sharpest(container, every, params))
+            _require_size(path, container.streams.video[0])
+            chosen = _sharpest(container, params)
     except (av.error.FFmpegError, OSError, ValueError) as error:
         raise InputError(f"{path} is not a clip that can be read ({error})") from error
     if not chosen:
         raise InputError(f"{path} has no frame that can be read")
-    return [(at, taken_with(rgb, lens, None, f"{path.name}#{at:.2f}")) for at, rgb in chosen[: params.max_frames]]
+    return [(at, taken_with(rgb, lens, None, f"{path.name}#{at:.2f}")) for at, rgb in chosen]
 
 
-def _sharpest(container, every_s: float, params: Params) -> Iterator[tuple[float, np.ndarray]]:  # type: ignore[no-untyped-def]
-    """The frame of each stretch with most fine detail, as (seconds, (H, W, 3) uint8)."""
-    stretch, best = -1, (-1.0, 0.0, np.zeros((0, 0, 3), np.uint8))
+def _require_size(path: Path, stream) -> None:  # type: ignore[no-untyped-def]
+    """Refuse frames larger than codecs provide for, and keep a stream from growing to such in its middle."""
+    codec = stream.codec_context
+    if codec.width * codec.height > _MAX_FRAME_PX:
+        raise InputError(
+            f"{path} has frames of {codec.width} x {codec.height} pixels, more than {_MAX_FRAME_PX:,}: reduce the clip"
+        )
+    codec.options = {"max_pixels": str(_MAX_FRAME_PX)}
+
+
+def _sharpest(container, params: Params) -> list[tuple[float, np.ndarray]]:  # type: ignore[no-untyped-def]
+    """The frame of each stretch with most fine detail, as (seconds, (H, W, 3) uint8), at most ``max_frames``.
+
+    How long stretches must be is known when the clip ends, for headers lie and streams have none: they double, and the
+    sharper of two neighbours stays, whenever there are more frames than may be kept.
+    """
+    start = None
+    every_s = max(params.every_s, float(container.duration or 0) / 1e6 / params.max_frames)
+    best: dict[int, tuple[float, float, np.ndarray]] = {}  # by stretch: detail, seconds, pixels
     for number, frame in enumerate(container.decode(video=0)):
         at = float(frame.time) if frame.time is not None else number / 30.0
-        if int(at / every_s) != stretch and best[0] >= 0:
-            yield best[1], best[2]
-            best = (-1.0, 0.0, best[2])
-        stretch = int(at / every_s)
+        start = at if start is None else start
         factor = min(1.0, params.longest_side_px / max(frame.width, frame.height))
         size = (max(2, round(frame.width * factor)), max(2, round(frame.height * factor)))
         rgb = frame.to_ndarray(format="rgb24", width=size[0], height=size[1])
         rgb = np.ascontiguousarray(np.rot90(rgb, round(getattr(frame, "rotation", 0) / 90) % 4))
         grey = rgb[::2, ::2].astype(np.float32).mean(2)
         detail = float(np.abs(np.diff(grey, 2, axis=0)).mean() + np.abs(np.diff(grey, 2, axis=1)).mean())
-        if detail > best[0]:
-            best = (detail, at, rgb)
-    if best[0] >= 0:
-        yield best[1], best[2]
+        stretch = int((at - start) // every_s)
+        if stretch not in best or detail > best[stretch][0]:
+            best[stretch] = detail, at, rgb
+        while len(best) > params.max_frames:
+            every_s *= 2
+            longer: dict[int, tuple[float, float, np.ndarray]] = {}
+            for stretch, one in best.items():
+                if stretch // 2 not in longer or one[0] > longer[stretch // 2][0]:
+                    longer[stretch // 2] = one
+            best = longer
+    return [best[stretch][1:] for stretch in sorted(best)]

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.formats.pictures import open_picture
 from gsmap.types.localization import Photo
-
-if TYPE_CHECKING:
-    from PIL import Image
-
-_Taken = TypeVar("_Taken")
 
 _EXIF_IFD, _FOCAL_35MM = 0x8769, 0xA405
 _FILM_DIAGONAL_MM = 43.267  # of a frame of 36 x 24 mm, which equivalent focal lengths mean
@@ -54,7 +48,7 @@ def read_photo(
 
     Raises:
         NotFoundError: no such file, or no mask of it.
-        InputError: not a picture that Pillow reads, or an implausibly large one; or its mask is none.
+        InputError, MissingDependencyError: not a picture that gsmap reads (`open_picture`); or its mask is none.
     """
     from PIL import ImageOps
 
@@ -62,11 +56,10 @@ def read_photo(
     if not path.is_file():
         raise NotFoundError(f"no photo at {path}")
 
-    def upright(picture: Image.Image) -> tuple[np.ndarray, object]:
+    with open_picture(path) as picture:
         focal_35mm = picture.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
-        return np.asarray(ImageOps.exif_transpose(picture).convert("RGB")), focal_35mm
-
-    rgb, focal_35mm = _opened(path, upright, "give a JPEG, PNG, WebP or TIFF")
+        ImageOps.exif_transpose(picture, in_place=True)
+        rgb = np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB"))
     photo = taken_with(rgb, lens, focal_35mm, path.name)
     return photo if masks is None else replace(photo, known=read_mask(path, masks, photo.size_px))
 
@@ -88,7 +81,8 @@ def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_
     found = next((one for one in offered if one.is_file()), None)
     if found is None:
         raise NotFoundError(f"{name.name} has no mask in {folder}: call it {offered[0].name}, white where all counts")
-    known = _opened(found, lambda picture: np.asarray(picture.convert("L")) > 0, "masks are PNG")
+    with open_picture(found) as picture:
+        known = np.asarray(picture.convert("L")) > 0
     if known.shape[::-1] != size_px:
         raise InputError(
             f"{found} has {known.shape[1]} x {known.shape[0]} pixels, its photo {size_px[0]} x {size_px[1]}: "
@@ -97,28 +91,6 @@ def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_
     if not known.any():
         raise InputError(f"{found} is black everywhere: it leaves nothing of its photo")
     return known
-
-
-def _opened(path: Path, take: Callable[[Image.Image], _Taken], advice: str) -> _Taken:
-    """What is taken of a picture in a file.
-
-    Raises:
-        InputError: not a picture that Pillow reads, or an implausibly large one; with the advice.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as picture:
-            return take(picture)
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        UnidentifiedImageError,
-        Image.DecompressionBombError,
-        Image.DecompressionBombWarning,
-    ) as error:
-        raise InputError(f"{path} is not a picture that can be read ({error}): {advice}") from error
 
 
 def taken_with(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str = "photo") -> Photo:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmap.errors import CorruptError
+from gsmap.errors import CorruptError, InputError
 from gsmap.geometry.metres import in_metres, resized
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.methods import family
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from gsmap.merge.sights import SightStore
     from gsmap.register import SceneView
 
-_LARGEST_PX = 4096  # of a kept photo's longer side
+_MAX_PIXELS = 1 << 24  # of a kept photo: so few bytes can claim any number
 
 
 def _store(path: str) -> Store:
@@ -165,14 +164,13 @@ def _kept(path: str, photo: StoredPhoto) -> KeptPhoto:
 
 def _picture(path: str, number: int) -> np.ndarray:
     """(H, W, 3) uint8 of a photo as it is kept."""
-    from PIL import Image
+    from gsmap.formats.pictures import open_picture
 
     try:
-        with Image.open(io.BytesIO(_store(path).photos.jpeg(number))) as picture:
-            if max(picture.size) > _LARGEST_PX:  # so few bytes can claim any number of pixels
-                raise ValueError(f"it claims {picture.size[0]} by {picture.size[1]} pixels")
+        data = _store(path).photos.jpeg(number)
+        with open_picture(f"photo p{number}", data=data, formats=["JPEG"], max_pixels=_MAX_PIXELS) as picture:
             return np.asarray(picture.convert("RGB"))
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
+    except InputError as error:
         raise CorruptError(
             f"what the map keeps of photo p{number} is no picture ({error}): take it back (gsmap remove MAP p{number} "
             "--photo) and add it again"

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from gsmap.errors import NotFoundError
+from gsmap.formats.pictures import open_picture
 from gsmap.geometry.transforms import transform_poses
 from gsmap.store import Store
 from gsmap.types import ScenePose
@@ -115,8 +116,8 @@ def _inside(root: Path, name: str) -> bool:
 
 def _size(path: Path) -> tuple[int, int]:
     """Width and height of the upright picture."""
-    from PIL import Image, ImageOps
+    from PIL import ImageOps
 
-    with Image.open(path) as picture:
+    with open_picture(path) as picture:
         width, height = ImageOps.exif_transpose(picture).size
     return width, height

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +24,7 @@ from gsmap.durable import open_file, sync_file, sync_folder
 from gsmap.errors import MALFORMED, ConfigError, CorruptError, GsmapError, NotFoundError, StoreError
 from gsmap.export.levels import Params as LevelParams
 from gsmap.export.levels import make_level
+from gsmap.formats.quantise import check_size
 from gsmap.geometry.metres import in_metres
 from gsmap.localize import (
     PlacedFeatures,
@@ -45,7 +49,8 @@ from gsmap.types.rows.exports import SmallMapReport, SmallSceneRow
 
 FILE_NAME = "localize.json"
 _FORMAT, _VERSION = "gsmap small map", 2
-_MAX_JSON, _MAX_SCENE = 1 << 26, 1 << 31
+_MAX_JSON, _MAX_SCENE = 1 << 25, 1 << 31
+_BAD_ZIP = (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, RuntimeError)
 _HEADER_BYTES = 1500  # of a scene in localize.json, about
 _ROUNDS = 3
 _DEVIATION_PX = 4.0  # of merged Gaussians in the pictures that they are fitted to: as sharp as photographs ask for
@@ -396,25 +401,60 @@ class SmallLocalizer(Localizer):
 
         path = self.folder / f"{scene}.npz"
         try:
-            with open(open_file(path), "rb") as file:
-                content = file.read(_MAX_SCENE + 1)
-            if len(content) > _MAX_SCENE or hashlib.sha256(content).hexdigest() != self.small[scene].sha256:
+            content = _read_file(path, _MAX_SCENE)
+            if hashlib.sha256(content).hexdigest() != self.small[scene].sha256:
                 raise ValueError("its bytes differ from what was written")
-            with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-                return {name: stored[name] for name in names}, len(content)
+            return _unpacked(path, content, names), len(content)
         except FileNotFoundError as error:
             raise CorruptError(f"{path} is missing: export the small map again") from error
-        except (OSError, EOFError, *MALFORMED) as error:
+        except (OSError, EOFError, MemoryError, *_BAD_ZIP, *MALFORMED) as error:
             raise _corrupt(path, error) from error
+
+
+def _read_file(path: Path, most: int) -> bytes:
+    """The bytes of a file of at most so many; memory is taken for those that there are.
+
+    Raises:
+        ValueError: it has more.
+    """
+    with open(open_file(path), "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise ValueError(f"{size:,} bytes, more than {most:,}")
+        return file.read(size)
+
+
+def _unpacked(path: Path, content: bytes, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Arrays of a scene's file, once their headers say that they are no larger than its bytes can mean.
+
+    Raises:
+        ValueError, KeyError, BadZipFile: bytes that `_npz` did not write, or that claim far more than they hold.
+    """
+    claimed = 0
+    with zipfile.ZipFile(io.BytesIO(content)) as stored:
+        entries = [stored.getinfo(f"{name}.npy") for name in names]
+        for entry in entries:
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{entry.filename} is packed in a way that gsmap does not use")
+            with stored.open(entry) as file:
+                if np.lib.format.read_magic(file) != (1, 0):
+                    raise ValueError(f"{entry.filename} has another header than gsmap writes")
+                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+                size = math.prod(shape) * dtype.itemsize
+                if dtype.hasobject or min(shape, default=0) < 0 or size != entry.file_size - file.tell():
+                    raise ValueError(f"{entry.filename} does not hold what its header claims")
+            claimed += size
+        check_size(path, claimed, len(content))
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in names}
 
 
 def _read_header(path: Path) -> dict[str, Any]:
     try:
-        with open(open_file(path), "rb") as file:
-            told = json.loads(file.read(_MAX_JSON))
+        told = json.loads(_read_file(path, _MAX_JSON))
         if told["format"] != _FORMAT or not isinstance(told["version"], int):
             raise ValueError("it is of another format")
-    except (OSError, *MALFORMED) as error:
+    except (OSError, MemoryError, *MALFORMED) as error:
         raise _corrupt(path, error) from error
     if told["version"] != _VERSION:
         raise ConfigError(f"{path.parent} was written by another version of gsmap ({told['version']}): export it again")

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsmap.errors import InputError
+from gsmap.errors import GsmapError, InputError
+from gsmap.formats.pictures import open_picture
 from gsmap.world.params import Params
 
 _GPS = 0x8825
@@ -64,12 +65,10 @@ def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | Non
 
 def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
     """Where a photo was taken; None where it does not say, or says what cannot be."""
-    from PIL import Image, UnidentifiedImageError
-
     try:
-        with Image.open(path) as picture:
+        with open_picture(path) as picture:
             gps = picture.getexif().get_ifd(_GPS)
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except GsmapError:
         return None
     datum = str(gps.get(_DATUM, "WGS-84")).strip("\0 ").upper().replace(" ", "").replace("-", "")
     latitude = _degrees(gps.get(_LATITUDE), gps.get(_LATITUDE - 1), "NS")

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import io
 import json
 import os
+import resource
 import shutil
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +22,7 @@ from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, R
 from gsmap.localize import Lens, index_recipe, read_photo
 from gsmap.map.localizing_small import localize_small
 from gsmap.map.settings import settings_of
+from gsmap.map.small_map import SmallLocalizer
 from gsmap.map.stages.localize import Localizer, feature_keys
 from gsmap.map.viewing import view_of
 from gsmap.store import Store
@@ -90,7 +97,7 @@ def test_nothing_is_begun_where_a_file_is_no_picture(made) -> None:
     folder, _, _ = made
     (folder / "text.jpg").write_text("none")
     with gsmap.map.open(folder / "m.gsmap") as m:
-        with pytest.raises(InputError, match="not a picture"):
+        with pytest.raises(InputError, match="cannot be read"):
             m.localize(folder / "photo.png", folder / "text.jpg")
         with pytest.raises(NotFoundError):
             m.localize(folder / "none.jpg")
@@ -268,6 +275,96 @@ def test_a_damaged_small_map_is_told(made, small, tmp_path, what) -> None:
         header.write_text(header.read_text().replace('"version": 2', '"version": 3'))
     with pytest.raises(ConfigError if what == "version" else CorruptError, match="again"):
         localize_small(out, [folder / "photo.png"], intrinsics=lens)
+
+
+@contextlib.contextmanager
+def room_for(num_bytes: int):
+    """Address space for so many bytes beyond what is mapped already."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + num_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def _scene_of(out: Path):
+    """A scene of a small map, whose features are read."""
+    return next(iter(SmallLocalizer(out).placed.values())).features
+
+
+def test_a_small_map_is_read_with_little_memory(small) -> None:
+    with room_for(512 << 20):
+        assert _scene_of(small[0]).num_features > 0
+
+
+def _npz_of(path: Path, method: int, **changed: np.ndarray | bytes) -> bytes:
+    """A scene's file with other arrays, or other bytes of them."""
+    out = io.BytesIO()
+    with np.load(path) as stored, zipfile.ZipFile(out, "w", method) as archive:
+        for name in stored.files:
+            value = changed.get(name, stored[name])
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                if isinstance(value, bytes):
+                    file.write(value)
+                else:
+                    np.lib.format.write_array(file, value, (1, 0), allow_pickle=True)
+    return out.getvalue()
+
+
+def _claims(shape: tuple[int, ...], held: int = 0) -> bytes:
+    """An array's header, and as many zeros."""
+    out = io.BytesIO()
+    np.lib.format.write_array_header_1_0(out, {"descr": "|u1", "fortran_order": False, "shape": shape})
+    return out.getvalue() + bytes(held)
+
+
+@pytest.mark.parametrize(
+    "what", ["zeros", "claims", "lzma", "bzip2", "negative", "objects", "no zip", "cut", "deflate"]
+)
+def test_a_hostile_small_map_is_damaged_and_costs_no_memory(small, tmp_path, what) -> None:
+    """Its digest fits its bytes: whoever made it made both."""
+    out = tmp_path / "small"
+    shutil.copytree(small[0], out)
+    (scene,) = out.glob("*.npz")
+    deflated, angles = zipfile.ZIP_DEFLATED, "features.angles"
+    if what == "zeros":
+        content = _npz_of(scene, deflated, **{angles: np.zeros(64 << 20, np.uint8)})
+    elif what == "claims":
+        content = _npz_of(scene, deflated, **{angles: _claims((1 << 34,))})
+    elif what in ("lzma", "bzip2"):
+        method = zipfile.ZIP_LZMA if what == "lzma" else zipfile.ZIP_BZIP2
+        content = _npz_of(scene, method)
+    elif what == "negative":
+        content = _npz_of(scene, deflated, **{angles: _claims((-1, -64), 64)})
+    elif what == "objects":
+        content = _npz_of(scene, deflated, **{angles: np.array([None, {}], object)})
+    else:
+        content = bytearray(scene.read_bytes())
+        if what == "no zip":
+            content = bytearray(b"PK") + bytes(100)
+        elif what == "cut":
+            content = content[:-30]
+        else:
+            at = 30 + int.from_bytes(content[26:28], "little") + int.from_bytes(content[28:30], "little")
+            content[at : at + 40] = b"\xff" * 40
+    scene.write_bytes(bytes(content))
+    header = json.loads((out / "localize.json").read_text())
+    header["scenes"][0]["sha256"] = hashlib.sha256(bytes(content)).hexdigest()
+    (out / "localize.json").write_text(json.dumps(header))
+    with room_for(512 << 20), pytest.raises(CorruptError):
+        _scene_of(out)
+
+
+def test_a_small_map_whose_files_are_vast_is_not_read(small, tmp_path) -> None:
+    out = tmp_path / "small"
+    shutil.copytree(small[0], out)
+    (scene,) = out.glob("*.npz")
+    for path, size in ((scene, 3 << 30), (out / "localize.json", 1 << 30)):
+        os.truncate(path, size)  # sparse
+        with room_for(512 << 20), pytest.raises(CorruptError):
+            _scene_of(out)
 
 
 # --- what is kept ---------------------------------------------------------------------------------------------------

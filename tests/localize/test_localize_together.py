@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -137,10 +138,10 @@ def test_photos_of_other_places_stay_refused_together(world, elsewhere) -> None:
     assert not any(one.is_placed for one in placed)
 
 
-def clip(path, images: np.ndarray) -> None:
+def clip(path, images: np.ndarray, codec: str = "mpeg4", form: str | None = None) -> None:
     av = pytest.importorskip("av")
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
+    with av.open(str(path), "w", format=form) as container:
+        stream = container.add_stream(codec, rate=10)
         stream.width, stream.height, stream.pix_fmt = images.shape[2], images.shape[1], "yuv420p"
         for image in images:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
@@ -156,6 +157,53 @@ def test_a_clip_gives_the_sharpest_frame_of_each_stretch(tmp_path) -> None:
     frames = read_clip(tmp_path / "a.mp4", params=reading.Params(every_s=1.0))
     assert [round(10 * at) for at, _ in frames] == [3, 12]
     assert frames[0][1].size_px == (96, 64)
+
+
+@pytest.mark.parametrize(("name", "codec"), [("a.mp4", "mpeg4"), ("a.m4v", "mpeg4"), ("a.h264", "libx264")])
+def test_a_clip_is_thinned_as_it_is_read(tmp_path, monkeypatch, name: str, codec: str) -> None:
+    """With a length in its header or without: few frames from all of it, and hardly more than these in memory."""
+    av = pytest.importorskip("av")
+    images = np.zeros((600, 96, 128, 3), np.uint8)
+    images += (np.arange(600) // 3).astype(np.uint8)[:, None, None, None]
+    form = {"a.m4v": "m4v", "a.h264": "h264"}.get(name)
+    clip(tmp_path / name, images, codec, form)
+    with av.open(str(tmp_path / name)) as container:
+        assert (container.duration is not None) == (form is None)
+    made: list[weakref.ref] = []
+    peak = 0
+
+    def counted(*arrays, **options):
+        nonlocal peak
+        made.append(weakref.ref(out := np.array(*arrays, **options)))
+        peak = max(peak, sum(one() is not None for one in made))
+        return out
+
+    monkeypatch.setattr(reading.np, "ascontiguousarray", counted)
+    frames = read_clip(tmp_path / name, params=reading.Params(every_s=0.1, max_frames=10))
+    assert peak <= 13
+    assert 5 <= len(frames) <= 10
+    numbers = np.array([3 * photo.rgb.mean() for _, photo in frames])  # each frame is as bright as its number says
+    assert numbers[0] < 130
+    assert numbers[-1] > 470
+    assert 0 < np.diff(numbers).min() <= np.diff(numbers).max() < 270
+
+
+def test_the_sharpest_of_a_long_stretch_stays(tmp_path) -> None:
+    """Wherever it lies, and whatever stretches were joined on the way."""
+    rng = np.random.default_rng(1)
+    images = np.full((320, 64, 96, 3), 128, np.uint8)
+    images[[37, 250]] = rng.integers(0, 255, (2, 64, 96, 3))
+    clip(tmp_path / "a.m4v", images, "mpeg4", "m4v")
+    frames = read_clip(tmp_path / "a.m4v", params=reading.Params(every_s=0.1, max_frames=4))
+    number = [round(10 * at) for at, _ in frames]
+    assert {37, 250} <= set(number)
+
+
+def test_vast_frames_are_refused_by_the_header(tmp_path, monkeypatch) -> None:
+    clip(tmp_path / "a.mp4", np.zeros((2, 64, 96, 3), np.uint8))
+    monkeypatch.setattr(reading, "_MAX_FRAME_PX", 64 * 96 - 1)
+    with pytest.raises(InputError):
+        read_clip(tmp_path / "a.mp4")
 
 
 def test_what_is_no_clip_is_refused(tmp_path) -> None:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
-from gsmap.errors import InputError, NotFoundError
+from gsmap.errors import InputError
+from gsmap.formats.pictures import open_picture
 from gsmap.formats.scans.params import Params
 from gsmap.types.cameras import Cameras
 from gsmap.types.scan import Scan
 
 _DEPTHS = ("I;16", "I;16B", "I;16L", "I", "F")
+_MAX_PIXELS = 1 << 25  # 30 times those of depth cameras; each takes some forty bytes on the way to points
 
 
 def read_depth(
@@ -109,12 +109,5 @@ def _colours(path: Path, shape: tuple[int, int]) -> np.ndarray:
 
 def _picture(path: Path, mode: str | None = None) -> tuple[np.ndarray, str]:
     """A picture's pixels, and its mode."""
-    if not path.exists():
-        raise NotFoundError(f"cannot read {path}: no such file")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path) as image:
-                return np.asarray(image if mode is None else image.convert(mode)), image.mode
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise InputError(f"{path} is not a picture that can be read: {error}") from error
+    with open_picture(path, max_pixels=_MAX_PIXELS) as image:
+        return np.asarray(image if mode is None else image.convert(mode)), image.mode

@@ -1,0 +1,101 @@
+"""Pictures from outside: the one place where gsmap opens photographs, masks, depth pictures and textures.
+
+Pillow reads some fifty formats, one of them (PostScript) by starting another program, and decodes pictures of any size
+that a few bytes claim. Here a picture has one of five formats, whatever its name, and its header is checked first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsmap.errors import GsmapError, InputError, MissingDependencyError, NotFoundError
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF")
+"""Names that Pillow gives the formats. HEIF (HEIC) is read where pillow-heif is installed."""
+
+MAX_PIXELS = 1 << 27
+"""The most pixels of a picture: those of phones have up to 108 million, of medium-format cameras 102 million."""
+
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+
+
+@contextlib.contextmanager
+def open_picture(
+    path: str | os.PathLike[str],
+    *,
+    data: bytes | None = None,
+    formats: Sequence[str] = FORMATS,
+    max_pixels: int = MAX_PIXELS,
+) -> Iterator[Image.Image]:
+    """Open a picture whose header passed; its pixels are decoded in the ``with`` block, by what asks for them.
+
+    Whatever a damaged picture makes Pillow raise in the block becomes an `InputError`: decode there, and compute later.
+
+    Args:
+        path: of its file.
+        data: its bytes, where it is no file; ``path`` then names it in errors.
+        formats: of `FORMATS`, those it may have.
+        max_pixels: the most that its header may claim.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: another format, too many pixels, or damaged.
+        MissingDependencyError: a HEIC picture, and pillow-heif is not installed.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    if data is None and not Path(path).is_file():
+        raise NotFoundError(f"cannot read {os.fspath(path)}: no such file")
+    name, readable = os.fspath(path), _readable(formats)
+    try:
+        with contextlib.ExitStack() as stack:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the bar is ours
+                picture = stack.enter_context(Image.open(path if data is None else io.BytesIO(data), formats=readable))
+            width, height = picture.size
+            if width * height > max_pixels:
+                raise InputError(f"{name} has {width} x {height} pixels, more than {max_pixels:,}: reduce the picture")
+            yield picture
+    except GsmapError:
+        raise
+    except UnidentifiedImageError as error:
+        if "HEIF" in formats and "HEIF" not in readable and _is_heif(path, data):
+            raise MissingDependencyError(f"{name} is a HEIC picture: pip install 'gsmap[heic]'") from error
+        raise InputError(f"{name} cannot be read as a {_listed(readable)} picture: convert it to one") from error
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{name} has more than {max_pixels:,} pixels: reduce the picture") from error
+    except MemoryError as error:
+        raise InputError(f"{name} needs more memory to be decoded than there is: reduce the picture") from error
+    except Exception as error:  # damage makes Pillow's readers raise nearly anything
+        raise InputError(f"{name} cannot be read as a {_listed(readable)} picture ({error}): save it again") from error
+
+
+def _readable(formats: Sequence[str]) -> list[str]:
+    """The formats that this installation reads."""
+    if "HEIF" in formats:
+        try:
+            import pillow_heif
+        except ImportError:
+            return [one for one in formats if one != "HEIF"]
+        pillow_heif.register_heif_opener()
+    return list(formats)
+
+
+def _is_heif(path: str | os.PathLike[str], data: bytes | None) -> bool:
+    if data is None:
+        with open(path, "rb") as file:
+            data = file.read(12)
+    return data[4:8] == b"ftyp" and data[8:12] in _HEIF_BRANDS
+
+
+def _listed(formats: Sequence[str]) -> str:
+    return " or ".join({"WEBP": "WebP", "HEIF": "HEIC"}.get(one, one) for one in formats)
