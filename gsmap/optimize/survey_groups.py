@@ -33,7 +33,7 @@ from gsmap.optimize.survey_snooping import first_points, weakness, without_outli
 from gsmap.optimize.survey_system import Active, Factor, System
 from gsmap.optimize.survey_terms import Unknowns
 from gsmap.types import Sim3
-from gsmap.types.world import Contradiction, WorldFrame
+from gsmap.types.world import UNSOLVED, Contradiction, WorldFrame
 
 _EQUAL = 2.0  # groups whose sigmas differ by less than this factor are equally precise; votes are counted by it too
 _SPECIFIC = ("altitude_zero", "feet", "above_takeoff")  # reasons that leave a mark of their own in the heights
@@ -217,7 +217,7 @@ class _Groups:
             x, active = without_outliers(self.system, x, allowed, gross)  # type: ignore[arg-type]
             x, active, factor, rows_kept = self._without_units(x, active, rows)
         except (np.linalg.LinAlgError, RuntimeError):
-            return f"{GROUPS[str(some.kinds[0])]} and the registrations of the map do not fit together: no solve ends"
+            return UNSOLVED
         tie = _Tie(x, active, factor, rows_kept)
         split = self._split(tie, rows)
         if split is not None:
@@ -482,7 +482,7 @@ class _Groups:
     def _refusal(self, problem: str) -> Refusal:
         found = self.verdicts.found
         if not found:
-            return Refusal(problem, "undetermined")
+            return Refusal(problem, "unsolved" if problem == UNSOLVED else "undetermined")
         texts = dict.fromkeys([*(one.text for one in found), problem])
         return Refusal("; ".join(texts), "contradiction", tuple(found))
 
