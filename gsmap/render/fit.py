@@ -58,7 +58,7 @@ def with_enough_memory(fit: Callable[[str], Fitted], backend: str = "auto") -> F
 
     try:
         return fit(chosen)
-    except torch.OutOfMemoryError as error:
+    except torch.cuda.OutOfMemoryError as error:
         logger.warning("the GPU's memory cannot hold an optimization; it runs on the CPU: %s", error)
     torch.cuda.empty_cache()
     return fit("native")

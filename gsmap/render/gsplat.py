@@ -223,7 +223,7 @@ def in_batches(count: int, size: int, do: Callable[[int, int], None]) -> None:
         last = min(first + size, count)
         try:
             do(first, last)
-        except torch.OutOfMemoryError as error:
+        except torch.cuda.OutOfMemoryError as error:
             _kept.clear()
             if device().type == "cuda":
                 torch.cuda.empty_cache()

@@ -85,7 +85,7 @@ class GsplatFitter(Fitter):
     def load(self, array: np.ndarray) -> Any:
         try:
             return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
-        except torch.OutOfMemoryError:
+        except torch.cuda.OutOfMemoryError:
             return array  # it is sent at every step
 
     def step(self, cameras: Cameras, images: Any, masks: Any = None) -> torch.Tensor | float:

@@ -222,7 +222,7 @@ def test_batches_shrink_where_memory_runs_out_and_the_answer_stays(device, monke
 
     def short_of_memory(scene, views, *rest, **options):
         if len(views.K) > most:
-            raise torch.OutOfMemoryError("no memory")
+            raise torch.cuda.OutOfMemoryError("no memory")
         drawn.append(len(views.K))
         return draw(scene, views, *rest, **options)
 
@@ -253,7 +253,7 @@ def test_a_fit_that_the_gpu_cannot_hold_runs_on_the_cpu(device, monkeypatch, cap
     def second_fails(*args, **options):
         calls.append(args)
         if len(calls) == 2:
-            raise torch.OutOfMemoryError("no memory")
+            raise torch.cuda.OutOfMemoryError("no memory")
         return step(*args, **options)
 
     monkeypatch.setattr(gsplat, "rasterize", second_fails)

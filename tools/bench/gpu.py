@@ -271,7 +271,7 @@ def measure_kernels(house: dict[str, Capture], options: argparse.Namespace) -> l
                 row["bare_packed_ms"] = 1e3 * timed(lambda bare=bare: bare(True), 10)
                 try:
                     row["bare_unpacked_ms"] = 1e3 * timed(lambda bare=bare: bare(False), 10)
-                except torch.OutOfMemoryError:
+                except torch.cuda.OutOfMemoryError:
                     row["bare_unpacked_ms"] = float("nan")
                 draw = functools.partial(_draw_anew, on_gpu, cameras)
                 row["ours_ms"] = 1e3 * timed(lambda draw=draw: draw(False), 10)
