@@ -45,7 +45,7 @@ def run(
     program: Callable[..., object], capfdbinary: pytest.CaptureFixture[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[list[str]], tuple[int, bytes]]:
     """Runs the command line here, with limits on time and memory; anything but an exit of its own is an error."""
-    monkeypatch.setattr(command_line, "build", lambda: program)
+    monkeypatch.setattr(command_line, "build", lambda *_: program)
 
     def too_long(*_: object) -> NoReturn:
         raise AssertionError(f"it took more than {_LIMIT_S} s")

@@ -154,7 +154,7 @@ def test_changes_are_told_and_drawn(copy, capsys) -> None:
         run(["-q", "localize", str(folder / "c.gsmap"), str(folder / "changed.jpg"), "--intrinsics", lens, "--changes"])
     assert not ended.value.code
     out = capsys.readouterr().out
-    assert f"changed.jpg differs, component {row.component}" in out
+    assert f"changed.jpg differs, component {row.component}" in " ".join(out.split())  # a long path breaks the title
     assert "component" in out.partition("differs")[0]
 
 

@@ -186,8 +186,9 @@ def test_what_came_in_before_gsmap_knew_of_origins_is_not_taken_twice(made: list
 def test_a_capture_that_single_precision_destroyed_is_refused(made: list[DemoCapture], tmp_path: Path) -> None:
     write(tmp_path / "in", made[:1], "<f4")
     with gsmap.map.create(tmp_path / "m.gsmap") as m:
+        (named,) = (tmp_path / "in").rglob("point_cloud.ply")  # of a folder it is set aside, and the rest is taken
         with pytest.raises(InputError, match=r"0\.25 there"):
-            m.ingest(tmp_path / "in")
+            m.ingest(named)
         g, positions, cameras = surveyed(made[0], LV95)
         rounded = Gaussians(positions, g.quats, g.log_scales, g.logit_opacities, g.sh)
         with pytest.raises(InputError, match=r"0\.25 there"):
