@@ -16,6 +16,7 @@ import numpy as np
 from gsmap.durable import is_file, make_folder, refuse_links, remove_tree
 from gsmap.export.levels import VERSION, Params, make_level
 from gsmap.export.manifest import FILE_NAME as MANIFEST
+from gsmap.render import backend
 from gsmap.types import Cameras, Gaussians, Tile
 
 LEVELS_FOLDER = "levels"
@@ -222,7 +223,11 @@ class _Maker:
     def parent(self, below: Sequence[tuple[Drawn, Gaussians | None]], height: int) -> Drawn:
         """What is drawn in place of its children; the one of earlier where it was made of the same."""
         children = [child for child, _ in below]
-        made_of = [f"levels {VERSION} {self.levels} {self.layout.key}", *(child.digest for child in children)]
+        fitted_by = backend()
+        recipe = f"levels {VERSION} {self.levels} {self.layout.key}"
+        if fitted_by != "native":  # the CPU's levels keep the names that they had
+            recipe += f" {fitted_by}"
+        made_of = [recipe, *(child.digest for child in children)]
         digest = hashlib.sha256("\n".join(made_of).encode()).hexdigest()
         uri = self.layout.level_uri(digest[:24])
         path = self.folder / uri

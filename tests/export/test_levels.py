@@ -169,6 +169,10 @@ def test_a_tileset_says_how_its_levels_look_and_keeps_them(tmp_path, monkeypatch
     write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: None, levels=replace(QUICK, steps=61))
     assert len(made) == 2
     assert "extras" not in json.loads(file.read_text())["root"]
+    # Levels that a GPU fitted are others, and do not stand for those of the CPU.
+    monkeypatch.setattr("gsmap.export.pyramid.backend", lambda: "gsplat")
+    write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: None, levels=replace(QUICK, steps=61))
+    assert len(made) == 3
 
 
 def test_a_tile_that_did_not_change_is_not_read_again_to_tell_its_box(tmp_path, monkeypatch):
