@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
 
 import torch
 
+from gsmap.render.backends import has_triton
 from gsmap.render.fitter import LearningRates
 
-HAS_TRITON = importlib.util.find_spec("triton") is not None
 _ROWS = 64
 
 
@@ -62,7 +61,7 @@ def step(
         updates: (N,) int32, how often each was stepped; counted on.
     """
     table = corrections.next()
-    by = _by_triton if values[0].is_cuda and HAS_TRITON else _by_torch
+    by = _by_triton if values[0].is_cuda and has_triton() else _by_torch
     by(values, gradients, moments, scales, opacities, frozen, updates, table, rates, corrections.betas, epsilon)
 
 

@@ -41,6 +41,12 @@ def gsplat_available() -> bool:
     return bool(torch.cuda.is_available())
 
 
+@functools.cache
+def has_triton() -> bool:
+    """Whether Triton is installed; without it torch does what its kernels do, more slowly."""
+    return importlib.util.find_spec("triton") is not None
+
+
 def _has_driver() -> bool:
     """Whether NVIDIA's driver is installed."""
     try:

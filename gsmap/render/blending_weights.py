@@ -6,12 +6,11 @@ blending them once more, by a Triton kernel where Triton is installed, else by t
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass
 
 import torch
 
-HAS_TRITON = importlib.util.find_spec("triton") is not None
+from gsmap.render.backends import has_triton
 
 TILE_PX = 16
 MIN_ALPHA = 1 / 255
@@ -61,7 +60,7 @@ def blending_weights(
     opacities = lists.opacities.detach().reshape(-1)
     starts = lists.starts.reshape(-1)
     ends = torch.cat([starts[1:], starts.new_tensor([len(lists.listed)])])
-    blend = _by_triton if means2d.is_cuda and HAS_TRITON else _by_torch
+    blend = _by_triton if means2d.is_cuda and has_triton() else _by_torch
     shown, largest = blend(
         means2d, conics, opacities, lists.listed, starts, ends, (views, height, width), TILE_PX, max_weight
     )

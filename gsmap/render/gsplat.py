@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,6 @@ logger = logging.getLogger(__name__)
 
 NEAR_PLANE = 0.01
 DILATION_PX2 = 0.3
-SH_DEGREE = {1: 0, 4: 1, 9: 2, 16: 3}
 
 # A batch of cameras is as large as fits into this; more gains nothing, for a batch fills the GPU long before.
 _BATCH_BYTES = 1 << 31
@@ -88,11 +88,11 @@ class DrawableGaussians:
         means, quats, log_scales, logits, sh = tensors.tensors()
         n = len(means)
         # gsplat has no word for a Gaussian that cannot be drawn; the native backend leaves it out.
-        sound = drawable(means, quats, log_scales, logits) & torch.isfinite(sh).flatten(1).all(1)
+        sound = drawable(tensors.tensors())
         rows = None if bool(sound.all()) else torch.nonzero(sound)[:, 0]
         if rows is not None:
             means, quats, log_scales, logits, sh = (t[rows] for t in (means, quats, log_scales, logits, sh))
-        return cls(means, unit_or_identity(quats), log_scales.exp(), torch.sigmoid(logits), sh, rows, n)
+        return cls(means, without_zeros(quats), log_scales.exp(), torch.sigmoid(logits), sh, rows, n)
 
     @property
     def nbytes(self) -> int:
@@ -131,14 +131,15 @@ class DeviceViews:
         return cls(given, K.view(-1, 3, 3), -(rotation.transpose(1, 2) @ translation)[..., 0], width, height)
 
 
-def drawable(means: torch.Tensor, quats: torch.Tensor, log_scales: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
-    """(N,) whether position, rotation, size and opacity are numbers that float32 can draw."""
-    sound = torch.isfinite(means).all(1) & torch.isfinite(quats).all(1)
+def drawable(values: Sequence[torch.Tensor]) -> torch.Tensor:
+    """(N,) whether means, quats, log_scales, logit_opacities and sh are numbers that float32 can draw."""
+    means, quats, log_scales, logits, sh = values
+    sound = torch.isfinite(means).all(1) & torch.isfinite(quats).all(1) & torch.isfinite(sh).flatten(1).all(1)
     return sound & ~(torch.isnan(log_scales) | (log_scales >= 80)).any(1) & ~torch.isnan(logits)
 
 
-def unit_or_identity(quats: torch.Tensor) -> torch.Tensor:
-    """(N, 4) quaternions, the identity in place of those of length zero."""
+def without_zeros(quats: torch.Tensor) -> torch.Tensor:
+    """(N, 4) quaternions as they are, but the identity in place of those of length zero."""
     identity = quats.new_tensor([1.0, 0, 0, 0])
     return torch.where(quats.square().sum(1, keepdim=True) > 1e-30, quats, identity)
 
@@ -317,7 +318,7 @@ def rasterize(
         opacities = scene.opacities[None]
         directions = scene.means[None] - views.centers[:, None]
         coefficients, mask = scene.sh[None], (radii > 0).all(-1)
-    colours = gs.spherical_harmonics(SH_DEGREE[scene.sh.shape[1]], directions, coefficients, masks=mask)
+    colours = gs.spherical_harmonics(math.isqrt(scene.sh.shape[1]) - 1, directions, coefficients, masks=mask)
     colours = torch.clamp_min(colours + 0.5, 0)
     if depth:
         colours = torch.cat([colours, depths[..., None]], -1)

@@ -42,9 +42,10 @@ class GsplatFitter(Fitter):
         self._background = torch.tensor(self.options.background, dtype=torch.float32, device=self._device)
         self._views: weakref.WeakKeyDictionary[Cameras, gsplat.DeviceViews] = weakref.WeakKeyDictionary()
         self._corrections = adam.Corrections(self.options.betas, self._device)
+        values = self._moved(gaussians)
         self._set(
-            self._moved(gaussians),
-            [[torch.zeros_like(value) for value in self._moved(gaussians)] for _ in range(2)],
+            values,
+            [[torch.zeros_like(value) for value in values] for _ in range(2)],
             torch.zeros(len(gaussians), dtype=torch.int32, device=self._device),
             torch.tensor(np.zeros(len(gaussians), bool) if held is None else held, device=self._device),
         )
@@ -63,8 +64,7 @@ class GsplatFitter(Fitter):
         frozen: torch.Tensor,
     ) -> None:
         self._values, self._moments, self._updates, self._frozen = values, moments, updates, frozen
-        means, quats, log_scales, logits, sh = values
-        hidden = ~(gsplat.drawable(means, quats, log_scales, logits) & torch.isfinite(sh).flatten(1).all(1))
+        hidden = ~gsplat.drawable(values)
         # Those that cannot be drawn stay as they are, and are drawn as something that no pixel shows.
         self._hidden = hidden if bool(hidden.any()) else None
         self.reset_statistics()
@@ -133,7 +133,7 @@ class GsplatFitter(Fitter):
             opacities, sh = torch.where(self._hidden, 0.0, opacities), torch.where(hidden[..., None], 0.0, sh)
         return gsplat.DrawableGaussians(
             means.detach().requires_grad_(),
-            gsplat.unit_or_identity(quats).requires_grad_(),
+            gsplat.without_zeros(quats).requires_grad_(),
             scales.requires_grad_(),
             opacities.requires_grad_(),
             sh.detach().requires_grad_(),

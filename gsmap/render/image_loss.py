@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 
 import torch
 import torch.nn.functional as F
 
-HAS_TRITON = importlib.util.find_spec("triton") is not None
+from gsmap.render.backends import has_triton
 
 # Wang et al. 2004: a Gaussian of sigma 1.5 and 11 taps; outside the image all is zero.
 _REACH = 5
@@ -36,7 +35,7 @@ def image_loss(
     Returns:
         (V,) losses, and the gradient (V, H, W, 3) of their mean with respect to the images.
     """
-    if images.is_cuda and HAS_TRITON:
+    if images.is_cuda and has_triton():
         return _by_triton(images.contiguous(), targets, masks, ssim_weight, huber_delta)
     return _by_torch(images, _scaled(targets), None if masks is None else _scaled(masks), ssim_weight, huber_delta)
 
