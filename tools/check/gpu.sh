@@ -16,14 +16,16 @@ set -uo pipefail
 cd "$(dirname "$0")/../.."
 PYTHON=${PYTHON:-python3}
 export PYTHONUNBUFFERED=1
+status=0
 say() { printf '== %4d s  %s\n' "$SECONDS" "$*"; }
 
 if [ "${1:-}" = --dry-run ]; then
     captures=$2 out=$3
     mkdir -p "$out"
-    timeout 900 "$PYTHON" -m pytest -q -p no:cacheprovider tests/render/test_render_gsplat.py 2>&1 | tee "$out/tests.log" | tail -n 3
-    timeout 1800 "$PYTHON" tools/bench/gpu.py "$captures" --dry-run --json "$out/gpu.json" 2>&1 | tee "$out/bench.log"
-    exit $?
+    timeout 900 "$PYTHON" -m pytest -q -p no:cacheprovider tests/render/test_render_gsplat.py 2>&1 | tee "$out/tests.log" | tail -n 3 ||
+        status=1
+    timeout 1800 "$PYTHON" tools/bench/gpu.py "$captures" --dry-run --json "$out/gpu.json" 2>&1 | tee "$out/bench.log" || status=1
+    exit "$status"
 fi
 
 wheels=$1 captures=$2 out=$3
@@ -53,7 +55,7 @@ wait "$native" || { tail -n 20 "$out/build.log"; exit 1; }
 
 # --- tests, then figures ---------------------------------------------------------------------------------------------
 say "tests"
-timeout "${TESTS_S:-90}" "$PYTHON" -m pytest -q -p no:cacheprovider tests/render/test_render_gsplat.py -k "${TESTS:-cuda or triton}" >"$out/tests.log" 2>&1
+timeout "${TESTS_S:-90}" "$PYTHON" -m pytest -q -p no:cacheprovider tests/render/test_render_gsplat.py -k "${TESTS:-cuda or triton}" >"$out/tests.log" 2>&1 || status=1
 tail -n "${TESTS_LINES:-25}" "$out/tests.log"
 declare -A limit=([kernels]=90 [fit]=60 [merge]=60 [describe]=70 [pairs]=170 [tile]=120 [memory]=60)
 for part in "${@:-kernels fit merge describe pairs tile memory}"; do
@@ -63,7 +65,8 @@ for part in "${@:-kernels fit merge describe pairs tile memory}"; do
         [ "$seconds" -lt "${limit[$one]}" ] || seconds=${limit[$one]}
         say "$one, at most $seconds s"
         # shellcheck disable=SC2086
-        timeout "$seconds" "$PYTHON" tools/bench/gpu.py "$captures" --parts "$one" --json "$out/gpu.json" ${BENCH_OPTIONS:-} 2>&1 | tee -a "$out/bench.log"
+        timeout "$seconds" "$PYTHON" tools/bench/gpu.py "$captures" --parts "$one" --json "$out/gpu.json" ${BENCH_OPTIONS:-} 2>&1 | tee -a "$out/bench.log" || status=1
     done
 done
 say "done"
+exit "$status"
