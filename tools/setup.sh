@@ -75,8 +75,8 @@ if [ "${1:-}" = test ]; then
     # Without isolation: the module is built by the tools that stay in the environment, again and again.
     pip install -q -c constraints.txt scikit-build-core nanobind cmake ninja
     pip install -q -c constraints.txt --no-build-isolation -e ".[test,lint,docs]" -e synthetic
-    # Leave plain path files: the import hooks beside them would stand before PYTHONPATH, and tools/planted_faults.py
-    # tests a copy that PYTHONPATH names.
+    # Leave plain path files: the import hooks beside them would stand before PYTHONPATH, and a checkout that PYTHONPATH
+    # names could not be tested with this environment.
     purelib=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
     find "$purelib" -maxdepth 1 -name '*gsmap*.pth' -exec sed -i '/^import /d' {} +
     PYTHON="$venv/bin/python" tools/build_native.sh >&2
