@@ -1,10 +1,10 @@
-"""What merging drops of an older capture, over settings of `gsmap.compare`: how these were chosen.
+"""What merging drops of an older capture, over constants of `gsmap.compare`: how these were chosen.
 
     tools/make_change.py DEV --set dev
     tools/make_change.py SEEN --set seen
-    tools/fit_drops.py DEV/* SEEN/2* --set compare.alike=.04,.05,.06 --set compare.about_m=.2,.35,.5
+    tools/fit_drops.py DEV/* SEEN/2* --set things._MAX_COLOUR_DISTANCE=.04,.05 --set things._ADJACENT_M=.2,.5
 
-For each value of each setting, the others at their defaults: the share of the Gaussians of removed and of painted
+For each value of each constant (of the module that uses it), the others as they are: the share of the Gaussians of removed and of painted
 things that is dropped, and of those of others, at worst and in the mean over the places (see tools/change_scores.py).
 The last column counts of others only those that both captures' photographs show in one colour: what a wall painted next
 to it lights otherwise has changed, too. Under true poses.
@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import change_scores as scores
 import numpy as np
 from change_truth import Truth
 
-from gsmap import compare
+from gsmap.compare import things
 from gsmap.merge.changes import settle
 from gsmap.types import PlacedScene
 
@@ -31,21 +32,24 @@ COLUMNS = ("gone", "painted", "false", "false_unlit")
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path, nargs="+")
-    parser.add_argument("--set", action="append", default=[], metavar="compare.NAME=V,V", help="values to try")
+    parser.add_argument("--set", action="append", default=[], metavar="MODULE.NAME=V,V", help="values to try")
     args = parser.parse_args()
     places = [Truth(folder) for folder in args.places]
     captures = [[_placed(truth, time) for time in truth.times[:2]] for truth in places]
-    tried = [("defaults", compare.Params())]
+    tried: list[tuple[str, Any, str, float]] = [("defaults", things, "_ADJACENT_M", things._ADJACENT_M)]
     for text in args.set:
-        name, values = text.removeprefix("compare.").split("=")
-        kind = type(getattr(compare.Params(), name))
-        tried += [(f"{name}={v}", replace(compare.Params(), **{name: kind(v)})) for v in values.split(",")]
+        path, values = text.split("=")
+        module, name = import_module(f"gsmap.compare.{path.split('.')[0]}"), path.split(".")[1]
+        kind = type(getattr(module, name))
+        tried += [(f"{path}={v}", module, name, kind(v)) for v in values.split(",")]
     print(f"{'':24}", *(f"{c:>19}" for c in COLUMNS), "(worst, mean)")
-    for label, params in tried:
-        rows = []
+    for label, module, name, value in tried:
+        usual, rows = getattr(module, name), []
+        setattr(module, name, value)
         for truth, scenes in zip(places, captures, strict=True):
-            before, after = scenes[0].gaussians.means, settle(scenes, params=params).scenes[0].gaussians.means
+            before, after = scenes[0].gaussians.means, settle(scenes).scenes[0].gaussians.means
             rows.append(scores.score_drops(truth, truth.times[1], truth.times[0], ~scores.kept_rows(before, after)))
+        setattr(module, name, usual)
         cells = []
         for column in COLUMNS:
             values = [row[column] for row in rows]

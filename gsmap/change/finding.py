@@ -33,7 +33,7 @@ def find_changes(
     Args:
         unlike: how unlike the light falls, see `gsmap.change.things.light`.
     """
-    tints = [p for p in paints(both, cells, params) if is_paint(p, unlike, params)]
+    tints = [p for p in paints(both, cells, params) if is_paint(p, unlike)]
     clear = [np.zeros(len(side), dtype=bool) for side in both]
     for paint in tints:
         if not paint.is_shell:

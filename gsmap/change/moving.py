@@ -20,6 +20,9 @@ from gsmap.compare.components import components
 from gsmap.compare.looks import place
 from gsmap.types import Sim3
 
+_YAW_STARTS = 24  # turns about the vertical from which a moved segment is looked for
+_MAX_OFFSET_M = 0.05  # of a moved segment from the surface where it stands
+_MAX_RIVAL_SCORE = 0.875  # relative to the best; a better rival makes a move ambiguous, unless by symmetry
 _ALIKE = 0.12  # tints that differ by less may be one thing's
 _DARKER = 0.12  # and a thing may be that much lighter or darker elsewhere
 _FEWEST = 30  # cells with which a thing can be told from others
@@ -99,7 +102,7 @@ def find_moves(
         news: list[Move] = []
         for move in sorted(found, key=lambda m: -m.score):
             if not any(_overlap(move, other, a, b) for other in moves + news):
-                whole = _completed(move, a, b, params)
+                whole = _completed(move, a, b)
                 if _is_panel(a.points(whole.older)) or _is_panel(b.points(whole.newer)) or _stays(whole):
                     continue
                 news.append(whole)
@@ -157,22 +160,22 @@ def _united(moves: list[Move], a: _Capture, b: _Capture) -> list[Move]:
     return kept
 
 
-def _completed(move: Move, a: _Capture, b: _Capture, params: Params) -> Move:
+def _completed(move: Move, a: _Capture, b: _Capture) -> Move:
     """The move with all that went along: cells beside it that fit by it, whether or not they seemed to have changed."""
     S = move.S_after_before
-    older = _with_more(move.older, a, b, S, params)
-    newer = _with_more(move.newer, b, a, S.inverse(), params)
+    older = _with_more(move.older, a, b, S)
+    newer = _with_more(move.newer, b, a, S.inverse())
     return replace(move, older=older, newer=newer)
 
 
-def _with_more(thing: Thing, here: _Capture, there: _Capture, pose: Sim3, params: Params) -> Thing:
+def _with_more(thing: Thing, here: _Capture, there: _Capture, pose: Sim3) -> Thing:
     side, cells = here.side, here.cells
     points = here.points(thing)
     low, high = points.min(0) - _BESIDE_M, points.max(0) + _BESIDE_M
     rows = np.flatnonzero(
         np.isin(cells.thing, np.unique(cells.thing[thing.cells])) & ((side.points > low) & (side.points < high)).all(1)
     )
-    _, alike = _fits(rows, pose.apply(side.points[rows]), side, there.side, params)
+    _, alike = _fits(rows, pose.apply(side.points[rows]), side, there.side)
     rows = rows[alike]
     if not len(rows):
         return thing
@@ -236,7 +239,7 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
         here.side.colours[seed.cells],
         there.side.points[onto],
         there.side.colours[onto],
-        params.yaw_starts,
+        _YAW_STARTS,
     )
     starts = [pose for _, pose in tried[:_TRIED]]
     # Pushed or turned a little: most votes are then for what did not change.
@@ -260,7 +263,7 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
         if theirs is None:
             continue
         mine = joined(seed, _covered(here, there.points(theirs), pose.inverse(), whole=2.0) or seed)
-        score = _score(mine, theirs, here, there, pose, params)
+        score = _score(mine, theirs, here, there, pose)
         scores.append((score, pose))
         if best is None or score > best[0]:
             best = score, pose, mine, theirs
@@ -268,14 +271,17 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
         return None
     score, pose, mine, theirs = best
     polished = settled(fine, there.tree, pose, (0.06,) * 10)
-    again = _score(mine, theirs, here, there, polished, params)
+    again = _score(mine, theirs, here, there, polished)
     if again > score:
         score, pose = again, polished
     runner_up = max((s for s, p in scores if _differ(p, pose, points)), default=0.0)
-    if score < params.min_moved + 0.1 * runner_up / max(score, 1e-6) or min(len(mine.moved), len(theirs.moved)) < 12:
+    if (
+        score < params.min_moved_fraction + 0.1 * runner_up / max(score, 1e-6)
+        or min(len(mine.moved), len(theirs.moved)) < 12
+    ):
         return None
-    symmetry = _symmetry(mine, theirs, here, there, pose, score, params)
-    if symmetry == "none" and runner_up > params.most_ambiguous * score:
+    symmetry = _symmetry(mine, theirs, here, there, pose, score)
+    if symmetry == "none" and runner_up > _MAX_RIVAL_SCORE * score:
         return None
     if back:
         return Move(theirs, mine, pose.inverse(), score, runner_up, symmetry)
@@ -317,16 +323,16 @@ def _covered(capture: _Capture, points: np.ndarray, pose: Sim3, whole: float = 0
     return reduce(joined, taken) if taken else None
 
 
-def _score(mine: Thing, theirs: Thing, here: _Capture, there: _Capture, pose: Sim3, params: Params) -> float:
+def _score(mine: Thing, theirs: Thing, here: _Capture, there: _Capture, pose: Sim3) -> float:
     """Share of the cells that fit where the other capture could see them: the worse way of the two."""
-    out = _agreement(mine, here, there, pose, params)
-    return min(out, _agreement(theirs, there, here, pose.inverse(), params)) if out > 0 else 0.0
+    out = _agreement(mine, here, there, pose)
+    return min(out, _agreement(theirs, there, here, pose.inverse())) if out > 0 else 0.0
 
 
-def _agreement(thing: Thing, here: _Capture, there: _Capture, pose: Sim3, params: Params) -> float:
+def _agreement(thing: Thing, here: _Capture, there: _Capture, pose: Sim3) -> float:
     rows = thing.cells[:: max(1, len(thing.cells) // _JUDGED)]
     moved = pose.apply(here.side.points[rows])
-    on, alike = _fits(rows, moved, here.side, there.side, params)
+    on, alike = _fits(rows, moved, here.side, there.side)
     through = ~on
     through[~on] = _looked_through(moved[~on], there.looks)
     seen = int((on | through).sum())
@@ -335,11 +341,9 @@ def _agreement(thing: Thing, here: _Capture, there: _Capture, pose: Sim3, params
     return float(alike.sum() / seen)
 
 
-def _fits(
-    rows: np.ndarray, moved: np.ndarray, side: Side, other: Side, params: Params
-) -> tuple[np.ndarray, np.ndarray]:
+def _fits(rows: np.ndarray, moved: np.ndarray, side: Side, other: Side) -> tuple[np.ndarray, np.ndarray]:
     """Which cells, where they have moved to (N, 3), lie on the other capture's surface, and which on their colour."""
-    distance, near = other.tree.query(moved, k=4, distance_upper_bound=1.5 * params.moved_within_m)
+    distance, near = other.tree.query(moved, k=4, distance_upper_bound=1.5 * _MAX_OFFSET_M)
     on = np.isfinite(distance[:, 0])
     theirs = other.tints[np.minimum(near, len(other) - 1)]
     apart = theirs - side.tints[rows][:, None]
@@ -360,7 +364,7 @@ def _looked_through(points: np.ndarray, looks: Looks) -> np.ndarray:
 
 
 def _symmetry(
-    mine: Thing, theirs: Thing, here: _Capture, there: _Capture, pose: Sim3, score: float, params: Params
+    mine: Thing, theirs: Thing, here: _Capture, there: _Capture, pose: Sim3, score: float
 ) -> Literal["none", "half", "any"]:
     """Whether the thing, turned about its own middle, fits as well."""
     points = here.points(mine)
@@ -374,7 +378,7 @@ def _symmetry(
         stays = np.linalg.norm(laid.apply(middle) - pose.apply(middle)) < _APART_M
         yaw = np.arctan2(*(laid.rotation @ turned.rotation.T)[[1, 0], 0])
         good = stays and abs(yaw) < 0.3
-        fits.append(bool(good and _score(mine, theirs, here, there, laid, params) >= _AS_GOOD * score))
+        fits.append(bool(good and _score(mine, theirs, here, there, laid) >= _AS_GOOD * score))
         if not fits[0]:
             return "none"
     return "any" if all(fits) else "half"

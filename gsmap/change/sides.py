@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap._native import beyond_ranges
-from gsmap.change.params import Params
 from gsmap.change.poses import tints
 from gsmap.compare import Comparison, Looks, Pictured, View
 from gsmap.compare.colours import FLOOR, Balance, logarithms
@@ -18,6 +17,9 @@ from gsmap.compare.structure import normals_of
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.sh import rgb_of_sh0
 
+CELL_M = 0.05  # surfaces are judged by cells of this size
+_MIN_CHROMA, _MIN_LIGHTNESS = 0.05, 0.15  # smallest differences, of colours in [0, 1], that may be a change
+_COLOUR_SIGMAS = 3.0  # robust standard deviations that exposure and noise may leave
 _CLIP_M = 0.15  # offsets beyond are other surfaces, not noise
 _STEEPEST = 0.2  # cosine below which a surface is seen too flat to measure an offset
 
@@ -94,17 +96,17 @@ class _Sums:
         return cls(np.zeros(count), np.zeros((count, 3)), np.zeros(count), np.zeros(count))
 
 
-def sides(older: Looks, newer: Looks, comparison: Comparison, params: Params) -> tuple[Side, Side]:
+def sides(older: Looks, newer: Looks, comparison: Comparison) -> tuple[Side, Side]:
     """Both captures' surfaces with what is known of them."""
     sums = _Sums.zeros(len(older.gaussians)), _Sums.zeros(len(newer.gaussians))
-    limits = _limits(comparison.balance, params)
+    limits = _limits(comparison.balance)
     # Every second view of each: neighbouring views of a walk show the same.
     for picture in comparison.newer_views[::2]:
         _add(sums, (picture.other, picture.own), picture, comparison, limits)
     for picture in comparison.older_views[1::2]:
         _add(sums, (picture.own, picture.other), picture, comparison, limits)
     made = [
-        _side(looks, evidence, one, comparison.balance if k == 0 else None, params)
+        _side(looks, evidence, one, comparison.balance if k == 0 else None)
         for k, (looks, evidence, one) in enumerate(
             zip((older, newer), (comparison.older, comparison.newer), sums, strict=True)
         )
@@ -112,11 +114,11 @@ def sides(older: Looks, newer: Looks, comparison: Comparison, params: Params) ->
     return made[0], made[1]
 
 
-def _limits(line: Balance, params: Params) -> tuple[float, float]:
+def _limits(line: Balance) -> tuple[float, float]:
     """Chroma and lightness from which on colours differ."""
     return (
-        max(params.min_chroma, params.colour_spreads * line.chroma_spread),
-        max(params.min_lightness, params.colour_spreads * line.lightness_spread),
+        max(_MIN_CHROMA, _COLOUR_SIGMAS * line.chroma_spread),
+        max(_MIN_LIGHTNESS, _COLOUR_SIGMAS * line.lightness_spread),
     )
 
 
@@ -183,11 +185,11 @@ def _along_normal(view: Any) -> np.ndarray:
     return np.clip(np.abs((normal * rays).sum(-1)), _STEEPEST, 1.0)
 
 
-def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None, params: Params) -> Side:
+def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None) -> Side:
     rows = np.flatnonzero(looks.surface)
     gaussians = looks.gaussians
     points = gaussians.means[rows].astype(np.float64)
-    label, counts = cell_labels(np.floor(points / params.cell_m))
+    label, counts = cell_labels(np.floor(points / CELL_M))
     colours = np.clip(rgb_of_sh0(gaussians.sh[rows, 0]).astype(np.float64), 0, 1)
     if line is not None:
         colours = np.clip(np.exp(np.log(colours + FLOOR) * line.slope + line.offset) - FLOOR, 0, 1)

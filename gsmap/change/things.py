@@ -8,11 +8,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.change.params import Params
-from gsmap.change.sides import Side
+from gsmap.change.sides import CELL_M, Side
 from gsmap.compare.components import components, groups
 from gsmap.compare.structure import planes
 from gsmap.geometry.cells import cell_labels
 
+_MIN_LOOKED_THROUGH = 0.5  # fraction of the views of a neighbourhood, for it to count as gone
+_CLUSTER_LINK_M = 0.1  # changed cells this near belong to one segment
+_MIN_PAINT = 1.9  # strength of a change of colour that is reported, times the least difference of colour
+_MAX_LEAK = 0.2  # fraction of it that goes on around its edges; that of light and shadow is larger
 _SMOOTH_M = 0.08  # neighbours that a cell asks
 _FEWEST_LOOKS = 3  # views through a neighbourhood, and pixels that compared its colour
 _FAINT = 0.6  # strength from which a cell may belong to something that changed its colour
@@ -58,18 +62,18 @@ class Cells:
     offset_m: np.ndarray
 
 
-def judge(sides: tuple[Side, Side], params: Params) -> tuple[Cells, Cells]:
+def judge(sides: tuple[Side, Side]) -> tuple[Cells, Cells]:
     """Which cells of each capture changed, and how."""
     points = np.concatenate([side.points for side in sides])
     normals = np.concatenate([side.normals for side in sides])
-    plane = planes(points, normals, params.cell_m / np.sqrt(2))
+    plane = planes(points, normals, CELL_M / np.sqrt(2))
     cut = len(sides[0])
-    return _judge(sides[0], plane[:cut], params), _judge(sides[1], plane[cut:], params)
+    return _judge(sides[0], plane[:cut]), _judge(sides[1], plane[cut:])
 
 
-def _judge(side: Side, plane: np.ndarray, params: Params) -> Cells:
+def _judge(side: Side, plane: np.ndarray) -> Cells:
     through, on = side.around(side.through, _SMOOTH_M), side.around(side.on, _SMOOTH_M)
-    moved = (through >= _FEWEST_LOOKS) & (through >= params.min_share * (through + on)) & (side.through >= side.on)
+    moved = (through >= _FEWEST_LOOKS) & (through >= _MIN_LOOKED_THROUGH * (through + on)) & (side.through >= side.on)
     looks = side.around(side.looks, _SMOOTH_M)
     strength = side.around(side.strength * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
     offset = side.around(side.offset_m * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
@@ -131,7 +135,7 @@ class Paint:
 
 def things_of(side: Side, cells: Cells, painted: np.ndarray, params: Params) -> list[Thing]:
     """Things of one capture that changed, largest first; ``painted`` (M,) bool are the cells of clear paint."""
-    fewest = max(2, round(params.min_area_m2 / params.cell_m**2))
+    fewest = max(2, round(params.min_area_m2 / CELL_M**2))
     changed = (cells.moved | painted) & (cells.thing >= 0)
     count = max(int(cells.thing.max(initial=-1)) + 1, 1)  # one at least, for -1 to index: all may be shell
     total = np.bincount(cells.thing[cells.judged & (cells.thing >= 0)], minlength=count)
@@ -148,7 +152,7 @@ def things_of(side: Side, cells: Cells, painted: np.ndarray, params: Params) -> 
         apart = cKDTree(box).query(side.points[rows], distance_upper_bound=_SAME_M)[0]
         whole[rows[outside | (np.isinf(apart) & cells.judged[rows])]] = False
     found = []
-    for group in groups(side.points, np.flatnonzero(changed | whole), params.reach_m, fewest, kind):
+    for group in groups(side.points, np.flatnonzero(changed | whole), _CLUSTER_LINK_M, fewest, kind):
         moved, tinted = group[cells.moved[group]], group[painted[group] & ~cells.moved[group]]
         if len(moved) + len(tinted) >= fewest:
             found.append(Thing(group, moved, tinted))
@@ -160,9 +164,9 @@ def paints(sides: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params)
     rows = [np.flatnonzero(c.painted) for c in cells]
     points = np.concatenate([side.points[r] for side, r in zip(sides, rows, strict=True)])
     plane = np.concatenate([c.plane[r] for c, r in zip(cells, rows, strict=True)])
-    fewest = max(2, round(params.min_area_m2 / params.cell_m**2))
+    fewest = max(2, round(params.min_area_m2 / CELL_M**2))
     found = []
-    for group in groups(points, np.arange(len(points)), params.reach_m, fewest, plane):
+    for group in groups(points, np.arange(len(points)), _CLUSTER_LINK_M, fewest, plane):
         parts = rows[0][group[group < len(rows[0])]], rows[1][group[group >= len(rows[0])] - len(rows[0])]
         if min(len(parts[0]), len(parts[1])) * 4 < fewest:  # Both captures must show it.
             continue
@@ -184,25 +188,25 @@ def paints(sides: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params)
                 float(light / max(light + hue, 1e-6)),
                 at >= 0,
                 0.0 if at >= 0 else min(_share(c, p) for c, p in zip(cells, parts, strict=True)),
-                len(group) / 2 * params.cell_m**2,
+                len(group) / 2 * CELL_M**2,
             )
         )
     return found
 
 
-def is_paint(paint: Paint, light: float, params: Params) -> bool:
+def is_paint(paint: Paint, light: float) -> bool:
     """Whether a change of colour is paint, and neither light nor a texture that two trainings show differently."""
     if not paint.is_shell and paint.share >= _MUCH and sum(map(len, paint.cells)) >= _MANY:
         less = 0.6 if paint.share >= _MOST and paint.coherence >= _COHERENT else 0.75
-        return paint.strength >= less * params.min_paint and paint.leak <= 2.5 * params.most_leak
-    least = params.min_paint
+        return paint.strength >= less * _MIN_PAINT and paint.leak <= 2.5 * _MAX_LEAK
+    least = _MIN_PAINT
     if light > LIT_OTHERWISE:
         least *= 1.6
     if paint.darkening > _DARK and paint.is_shell:
         least *= 1.8
     if paint.coherence < _COHERENT:
         least *= 1.6
-    return paint.strength >= least and paint.leak <= params.most_leak
+    return paint.strength >= least and paint.leak <= _MAX_LEAK
 
 
 def light(sides: tuple[Side, Side]) -> float:

@@ -15,9 +15,8 @@ from gsmap.compare.comparing import (
 )
 from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, Evidence
 from gsmap.compare.joining import joined, outdated
-from gsmap.compare.looks import Looks, View, look
+from gsmap.compare.looks import MAX_VIEWS, Looks, View, look
 from gsmap.compare.neighbourhoods import grown, ranges
-from gsmap.compare.params import Params
 
 VERSION = 4
 """Raised whenever two captures come out otherwise for the same input."""
@@ -27,6 +26,7 @@ __all__ = [
     "COLOUR",
     "GONE",
     "HIDDEN",
+    "MAX_VIEWS",
     "OTHER_BEFORE",
     "OTHER_BEHIND",
     "REPAINTED",
@@ -38,7 +38,6 @@ __all__ = [
     "Comparison",
     "Evidence",
     "Looks",
-    "Params",
     "Pictured",
     "View",
     "compare",

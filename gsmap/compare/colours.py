@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap._native import tones_apart
-from gsmap.compare.params import Params
 
 FLOOR = 0.03  # added before logarithms: what is darker is noise
 _SAMPLES = 40_000  # pixels that a line is fitted to
 _ROUNDS = 6
 _FEWEST = 200  # pixels with which a line is fitted at all
+_MIN_CHROMA, _MIN_LIGHTNESS = 0.06, 0.2  # smallest differences, of colours in [0, 1], that may be a change
+_CHROMA_SIGMAS, _LIGHTNESS_SIGMAS = 3.0, 5.0  # robust standard deviations that exposure and noise may leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,16 +120,16 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
     return Balance(slope, offset, spread, 1.4826 * float(np.median(np.abs(lightness))))
 
 
-def limits(line: Balance, params: Params) -> tuple[float, float]:
+def limits(line: Balance) -> tuple[float, float]:
     """Differences of chroma and of lightness that light and noise explain."""
     return (
-        max(params.min_chroma, params.chroma_spreads * line.chroma_spread),
-        max(params.min_lightness, params.lightness_spreads * line.lightness_spread),
+        max(_MIN_CHROMA, _CHROMA_SIGMAS * line.chroma_spread),
+        max(_MIN_LIGHTNESS, _LIGHTNESS_SIGMAS * line.lightness_spread),
     )
 
 
-def differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray, params: Params) -> np.ndarray:
+def differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray) -> np.ndarray:
     """Where colours differ by more than light and noise explain."""
     most = np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1]))
-    out: np.ndarray = (most > limits(line, params)[0]) | (np.abs(lightness) > limits(line, params)[1])
+    out: np.ndarray = (most > limits(line)[0]) | (np.abs(lightness) > limits(line)[1])
     return out

@@ -9,8 +9,7 @@ import numpy as np
 from gsmap._native import add_colours, count_looks
 from gsmap.compare.colours import Balance, balance, differ
 from gsmap.compare.evidence import REPAINTED, Evidence, Tally
-from gsmap.compare.looks import Looks, Placed, View, place, view_of
-from gsmap.compare.params import Params
+from gsmap.compare.looks import MAX_TOLERANCE_M, MIN_TOLERANCE_M, NEAREST_M, Looks, Placed, View, place, view_of
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.render import render
 from gsmap.types import Gaussians
@@ -20,6 +19,10 @@ UNSURE, AGREE, COLOUR, OTHER_BEFORE, OTHER_BEHIND = 0, 1, 2, 3, 4
 that was not seen well. ``AGREE``: one surface, one colour. ``COLOUR``: one surface in two colours. ``OTHER_BEFORE``:
 the other capture has a thing where this one looked through. ``OTHER_BEHIND``: this one has a thing before what the
 other shows, which proves nothing by itself: the other's cameras may never have seen the place from here."""
+
+
+_TOLERANCE_SIGMAS = 3.5  # robust standard deviations of the depths that agree
+_TOLERANCE_PER_DEPTH = 0.01  # further tolerance in metres per metre of depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +66,7 @@ class Comparison:
     tolerance_m: tuple[float, float]
 
 
-def compare(older: Looks, newer: Looks, params: Params | None = None) -> Comparison:
+def compare(older: Looks, newer: Looks) -> Comparison:
     """Compare two captures that lie in one metric frame.
 
     Each is rendered from the other's cameras once, its surfaces alone: from where its own cameras never stood its haze
@@ -71,25 +74,21 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
     """
     from gsmap.compare.things import Side, remnants, shells  # with scipy, which naming a recipe does without
 
-    params = params or Params()
     surfaces = {id(one): _surface(one) for one in (older, newer)}
     crossed = [
-        [
-            (own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)], params))
-            for i in range(len(own.views))
-        ]
+        [(own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)])) for i in range(len(own.views))]
         for own, other in ((older, newer), (newer, older))
     ]
-    tolerance = _tolerance([pair for pairs in crossed for pair in pairs], params)
+    tolerance = _tolerance([pair for pairs in crossed for pair in pairs])
     line = _line(crossed, tolerance)
     pictured = [
-        [_outcomes(own, sure, other, line, sign, tolerance, params) for own, sure, other in pairs]
+        [_outcomes(own, sure, other, line, sign, tolerance) for own, sure, other in pairs]
         for pairs, sign in zip(crossed, (-1, 1), strict=True)
     ]
     tallies = Tally(len(older.gaussians)), Tally(len(newer.gaussians))
     for judged, judge, by, of in ((tallies[0], tallies[1], newer, older), (tallies[1], tallies[0], older, newer)):
         for picture, sure, own in zip(pictured[by is newer], by.sure, by.placed, strict=True):
-            at = place(of.gaussians.means, picture.own, params.nearest_m)
+            at = place(of.gaussians.means, picture.own, NEAREST_M)
             _count(judged, at, picture, sure, tolerance)
             _count_colour(judge, own, picture, tolerance)
     both = older, newer
@@ -102,7 +101,6 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             other.gaussians.means[other.surface],
             len(other.views),
             line,
-            params,
         )
         for tally, one, other, shell in zip(tallies, both, both[::-1], walls, strict=True)
     ]
@@ -116,7 +114,7 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
         )
         for one, found in zip(both, evidence, strict=True)
     )
-    for found, rest in zip(evidence, remnants((older_end, newer_end), params), strict=True):
+    for found, rest in zip(evidence, remnants((older_end, newer_end)), strict=True):
         found.state[rest] = REPAINTED
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
 
@@ -126,25 +124,25 @@ def _surface(looks: Looks) -> tuple[Gaussians, np.ndarray]:
     return (looks.gaussians if len(rows) == len(looks.surface) else looks.gaussians[rows]), rows
 
 
-def _seen_by(view: View, gaussians: Gaussians, rows: np.ndarray, params: Params) -> View:
+def _seen_by(view: View, gaussians: Gaussians, rows: np.ndarray) -> View:
     seen = render(gaussians, view.camera)
     dominant = seen.dominant_id[0]
     whole = np.where(dominant >= 0, rows[np.maximum(dominant, 0)] if len(rows) else -1, -1).astype(np.int32)
-    return view_of(seen.colour[0], seen.alpha[0], seen.depth[0], whole, view.camera, params)
+    return view_of(seen.colour[0], seen.alpha[0], seen.depth[0], whole, view.camera)
 
 
-def _tolerance(pairs: list[tuple[View, np.ndarray, View]], params: Params) -> tuple[float, float]:
+def _tolerance(pairs: list[tuple[View, np.ndarray, View]]) -> tuple[float, float]:
     """Base and share of the depth: what the pair's own surfaces scatter by, within limits."""
     found = []
     for own, sure, other in pairs:
         both = (sure & other.solid)[::2, ::2]
         off = np.abs(other.depth - own.depth)[::2, ::2][both]
-        limit = params.most_tolerance_m + params.tolerance_share * own.depth[::2, ::2][both]
+        limit = MAX_TOLERANCE_M + _TOLERANCE_PER_DEPTH * own.depth[::2, ::2][both]
         found.append(off[off < limit])
     off = np.concatenate(found) if found else np.zeros(0)
-    spread = 1.4826 * float(np.median(off)) if len(off) else params.most_tolerance_m
-    base = float(np.clip(params.tolerance_spreads * spread, params.least_tolerance_m, params.most_tolerance_m))
-    return base, params.tolerance_share
+    spread = 1.4826 * float(np.median(off)) if len(off) else MAX_TOLERANCE_M
+    base = float(np.clip(_TOLERANCE_SIGMAS * spread, MIN_TOLERANCE_M, MAX_TOLERANCE_M))
+    return base, _TOLERANCE_PER_DEPTH
 
 
 def _line(crossed: list[list[tuple[View, np.ndarray, View]]], tolerance: tuple[float, float]) -> Balance:
@@ -172,7 +170,6 @@ def _outcomes(
     line: Balance,
     sign: int,
     tolerance: tuple[float, float],
-    params: Params,
 ) -> Pictured:
     """``line`` takes the older's colours to the newer's."""
     base, share = tolerance
@@ -184,7 +181,7 @@ def _outcomes(
     chroma, lightness = line.differences(older.colour, newer.colour, one)
     outcome = np.full(own.depth.shape, UNSURE, dtype=np.uint8)
     outcome[one & sure] = AGREE
-    outcome[one & sure & differ(line, chroma, lightness, params)] = COLOUR
+    outcome[one & sure & differ(line, chroma, lightness)] = COLOUR
     # Beyond both neighbourhoods' extremes: a pixel off at an edge proves nothing.
     outcome[both & (other.far < own.near - gap)] = OTHER_BEFORE
     outcome[both & (other.near > own.far + gap)] = OTHER_BEHIND

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.compare.colours import Balance, limits
-from gsmap.compare.params import Params
+from gsmap.compare.looks import CELL_M, MIN_VIEWS
 from gsmap.geometry.morton import morton_order
 from gsmap.geometry.neighbours import neighbours_of
 
@@ -48,6 +48,10 @@ class Evidence:
 _PART = 0.3  # of a difference that a Gaussian must have itself, where its neighbours have it
 _BORDER = 0.4  # of its neighbours that changed, for a Gaussian to be at a change's border
 _ROUNDS = 2
+_MIN_AGREEMENT = 0.6  # fraction of the views that could judge a Gaussian, for it to count as gone
+_MAX_NEIGHBOURS = 16  # within `CELL_M`, that vote with a Gaussian
+CLEAR_M = 0.05  # a root lies farther than this from the other capture: blurred surfaces can be seen through
+_ROOT_COLOUR = 2.0  # times the least difference of colour, around a repainted root
 
 
 class Tally:
@@ -75,7 +79,6 @@ class Tally:
         others: np.ndarray,
         views: int,
         line: Balance,
-        params: Params,
     ) -> Evidence:
         """The counts and what they come to.
 
@@ -91,15 +94,15 @@ class Tally:
 
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
-        near = _Neighbours(points, shows, params)
-        state = self._geometry(near, params)
+        near = _Neighbours(points, shows)
+        state = self._geometry(near)
         unchanged = np.where(state == GONE, np.int8(SAME), state)
         # What is near the other's surface, yet part of a thing that stood before it, is no part of that surface.
         beside = near.sums((state == GONE).astype(np.int32)) >= 2
         state[(state == SAME) & (self.covered > self.colour_seen) & (beside | (self.through >= 1))] = GONE
         same = state == SAME
         seen = same & (self.colour_seen >= 1) & shows
-        limit = limits(line, params)
+        limit = limits(line)
         differs = np.maximum(np.abs(chroma).max(1) / limit[0], np.abs(lightness) / limit[1])
         around = near.mean(np.where(seen, differs, 0), seen)
         state[same & (around >= 1) & (differs >= _PART)] = REPAINTED
@@ -107,28 +110,28 @@ class Tally:
         for _ in range(_ROUNDS):
             beside = near.sums((state >= REPAINTED).astype(np.int32)) >= _BORDER * np.maximum(near.count, 1)
             state[(state == SAME) & beside & (differs >= _PART)] = REPAINTED
-        _follow(state, near, self.grazed > 0, self.colour_seen < params.min_views)
-        looks = min(params.min_views, views)
+        _follow(state, near, self.grazed > 0, self.colour_seen < MIN_VIEWS)
+        looks = min(MIN_VIEWS, views)
         gone = (state == GONE) & (self.through >= looks) & ((self.sure >= 1) | (self.on_surface == 0))
-        gone[gone] = clear(points[gone], others, params.clear_m)
-        painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= params.root_colour) & (differs >= 1)
+        gone[gone] = clear(points[gone], others, CLEAR_M)
+        painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= _ROOT_COLOUR) & (differs >= 1)
         # What one can look through is no wall.
         shell = np.where(state == GONE, -1, shell)
-        thing = things(points, shell, params)
+        thing = things(points, shell)
         changed, judged, hidden = state >= REPAINTED, state >= SAME, state == HIDDEN
-        framed = by_shell(points, shell, params)
+        framed = by_shell(points, shell)
         doubts = Doubts(points, shell, thing, changed, gone | painted, judged, hidden, differs, framed)
-        stands = rooted(doubts, params)
+        stands = rooted(doubts)
         state[doubts.changed & ~stands] = unchanged[doubts.changed & ~stands]
         # Whole things, of what turned out to have changed.
-        state[kin(replace(doubts, changed=stands), params) & (state < REPAINTED)] = REPAINTED
+        state[kin(replace(doubts, changed=stands)) & (state < REPAINTED)] = REPAINTED
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, thing, framed, state)
 
-    def _geometry(self, near: _Neighbours, params: Params) -> np.ndarray:
+    def _geometry(self, near: _Neighbours) -> np.ndarray:
         through, on = near.sums(self.through), near.sums(self.on_surface)
         judged = self.through + self.on_surface
-        few, share = params.min_views, params.min_share
+        few, share = MIN_VIEWS, _MIN_AGREEMENT
         state = np.full(len(judged), UNSEEN, dtype=np.int8)
         state[self.hidden >= few] = HIDDEN
         # A Gaussian counts as much as all of its neighbours together.
@@ -144,15 +147,15 @@ class Tally:
 class _Neighbours:
     """The nearest Gaussians that show, of each."""
 
-    def __init__(self, points: np.ndarray, shows: np.ndarray, params: Params) -> None:
+    def __init__(self, points: np.ndarray, shows: np.ndarray) -> None:
         self.rows = np.flatnonzero(shows)
         self.index = np.zeros((len(points), 0), dtype=np.int64)
         if len(self.rows):
-            count = min(params.neighbours, len(self.rows))
+            count = min(_MAX_NEIGHBOURS, len(self.rows))
             # Along a curve through them, as their neighbours are then in the cache.
             order = morton_order(points)
             self.index = np.empty((len(points), count), dtype=np.int64)
-            self.index[order] = neighbours_of(points[self.rows], points[order], count, params.cell_m)[1]
+            self.index[order] = neighbours_of(points[self.rows], points[order], count, CELL_M)[1]
 
     @property
     def count(self) -> np.ndarray:

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmap.compare.comparing import AGREE, OTHER_BEHIND, UNSURE, Comparison
-from gsmap.compare.looks import Looks, place
-from gsmap.compare.params import Params
+from gsmap.compare.looks import MAX_TOLERANCE_M, MAX_VIEWS, NEAREST_M, Looks, place
 from gsmap.types import Gaussians, PlacedScene
 
 _SAMPLE = 1500  # points of a capture by which views of others are chosen
@@ -17,7 +16,7 @@ _ENOUGH = 8  # views of a point: more add little
 _VIEWS = 2  # times as many as of one capture: what several show together is larger than what one does
 
 
-def joined(parts: Sequence[tuple[Looks, np.ndarray]], of: PlacedScene, params: Params | None = None) -> Looks:
+def joined(parts: Sequence[tuple[Looks, np.ndarray]], of: PlacedScene, max_views: int = MAX_VIEWS) -> Looks:
     """The looks of several captures as one, with those views alone that look at what ``of`` shows.
 
     Args:
@@ -25,8 +24,7 @@ def joined(parts: Sequence[tuple[Looks, np.ndarray]], of: PlacedScene, params: P
             are these, one capture after another.
         of: the capture that is going to be compared.
     """
-    params = params or Params()
-    chosen = _chosen([looks for looks, _ in parts], of, params)
+    chosen = _chosen([looks for looks, _ in parts], of, max_views)
     views, sure, placed, first = [], [], [], 0
     for (looks, stays), picked in zip(parts, chosen, strict=True):
         row = np.where(stays, np.cumsum(stays) - 1 + first, -1).astype(np.int32)
@@ -70,7 +68,7 @@ def outdated(looks: Looks, comparison: Comparison, stays: np.ndarray) -> Looks:
     return replace(looks, views=tuple(views), sure=tuple(sure))
 
 
-def _chosen(captures: Sequence[Looks], of: PlacedScene, params: Params) -> list[list[int]]:
+def _chosen(captures: Sequence[Looks], of: PlacedScene, max_views: int) -> list[list[int]]:
     """Of each capture the views to take: at most twice ``max_views`` in all, one after another what adds most."""
     chosen: list[list[int]] = [[] for _ in captures]
     points = of.gaussians.means[:: max(1, len(of.gaussians) // _SAMPLE)]
@@ -80,13 +78,13 @@ def _chosen(captures: Sequence[Looks], of: PlacedScene, params: Params) -> list[
     sees = np.zeros((len(names), len(points)), dtype=np.float32)
     for i, (c, v) in enumerate(names):
         view = captures[c].views[v]
-        at = place(points, view, params.nearest_m)
+        at = place(points, view, NEAREST_M)
         # What is behind a surface is not seen, whatever stands in the picture's frame.
-        seen = at.z < view.far[at.row, at.column] + params.most_tolerance_m
+        seen = at.z < view.far[at.row, at.column] + MAX_TOLERANCE_M
         # Among views that see as much, the newest.
         sees[i, at.index[seen]] = 1 + 0.2 * (len(captures) - c) / len(captures)
     wanting = np.full(len(points), _ENOUGH, dtype=np.float32)
-    for _ in range(min(_VIEWS * params.max_views, len(names))):
+    for _ in range(min(_VIEWS * max_views, len(names))):
         gain = sees @ np.minimum(wanting, 1)
         best = int(np.argmax(gain))
         if gain[best] <= 0:

@@ -8,10 +8,17 @@ import numpy as np
 
 from gsmap._native import place_points
 from gsmap.compare.neighbourhoods import extremes, shrunk
-from gsmap.compare.params import Params
 from gsmap.geometry.voxels import voxel_labels
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
+
+LONGEST_SIDE_PX, MAX_VIEWS = 240, 48  # default size and number of the views of a capture
+MIN_ALPHA = 0.9  # of a pixel that shows a surface
+MIN_WEIGHT = 0.1  # blending weight in some own view, for a Gaussian to be part of a surface
+NEAREST_M = 0.2  # nearer Gaussians are not judged by a view
+MIN_TOLERANCE_M, MAX_TOLERANCE_M = 0.03, 0.1  # of depths of one surface; the captures' agreement decides in between
+MIN_VIEWS = 2  # that must agree before anything is concluded
+CELL_M = 0.12  # Gaussians this near vote together
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,26 +89,25 @@ class Looks:
         return self.scene.gaussians
 
 
-def look(scene: PlacedScene, params: Params | None = None) -> Looks:
+def look(scene: PlacedScene, *, longest_side_px: int = LONGEST_SIDE_PX, max_views: int = MAX_VIEWS) -> Looks:
     """Render a capture from its own cameras; one without cameras has no views and says nothing of others."""
-    params = params or Params()
     count = len(scene.gaussians)
     largest = np.zeros(count, dtype=np.float32)
     views = []
-    for camera in own_cameras(scene, params):
-        view, weight = _view(scene.gaussians, camera, params)
+    for camera in own_cameras(scene, longest_side_px, max_views):
+        view, weight = _view(scene.gaussians, camera)
         views.append(view)
         np.maximum(largest, weight, out=largest)
     times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
-    placed = tuple(place(scene.gaussians.means, view, params.nearest_m) for view in views)
+    placed = tuple(place(scene.gaussians.means, view, NEAREST_M) for view in views)
     for view, at in zip(views, placed, strict=True):
-        margin = params.least_tolerance_m
+        margin = MIN_TOLERANCE_M
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
         times_seen[at.index[on]] += 1
         sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
-    well = best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
+    well = best_of_cell(scene.gaussians.means, times_seen, CELL_M) >= MIN_VIEWS
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
-    surface = largest >= params.min_weight if views else np.ones(count, dtype=bool)
+    surface = largest >= MIN_WEIGHT if views else np.ones(count, dtype=bool)
     return Looks(scene, tuple(views), surface, times_seen, sharpness, sure, placed)
 
 
@@ -116,11 +122,11 @@ def best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.nd
     return out
 
 
-def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
+def own_cameras(scene: PlacedScene, longest_side_px: int, max_views: int) -> list[Cameras]:
     """At most ``max_views`` cameras of a capture, evenly along its path, small; none where nobody knows what it saw."""
     if scene.cameras is None or scene.cameras.synthesised or not len(scene.cameras) or not len(scene.gaussians):
         return []
-    small = scene.cameras.evenly(params.max_views).resized(params.longest_side_px)
+    small = scene.cameras.evenly(max_views).resized(longest_side_px)
     return [small[i] for i in range(len(small))]
 
 
@@ -140,9 +146,9 @@ def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
     )
 
 
-def _view(gaussians: Gaussians, camera: Cameras, params: Params) -> tuple[View, np.ndarray]:
+def _view(gaussians: Gaussians, camera: Cameras) -> tuple[View, np.ndarray]:
     seen = render(gaussians, camera, max_weight=True)
-    return view_of(seen.colour[0], seen.alpha[0], seen.depth[0], seen.dominant_id[0], camera, params), seen.max_weight
+    return view_of(seen.colour[0], seen.alpha[0], seen.depth[0], seen.dominant_id[0], camera), seen.max_weight
 
 
 def view_of(
@@ -151,10 +157,9 @@ def view_of(
     depth: np.ndarray,
     dominant_id: np.ndarray,
     camera: Cameras,
-    params: Params,
 ) -> View:
     """A picture with what its neighbourhoods say."""
-    opaque = alpha > params.min_alpha
+    opaque = alpha > MIN_ALPHA
     near, far = extremes(depth, opaque)
     solid = opaque & shrunk(opaque)
     return View(camera, np.clip(colour, 0, 1), depth, near, far, opaque, solid, dominant_id)

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from gsmap.compare.components import components
-from gsmap.compare.params import Params
 from gsmap.compare.structure import normals_of, planes
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.neighbours import nearest_of, neighbours_of
@@ -22,6 +21,20 @@ from gsmap.geometry.neighbours import nearest_of, neighbours_of
 _CELL_M = 0.05  # of the surface in which planes are looked for
 _FEWEST = 5  # points that have a hull
 _ASKED = 5  # of the nearest that were judged
+_CHANGE_LINK_M = 0.1  # changed Gaussians this near on one shell plane, or off all planes, are one change
+MIN_ROOTS, MIN_ROOT_FRACTION = 8, 0.2  # Gaussians beyond doubt, and their fraction, that prove a change
+_ISOLATED_COLOUR = 4.0  # times the least difference of colour, that counts beside a change without neighbours
+_ADJACENT_M = 0.35  # largest distance from a proven change at which such a Gaussian joins it
+_SEGMENT_LINK_M = 0.08  # Gaussians this near are of one segment
+_MIN_CHANGED_FRACTION = 0.2  # of a segment, from which on the change spreads over it
+_WEAK_COLOUR = 0.2  # times the least difference of colour, that counts there
+_NEIGHBOUR_M = 0.15  # within which most neighbours on the segment must have changed
+_NEAR_SHELL_M = 0.1  # what is this near to the shell may be a frame or skirting board of it
+MAX_OUTSIDE_HULL_M = 0.05  # such a part joins a segment's change only this far outside of the hull of that
+_MIN_REMNANT_FRACTION = 0.5  # of a segment that must have changed for the rest to be tested
+_MIN_REMNANT_SCORE = 0.7  # mean score from which on the rest changed, too
+_MAX_COLOUR_DISTANCE = 0.05  # in [0, 1], to the colours that changed on the segment, for a score of 1
+_NEW_WEIGHT = 0.5  # score for the fraction that is new of the other capture's segment
 
 
 def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
@@ -44,17 +57,17 @@ def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
     return out
 
 
-def things(points: np.ndarray, shell: np.ndarray, params: Params) -> np.ndarray:
+def things(points: np.ndarray, shell: np.ndarray) -> np.ndarray:
     """(N,) int64 what hangs together off floors, ceilings and walls, from 0; -1 for what is on these."""
     out = np.full(len(points), -1, dtype=np.int64)
     loose = np.flatnonzero(shell < 0)
-    out[loose] = components(points[loose], params.link_m)
+    out[loose] = components(points[loose], _SEGMENT_LINK_M)
     return out
 
 
-def by_shell(points: np.ndarray, shell: np.ndarray, params: Params) -> np.ndarray:
+def by_shell(points: np.ndarray, shell: np.ndarray) -> np.ndarray:
     """(N,) bool, what lies by a floor, ceiling or wall without being part of it, as frames of doors and windows do."""
-    return (shell < 0) & ~clear(points, points[shell >= 0], params.by_shell_m)
+    return (shell < 0) & ~clear(points, points[shell >= 0], _NEAR_SHELL_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +97,7 @@ class Doubts:
     framed: np.ndarray
 
 
-def rooted(doubts: Doubts, params: Params) -> np.ndarray:
+def rooted(doubts: Doubts) -> np.ndarray:
     """(N,) bool, what belongs to a change, on one wall or on none, that has roots: enough of it is beyond doubt.
 
     Light that a new colour throws on the next wall has none, nor has what is off at an edge. A change ends a few
@@ -92,21 +105,21 @@ def rooted(doubts: Doubts, params: Params) -> np.ndarray:
     neighbours to ask: what is beyond doubt alone needs to be near.
     """
     rows = np.flatnonzero(doubts.changed)
-    label = components(doubts.points[rows], params.reach_m, doubts.shell[rows])
+    label = components(doubts.points[rows], _CHANGE_LINK_M, doubts.shell[rows])
     size = np.bincount(label)
     roots = np.bincount(label, doubts.sure[rows])
     out = np.zeros(len(doubts.changed), dtype=bool)
-    out[rows] = ((roots >= params.min_roots) & (roots >= params.root_share * size))[label]
-    alone = (doubts.changed & doubts.sure) | (doubts.differs >= params.alone_colour)
+    out[rows] = ((roots >= MIN_ROOTS) & (roots >= MIN_ROOT_FRACTION * size))[label]
+    alone = (doubts.changed & doubts.sure) | (doubts.differs >= _ISOLATED_COLOUR)
     beyond, found = np.flatnonzero(alone & ~out), np.flatnonzero(out)
     while len(beyond) and len(found):
-        near = nearest_of(doubts.points[found], doubts.points[beyond], params.about_m)[0]
+        near = nearest_of(doubts.points[found], doubts.points[beyond], _ADJACENT_M)[0]
         found, beyond = beyond[np.isfinite(near)], beyond[np.isinf(near)]
         out[found] = True
     return out
 
 
-def kin(doubts: Doubts, params: Params) -> np.ndarray:
+def kin(doubts: Doubts) -> np.ndarray:
     """(N,) bool, the changed and what changed with them: of things much of which changed, what differs a little and is
     tied to what changed, and what most of those about it on the thing did. A door's frame hangs together with what
     stands before it, and does not go along."""
@@ -115,27 +128,27 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     out = doubts.changed.copy()
     for wall in np.unique(doubts.shell[out & doubts.judged & (doubts.shell >= 0)]):
         on, hidden = doubts.judged & (doubts.shell == wall), doubts.hidden & (doubts.shell == wall)
-        if out[on].mean() >= params.kin_share:
-            out[_with_most(doubts, on, hidden & ~out, out, params.about_m)] = True
+        if out[on].mean() >= _MIN_CHANGED_FRACTION:
+            out[_with_most(doubts, on, hidden & ~out, out, _ADJACENT_M)] = True
     if not count:
         return out
     judged = np.bincount(thing[loose], doubts.judged[loose], count)
     changed = np.bincount(thing[loose], doubts.changed[loose], count)
-    much = (changed >= params.kin_share * judged) & (changed >= params.min_roots)
+    much = (changed >= _MIN_CHANGED_FRACTION * judged) & (changed >= MIN_ROOTS)
     of_these = loose[much[thing[loose]]]
-    weak = of_these[doubts.changed[of_these] | (doubts.differs[of_these] >= params.kin_colour)]
-    label = components(doubts.points[weak], params.reach_m, thing[weak])
-    tied = np.bincount(label, doubts.changed[weak]) >= params.kin_share * np.bincount(label)
+    weak = of_these[doubts.changed[of_these] | (doubts.differs[of_these] >= _WEAK_COLOUR)]
+    label = components(doubts.points[weak], _CHANGE_LINK_M, thing[weak])
+    tied = np.bincount(label, doubts.changed[weak]) >= _MIN_CHANGED_FRACTION * np.bincount(label)
     out[weak[tied[label]]] = True
     mine = np.zeros(len(out), dtype=bool)
     mine[of_these] = True
-    out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, params.beside_m)] = True
-    out[_with_most(doubts, mine, mine & ~out, out, params.beside_m)] = True
+    out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, _NEIGHBOUR_M)] = True
+    out[_with_most(doubts, mine, mine & ~out, out, _NEIGHBOUR_M)] = True
     asked = np.flatnonzero(out & ~doubts.changed & doubts.framed)
     for k in np.unique(thing[asked]):
         rows = asked[thing[asked] == k]
         changed = doubts.points[doubts.changed & (thing == k)]
-        out[rows[~between(doubts.points[rows], changed, params.beyond_m)]] = False
+        out[rows[~between(doubts.points[rows], changed, MAX_OUTSIDE_HULL_M)]] = False
     return out
 
 
@@ -164,7 +177,7 @@ class Side:
         return out
 
 
-def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
+def remnants(sides: tuple[Side, Side]) -> list[np.ndarray]:
     """Of each of two captures (N,) bool, what is left of things most of which changed and belongs to them: a sofa that
     was pushed along by half its length still shows itself, in its own colour, where its halves meet.
 
@@ -177,7 +190,7 @@ def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
         out = np.zeros(len(one.points), dtype=bool)
         found.append(out)
         thing = one.thing
-        left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= params.most_share))
+        left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= _MIN_REMNANT_FRACTION))
         if not len(left) or not len(other.points):
             continue
         nearest = nearest_of(other.points, one.points[left])[1]
@@ -188,14 +201,14 @@ def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
             theirs = other.points[other.changed & np.isin(other.thing, beside[beside >= 0])]
             changed = np.concatenate([one.points[one.changed & (thing == k)], theirs])
             rows = np.flatnonzero((thing[left] == k) & one.framed[left])
-            stays[rows] = ~between(one.points[left[rows]], changed, params.beyond_m)
-        score = params.new_weight * new[nearest]
+            stays[rows] = ~between(one.points[left[rows]], changed, MAX_OUTSIDE_HULL_M)
+        score = _NEW_WEIGHT * new[nearest]
         for k in np.unique(thing[left]):
             changed, rows = one.colours[one.changed & (thing == k)], np.flatnonzero(thing[left] == k)
-            if len(changed) >= max(_ASKED, params.min_roots):
-                score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < params.alike
-        label = components(one.points[left], params.link_m, thing[left])
-        goes = (np.bincount(label, score) >= params.piece_score * np.bincount(label))[label]
+            if len(changed) >= max(_ASKED, MIN_ROOTS):
+                score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < _MAX_COLOUR_DISTANCE
+        label = components(one.points[left], _SEGMENT_LINK_M, thing[left])
+        goes = (np.bincount(label, score) >= _MIN_REMNANT_SCORE * np.bincount(label))[label]
         out[left[goes & ~stays]] = True
     return found
 

@@ -14,32 +14,29 @@ from gsmap.types import Sim3
 
 _SAMPLES = 12  # points along each axis of a capture's box at which it is asked who was there before
 _COVERED = 0.99  # of these points: the box is covered
+MAX_SHIFT_M = 0.02  # a pair that moved farther against each other, anywhere in what both show, is compared again
+_MAX_TURN_DEG = 0.2  # and one that turned further
 
 
 @dataclass(frozen=True)
 class Params:
-    """Which captures are compared, and when they are compared again.
+    """Settings of the choice of earlier visits that a scene is compared with.
 
     Args:
-        min_new_share: an earlier capture is compared with if it shows at least this share of a capture's box that no
-            later one of them shows.
-        most: with so many earlier captures at most.
-        moved_m: a pair is compared again when one of the two has moved by more than this against the other, anywhere
-            in what they share.
-        moved_deg: and when it has turned by more.
+        min_new_fraction: Smallest fraction in (0, 1] of a scene's bounding box that an earlier visit must show beyond
+            the later ones of them for the two to be compared; larger compares fewer pairs.
+        max_earlier_visits: Largest number of earlier visits that a scene is compared with, at least 0; larger compares
+            more pairs.
     """
 
-    min_new_share: float = 0.1
-    most: int = 8
-    moved_m: float = 0.02
-    moved_deg: float = 0.2
+    min_new_fraction: float = 0.1
+    max_earlier_visits: int = 8
 
     def __post_init__(self) -> None:
-        if not 0 < self.min_new_share <= 1:
-            raise ConfigError(f"visits.min_new_share must be a share in (0, 1], got {self.min_new_share}")
-        for name in ("most", "moved_m", "moved_deg"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"visits.{name} must not be negative, got {getattr(self, name)}")
+        if not 0 < self.min_new_fraction <= 1:
+            raise ConfigError(f"visits.min_new_fraction must be a share in (0, 1], got {self.min_new_fraction}")
+        if not self.max_earlier_visits >= 0:
+            raise ConfigError(f"visits.max_earlier_visits must not be negative, got {self.max_earlier_visits}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,25 +77,25 @@ def pairs_of_visits(visits: Sequence[Visit], params: Params) -> list[tuple[str, 
         left = np.ones(_SAMPLES**3, dtype=bool)
         points, count = _samples(newer), 0
         for older in reversed(ordered[:i]):
-            if count == params.most or left.mean() <= 1 - _COVERED:
+            if count == params.max_earlier_visits or left.mean() <= 1 - _COVERED:
                 break
             if older.when == newer.when or older.component != newer.component:
                 continue
             if not _touch(boxes[older.scene], boxes[newer.scene]):
                 continue
             seen = left & _inside(points, older)
-            if seen.mean() >= params.min_new_share:
+            if seen.mean() >= params.min_new_fraction:
                 found.append((older.scene, newer.scene))
                 left, count = left & ~seen, count + 1
     return found
 
 
-def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3, params: Params) -> bool:
+def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3) -> bool:
     """Whether two captures lie otherwise to each other than ``S_newer_older`` says, by more than they may."""
     now = newer.S_map_scene.inverse() @ older.S_map_scene
     turn = now.rotation @ S_newer_older.rotation.T
     sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    if np.degrees(np.arctan2(sine, (np.trace(turn) - 1) / 2)) > params.moved_deg:
+    if np.degrees(np.arctan2(sine, (np.trace(turn) - 1) / 2)) > _MAX_TURN_DEG:
         return True
     a, b = older.box(), newer.box()
     shared = np.array([np.maximum(a[0], b[0]), np.minimum(a[1], b[1])])
@@ -106,7 +103,7 @@ def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3, params: Params) -
         shared = b
     in_newer = newer.S_map_scene.inverse().apply(box_corners(shared))
     off = S_newer_older.apply(now.inverse().apply(in_newer)) - in_newer
-    return bool(np.linalg.norm(off, axis=1).max() * newer.S_map_scene.scale > params.moved_m)
+    return bool(np.linalg.norm(off, axis=1).max() * newer.S_map_scene.scale > MAX_SHIFT_M)
 
 
 def _samples(visit: Visit) -> np.ndarray:

@@ -97,8 +97,8 @@ class Settled:
 def settle(
     scenes: Sequence[PlacedScene],
     prefer: Prefer = "newest",
-    params: compare.Params | None = None,
     *,
+    max_views: int = compare.MAX_VIEWS,
     one_exposure: bool = True,
 ) -> Settled:
     """Drop what captures of other dates disprove.
@@ -112,7 +112,6 @@ def settle(
         one_exposure: bring all of it to the newest's exposure. Not of a piece of a map, whose neighbours would show the
             same capture in another one.
     """
-    params = params or compare.Params()
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
     changed, behind = ([np.zeros(len(s.gaussians), dtype=bool) for s in scenes] for _ in range(2))
     rivals = [_none(s) for s in scenes]
@@ -122,13 +121,13 @@ def settle(
     for group in groups:
         added = []
         for i in group:
-            looks = compare.look(scenes[i], params)
+            looks = compare.look(scenes[i], max_views=max_views)
             parts = [one for one in truth if overlapping(one.looks.scene, scenes[i])]
             if not parts:
                 added.append(_Standing(i, looks, np.ones(len(looks.gaussians), dtype=bool)))
                 continue
-            joined = compare.joined([(one.looks, one.shows) for one in parts], scenes[i], params)
-            found = compare.compare(looks, joined, params)
+            joined = compare.joined([(one.looks, one.shows) for one in parts], scenes[i], max_views)
+            found = compare.compare(looks, joined)
             verdict = _verdict(looks, joined, found, prefer)
             exposures[i] = _exposure(found)
             keeps[i] &= ~verdict.lost

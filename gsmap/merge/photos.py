@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.compare import colours
-from gsmap.compare import params as comparing
 from gsmap.compare.neighbourhoods import grown
 from gsmap.errors import ConfigError
 from gsmap.render import render
@@ -68,9 +67,7 @@ class Shown:
     depth: np.ndarray
 
 
-def shown(
-    photo: KeptPhoto, scene: PlacedScene, longest_side_px: int, params: Params, differing: comparing.Params
-) -> Shown | None:
+def shown(photo: KeptPhoto, scene: PlacedScene, longest_side_px: int, params: Params) -> Shown | None:
     """A photograph beside what its capture shows from there; None where that is something else, or its pose is not
     known well enough."""
     longest = int(photo.camera.sizes_px.max())
@@ -92,7 +89,7 @@ def shown(
         chroma_spread=min(line.chroma_spread, params.max_spread),
         lightness_spread=min(line.lightness_spread, params.max_spread),
     )
-    differ = colours.differ(line, *line.differences(picture, seen.colour[0], opaque), differing)
+    differ = colours.differ(line, *line.differences(picture, seen.colour[0], opaque))
     counts = opaque & ~grown(differ & opaque, params.margin_px)
     if counts.sum() < params.min_agreeing * opaque.sum():
         return None

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmap import compare
 from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.projection import in_image, project
@@ -83,7 +82,6 @@ def render_references(
     settled: Settled | None,
     progress: Progress,
     params: Params | None = None,
-    comparing: compare.Params | None = None,
 ) -> References:
     """Render each scene from its own cameras; keep the views that show enough of the tile.
 
@@ -93,11 +91,8 @@ def render_references(
     beyond is not there when the tile is fitted, and must not be made up for. ``settled`` (`gsmap.merge.changes`) knows
     where the pictures of a scene are overruled. Photographs count where they show what their scene shows
     (`gsmap.merge.photos`).
-
-    Args:
-        comparing: what counts as showing something else.
     """
-    params, comparing = params or Params(), comparing or compare.Params()
+    params = params or Params()
     near = [inside(scene.gaussians.means, bounds, halo_m) for scene in scenes]
     pieces = [scene.gaussians if n.all() else scene.gaussians[n] for scene, n in zip(scenes, near, strict=True)]
     todo = [
@@ -152,7 +147,7 @@ def render_references(
         kept.append(i)
         shares.append(share)
     num_rendered = len(kept)
-    for i, one in _photos(scenes, pieces, longest_side_px, params.photos, comparing):
+    for i, one in _photos(scenes, pieces, longest_side_px, params.photos):
         counts = one.counts & inside_pixels(one.camera, one.depth, bounds, halo_m / 2)
         if settled is not None and settled.is_disputed(i):
             counts &= ~settled.overruled_pixels(i, one.camera)
@@ -186,7 +181,6 @@ def _photos(
     pieces: Sequence[Gaussians],
     longest_side_px: int,
     params: photos.Params,
-    comparing: compare.Params,
 ) -> Iterator[tuple[int, photos.Shown]]:
     """Photographs that may show the tile and are to be believed, with the scene of each."""
     if not params.share:
@@ -201,7 +195,7 @@ def _photos(
         most = np.argsort([-share for _, _, share in asked], kind="stable")[: params.max_photos]
         asked = [asked[row] for row in sorted(most)]
     for i, photo, _ in asked:
-        one = photos.shown(photo, scenes[i], longest_side_px, params, comparing)
+        one = photos.shown(photo, scenes[i], longest_side_px, params)
         if one is not None:
             yield i, one
 

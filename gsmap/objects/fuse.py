@@ -9,6 +9,10 @@ import numpy as np
 
 from gsmap.geometry.cells import cell_labels, group_means
 
+_CELL_M = 0.12  # edge of the cells that segments are compared by
+_MIN_OVERLAP_OF_LARGER = 0.2  # fraction of the larger segment's cells that two segments of one object share
+_MAX_LAB = 15.0  # median difference of their colours, after exposure balancing
+_MIN_IOU = 0.4  # from which on the colours may differ: the object was painted
 _AHEAD = 3  # a thing is compared with those of so many later captures at its place: linear in captures, few gaps
 
 
@@ -33,30 +37,11 @@ class Placed:
     count: int
 
 
-@dataclass(frozen=True)
-class Params:
-    """When two things are one.
-
-    Args:
-        cell_m: edge of the cells they are compared by.
-        min_contained: the share of the smaller one's cells that they share, at least.
-        min_size: and of the larger one's.
-        max_lab: in most cells their colours differ by less, after the captures' exposures are balanced,
-        same_shape: or else they share this much of both: a thing that was painted.
-    """
-
-    cell_m: float = 0.12
-    min_contained: float = 0.45
-    min_size: float = 0.2
-    max_lab: float = 15.0
-    same_shape: float = 0.4
-
-
 def fuse(
     captures: Sequence[Placed],
     moved: Sequence[tuple[Node, Node]] = (),
     parted: Sequence[tuple[Node, int]] = (),
-    params: Params | None = None,
+    min_overlap: float = 0.45,
 ) -> list[tuple[Node, ...]]:
     """Groups of things that are one object, at most one of each capture; each thing is in one.
 
@@ -72,15 +57,14 @@ def fuse(
     Returns:
         Groups by their first node; nodes within by capture.
     """
-    params = params or Params()
-    first, cells, lab = _cells(captures, params.cell_m)
+    first, cells, lab = _cells(captures, _CELL_M)
     home = np.searchsorted(first, np.arange(first[-1]), "right") - 1
     sizes = np.bincount(cells[:, 1], minlength=first[-1])
     a, b, shared, differ = _overlaps(cells, lab, home)
     smaller, larger = np.minimum(sizes[a], sizes[b]), np.maximum(sizes[a], sizes[b])
     union = sizes[a] + sizes[b] - shared
-    fits = (shared >= params.min_contained * smaller) & (shared >= params.min_size * larger)
-    fits &= (differ < params.max_lab) | (shared >= params.same_shape * union)
+    fits = (shared >= min_overlap * smaller) & (shared >= _MIN_OVERLAP_OF_LARGER * larger)
+    fits &= (differ < _MAX_LAB) | (shared >= _MIN_IOU * union)
     a, b, score = a[fits], b[fits], (shared / np.maximum(larger, 1))[fits]
     best = _mutual(a, b, score, home)
     order = np.argsort(-score[best], kind="stable")

@@ -12,32 +12,13 @@ from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, SightingState
 
-
-@dataclass(frozen=True)
-class Params:
-    """How captures look for things.
-
-    Args:
-        max_views: of a capture's cameras, evenly spread.
-        longest_side_px: of a render.
-        tolerance_m: a surface so near to a point is its own, beside
-        tolerance: this share of its distance.
-        min_looked: a capture that looked at less than this share of a place says nothing of it.
-        min_there: a thing is there where so much of what was looked at is a surface of its colour,
-        same_shape: or so much of it a surface of any colour: a thing that was painted.
-        patch_m: edge of the cells over which colours are averaged.
-        max_lab: mean colours that differ by less are alike, L*a*b* units.
-    """
-
-    max_views: int = 32
-    longest_side_px: int = 128
-    tolerance_m: float = 0.1
-    tolerance: float = 0.02
-    min_looked: float = 0.5
-    min_there: float = 0.5
-    same_shape: float = 0.9
-    patch_m: float = 0.25
-    max_lab: float = 14.0
+MAX_VIEWS, LONGEST_SIDE_PX = 32, 128  # default number of a capture's views that are rendered, and their size
+_TOLERANCE_M, _TOLERANCE_PER_DEPTH = 0.1, 0.02  # between a point and the surface that it is on; metres, and per metre
+_MIN_OBSERVED = 0.5  # fraction of an object's points below which it is unobserved
+_MIN_PRESENT = 0.5  # fraction of the observed points on a surface of its colour, for it to be seen
+_MIN_SAME_SHAPE = 0.9  # or on a surface of any colour: an object that was painted
+_PATCH_M = 0.25  # edge of the cells over which colours are averaged
+_MAX_LAB = 14.0  # difference of mean colours, L*a*b* units, of one surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +51,16 @@ class Glance:
     colours: np.ndarray
 
 
-def open_eyes(gaussians: Gaussians, cameras: Cameras | None, params: Params | None = None) -> Eyes:
+def open_eyes(
+    gaussians: Gaussians,
+    cameras: Cameras | None,
+    max_views: int = MAX_VIEWS,
+    longest_side_px: int = LONGEST_SIDE_PX,
+) -> Eyes:
     """Render a capture through its own cameras; without cameras it has seen nothing."""
-    params = params or Params()
     if cameras is None or not len(cameras) or cameras.synthesised:
         return Eyes((), (), ())
-    small = cameras.evenly(params.max_views).resized(params.longest_side_px)
+    small = cameras.evenly(max_views).resized(longest_side_px)
     views = tuple(small[i] for i in range(len(small)))
     seen = [render(gaussians, view, dominant_id=False) for view in views]
     return Eyes(
@@ -85,13 +70,12 @@ def open_eyes(gaussians: Gaussians, cameras: Cameras | None, params: Params | No
     )
 
 
-def in_view(cameras: Cameras | None, points: np.ndarray, params: Params | None = None) -> bool:
+def in_view(cameras: Cameras | None, points: np.ndarray, max_views: int = MAX_VIEWS) -> bool:
     """Whether any camera that a capture looks with has one of the points (K, 3) in its picture, whatever stands before
     it; its frame and unit."""
-    params = params or Params()
     if cameras is None or cameras.synthesised:
         return False
-    some = cameras.evenly(params.max_views)
+    some = cameras.evenly(max_views)
     for view in (some[i] for i in range(len(some))):
         pixels, z = project(points, view.T_camera_frame[0], view.intrinsics_px[0])
         if in_image(pixels, z, view.sizes_px[0]).any():
@@ -99,9 +83,8 @@ def in_view(cameras: Cameras | None, points: np.ndarray, params: Params | None =
     return False
 
 
-def glance(eyes: Eyes, points: np.ndarray, unit_m: float, params: Params | None = None) -> Glance:
+def glance(eyes: Eyes, points: np.ndarray, unit_m: float) -> Glance:
     """What a capture saw at points (K, 3), its frame and unit; ``unit_m`` is metres per unit."""
-    params = params or Params()
     through, times = np.zeros(len(points), bool), np.zeros(len(points))
     colours = np.zeros((len(points), 3))
     for view, depth, colour in zip(eyes.cameras, eyes.depths, eyes.colours, strict=True):
@@ -109,7 +92,7 @@ def glance(eyes: Eyes, points: np.ndarray, unit_m: float, params: Params | None 
         rows = np.flatnonzero(in_image(pixels, z, view.sizes_px[0], near=0.05 / unit_m))
         column, row = pixels[rows].astype(np.int64).T
         surface = depth[row, column]
-        margin = params.tolerance_m / unit_m + params.tolerance * z[rows]
+        margin = _TOLERANCE_M / unit_m + _TOLERANCE_PER_DEPTH * z[rows]
         through[rows] |= (surface > 0) & (surface > z[rows] + margin)
         on = (surface > 0) & (np.abs(surface - z[rows]) <= margin)
         times[rows[on]] += 1
@@ -118,9 +101,7 @@ def glance(eyes: Eyes, points: np.ndarray, unit_m: float, params: Params | None 
         return Glance(through, times > 0, colours / times[:, None])
 
 
-def judge(
-    seen: Glance, points: np.ndarray, colours: np.ndarray, shift: np.ndarray, params: Params | None = None
-) -> tuple[SightingState, float]:
+def judge(seen: Glance, points: np.ndarray, colours: np.ndarray, shift: np.ndarray) -> tuple[SightingState, float]:
     """Whether a thing that other captures show is there.
 
     Args:
@@ -133,17 +114,16 @@ def judge(
         The state: ``unseen`` where too little of its place was looked at; ``seen`` where most of what was looked at
         is a surface of its colour and was not looked through; else ``absent``. And the share that was looked at.
     """
-    params = params or Params()
     looked = seen.through | seen.on
     share = float(looked.mean()) if len(looked) else 0.0
-    if share < params.min_looked:
+    if share < _MIN_OBSERVED:
         return "unseen", share
     # Books and leaves differ from pixel to pixel: what is compared is the mean of a patch.
     rows = np.flatnonzero(seen.on)
     off = seen.colours[rows] - shift - colours[rows]
-    label, counts = cell_labels(np.floor(points[rows] / params.patch_m))
+    label, counts = cell_labels(np.floor(points[rows] / _PATCH_M))
     alike = np.zeros(len(points), bool)
-    alike[rows] = (np.linalg.norm(group_means(off, label, counts), axis=1) < params.max_lab)[label]
+    alike[rows] = (np.linalg.norm(group_means(off, label, counts), axis=1) < _MAX_LAB)[label]
     solid = seen.on & ~seen.through
-    there = (solid & alike).sum() >= params.min_there * looked.sum() or solid.sum() >= params.same_shape * looked.sum()
+    there = (solid & alike).sum() >= _MIN_PRESENT * looked.sum() or solid.sum() >= _MIN_SAME_SHAPE * looked.sum()
     return ("seen" if there else "absent"), share

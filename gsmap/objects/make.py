@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmap import render
 from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects.fuse import Node, Placed, fuse
-from gsmap.objects.fuse import Params as FuseParams
 from gsmap.objects.looks import Eyes, glance, judge
-from gsmap.objects.looks import Params as LookParams
-from gsmap.objects.rooms import Params as RoomParams
 from gsmap.types import MapObject, Sighting, SightingState, Sim3, Things
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
@@ -23,19 +20,25 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class Params:
-    """How objects are made.
+    """Settings of objects: the association of segments, visibility tests and rooms.
 
     Args:
-        fuse: when things of two captures are one.
-        look: how captures look for the things of others.
-        rooms: how the place is cut into rooms.
-        min_points: a thing of fewer points makes no object by itself.
+        min_gaussians: Smallest number of Gaussians, at least 0, of a segment that becomes an object; larger drops small
+            objects.
+        min_overlap: Smallest fraction in [0, 1] of the smaller of two segments that must lie in the cells of the larger
+            for both to be one object; larger splits objects more often.
+        max_views: Largest number of views of a scene, at least 1 and evenly spread, in which objects are looked up;
+            larger leaves fewer objects unobserved and takes more time.
+        longest_side_px: Longest side in pixels, at least 1, of these views; larger resolves smaller objects and takes
+            more time.
+        min_room_area_m2: Smallest floor area of a room in square metres, at least 0; larger drops closets.
     """
 
-    fuse: FuseParams = field(default_factory=FuseParams)
-    look: LookParams = field(default_factory=LookParams)
-    rooms: RoomParams = field(default_factory=RoomParams)
-    min_points: int = 40
+    min_gaussians: int = 40
+    min_overlap: float = 0.45
+    max_views: int = 32
+    longest_side_px: int = 128
+    min_room_area_m2: float = 1.5
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
@@ -88,14 +91,14 @@ def make_objects(
     """
     params = params or Params()
     placed = [_placed(capture, metres) for capture in captures]
-    groups = fuse(placed, moved, parted, params.fuse)
+    groups = fuse(placed, moved, parted, params.min_overlap)
     gone = set(parted)
     kept = []
     for group in groups:
         rows = {c: np.flatnonzero(placed[c].things == t) for c, t in group}
         places = {c: (placed[c].points[mine] / metres, placed[c].lab[mine]) for c, mine in rows.items()}
         members = max(np.count_nonzero(captures[c].things.members == t) for c, t in group)
-        if members >= params.min_points:
+        if members >= params.min_gaussians:
             kept.append((group, places))
     sightings: list[dict[int, Sighting]] = [
         {c: Sighting(captures[c].scene, "seen", t, np.array([at[c][0].min(0), at[c][0].max(0)])) for c, t in group}
@@ -124,14 +127,11 @@ def make_objects(
             own = [places[o][1] for (_, places), o in zip(kept, of, strict=True)]
             # The exposure: by what is certainly there, else by all that has a surface where it should.
             sure = [i for i, mine in enumerate(sightings) if c in mine] or asking
-            glances = {
-                i: glance(seen, S_scene_map.apply(points[i]), unit, params.look)
-                for i in dict.fromkeys([*sure, *asking])
-            }
+            glances = {i: glance(seen, S_scene_map.apply(points[i]), unit) for i in dict.fromkeys([*sure, *asking])}
             off = np.concatenate([(glances[i].colours - own[i])[glances[i].on] for i in sure])
             shift = np.median(off, axis=0) if len(off) else np.zeros(3)
             for i in asking:
-                said[i] = judge(glances[i], points[i] * metres, own[i], shift, params.look)
+                said[i] = judge(glances[i], points[i] * metres, own[i], shift)
         for i, (state, share) in said.items():
             asked = captures[of[i]].scene
             if any((node, c) in gone for node in kept[i][0]):

@@ -2,14 +2,13 @@
 
 Between the height of doors and the ceiling nothing stands but walls, and above an open door its lintel: what is one
 piece of floor there is one room, whatever furniture stands in it. Where doors reach the ceiling, or nobody saw their
-lintels, the distance to the nearest wall tells: a passage narrower than `Params.door_m` parts two rooms (as in Bormann
+lintels, the distance to the nearest wall tells: a passage narrower than `_DOOR_M` parts two rooms (as in Bormann
 et al. 2016, "Room segmentation: survey, implementation, and analysis").
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -18,60 +17,37 @@ from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.types import Gaussians, Room
 
 _BIN_M = 0.05  # of heights
+_CELL_M = 0.1  # edge of the cells of the floor plan
+_MAX_GAUSSIANS = 150_000  # of a capture, evenly; its neighbours fill the gaps
+_MIN_OPACITY = 0.5  # of a surface
+_ABOVE_DOORS_M = 2.12  # above the floor, from which on nothing but walls and lintels stands
+_BELOW_CEILING_M = 0.1  # to which walls are looked for
+_DEFAULT_CEILING_M = 2.4  # above the floor, where no ceiling was seen
+_MIN_WALL_FILL = 0.5  # fraction of the height in between that a wall fills
+_MIN_WALL_M = 0.8  # length of a wall
+_DOOR_M = 1.2  # width of a passage that separates two rooms
+_STOREY_M = 1.5  # difference in height between cameras of two storeys
+_MIN_DOOR_M = 0.5  # width of an opening that joins two rooms
 
 
-@dataclass(frozen=True)
-class Params:
-    """How a place is cut into rooms; lengths in metres.
-
-    Args:
-        cell_m: edge of the cells of the plan.
-        max_gaussians: of a capture, evenly; of more their neighbours fill the gaps.
-        min_opacity: Gaussians that are less opaque are no surface.
-        above_m: nothing but walls and lintels stands higher above the floor than this,
-        below_m: and lower below the ceiling.
-        no_ceiling_m: where no ceiling was seen, walls are looked for up to so far above the floor.
-        wall: a column is of a wall where surfaces fill this share of its height in between,
-        min_wall_m: and columns of a wall stand in a row of at least this length.
-        door_m: passages narrower than this part two rooms.
-        min_area_m2: what is smaller is no room.
-        storey_m: cameras that stand so much higher than others stand on another storey.
-        min_door_m: rooms are joined by an opening of at least this width.
-    """
-
-    cell_m: float = 0.1
-    max_gaussians: int = 150_000
-    min_opacity: float = 0.5
-    above_m: float = 2.12
-    below_m: float = 0.1
-    no_ceiling_m: float = 2.4
-    wall: float = 0.5
-    min_wall_m: float = 0.8
-    door_m: float = 1.2
-    min_area_m2: float = 1.5
-    storey_m: float = 1.5
-    min_door_m: float = 0.5
-
-
-def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, params: Params | None = None) -> list[Room]:
+def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, min_area_m2: float = 1.5) -> list[Room]:
     """The rooms that captures of a place show, the largest first.
 
     Args:
         captures: in one level frame, metres, z up.
         eyes: (C, 3) where their cameras stood: they tell storeys apart; may be none.
     """
-    params = params or Params()
-    parts = [_surface(gaussians, params) for gaussians in captures]
+    parts = [_surface(gaussians) for gaussians in captures]
     points = np.concatenate([np.zeros((0, 3)), *(p for p, _ in parts)])
     flat = np.concatenate([np.zeros(0, bool), *(f for _, f in parts)])
     whose = np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
     if len(points) < 100:
         return []
     rooms: list[Room] = []
-    for height in _storeys(eyes, points, params):
-        floor, ceiling = _floor_and_ceiling(points[flat, 2], height, params)
+    for height in _storeys(eyes, points):
+        floor, ceiling = _floor_and_ceiling(points[flat, 2], height)
         mine = (points[:, 2] > floor - 0.3) & (points[:, 2] < ceiling + 0.3)
-        rooms += _of_storey(points[mine], flat[mine], whose[mine], floor, ceiling, len(rooms), params)
+        rooms += _of_storey(points[mine], flat[mine], whose[mine], floor, ceiling, len(rooms), min_area_m2)
     order = sorted(range(len(rooms)), key=lambda i: (-rooms[i].area_m2, *rooms[i].low))
     place = {old: new for new, old in enumerate(order)}
     return [
@@ -80,20 +56,20 @@ def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, params: Params |
     ]
 
 
-def _surface(gaussians: Gaussians, params: Params) -> tuple[np.ndarray, np.ndarray]:
+def _surface(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Points (P, 3) all over the Gaussians, half a cell apart, and which lie on a level surface.
 
     Blank walls are made of few wide Gaussians, whose means alone would leave holes.
     """
-    opaque = gaussians.logit_opacities > np.log(params.min_opacity / (1 - params.min_opacity))
+    opaque = gaussians.logit_opacities > np.log(_MIN_OPACITY / (1 - _MIN_OPACITY))
     rows = np.flatnonzero(opaque)
-    kept = gaussians[rows[:: -(-len(rows) // params.max_gaussians) or 1]]
+    kept = gaussians[rows[:: -(-len(rows) // _MAX_GAUSSIANS) or 1]]
     scales, axes = kept.scales.astype(np.float64), quats_to_matrices(kept.quats)
     order = np.argsort(-scales, axis=1)
     rows = np.arange(len(kept))
     wide = [axes[rows, :, order[:, k]] * scales[rows, order[:, k]][:, None] for k in (0, 1)]
     level = np.abs(axes[rows, 2, order[:, 2]]) > 0.8
-    step = params.cell_m / 2
+    step = _CELL_M / 2
     counts = np.stack([np.clip(np.ceil(2 * scales[rows, order[:, k]] / step), 1, 15) for k in (0, 1)], 1).astype(int)
     points, flat = [], []
     for a, b in np.unique(counts, axis=0):
@@ -108,23 +84,23 @@ def _surface(gaussians: Gaussians, params: Params) -> tuple[np.ndarray, np.ndarr
     return np.concatenate([np.zeros((0, 3)), *points]), np.concatenate([np.zeros(0, bool), *flat])
 
 
-def _storeys(eyes: np.ndarray, points: np.ndarray, params: Params) -> list[float]:
+def _storeys(eyes: np.ndarray, points: np.ndarray) -> list[float]:
     """The height of the eyes on each storey, the lowest first; without cameras the middle of what there is."""
     if not len(eyes):
         return [float(np.median(points[:, 2]))]
     heights = np.sort(eyes[:, 2])
-    cuts = np.flatnonzero(np.diff(heights) > params.storey_m) + 1
+    cuts = np.flatnonzero(np.diff(heights) > _STOREY_M) + 1
     return [float(np.median(part)) for part in np.split(heights, cuts)]
 
 
-def _floor_and_ceiling(heights: np.ndarray, eye: float, params: Params) -> tuple[float, float]:
+def _floor_and_ceiling(heights: np.ndarray, eye: float) -> tuple[float, float]:
     """Where most of what is level lies below and above the eyes."""
     floor = _mode(heights[(heights > eye - 2.0) & (heights < eye - 0.6)], eye - 1.5)
-    above = heights[(heights > floor + params.above_m) & (heights < floor + 4.0)]
+    above = heights[(heights > floor + _ABOVE_DOORS_M) & (heights < floor + 4.0)]
     below = np.count_nonzero(np.abs(heights - floor) < _BIN_M)
-    ceiling = _mode(above, floor + params.no_ceiling_m)
+    ceiling = _mode(above, floor + _DEFAULT_CEILING_M)
     if np.count_nonzero(np.abs(above - ceiling) < _BIN_M) < 0.1 * below:
-        ceiling = floor + params.no_ceiling_m
+        ceiling = floor + _DEFAULT_CEILING_M
     return floor, ceiling
 
 
@@ -143,24 +119,24 @@ def _of_storey(
     floor: float,
     ceiling: float,
     first: int,
-    params: Params,
+    min_area_m2: float,
 ) -> list[Room]:
     """The rooms of one storey; their numbers begin with ``first``.
 
     Args:
         flat: (P,) bool, which points lie on a level surface. whose: (P,) index of the capture that shows each.
     """
-    cell = params.cell_m
+    cell = _CELL_M
     low = points[:, :2].min(0) - 3 * cell
     at = np.floor((points[:, :2] - low) / cell).astype(int)
     shape = tuple(at.max(0) + 4)
-    bottom, top = floor + params.above_m, ceiling - params.below_m
+    bottom, top = floor + _ABOVE_DOORS_M, ceiling - _BELOW_CEILING_M
     bins = max(round((top - bottom) / _BIN_M), 1)
     filled = np.zeros((*shape, bins), bool)
     high = (points[:, 2] >= bottom) & (points[:, 2] < top)
     level = np.minimum(((points[high, 2] - bottom) / (top - bottom) * bins).astype(int), bins - 1)
     filled[at[high, 0], at[high, 1], level] = True
-    wall = _long(filled.mean(2) >= params.wall, params.min_wall_m / cell)
+    wall = _long(filled.mean(2) >= _MIN_WALL_FILL, _MIN_WALL_M / cell)
     inside = np.zeros(shape, bool)
     seen = flat & ((np.abs(points[:, 2] - floor) < 0.15) | (np.abs(points[:, 2] - ceiling) < 0.15))
     inside[at[seen, 0], at[seen, 1]] = True
@@ -168,7 +144,7 @@ def _of_storey(
     blocked = np.zeros(shape, bool)
     blocked[at[body, 0], at[body, 1]] = True
     inside = ndimage.binary_fill_holes(ndimage.binary_closing(inside | blocked, np.ones((3, 3)), iterations=2))
-    labels = _cut(inside & ~wall, params)
+    labels = _cut(inside & ~wall, min_area_m2)
     grown = _grown(labels, wall & inside)
     # A door that one capture shows open is a door, though another shows it shut.
     open_floors = []
@@ -184,7 +160,7 @@ def _of_storey(
         mine = grown == number
         rows, columns = np.flatnonzero(mine.any(1)), np.flatnonzero(mine.any(0))
         part = mine[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        doors = {other for floors in open_floors for other in _joined_to(labels, number, floors, params)}
+        doors = {other for floors in open_floors for other in _joined_to(labels, number, floors)}
         joined = tuple(first + other - 1 for other in sorted(doors))
         rooms.append(Room(low + cell * np.array([rows[0], columns[0]]), part, cell, floor, ceiling, joined))
     return rooms
@@ -199,16 +175,16 @@ def _long(wall: np.ndarray, cells: float) -> np.ndarray:
     return out
 
 
-def _cut(free: np.ndarray, params: Params) -> np.ndarray:
+def _cut(free: np.ndarray, min_area_m2: float) -> np.ndarray:
     """Labels (X, Y) from 1 of the rooms of a free floor, 0 for none.
 
     Each piece of floor whose middle is wider than a door is a room with what lies nearest to it on foot; one that is
     nowhere so wide is a room as a whole.
     """
-    distance = ndimage.distance_transform_edt(free) * params.cell_m
+    distance = ndimage.distance_transform_edt(free) * _CELL_M
     pieces, count = ndimage.label(free)
-    cores, _ = ndimage.label(distance > params.door_m / 2)
-    least = params.min_area_m2 / params.cell_m**2
+    cores, _ = ndimage.label(distance > _DOOR_M / 2)
+    least = min_area_m2 / _CELL_M**2
     out = np.zeros(free.shape, int)
     number = 0
     for piece in range(1, count + 1):
@@ -246,7 +222,7 @@ def _grown(labels: np.ndarray, wall: np.ndarray) -> np.ndarray:
     return np.where((labels == 0) & wall, spread, labels)
 
 
-def _joined_to(labels: np.ndarray, number: int, open_floor: np.ndarray, params: Params) -> list[int]:
+def _joined_to(labels: np.ndarray, number: int, open_floor: np.ndarray) -> list[int]:
     """Numbers of the rooms that one can walk to from one: over floor with nothing on it, as wide as a door at least.
 
     Args:
@@ -264,7 +240,7 @@ def _joined_to(labels: np.ndarray, number: int, open_floor: np.ndarray, params: 
         for passage in both[both > 0]:
             rows, columns = np.nonzero((passages == passage) & (labels != number) & (labels != other))
             cut = not len(rows)  # one piece of floor, parted where it is narrow
-            if cut or max(np.ptp(rows), np.ptp(columns)) + 1 >= params.min_door_m / params.cell_m:
+            if cut or max(np.ptp(rows), np.ptp(columns)) + 1 >= _MIN_DOOR_M / _CELL_M:
                 out.append(other)
                 break
     return out

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.compare import HIDDEN, UNSEEN, Looks, compare, look
-from gsmap.compare import Params as CompareParams
-from gsmap.compare.looks import best_of_cell
+from gsmap.compare.looks import CELL_M, best_of_cell
 from gsmap.errors import ConfigError
 from gsmap.render import render
 from gsmap.types import Gaussians, PlacedScene
@@ -19,35 +18,38 @@ __all__ = ["Params", "fidelity_db", "look", "seen_again", "shown"]
 
 @dataclass(frozen=True)
 class Params:
-    """When a capture may be kept compact, and how.
+    """Settings of thinning.
 
     Args:
-        min_seen_again: share of its surface that newer captures, kept whole, must have looked at.
-        min_weight: a Gaussian that nowhere makes up this share of a pixel of its capture's own pictures goes.
-        min_fidelity_db: PSNR of what is kept against what there was, in the capture's own pictures: with less, it stays
-            as it is. At 43 dB a capture that fits its photographs at 27 dB loses 0.1 dB of that.
-        pictures: of its own that are compared; evenly along its path.
-        longest_side_px: size of these.
-        compare: what counts as looked at.
+        min_seen_again: Smallest fraction in [0, 1] of a scene's surface that newer, whole scenes must have observed
+            before it is thinned; larger thins fewer scenes.
+        min_weight: Largest blending weight in [0, 1] that a Gaussian must reach in some view of its scene to be kept;
+            larger removes more Gaussians.
+        min_fidelity_db: Smallest PSNR in dB of the thinned scene against the whole one, in the scene's own views, at
+            which it is thinned; larger thins fewer scenes. At 43 dB a scene that fits its photographs at 27 dB loses
+            0.1 dB of that.
+        max_views: Largest number of views, at least 1, evenly along the camera path, in which the PSNR is measured;
+            larger is more reliable and slower.
+        longest_side_px: Longest side in pixels, at least 1, of these views; larger counts smaller Gaussians as visible
+            and is slower.
     """
 
     min_seen_again: float = 0.9
     min_weight: float = 0.01
     min_fidelity_db: float = 43.0
-    pictures: int = 24
+    max_views: int = 24
     longest_side_px: int = 480
-    compare: CompareParams = field(default_factory=CompareParams)
 
     def __post_init__(self) -> None:
         for name in ("min_seen_again", "min_weight"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}")
-        for name in ("pictures", "longest_side_px"):
+        for name in ("max_views", "longest_side_px"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
 
 
-def seen_again(older: PlacedScene, newer: Sequence[Looks], params: CompareParams | None = None) -> float:
+def seen_again(older: PlacedScene, newer: Sequence[Looks]) -> float:
     """Share of a capture's surface that newer captures of the same frame looked at, whatever they found there.
 
     What stands behind what they show, they did not look at; what lies a little behind in a cell of which they saw the
@@ -57,15 +59,14 @@ def seen_again(older: PlacedScene, newer: Sequence[Looks], params: CompareParams
         older: in metres, with its cameras.
         newer: see `gsmap.compare.look`.
     """
-    params = params or CompareParams()
-    mine = look(older, params)
+    mine = look(older)
     surface = mine.surface & (mine.times_seen > 0)
     if not surface.any():
         return 0.0
     seen = np.zeros(len(older.gaussians), dtype=bool)
     for other in newer:
-        seen |= ~np.isin(compare(mine, other, params).older.state, (UNSEEN, HIDDEN))
-    seen = best_of_cell(older.gaussians.means, seen, params.cell_m)
+        seen |= ~np.isin(compare(mine, other).older.state, (UNSEEN, HIDDEN))
+    seen = best_of_cell(older.gaussians.means, seen, CELL_M)
     return float(seen[surface].mean())
 
 
@@ -89,7 +90,7 @@ def fidelity_db(scene: PlacedScene, kept: Gaussians, params: Params) -> float:
     """
     if scene.cameras is None or not len(scene.cameras):
         return float("nan")
-    small = scene.cameras.evenly(params.pictures).resized(params.longest_side_px)
+    small = scene.cameras.evenly(params.max_views).resized(params.longest_side_px)
     squares = []
     for i in range(len(small)):
         before, after = (

@@ -146,7 +146,9 @@ def test_the_key_names_the_settings_and_the_code():
     assert key.stage == "change"
     assert key.version["change"] == change.VERSION
     assert "compare" in key.version
-    assert key.recipe != change.recipe_key(change.Params(voxel_m=0.2)).recipe
+    others = {"longest_side_px": 99, "max_views": 9, "voxel_m": 0.2, "min_area_m2": 0.5, "min_moved_fraction": 0.9}
+    for name, value in {**others, "min_confidence": 0.9}.items():
+        assert key.recipe != change.recipe_key(change.Params(**{name: value})).recipe
     with pytest.raises(ConfigError, match="voxel_m must be positive"):
         change.Params(voxel_m=0.0)
 

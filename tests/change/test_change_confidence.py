@@ -65,7 +65,7 @@ def test_a_smooth_thing_of_few_cells_is_one_thing():
         none,
         none,
     )
-    cells, _ = judge((side, side), Params())
+    cells, _ = judge((side, side))
     (thing,) = things_of(side, cells, np.zeros(count, dtype=bool), Params())
     assert len(thing.moved) == count
 

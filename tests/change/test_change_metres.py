@@ -9,7 +9,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.types import Sim3
 
 UNIT = 10.0  # metres
-QUICK = {"change.compare.max_views": 16, "change.compare.longest_side_px": 128}
+QUICK = {"change.max_views": 16, "change.longest_side_px": 128}
 
 
 @pytest.fixture

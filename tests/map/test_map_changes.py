@@ -305,11 +305,14 @@ def test_a_capture_meets_the_visits_that_together_cover_it() -> None:
         visit("same", 1),
     ]
     assert pairs_of_visits([*others, visit("new", 1)], Params()) == []
-    met = pairs_of_visits([*others, visit("new", 1)], Params(min_new_share=0.01))
+    met = pairs_of_visits([*others, visit("new", 1)], Params(min_new_fraction=0.01))
     assert met == [("near", "new"), ("near", "same")]
-    assert pairs_of_visits([north, south, hall, visit("all", 3, (0, 8))], Params(most=1))[-1] == ("south", "all")
+    assert pairs_of_visits([north, south, hall, visit("all", 3, (0, 8))], Params(max_earlier_visits=1))[-1] == (
+        "south",
+        "all",
+    )
     with pytest.raises(ConfigError):
-        Params(min_new_share=0)
+        Params(min_new_fraction=0)
 
 
 def test_a_capture_lies_where_its_pose_says() -> None:
@@ -328,9 +331,9 @@ def test_how_far_a_pair_may_move_before_it_is_compared_again() -> None:
         (at(0.0, 0.19), False),
         (at(0.0, 0.25), True),
     ):
-        assert has_moved(a, b, then, Params()) is moved
+        assert has_moved(a, b, then) is moved
     # Metres of the map, whatever the scenes' units are.
     big = Sim3(np.eye(3), np.zeros(3), 10.0)
     c, d = (visit(name, 0, (0, 0.4), pose=big) for name in "cd")
-    assert has_moved(c, d, at(0.003), Params())
-    assert not has_moved(c, d, at(0.0019), Params())
+    assert has_moved(c, d, at(0.003))
+    assert not has_moved(c, d, at(0.0019))

@@ -172,7 +172,7 @@ def test_captures_are_compared_in_linear_time(monkeypatch):
     for count in (4, 8, 16):
         calls.clear()
         scenes = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(count)]
-        settle(scenes, params=compare.Params(max_views=8))
+        settle(scenes, max_views=8)
         spent[count] = sum(calls)
     assert spent[16] - spent[8] == 2 * (spent[8] - spent[4])
     assert spent[16] <= 16 * (7 + 7 + 2 * 8)
@@ -182,7 +182,7 @@ def test_looks_of_many_captures_together_are_those_that_add_coverage():
     many = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(6)]
     looks = [compare.look(scene) for scene in many[::-1]]
     stays = [np.ones(len(one.gaussians), dtype=bool) for one in looks]
-    joined = compare.joined(list(zip(looks, stays, strict=True)), many[0], compare.Params(max_views=3))
+    joined = compare.joined(list(zip(looks, stays, strict=True)), many[0], max_views=3)
     assert len(joined.views) == 6
     assert len(joined.gaussians) == sum(len(scene.gaussians) for scene in many)
     for view in joined.views:
@@ -203,9 +203,9 @@ def test_truth_grows_by_what_is_new_to_it_alone(monkeypatch):
     """Ten captures of one wall weigh, to the next, as much as one."""
     weights = []
 
-    def weighed(older, newer, params=None):
+    def weighed(older, newer):
         weights.append(len(newer.gaussians))
-        return real(older, newer, params)
+        return real(older, newer)
 
     real = compare.compare
     monkeypatch.setattr(compare, "compare", weighed)

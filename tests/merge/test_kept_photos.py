@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from synthetic_walls import cameras_facing, texture, two_scenes, wall
 
-from gsmap import compare
 from gsmap.errors import ConfigError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import PlacedScene, default_params, merge, photos_m, references
@@ -38,7 +37,7 @@ def photo_at(x, **options):
 
 
 def ask(photo, scene=None, params=None):
-    return shown(photo, scene or two_scenes(grain=0.0)[0], WIDTH, params or Params(), compare.Params())
+    return shown(photo, scene or two_scenes(grain=0.0)[0], WIDTH, params or Params())
 
 
 def error(gaussians: Gaussians, xs) -> float:
@@ -88,7 +87,7 @@ def test_a_larger_picture_is_reduced_and_a_smaller_one_taken_as_it_is():
     large = replace(photo_at(-0.5), camera=cameras_facing([-0.5]).resized(256))
     found = ask(replace(large, read=lambda: np.repeat(np.repeat(picture_at(-0.5), 4, 0), 4, 1)))
     assert found.image.shape == (48, 64, 3)
-    small = shown(photo_at(-0.5), two_scenes(grain=0.0)[0], 960, Params(), compare.Params())
+    small = shown(photo_at(-0.5), two_scenes(grain=0.0)[0], 960, Params())
     assert small.image.shape == (48, 64, 3)
 
 
@@ -139,7 +138,7 @@ def test_photographs_of_balanced_captures_are_brought_to_the_balanced_colours():
     brighter = apply_gain(b.gaussians, np.array([1.25, 1.1, 0.9]))
     photo = replace(photo_at(0.5), around=lambda: brighter)
     scenes, log_gains = balance_exposure([a, PlacedScene(brighter, b.cameras, "b", photos=(photo,))])
-    found = shown(scenes[1].photos[0], scenes[1], WIDTH, Params(), compare.Params())
+    found = shown(scenes[1].photos[0], scenes[1], WIDTH, Params())
     colours = found.image[found.counts].mean(0) / 255
     balanced = render(scenes[1].gaussians, cameras_facing([0.5])).colour[0][found.counts].mean(0)
     assert log_gains.any()

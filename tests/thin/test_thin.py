@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from synthetic_walls import cameras_facing, wall
 
-from gsmap.compare import Params as CompareParams
 from gsmap.errors import ConfigError
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.render import render
@@ -22,7 +21,7 @@ def older():
 @pytest.mark.parametrize(("middles", "low", "high"), [((-1.5, 1.5), 0.75, 1.0), ((-1.5, -1.0), 0.1, 0.6)])
 def test_how_much_newer_captures_saw(older, middles, low, high):
     newer = PlacedScene(wall(2, -2, 2), cameras_facing(np.linspace(*middles, 9)), "new")
-    assert low <= seen_again(older, [look(newer)], CompareParams()) <= high
+    assert low <= seen_again(older, [look(newer)]) <= high
 
 
 def test_captures_add_up_and_none_saw_nothing(older):
@@ -62,7 +61,9 @@ def test_what_no_picture_shows_goes_and_the_pictures_stay(older):
     camera = both.cameras[4].resized(480)
     before, after = (np.clip(render(g, camera).colour, 0, 1) for g in (both.gaussians, kept))
     error = ((before - after) ** 2).mean()
-    assert fidelity_db(both, kept, Params(pictures=100)) == pytest.approx(-10 * np.log10(error), abs=6)
+    assert fidelity_db(both, kept, Params(max_views=100, longest_side_px=480)) == pytest.approx(
+        -10 * np.log10(error), abs=6
+    )
     assert fidelity_db(both, both.gaussians, Params()) == float("inf")
     assert fidelity_db(both, both.gaussians[: n // 2], Params()) < 30
 

@@ -135,7 +135,7 @@ def _valid(current: Iterable[Comparison], asked: Wanted, settings: Settings) -> 
         if (one.older, one.newer) in pairs
         and one.whole
         and one.key == _key(settings, asked, one.older, one.newer).digest
-        and not has_moved(asked.visits[one.older], asked.visits[one.newer], one.S_newer_older, settings.visits)
+        and not has_moved(asked.visits[one.older], asked.visits[one.newer], one.S_newer_older)
     ]
 
 

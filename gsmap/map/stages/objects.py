@@ -15,6 +15,7 @@ from gsmap.map.dates import parsed
 from gsmap.map.metres import map_metres
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
+from gsmap.map.visits import MAX_SHIFT_M
 from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects import Capture, Eyes, changed_thing, find_rooms, in_view, make_objects, open_eyes, recipe_key
 from gsmap.objects.fuse import Node
@@ -77,7 +78,7 @@ def objects_of_components(
         kept = None if key is None else next((one for one in sets if one.key == key.digest), None)
         if kept is not None and given & {thing.id for thing in kept.objects}:
             kept = None  # an older gsmap gave numbers twice
-        still = {} if kept is None else _unmoved(kept.poses, poses, scenes, unit, settings)
+        still = {} if kept is None else _unmoved(kept.poses, poses, scenes, unit)
         if kept is not None and still.keys() == poses.keys():
             parts.append(Part(component, kept, None, None))
             given |= {thing.id for thing in kept.objects}
@@ -134,7 +135,7 @@ def _key(
 
 
 def _unmoved(
-    then: Mapping[str, Sim3], now: Mapping[str, Sim3], scenes: Mapping[str, Scene], unit: float, settings: Settings
+    then: Mapping[str, Sim3], now: Mapping[str, Sim3], scenes: Mapping[str, Scene], unit: float
 ) -> dict[str, Sim3]:
     """The captures of now that lie where they lay, within what visits are taken to be unmoved by."""
     out = {}
@@ -142,7 +143,7 @@ def _unmoved(
         if scene in then:
             corners = box_corners(scenes[scene].bounds)
             off = np.linalg.norm(pose.apply(corners) - then[scene].apply(corners), axis=1).max() * unit
-            if off <= settings.visits.moved_m:
+            if off <= MAX_SHIFT_M:
                 out[scene] = pose
     return out
 
@@ -174,7 +175,7 @@ def _made(
     for old in sets:
         if key is None or old.recipe != key.recipe or old.metres != unit:
             continue
-        still = _unmoved(old.poses, poses, scenes, unit, settings)
+        still = _unmoved(old.poses, poses, scenes, unit)
         for thing in old.objects:
             shown = {sighting.scene: sighting.thing for sighting in thing.sightings}
             for one in thing.sightings:
@@ -188,11 +189,11 @@ def _made(
     def could_see(capture: Capture, points: np.ndarray) -> bool:
         if key is None or scenes[capture.scene].thinning is not None:
             return False  # what is left of it does not show what it looked at
-        return in_view(store.scenes.cameras(capture.scene), points, settings.objects.look)
+        return in_view(store.scenes.cameras(capture.scene), points, settings.objects.max_views)
 
     def eyes(capture: Capture) -> Eyes:
         gaussians, cameras = store.scenes.gaussians(capture.scene), store.scenes.cameras(capture.scene)
-        return open_eyes(gaussians, cameras, settings.objects.look)
+        return open_eyes(gaussians, cameras, settings.objects.max_views, settings.objects.longest_side_px)
 
     moved, parted = _told(store, captures)
     objects = make_objects(
@@ -241,7 +242,7 @@ def _rooms(store: Store, settings: Settings, poses: Mapping[str, Sim3], up: np.n
         captures.append(transform_gaussians(Gaussians(**columns, sh=sh), S))
         if not cameras.synthesised:
             eyes.append(S.apply(cameras.centers))
-    return find_rooms(captures, np.concatenate(eyes), settings.objects.rooms)
+    return find_rooms(captures, np.concatenate(eyes), settings.objects.min_room_area_m2)
 
 
 def _digest(things: Things) -> str:

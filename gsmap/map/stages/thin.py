@@ -134,7 +134,7 @@ def _superseded(
         known: scenes with a date and a pose, oldest first.
         before: what was captured earlier is old.
     """
-    bar, params = settings.thin.min_seen_again, settings.thin.compare
+    bar = settings.thin.min_seen_again
     metres = metres_of_scenes(store, settings, graph)
     looks: dict[str, Looks] = {}
     stay: list[Scene] = []
@@ -152,8 +152,8 @@ def _superseded(
         ]
         for other in newer:
             if other.id not in looks:
-                looks[other.id] = look(placed(other), params)
-        return seen_again(placed(scene), [looks[other.id] for other in newer], params) if newer else 0.0
+                looks[other.id] = look(placed(other))
+        return seen_again(placed(scene), [looks[other.id] for other in newer]) if newer else 0.0
 
     for done, scene in enumerate(reversed(known)):
         progress("thin", 0.5 * done / len(known), f"looking at {scene.name}")

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmap import compare
 from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.voxels import merge_groups, voxel_labels
@@ -115,7 +114,6 @@ class Params:
         rates: the optimiser's steps.
         stopping: when to stop, where the number of steps is not given.
         references: which views are reproduced.
-        compare: what counts as disagreeing, unless both are shown.
         exposure: how exposures are compared, where they are balanced.
     """
 
@@ -139,7 +137,6 @@ class Params:
     rates: Rates = field(default_factory=Rates)
     stopping: Stopping = field(default_factory=Stopping)
     references: references.Params = field(default_factory=references.Params)
-    compare: compare.Params = field(default_factory=compare.Params)
     exposure: exposure.Params = field(default_factory=exposure.Params)
 
     def __post_init__(self) -> None:
@@ -193,7 +190,7 @@ def merge(
     """Drop what is gone, balance exposures, render references, choose what to keep, and fit it to the references."""
     deadline = None if budget_s is None else time.monotonic() + budget_s
     notes: list[str] = []
-    settled = settle(scenes, params.prefer, params.compare, one_exposure=bounds is None)
+    settled = settle(scenes, params.prefer, one_exposure=bounds is None)
     scenes = settled.scenes
     notes += settled.notes()
     if params.balance_exposure:
@@ -208,7 +205,6 @@ def merge(
         settled,
         lambda fraction, text: progress(0.2 * fraction, text),
         params.references,
-        params.compare,
     )
     # One capture alone shows nothing twice and is what its pictures show: thinned or fitted to them it could but lose.
     alone = sum(bool(inside(scene.gaussians.means, bounds, params.halo_m).any()) for scene in scenes) < 2
