@@ -1,6 +1,6 @@
 """The fit of merged tiles: how many passes over the views, and how long its steps are; CPU seconds beside PSNR.
 
-    python tools/bench_fit.py [--seed 72] [--vary-exposure] [--set passes=4 rates.sh_base=0.02] [--set ...]
+    python tools/bench_fit.py [--seed 72] [--vary-exposure] [--set max_passes=4 momentum=0.9] [--set ...]
 
 A made place of four captures is merged in tiles once for each width of halo, up to the fit, and fitted by each of the
 settings of `gsmap.merge.mergers.tto` that are given: first those that are shipped, then each ``--set`` (several
@@ -78,11 +78,7 @@ def main() -> None:
 def changed(params: tto.Params, words: list[str]) -> tto.Params:
     for word in words:
         name, _, value = word.partition("=")
-        where, _, leaf = name.rpartition(".")
-        if where:
-            params = replace(params, **{where: replace(getattr(params, where), **{leaf: float(value)})})
-        else:
-            params = replace(params, **{leaf: float(value)})
+        params = replace(params, **{name: float(value)})
     return params
 
 

@@ -54,7 +54,7 @@ def main() -> None:
         for method in arguments.methods:
             add(rows, merge_row(captures, S_map_scene, images, method, default_params(method), f"{method} ({kind})"))
         for keep in arguments.curve:
-            params = replace(default_params("tto"), keep=keep)
+            params = replace(default_params("tto"), kept_fraction=keep)
             add(rows, merge_row(captures, S_map_scene, images, "tto", params, f"tto keep={keep:g} ({kind})"))
         if arguments.tiles:
             add(rows, tiled_row(captures, S_map_scene, images, arguments.tiles, f"tto, tiles ({kind})"))

@@ -120,10 +120,7 @@ def measure(
         for number, scene in enumerate(scenes)
     ]
     for share in shares:
-        params = default_params("tto")
-        params = replace(
-            params, references=replace(params.references, photos=replace(params.references.photos, share=share))
-        )
+        params = replace(default_params("tto"), photo_weight=share)
         began = time.process_time()
         merged = merge(given, "tto", params)
         seconds = time.process_time() - began

@@ -4,8 +4,9 @@
     tools/make_change.py SEEN --set seen
     tools/fit_drops.py DEV/* SEEN/2* --set things._MAX_COLOUR_DISTANCE=.04,.05 --set things._ADJACENT_M=.2,.5
 
-For each value of each constant (of the module that uses it), the others as they are: the share of the Gaussians of removed and of painted
-things that is dropped, and of those of others, at worst and in the mean over the places (see tools/change_scores.py).
+For each value of each constant (of the module that uses it), the others as they are: the share of the Gaussians of
+removed and of painted things that is dropped, and of those of others, at worst and in the mean over the places (see
+tools/change_scores.py).
 The last column counts of others only those that both captures' photographs show in one colour: what a wall painted next
 to it lights otherwise has changed, too. Under true poses.
 """

@@ -26,6 +26,8 @@ VERSION = 4
 """Raised whenever levels of the same tiles and cameras come out otherwise: they are then made again."""
 
 _SCREEN_PX = 16.0  # viewers of 3D Tiles refine what is off by more pixels than this, if not told otherwise
+_DEVIATION_PX = 3.0  # size of a level's Gaussians (largest deviation, median) in the views that it is fitted to
+_MIN_PSNR_DB = 30.0  # of a level that is similar enough to be shown
 _TRIED = 240  # cameras near a level of which the ones that see it best are taken
 _SAMPLE = 1000  # Gaussians that tell how well a camera sees a level
 _SEEN = 0.15  # share of them that makes a view of it
@@ -35,28 +37,21 @@ _LAST = 0.1  # of the first step, reached exponentially; the steps of merging, w
 
 @dataclass(frozen=True)
 class Params:
-    """How levels are refined and measured.
+    """Settings of levels of detail.
 
     Args:
-        views: cameras of the captures that a level is seen from; every fourth is kept to measure it. 0: levels are
-            merged only, and their errors are distances.
-        steps: of fitting one level.
-        deviation_px: size of a level's Gaussians (largest deviation, median) in the pictures that it is fitted to.
-        least_db: PSNR from which a level is like enough to be shown.
+        views: Largest number of the scenes' cameras, at least 0, that a level is fitted to and measured by; larger is
+            slower and more reliable, and with 0 levels are merged only and their errors are distances.
+        steps: Number of optimization steps of one level, at least 0; larger improves levels and takes more time.
     """
 
     views: int = 48
     steps: int = 200
-    deviation_px: float = 3.0
-    least_db: float = 30.0
 
     def __post_init__(self) -> None:
         for name in ("views", "steps"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("deviation_px", "least_db"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +70,19 @@ class Level:
     psnr_db: tuple[float, float] | None = None
 
 
-def make_level(finer: Gaussians, max_count: int, cameras: Cameras | None, params: Params = Params()) -> Level:
+def make_level(
+    finer: Gaussians,
+    max_count: int,
+    cameras: Cameras | None,
+    params: Params = Params(),
+    *,
+    deviation_px: float = _DEVIATION_PX,
+) -> Level:
     """At most so many Gaussians in place of finer ones.
 
     Args:
         cameras: of the captures, in the frame of the Gaussians; None where there are none.
+        deviation_px: size of its Gaussians (largest deviation, median) in the views that it is fitted to.
     """
     start, apart = tiles3d.coarser(finer, max_count)
     views = None if cameras is None or not params.views else _views(finer, cameras, params.views)
@@ -87,7 +90,7 @@ def make_level(finer: Gaussians, max_count: int, cameras: Cameras | None, params
         return Level(start, apart)
     kept = np.arange(len(views)) % 4 == 3
     depths = _depths(start, views)  # it has the depths of what it stands for, at a fraction of the cost
-    footprint = float(np.exp(np.median(start.log_scales.max(1)))) / params.deviation_px
+    footprint = float(np.exp(np.median(start.log_scales.max(1)))) / deviation_px
     fitted = with_enough_memory(
         lambda backend: _fitted(start, finer, views[~kept], depths[~kept], footprint, params, backend)
     )
@@ -97,7 +100,7 @@ def make_level(finer: Gaussians, max_count: int, cameras: Cameras | None, params
         return [_View(camera, _picture(finer, camera)) for camera in _seen_at(views[kept], depths[kept], footprint)]
 
     level = max(fitted, start, key=lambda one: np.median(_decibels(one, judges(footprint))))
-    shown, decibels = _measured(level, judges, footprint, params.least_db)
+    shown, decibels = _measured(level, judges, footprint)
     return Level(level, _SCREEN_PX * shown, (float(decibels.min()), float(np.median(decibels))))
 
 
@@ -181,15 +184,13 @@ def _fitted(
     return fitter.gaussians()
 
 
-def _measured(
-    level: Gaussians, judges: Callable[[float], list[_View]], footprint: float, least_db: float
-) -> tuple[float, np.ndarray]:
+def _measured(level: Gaussians, judges: Callable[[float], list[_View]], footprint: float) -> tuple[float, np.ndarray]:
     """The smallest footprint of a pixel at which every second view is like enough, and PSNR (V,) there.
 
     Looked for from half the given one to four times; where none is, the last.
     """
     for size in (footprint * 2.0 ** np.arange(-1, 3)).tolist():
         decibels = _decibels(level, judges(size))
-        if np.median(decibels) >= least_db:
+        if np.median(decibels) >= _MIN_PSNR_DB:
             break
     return size, decibels

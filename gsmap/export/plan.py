@@ -19,23 +19,26 @@ _MAX_ROUNDED_M = 1e-3
 
 @dataclass(frozen=True)
 class Params:
-    """How a map is cut into tiles and kept up to date.
+    """Settings of tiles and their levels of detail.
 
     Args:
-        moved_m: a tile is made again when a scene moved farther than this within it.
-        max_tiles: an export of more tiles than this is refused; tiles that no scene reaches into do not count.
-        shared_bytes: what renders of the captures, which tiles share while they are made, may take in the folder.
-        levels: how the coarser levels of 3D Tiles are made.
+        max_shift_m: Largest distance in metres, at least 0, that a scene may have moved within a tile before the tile
+            is made again; larger reuses more tiles.
+        max_tiles: Largest number of tiles of an export, counting those that a scene reaches into; larger permits larger
+            exports.
+        max_shared_bytes: Largest size in bytes, at least 0, of the renders that tiles share in the folder while they
+            are made; larger needs more disk and renders less often.
+        levels: Settings of the coarser levels of 3D Tiles and streamed SOG.
     """
 
-    moved_m: float = 0.005
+    max_shift_m: float = 0.005
     max_tiles: int = 1_000_000
-    shared_bytes: int = 4 << 30
+    max_shared_bytes: int = 4 << 30
     levels: levels.Params = field(default_factory=levels.Params)
 
     def __post_init__(self) -> None:
-        if not self.moved_m >= 0:
-            raise ConfigError(f"moved_m must not be negative, got {self.moved_m}")
+        if not self.max_shift_m >= 0:
+            raise ConfigError(f"max_shift_m must not be negative, got {self.max_shift_m}")
 
 
 @dataclass(frozen=True, eq=False)

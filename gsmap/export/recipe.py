@@ -103,7 +103,9 @@ class TileRecipe:
         return self.merge.of(*inputs).digest
 
 
-def dirty_reason(planned: PlannedTile, tile: Tile | None, recipe: TileRecipe, moved_m: float = Params.moved_m) -> str:
+def dirty_reason(
+    planned: PlannedTile, tile: Tile | None, recipe: TileRecipe, max_shift_m: float = Params.max_shift_m
+) -> str:
     """Why a tile made earlier must be made again, in words; empty where it need not.
 
     Poses are compared with those the tile was made with, not with the last revision, so slow drift cannot creep.
@@ -119,7 +121,7 @@ def dirty_reason(planned: PlannedTile, tile: Tile | None, recipe: TileRecipe, mo
         # How far the scene's content at the tile's corners has moved.
         then = tile.poses[scene] @ pose.inverse()
         moved = np.linalg.norm(then.apply(corners) - corners, axis=1).max() * planned.metres_per_unit
-        if moved > moved_m:
+        if moved > max_shift_m:
             return f"scene {scene[:12]} moved by {moved:.3g} m"
     return ""
 

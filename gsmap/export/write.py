@@ -198,7 +198,7 @@ def export_tiles(
 def _must_make(
     planned: PlannedTile, tile: Tile | None, manifest: Manifest, out: Path, recipe: TileRecipe, params: Params
 ) -> bool:
-    if dirty_reason(planned, tile, recipe, params.moved_m):
+    if dirty_reason(planned, tile, recipe, params.max_shift_m):
         return True
     return tile is None or not manifest.has_file(out, tile)
 

@@ -209,7 +209,7 @@ class _Export:
         tiles = [tile for tile in self._tiles.get(scene, []) if tile.path]
         if not tiles:
             return None
-        # Tiles of one export may differ in the pose by what `export.moved_m` lets pass: the fullest one decides.
+        # Tiles of one export may differ in the pose by what `export.max_shift_m` lets pass: the fullest one decides.
         fullest = max(tiles, key=lambda tile: tile.num_gaussians)
         return Gaussians.concatenate([self._read(tile.path) for tile in tiles]), fullest.poses[scene]
 

@@ -61,9 +61,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "merge.mergers.tto.owner_cells": False,
         "merge.mergers.tto.ssim_weight": 0.0,
         "merge.mergers.tto.huber_delta": 0.0,
-        "merge.mergers.tto.rates.momentum": 0.9,
+        "merge.mergers.tto.momentum": 0.9,
         "merge.mergers.tto.min_weight": 0.0,
-        "merge.mergers.tto.keep": 1.0,
+        "merge.mergers.tto.kept_fraction": 1.0,
         "merge.mergers.tto.prefer": "both",
     },
 }

@@ -234,8 +234,8 @@ def _packed(
     else:
         count = max(int(len(shown) * (free / taken) ** (1 / (1 - _SPARSER))), 1)
         views = params.refine_views if count < params.refine_below * len(shown) else 0
-        told = LevelParams(views=views, steps=params.refine_steps, deviation_px=_DEVIATION_PX)
-        shown = make_level(shown, count, whole.cameras, told).gaussians
+        told = LevelParams(views=views, steps=params.refine_steps)
+        shown = make_level(shown, count, whole.cameras, told, deviation_px=_DEVIATION_PX).gaussians
         packed = packed_gaussians.pack(shown, coarse)
     content = _npz(arrays | packed)
     about = localizer.scenes[whole.scene]

@@ -45,11 +45,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Params:
-    """How captures are merged.
+    """Settings of merging.
 
     Args:
-        method: the merger: ``tto``, ``voxel``, ``union``, ``distance``, or one that another package adds.
-        mergers: the settings of each merger.
+        method: Merger in use: ``tto``, ``voxel``, ``union``, ``distance``, or one that another package adds.
+        mergers: Settings of each merger, by its name.
     """
 
     method: str = "tto"

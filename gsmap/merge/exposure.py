@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,44 +14,23 @@ from gsmap.merge.placed import overlapping, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, KeptPhoto, PlacedScene
 
-
-@dataclass(frozen=True)
-class Params:
-    """How the exposures of two captures are compared.
-
-    Args:
-        views_per_pair: views of one capture, those that see most of the other, that are compared.
-        longest_side_px: size of these views.
-        min_pixels: with fewer that show one surface in both, nothing is known of the pair.
-        same_surface: depths that differ by at most this share are one surface.
-        min_opacity: alpha from which on a pixel shows a surface.
-        darkest, brightest: colours outside this range (of [0, 1]) are black or blown out and say nothing.
-        negligible_log_gain: where no gain's logarithm is larger, the captures are left as they are.
-        largest_gain: no capture is made brighter or darker than by this factor.
-    """
-
-    views_per_pair: int = 6
-    longest_side_px: int = 160
-    min_pixels: int = 500
-    same_surface: float = 0.05
-    min_opacity: float = 0.95
-    darkest: float = 0.05
-    brightest: float = 0.95
-    negligible_log_gain: float = 0.01
-    largest_gain: float = 4.0
+_MAX_VIEWS, _LONGEST_SIDE_PX = 6, 160  # of a pair: views of one scene that see most of the other, and their size
+_MIN_PIXELS = 500  # that show one surface in both scenes, for a gain to be estimated
+_MAX_DEPTH_RATIO = 0.05  # relative difference in depth of one surface
+_MIN_ALPHA = 0.95  # of a pixel that shows a surface
+_MIN_COLOUR, _MAX_COLOUR = 0.05, 0.95  # colours outside are black or saturated
+_NEGLIGIBLE_LOG_GAIN = 0.01
+_MAX_GAIN = 4.0
 
 
-def balance_exposure(
-    scenes: Sequence[PlacedScene], params: Params | None = None
-) -> tuple[list[PlacedScene], np.ndarray]:
+def balance_exposure(scenes: Sequence[PlacedScene]) -> tuple[list[PlacedScene], np.ndarray]:
     """The scenes with one gain per scene and colour channel removed, and the log-gains (S, 3) that were added.
 
     Gains are the least-squares answer to the median log-ratios of colour wherever two captures show the same surface;
     their mean over scenes that are tied together is zero, so the brightness of the whole stays.
     """
-    params = params or Params()
-    log_gains = _solve(len(scenes), _ratios(scenes, params), np.log(params.largest_gain))
-    if np.abs(log_gains).max(initial=0) < params.negligible_log_gain:
+    log_gains = _solve(len(scenes), _ratios(scenes), np.log(_MAX_GAIN))
+    if np.abs(log_gains).max(initial=0) < _NEGLIGIBLE_LOG_GAIN:
         return list(scenes), np.zeros_like(log_gains)
     balanced = [
         replace(
@@ -90,35 +69,35 @@ def apply_balance(gaussians: Gaussians, balance: Balance) -> Gaussians:
     return replace(gaussians, sh=sh)
 
 
-def _ratios(scenes: Sequence[PlacedScene], params: Params) -> list[tuple[int, int, np.ndarray, float]]:
+def _ratios(scenes: Sequence[PlacedScene]) -> list[tuple[int, int, np.ndarray, float]]:
     """(i, j, median log(colour_i / colour_j) (3,), pixels) of every pair of scenes that show a surface in common."""
     found = []
     for i, scene in enumerate(scenes):
         for j, other in enumerate(scenes):
             if i == j or scene.cameras is None or not overlapping(scene, other):
                 continue
-            cameras = _looking_at(scene.cameras, other.gaussians, params)
-            samples = [_same_surface(scene, other, cameras[c], params) for c in range(len(cameras))]
+            cameras = _looking_at(scene.cameras, other.gaussians)
+            samples = [_same_surface(scene, other, cameras[c]) for c in range(len(cameras))]
             ratios = np.concatenate(samples) if samples else np.zeros((0, 3))
-            if len(ratios) >= params.min_pixels:
+            if len(ratios) >= _MIN_PIXELS:
                 found.append((i, j, np.median(ratios, axis=0), float(len(ratios))))
     return found
 
 
-def _looking_at(cameras: Cameras, gaussians: Gaussians, params: Params) -> Cameras:
+def _looking_at(cameras: Cameras, gaussians: Gaussians) -> Cameras:
     """The few cameras that have most of the Gaussians' means in view."""
     share = share_in_view(cameras, gaussians.means)
-    best = np.argsort(-share, kind="stable")[: params.views_per_pair]
-    return cameras[best[share[best] > 0]].resized(params.longest_side_px)
+    best = np.argsort(-share, kind="stable")[:_MAX_VIEWS]
+    return cameras[best[share[best] > 0]].resized(_LONGEST_SIDE_PX)
 
 
-def _same_surface(scene: PlacedScene, other: PlacedScene, camera: Cameras, params: Params) -> np.ndarray:
+def _same_surface(scene: PlacedScene, other: PlacedScene, camera: Cameras) -> np.ndarray:
     """(K, 3) log-ratios of colour at pixels where both scenes show one surface, neither black nor blown out."""
     a, b = render(scene.gaussians, camera), render(other.gaussians, camera)
-    same = np.abs(a.depth[0] - b.depth[0]) < params.same_surface * np.minimum(a.depth[0], b.depth[0])
-    same &= (a.alpha[0] > params.min_opacity) & (b.alpha[0] > params.min_opacity)
+    same = np.abs(a.depth[0] - b.depth[0]) < _MAX_DEPTH_RATIO * np.minimum(a.depth[0], b.depth[0])
+    same &= (a.alpha[0] > _MIN_ALPHA) & (b.alpha[0] > _MIN_ALPHA)
     colours = np.stack([a.colour[0][same], b.colour[0][same]])
-    usable = ((colours > params.darkest) & (colours < params.brightest)).all((0, 2))
+    usable = ((colours > _MIN_COLOUR) & (colours < _MAX_COLOUR)).all((0, 2))
     ratios: np.ndarray = np.log(colours[0][usable] / colours[1][usable])
     return ratios
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.projection import in_image, project
 from gsmap.merge import photos
@@ -21,29 +20,11 @@ from gsmap.types.progress import Progress
 WEIGHT_UNIT = 0.1  # of `References.visible_pixels`, for what dominates no pixel: always less than one pixel
 
 
-@dataclass(frozen=True)
-class Params:
-    """Which views of the captures are reproduced, and how often.
-
-    Args:
-        min_share: a view counts when at least this share of its picture shows the tile.
-        enough_share: a view of which at least this share shows the tile is used once in every pass; one that shows
-            less, now and then.
-        margin_px: pictures are cropped to what counts and this much around it, for the windows of SSIM.
-        max_views: of more views than that, those are reproduced that together see the tile best, newer ones first; so
-            that neither memory (3 MB a view of 960 pixels) nor time grows with the captures of a place.
-        photos: which photographs are reproduced as well.
-    """
-
-    min_share: float = 0.02
-    enough_share: float = 0.25
-    margin_px: int = 6
-    max_views: int = 360
-    photos: photos.Params = field(default_factory=photos.Params)
-
-    def __post_init__(self) -> None:
-        if self.max_views < 1:
-            raise ConfigError(f"max_views must be positive, got {self.max_views}")
+MAX_VIEWS, PHOTO_WEIGHT = 360, 4.0  # defaults of `render_references`
+_MIN_TILE_FRACTION = 0.02  # of a view that must show the tile
+_FULL_TILE_FRACTION = 0.25  # from which on a view is used once in every pass; with less, in proportion
+_MARGIN_PX = 6  # around what counts of a view, for the windows of SSIM
+_MAX_PHOTOS = 120  # of a tile; those in which most of it lies
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +62,9 @@ def render_references(
     longest_side_px: int,
     settled: Settled | None,
     progress: Progress,
-    params: Params | None = None,
+    *,
+    max_views: int = MAX_VIEWS,
+    photo_weight: float = PHOTO_WEIGHT,
 ) -> References:
     """Render each scene from its own cameras; keep the views that show enough of the tile.
 
@@ -92,7 +75,6 @@ def render_references(
     where the pictures of a scene are overruled. Photographs count where they show what their scene shows
     (`gsmap.merge.photos`).
     """
-    params = params or Params()
     near = [inside(scene.gaussians.means, bounds, halo_m) for scene in scenes]
     pieces = [scene.gaussians if n.all() else scene.gaussians[n] for scene, n in zip(scenes, near, strict=True)]
     todo = [
@@ -101,7 +83,7 @@ def render_references(
         if scene.cameras is not None
         for c in np.flatnonzero(share_in_view(scene.cameras, piece.means) > 0)
     ]
-    todo = _best_views(todo, scenes, pieces, params.max_views)
+    todo = _best_views(todo, scenes, pieces, max_views)
     cameras, images, weights, kept, shares = [], [], [], [], []
     pixels, sure = ([np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes] for _ in range(2))
     largest = [np.zeros(len(scene.gaussians), dtype=np.float32) for scene in scenes]
@@ -129,9 +111,9 @@ def render_references(
         counts = inside_pixels(camera, depth, bounds, halo_m / 2)
         if disputed is not None:
             counts &= ~disputed
-        if counts.mean() < params.min_share:  # a weight is at most 1
+        if counts.mean() < _MIN_TILE_FRACTION:  # a weight is at most 1
             continue
-        window = _window(counts, params.margin_px)
+        window = _window(counts, _MARGIN_PX)
         if shared is None and pieces[i] is scenes[i].gaussians:
             colour, alpha = seen.colour[0][window], seen.alpha[0][window]
         else:
@@ -139,7 +121,7 @@ def render_references(
             colour, alpha = local.colour[0], local.alpha[0]
         weight = alpha * counts[window]
         share = float(weight.sum() / counts.size)
-        if share < params.min_share:
+        if share < _MIN_TILE_FRACTION:
             continue
         cameras.append(_cropped(camera, window))
         images.append(np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8))
@@ -147,21 +129,21 @@ def render_references(
         kept.append(i)
         shares.append(share)
     num_rendered = len(kept)
-    for i, one in _photos(scenes, pieces, longest_side_px, params.photos):
+    for i, one in _photos(scenes, pieces, longest_side_px) if photo_weight else ():
         counts = one.counts & inside_pixels(one.camera, one.depth, bounds, halo_m / 2)
         if settled is not None and settled.is_disputed(i):
             counts &= ~settled.overruled_pixels(i, one.camera)
         share = float(counts.mean())
-        if share < params.min_share:
+        if share < _MIN_TILE_FRACTION:
             continue
-        window = _window(counts, params.margin_px)
+        window = _window(counts, _MARGIN_PX)
         cameras.append(_cropped(one.camera, window))
         images.append(np.ascontiguousarray(one.image[window]))
         weights.append(np.where(counts[window], 255, 0).astype(np.uint8))
         kept.append(i)
         shares.append(share)
-    often = np.minimum(1.0, np.array(shares) / params.enough_share)
-    often[num_rendered:] *= params.photos.share
+    often = np.minimum(1.0, np.array(shares) / _FULL_TILE_FRACTION)
+    often[num_rendered:] *= photo_weight
     return References(
         _joined(cameras),
         images,
@@ -180,22 +162,19 @@ def _photos(
     scenes: Sequence[PlacedScene],
     pieces: Sequence[Gaussians],
     longest_side_px: int,
-    params: photos.Params,
 ) -> Iterator[tuple[int, photos.Shown]]:
     """Photographs that may show the tile and are to be believed, with the scene of each."""
-    if not params.share:
-        return
     asked = [
         (i, photo, share)
         for i, (scene, piece) in enumerate(zip(scenes, pieces, strict=True))
         for photo in scene.photos
         if (share := float(share_in_view(photo.camera, piece.means)[0])) > 0
     ]
-    if len(asked) > params.max_photos:
-        most = np.argsort([-share for _, _, share in asked], kind="stable")[: params.max_photos]
+    if len(asked) > _MAX_PHOTOS:
+        most = np.argsort([-share for _, _, share in asked], kind="stable")[:_MAX_PHOTOS]
         asked = [asked[row] for row in sorted(most)]
     for i, photo, _ in asked:
-        one = photos.shown(photo, scenes[i], longest_side_px, params)
+        one = photos.shown(photo, scenes[i], longest_side_px)
         if one is not None:
             yield i, one
 

@@ -110,7 +110,7 @@ def test_another_version_of_the_merger_makes_all_of_its_tiles_again(row, monkeyp
 
 def test_a_setting_of_the_merger_counts_and_one_of_another_does_not(row):
     first = row.export()
-    other = changed(Params("voxel"), {"mergers.tto.keep": 0.5, "mergers.tto.rates.means": 0.01})
+    other = changed(Params("voxel"), {"mergers.tto.kept_fraction": 0.5, "mergers.tto.momentum": 0.01})
     assert row.export(other).recomputed == 0
     mine = changed(other, {"mergers.voxel.voxel_m": 0.02})
     assert row.export(mine).recomputed == len(first.tiles)
@@ -255,7 +255,7 @@ def test_a_merger_of_another_package_merges_exports_and_has_settings(added, row)
 
 
 def test_steps_are_the_setting_that_the_contract_names():
-    assert with_steps("tto", tto.Params(keep=0.5), 7) == tto.Params(keep=0.5, steps=7)
+    assert with_steps("tto", tto.Params(kept_fraction=0.5), 7) == tto.Params(kept_fraction=0.5, steps=7)
     with pytest.raises(ConfigError, match="takes no steps"):
         with_steps("voxel", None, 7)
     with pytest.raises(ConfigError, match="negative"):

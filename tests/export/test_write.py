@@ -216,8 +216,8 @@ def test_folders_of_others_are_left_alone(street):
 def test_bad_options_are_refused_before_anything_is_written(street):
     with pytest.raises(ConfigError, match="choose one of"):
         street.export(format="obj")
-    with pytest.raises(ConfigError, match="moved_m"):
-        street.export(params=Params(moved_m=-1))
+    with pytest.raises(ConfigError, match="max_shift_m"):
+        street.export(params=Params(max_shift_m=-1))
     assert not street.out.exists()
     (street.out.parent / "file").write_text("mine")
     with pytest.raises(StoreError, match="cannot write the export"):

@@ -138,7 +138,7 @@ VERBS = {
         Verb("edge", "placed", "edge MAP a:b --pose IN/pose2.txt --sigma 1,0.1"),
         Verb("prior", "placed", "prior MAP a --anchor"),
         Verb("edit", "placed", "edit MAP a --captured-at 2024-05-31 --note wet --tag hall"),
-        Verb("settings", "placed", "settings MAP --set export.moved_m=0.01"),
+        Verb("settings", "placed", "settings MAP --set export.max_shift_m=0.01"),
         Verb("backup", "placed", "backup MAP HERE/kept", then=RESTORED),
         Verb("backup-again", "grown", "backup MAP HERE/kept", then=RESTORED),
         Verb("backup-keep", "grown", "backup MAP HERE/kept --keep 1", then=RESTORED),

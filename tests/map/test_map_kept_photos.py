@@ -141,7 +141,7 @@ def test_only_tiles_near_it_and_mergers_that_use_it_know_of_it(site: Map, tmp_pa
     tiles = export(site, tmp_path / "tiles", tile_size_m=1.0)
     assert tiles.recomputed == len(tiles.tiles)
     assert reproduced(tiles) >= 1
-    site.with_settings({"merge.mergers.tto.references.photos.share": 0.0})
+    site.with_settings({"merge.mergers.tto.photo_weight": 0.0})
     without = export(site, tmp_path / "without")
     assert reproduced(without) == 0
 

@@ -23,8 +23,14 @@ def test_the_preset_is_what_was_published():
     assert register.refiners["icp"].means
     # Voxels of 1 cm of the union, nothing pruned, no capture before another, and L1 alone.
     tto = merge.mergers["tto"]
-    assert (merge.method, tto.voxel_m, tto.ssim_weight, tto.keep, tto.min_weight) == ("tto", 0.01, 0.0, 1.0, 0.0)
-    assert (tto.huber_delta, tto.rates.momentum) == (0.0, 0.9)
+    assert (merge.method, tto.voxel_m, tto.ssim_weight, tto.kept_fraction, tto.min_weight) == (
+        "tto",
+        0.01,
+        0.0,
+        1.0,
+        0.0,
+    )
+    assert (tto.huber_delta, tto.momentum) == (0.0, 0.9)
     assert (tto.owner_cells, tto.prefer, tto.balance_exposure) == (False, "both", False)
 
 

@@ -138,7 +138,7 @@ def test_what_lies_behind_the_newest_beside_a_change_wins_no_cell():
     wanted = render_references(settled.scenes, None, 1.0, 120, settled, quiet)
     for behind, share in ((False, (0.3, 0.7)), (True, (0.0, 0.05))):
         told = replace(settled, behind=[np.full(len(g), behind and i == 0) for i, g in enumerate(settled.changed)])
-        origin = tto._start(settled.scenes, wanted, told, Params(keep=1.0), None)[1]
+        origin = tto._start(settled.scenes, wanted, told, Params(kept_fraction=1.0), None)[1]
         assert share[0] <= (origin == 0).mean() <= share[1]
 
 

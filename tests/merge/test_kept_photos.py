@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from synthetic_walls import cameras_facing, texture, two_scenes, wall
 
-from gsmap.errors import ConfigError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.merge import PlacedScene, default_params, merge, photos_m, references
+from gsmap.merge import PlacedScene, default_params, merge, photos, photos_m, references
 from gsmap.merge.exposure import apply_gain, balance_exposure
-from gsmap.merge.photos import Params, shown
+from gsmap.merge.photos import shown
 from gsmap.merge.references import render_references
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.render import render
@@ -36,8 +35,8 @@ def photo_at(x, **options):
     return KeptPhoto(cameras_facing([x]), lambda: picture_at(x, **options), 0.001, 0.003)
 
 
-def ask(photo, scene=None, params=None):
-    return shown(photo, scene or two_scenes(grain=0.0)[0], WIDTH, params or Params())
+def ask(photo, scene=None):
+    return shown(photo, scene or two_scenes(grain=0.0)[0], WIDTH)
 
 
 def error(gaussians: Gaussians, xs) -> float:
@@ -62,12 +61,13 @@ def test_what_stands_before_the_place_does_not_count():
     assert found.counts[4:-4, 4:20].mean() > 0.9
 
 
-def test_a_picture_of_something_else_or_from_who_knows_where_is_left_out():
+def test_a_picture_of_something_else_or_from_who_knows_where_is_left_out(monkeypatch):
     other = KeptPhoto(cameras_facing([-0.5]), lambda: picture_at(1.1)[:, ::-1].copy())
     assert ask(other) is None
     assert ask(replace(photo_at(-0.5), sigma_m=0.1)) is None  # 480 / 64 * 60 px * .1 / 1.2
     assert ask(replace(photo_at(-0.5), sigma_rad=0.02)) is None
-    assert ask(replace(photo_at(-0.5), sigma_m=0.1), params=Params(max_sigma_px=100.0)) is not None
+    monkeypatch.setattr(photos, "_MAX_SIGMA_PX", 100.0)
+    assert ask(replace(photo_at(-0.5), sigma_m=0.1)) is not None
 
 
 def test_before_a_plain_wall_a_picture_of_another_place_is_told_by_following_nothing():
@@ -78,16 +78,11 @@ def test_before_a_plain_wall_a_picture_of_another_place_is_told_by_following_not
     assert ask(KeptPhoto(cameras_facing([-0.5]), lambda: shows[..., ::-1].copy()), scene) is None
 
 
-def test_settings_that_cannot_be_are_refused():
-    with pytest.raises(ConfigError, match="share must not be negative, got -1"):
-        Params(share=-1.0)
-
-
 def test_a_larger_picture_is_reduced_and_a_smaller_one_taken_as_it_is():
     large = replace(photo_at(-0.5), camera=cameras_facing([-0.5]).resized(256))
     found = ask(replace(large, read=lambda: np.repeat(np.repeat(picture_at(-0.5), 4, 0), 4, 1)))
     assert found.image.shape == (48, 64, 3)
-    small = shown(photo_at(-0.5), two_scenes(grain=0.0)[0], 960, Params())
+    small = shown(photo_at(-0.5), two_scenes(grain=0.0)[0], 960)
     assert small.image.shape == (48, 64, 3)
 
 
@@ -117,9 +112,9 @@ def test_the_merged_map_is_nearer_to_what_no_capture_showed_so_sharply():
     assert fitted.notes == ("4 photographs were reproduced as well",)
     between = (-0.55, 0.0, 0.55)  # where no photo was taken
     assert error(fitted.gaussians, between) < 0.6 * error(plain.gaussians, between)
-    without = replace(params, references=replace(params.references, photos=Params(share=0.0)))
+    without = replace(params, photo_weight=0.0)
     assert np.array_equal(merge(with_photos, "tto", without).gaussians.means, plain.gaussians.means)
-    assert photos_m("tto", params) == params.reach_m + 0.5
+    assert photos_m("tto", params) == 10.5
     assert photos_m("tto", without) is None
     assert photos_m("union") is None
 
@@ -138,7 +133,7 @@ def test_photographs_of_balanced_captures_are_brought_to_the_balanced_colours():
     brighter = apply_gain(b.gaussians, np.array([1.25, 1.1, 0.9]))
     photo = replace(photo_at(0.5), around=lambda: brighter)
     scenes, log_gains = balance_exposure([a, PlacedScene(brighter, b.cameras, "b", photos=(photo,))])
-    found = shown(scenes[1].photos[0], scenes[1], WIDTH, Params())
+    found = shown(scenes[1].photos[0], scenes[1], WIDTH)
     colours = found.image[found.counts].mean(0) / 255
     balanced = render(scenes[1].gaussians, cameras_facing([0.5])).colour[0][found.counts].mean(0)
     assert log_gains.any()
@@ -188,11 +183,11 @@ def test_how_well_a_photograph_is_known_in_the_unit_of_its_scene():
         assert ("1 photograph was reproduced as well" in notes) == taken
 
 
-def test_of_too_many_photographs_those_that_show_most_are_reproduced():
+def test_of_too_many_photographs_those_that_show_most_are_reproduced(monkeypatch):
     a, b = two_scenes(grain=GRAIN)
     scenes = [replace(a, photos=(photo_at(-1.4), photo_at(-0.9))), replace(b, photos=(photo_at(0.6),))]
-    params = references.Params(photos=Params(max_photos=2))
-    found = render_references(scenes, None, 0.0, 64, None, quiet, params)
+    monkeypatch.setattr(references, "_MAX_PHOTOS", 2)
+    found = render_references(scenes, None, 0.0, 64, None, quiet)
     assert found.num_photos == 2
     assert sorted(found.cameras.centers[-2:, 0].tolist()) == [-0.9, 0.6]
 
@@ -200,7 +195,7 @@ def test_of_too_many_photographs_those_that_show_most_are_reproduced():
 def test_what_is_around_photographs_that_stand_together_is_read_once():
     a, b = two_scenes(grain=GRAIN)
     with_photos, without, S = [], [], Sim3.identity()
-    photos = [moved(photo_at(x), S) for x in (-0.9, -0.8, -0.7)]
+    kept = [moved(photo_at(x), S) for x in (-0.9, -0.8, -0.7)]
     params = replace(default_params("tto"), steps=0)
     bounds = np.array([[-1.5, -2, -2], [0.5, 2, 2]])
     merge_tile([lazy(a, S, without), lazy(b, S, [])], "tto", params, bounds=bounds)

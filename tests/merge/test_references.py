@@ -3,7 +3,7 @@ from synthetic_walls import cameras_facing, two_scenes, wall
 
 from gsmap.merge import PlacedScene
 from gsmap.merge.exposure import apply_gain, balance_exposure
-from gsmap.merge.references import Params, render_references, view_schedule
+from gsmap.merge.references import render_references, view_schedule
 from gsmap.merge.sights import surface_axes
 from gsmap.render import render
 
@@ -72,7 +72,7 @@ def test_of_many_views_those_are_reproduced_that_add_most():
     scene = wall(0, -1.5, 1.5)
     crowd = PlacedScene(scene, cameras_facing(np.full(20, -0.9)), "a", "2020-01-01")
     newer = PlacedScene(scene, cameras_facing(np.linspace(-0.9, 0.9, 5)), "b", "2021-01-01")
-    views = render_references([crowd, newer], None, 0.0, 64, None, quiet, Params(max_views=6))
+    views = render_references([crowd, newer], None, 0.0, 64, None, quiet, max_views=6)
     assert len(views) == 6
     # One place that twenty cameras look at needs few of them; the others each see what no other does.
     assert (views.scene == 1).sum() >= 4

@@ -29,7 +29,7 @@ def likeness(merged, parts):
 def test_it_beats_the_closed_forms_with_fewer_gaussians():
     parts = two_scenes()
     others = [merge(parts, method) for method in ("union", "voxel", "distance")]
-    tto = merge(parts, "tto", Params(keep=0.7, steps=250))
+    tto = merge(parts, "tto", Params(kept_fraction=0.7, steps=250))
     assert likeness(tto.gaussians, parts) > max(likeness(r.gaussians, parts) for r in others) + 0.2
     assert len(tto.gaussians) <= 0.7 * len(others[0].gaussians)
     assert tto.steps == 250
@@ -55,18 +55,18 @@ def halves():
 
 def test_one_capture_alone_is_neither_thinned_nor_fitted():
     one = PlacedScene(wall(0, -1, 1), cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")
-    result = merge([one], "tto", Params(keep=0.3, voxel_m=1e-3))
+    result = merge([one], "tto", Params(kept_fraction=0.3, voxel_m=1e-3))
     assert result.steps == 0
     assert likeness(result.gaussians, [one]) > 40
     far = PlacedScene(wall(0, 50, 52), cameras_facing(np.linspace(50.4, 51.6, 5)), "b")
     here = np.array([[-2.0, -2, -2], [2, 2, 2]])
-    tile = merge([one, far], "tto", Params(keep=0.3, voxel_m=1e-3), bounds=here)
+    tile = merge([one, far], "tto", Params(kept_fraction=0.3, voxel_m=1e-3), bounds=here)
     assert tile.steps == 0
     assert likeness(tile.gaussians, [one]) > 40
 
 
 def test_it_stops_when_it_no_longer_gains():
-    result = merge(halves(), "tto", Params(keep=1.0, passes=100))
+    result = merge(halves(), "tto", Params(kept_fraction=1.0, max_passes=100))
     assert 10 <= result.steps < 2000
     assert not result.truncated
 
@@ -88,13 +88,17 @@ def test_without_cameras_it_still_merges():
 
 def test_tiles_fit_together_in_any_order():
     parts = two_scenes()
-    params = Params(steps=80, keep=0.9)
+    params = Params(steps=80, kept_fraction=0.9)
     boxes = [np.array([[x, -2, -2], [x + 1.0, 2, 2]]) for x in (-2.0, -1, 0, 1)]
     tiles = [merge(parts, "tto", params, bounds=box) for box in boxes]
     for tile, box in zip(tiles, boxes, strict=True):
         assert ((tile.gaussians.means >= box[0]) & (tile.gaussians.means < box[1])).all()
     # Every Gaussian belongs to one tile, whichever way it was pushed at the border.
-    apart = [merge(parts, "tto", Params(steps=s, keep=1.0, min_weight=0.0), bounds=b) for b in boxes for s in (0, 40)]
+    apart = [
+        merge(parts, "tto", Params(steps=s, kept_fraction=1.0, min_weight=0.0), bounds=b)
+        for b in boxes
+        for s in (0, 40)
+    ]
     assert sum(len(t.gaussians) for t in apart[0::2]) == sum(len(t.gaussians) for t in apart[1::2])
     whole = merge(parts, "tto", params)
     together = Gaussians.concatenate([t.gaussians for t in tiles])
@@ -136,8 +140,8 @@ def test_of_too_many_the_most_alike_become_one(watched):
     """Three quarters of what there is look like all of it: pairs are merged and nothing is cut away."""
     both = halves()
     cameras, count = both[0].cameras, sum(len(one.gaussians) for one in both)
-    whole = merge(both, "tto", Params(steps=0, keep=1.0, voxel_m=1e-3)).gaussians
-    fewer = merge(both, "tto", Params(steps=0, keep=0.5, voxel_m=1e-3)).gaussians
+    whole = merge(both, "tto", Params(steps=0, kept_fraction=1.0, voxel_m=1e-3)).gaussians
+    fewer = merge(both, "tto", Params(steps=0, kept_fraction=0.5, voxel_m=1e-3)).gaussians
     assert 0.45 * count < len(fewer) <= 0.5 * count
     wanted, shown = (render(g, cameras).colour for g in (whole, fewer))
     alpha = render(fewer, cameras).alpha[:, 12:36, 16:48]
@@ -183,7 +187,7 @@ def test_the_halo_is_fitted_along_and_only_its_outer_half_is_frozen(watched):
 
 def test_a_cell_of_two_captures_holds_one_of_them():
     scenes, cell_m, cover_m = two_scenes(), 0.5, 0.1
-    params = Params(steps=0, keep=1.0, min_weight=0.0, cell_m=cell_m, cover_m=cover_m)
+    params = Params(steps=0, kept_fraction=1.0, min_weight=0.0)
 
     def nearest_of_the_other_m(result):
         """How near the two captures come to one another within a cell."""
@@ -219,7 +223,7 @@ def test_ssim_is_part_of_what_is_fitted():
     assert structure(with_ssim) > structure(without) + 1e-4
 
 
-def test_few_passes_come_nearer_by_huber_s_loss_and_less_momentum(watched):
+def test_few_passes_come_nearer_by_huber_s_loss_and_less_momentum(watched, monkeypatch):
     """The colours that a fit of few steps misses its references by; what a map loses is square errors."""
 
     def missed(params):
@@ -231,19 +235,20 @@ def test_few_passes_come_nearer_by_huber_s_loss_and_less_momentum(watched):
         ]
         return np.mean([error.mean() for error in errors])
 
-    params = Params(passes=3.0, stopping=tto.Stopping(sure_share=1.0))
-    as_in_training = replace(params.rates, momentum=0.9)
-    assert missed(params) < 0.97 * missed(replace(params, rates=as_in_training))
+    monkeypatch.setattr(tto, "_SURE_FRACTION", 1.0)
+    params = Params(max_passes=3.0)
+    as_in_training = replace(params, momentum=0.9)
+    assert missed(params) < 0.97 * missed(as_in_training)
     assert missed(params) < 0.97 * missed(replace(params, huber_delta=0.0))
 
 
 def test_a_momentum_that_never_forgets_is_refused():
     with pytest.raises(ConfigError, match="momentum"):
-        Params(rates=replace(Params().rates, momentum=1.0))
+        Params(momentum=1.0)
 
 
 PLAIN = Params(
-    owner_cells=False, ssim_weight=0.0, huber_delta=0.0, min_weight=0.0, keep=1.0, prefer="both", voxel_m=0.01
+    owner_cells=False, ssim_weight=0.0, huber_delta=0.0, min_weight=0.0, kept_fraction=1.0, prefer="both", voxel_m=0.01
 )
 
 
@@ -274,12 +279,14 @@ def test_where_both_are_preferred_dates_decide_nothing():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"keep": 1.2},
+        {"kept_fraction": 1.2},
         {"steps": -1},
         {"voxel_m": 0.0},
         {"halo_m": -1.0},
         {"ssim_weight": 2.0},
         {"huber_delta": -0.1},
+        {"photo_weight": -1.0},
+        {"max_views": 0},
     ],
 )
 def test_settings_that_make_no_sense_are_refused_by_name(wrong):

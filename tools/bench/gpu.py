@@ -362,7 +362,7 @@ def steps_per_second(capture: Capture, what: str, times: int, side: int | None, 
 
 def small_tto(options: argparse.Namespace):
     params = default_params("tto")
-    return replace(params, passes=0.2, longest_side_px=48) if options.dry_run else params
+    return replace(params, max_passes=0.2, longest_side_px=48) if options.dry_run else params
 
 
 def measure_tile(house: dict[str, Capture], options: argparse.Namespace) -> list[dict]:

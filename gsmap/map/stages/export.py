@@ -346,7 +346,7 @@ def _maker(
         is_cut=request.tile_size_m > 0 or request.bbox is not None,
         budget_s=request.budget_s,
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
-        store=SightStore(folder, settings.export.shared_bytes),
+        store=SightStore(folder, settings.export.max_shared_bytes),
         passing={scene: planned.passing[scene] for scene in tile.poses if scene in planned.passing},
         photos=_by_scene(planned.photos.get((tile.component, tile.name), ())),
     )
@@ -406,7 +406,7 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
             tile
             for tile in planned.tiles
             if (made := old.get((tile.component, tile.name))) is not None
-            and dirty_reason(tile, made, planned.recipe, settings.export.moved_m)
+            and dirty_reason(tile, made, planned.recipe, settings.export.max_shift_m)
         ]
         gone = set(old) - {(tile.component, tile.name) for tile in planned.tiles}
         if again or gone:

@@ -18,7 +18,7 @@ RENDERS = False
 
 @dataclass(frozen=True)
 class Params:
-    """Nothing to choose."""
+    """Settings of distance-based selection: none."""
 
 
 def reach_m(params: Params) -> float:

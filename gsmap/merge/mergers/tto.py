@@ -4,14 +4,14 @@ Graph-GSReg's merging (voxelise the union, then minimise the difference to rende
 needed) with what measurably helps: in every cell the capture that shows most of it is the one that starts there, what
 is nowhere seen goes, what is most alike becomes one where there is too much, the newest capture wins where the place
 changed, and exposures can be balanced. With `owner_cells` off, both preferred, an `ssim_weight`, `huber_delta` and
-`min_weight` of 0 and a `keep` of 1 it is the published method: an L1 fit of all voxels of the union.
+`min_weight` of 0 and a `kept_fraction` of 1 it is the published method: an L1 fit of all voxels of the union.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy as np
 from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.voxels import merge_groups, voxel_labels
-from gsmap.merge import exposure, references
+from gsmap.merge import references
 from gsmap.merge.changes import Prefer, Settled, settle
 from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.placed import pulled_inside, united
@@ -37,122 +37,84 @@ RENDERS = True
 _BESIDE_M = 0.025  # of what changed, within which no other capture's Gaussians are laid over it
 
 
-@dataclass(frozen=True)
-class Rates:
-    """Adam's first steps, for Gaussians that are nearly right: as long as pays in few passes (`tools/bench_fit.py`).
-
-    Args:
-        means: of positions, as a share of the Gaussians' median size.
-        quats: of rotations.
-        log_scales: of sizes.
-        logit_opacities: of opacities.
-        sh_base: of colours.
-        sh_rest: of what colours depend on the direction.
-        last: the last step as a share of the first, reached exponentially.
-        momentum: share of the gradients before that a step keeps. What pays in training is too much here: a Gaussian is
-            moved a hundred times, each by another view than the last.
-    """
-
-    means: float = 0.07
-    quats: float = 8e-3
-    log_scales: float = 4e-2
-    logit_opacities: float = 0.25
-    sh_base: float = 4e-2
-    sh_rest: float = 5e-3
-    last: float = 0.1
-    momentum: float = 0.5
-
-    def at(self, progress: float, size_m: float) -> LearningRates:
-        """The steps at a share of the optimisation, for Gaussians of a size."""
-        first = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("last", "momentum")}
-        first |= {"means": self.means * size_m}
-        return LearningRates(**{name: rate * self.last**progress for name, rate in first.items()})
-
-
-@dataclass(frozen=True)
-class Stopping:
-    """When to stop, where the number of steps is not given.
-
-    Args:
-        min_pass_steps: steps that count as a pass over all views, for a tile that few pixels show.
-        sure_share: share of the steps that are taken whatever they gain: the first, long ones may lose.
-        min_gain: stop when a pass over all views lowers the loss by less than this share.
-    """
-
-    min_pass_steps: int = 20
-    sure_share: float = 0.5
-    min_gain: float = 0.002
+_FIRST = LearningRates(
+    means=0.07, quats=8e-3, log_scales=4e-2, logit_opacities=0.25, sh_base=4e-2, sh_rest=5e-3
+)  # first steps of Adam, positions relative to the Gaussians' median size: as long as pays in few passes
+_LAST = 0.1  # last step relative to the first, reached exponentially
+_OWNER_CELL_M = 0.5  # edge of the owner cells
+_COVER_M = 0.1  # an owner's Gaussian this near replaces another scene's
+_CAMERA_REACH_M = 10.0  # around a tile's halo, within which cameras are used
+_MIN_CAMERAS = 12  # of each scene, the nearest, wherever they stand
+_SEED = 0  # of the order of views
+_MIN_PASS_STEPS = 20  # of a pass over all views, for a tile that few pixels show
+_SURE_FRACTION = 0.5  # of the steps, taken whatever they gain: the first, long ones may lose
+_MIN_GAIN = 0.002  # relative decrease of the loss by a pass, below which the fit stops
 
 
 @dataclass(frozen=True)
 class Params:
-    """Test-time optimisation.
+    """Settings of test-time optimization.
 
     Args:
-        min_weight: drop what nowhere makes up this share of a pixel of its capture's own views, and dominates none.
-        keep: at most this share of the Gaussians that went in, of each tile that several captures show; of more, the
-            pairs that are most alike become one; 1 keeps all.
-        voxel_m: side of the voxels in which Gaussians are first merged.
-        owner_cells: give every cell of a grid to the capture that shows most of it, so that two captures of one
-            surface do not lie over one another.
-        cell_m: side of these cells.
-        cover_m: an owner's Gaussian this near stands for another capture's.
-        ssim_weight: share of 1 - SSIM in the loss; the rest is Huber's.
-        huber_delta: differences of colours below this, of [0, 1], count by their square, so that steps shorten as the
-            fit gets near; 0 is L1.
-        passes: how often each view is used, where steps are not given; fewer when it no longer gains.
-        steps: how many optimisation steps, exactly.
-        halo_m: how far around a tile its surroundings are rendered along, the outer half of it frozen.
-        reach_m: how far around a tile cameras are looked for.
-        min_cameras: a tile that no camera stands in or near is refined from this many, the nearest of each capture,
-            wherever they stand.
-        longest_side_px: size of the pictures that are compared.
-        balance_exposure: bring captures to one exposure first: even to the eye, but no longer what each capture looks
-            like.
-        prefer: who is shown where captures of other dates disagree: the ``newest``, who saw it ``best``, or ``both``.
-        seed: of the order of views.
-        rates: the optimiser's steps.
-        stopping: when to stop, where the number of steps is not given.
-        references: which views are reproduced.
-        exposure: how exposures are compared, where they are balanced.
+        min_weight: Smallest blending weight in [0, 1] that a Gaussian must reach in some view of its scene to be kept;
+            larger removes more Gaussians.
+        kept_fraction: Largest number of Gaussians that a tile starts from, as a fraction in [0, 1] of its scenes'
+            Gaussians; smaller merges more of the most similar pairs, and 1 merges none.
+        voxel_m: Edge in metres, positive, of the voxels in which Gaussians are merged first; larger leaves fewer.
+        owner_cells: Whether each cell of half a metre belongs to the scene that shows most of it, so that two scenes of
+            one surface do not overlay each other.
+        ssim_weight: Weight in [0, 1] of 1 - SSIM in the loss, the rest being Huber's loss; larger favours structure
+            over colour.
+        huber_delta: Difference of colours in [0, 1], at least 0, below which the loss is quadratic; 0 is the L1 loss.
+        momentum: First-moment decay rate of Adam in [0, 1); larger smooths the steps more, which delays a fit of few
+            steps.
+        max_passes: Largest number of passes over all views, at least 0, where ``steps`` is not given; the fit ends
+            earlier once it no longer improves, and larger improves it at the cost of time.
+        steps: Exact number of optimization steps, at least 0; none leaves it to ``max_passes``.
+        halo_m: Width in metres, at least 0, of the surroundings of a tile that are optimized with it, the outer half
+            fixed; larger hides seams better and takes more time.
+        longest_side_px: Longest side in pixels, at least 1, of the reference views; larger keeps finer detail and takes
+            more time and memory.
+        max_views: Largest number of reference views of a tile, at least 1, those that together see it best, newer ones
+            first; larger takes more memory (3 MB per view of 960 pixels) and time.
+        photo_weight: Number of uses of a kept photo in every pass, at least 0, relative to a rendered view; larger
+            follows photos more closely, and 0 ignores them.
+        balance_exposure: Whether scenes are brought to one exposure first, which looks even but no longer reproduces
+            each scene.
+        prefer: Scene that is shown where scenes of different dates disagree: the ``newest``, the ``best`` observed one,
+            or ``both``.
     """
 
     min_weight: float = 0.05
-    keep: float = 0.8
+    kept_fraction: float = 0.8
     voxel_m: float = 0.01
     owner_cells: bool = True
-    cell_m: float = 0.5
-    cover_m: float = 0.1
     ssim_weight: float = 0.2
     huber_delta: float = 0.05
-    passes: float = 4.0
+    momentum: float = 0.5
+    max_passes: float = 4.0
     steps: int | None = None
     halo_m: float = 1.0
-    reach_m: float = 10.0
-    min_cameras: int = 12
     longest_side_px: int = 960
+    max_views: int = references.MAX_VIEWS
+    photo_weight: float = references.PHOTO_WEIGHT
     balance_exposure: bool = False
     prefer: Prefer = "newest"
-    seed: int = 0
-    rates: Rates = field(default_factory=Rates)
-    stopping: Stopping = field(default_factory=Stopping)
-    references: references.Params = field(default_factory=references.Params)
-    exposure: exposure.Params = field(default_factory=exposure.Params)
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 0:
             raise ConfigError(f"steps must not be negative, got {self.steps}")
-        for name in ("voxel_m", "cell_m", "longest_side_px"):
+        for name in ("voxel_m", "longest_side_px", "max_views"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("cover_m", "passes", "halo_m", "reach_m", "min_cameras", "min_weight", "huber_delta"):
+        for name in ("max_passes", "halo_m", "min_weight", "huber_delta", "photo_weight"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("keep", "ssim_weight"):
+        for name in ("kept_fraction", "ssim_weight"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}")
-        if not 0 <= self.rates.momentum < 1:
-            raise ConfigError(f"rates.momentum must be in [0, 1), got {self.rates.momentum}")
+        if not 0 <= self.momentum < 1:
+            raise ConfigError(f"momentum must be in [0, 1), got {self.momentum}")
 
 
 def reach_m(params: Params) -> float:
@@ -161,19 +123,19 @@ def reach_m(params: Params) -> float:
 
 def reading_m(params: Params, dated: bool) -> float:
     compares = params.balance_exposure or (dated and uses_dates(params))
-    return params.halo_m + (params.reach_m if compares else 0.0)
+    return params.halo_m + (_CAMERA_REACH_M if compares else 0.0)
 
 
 def looking_m(params: Params) -> float:
-    return params.halo_m + params.reach_m
+    return params.halo_m + _CAMERA_REACH_M
 
 
 def min_cameras(params: Params) -> int:
-    return params.min_cameras
+    return _MIN_CAMERAS
 
 
 def photos_m(params: Params) -> float | None:
-    return looking_m(params) if params.references.photos.share > 0 else None
+    return looking_m(params) if params.photo_weight > 0 else None
 
 
 def uses_dates(params: Params) -> bool:
@@ -194,7 +156,7 @@ def merge(
     scenes = settled.scenes
     notes += settled.notes()
     if params.balance_exposure:
-        scenes, log_gains = balance_exposure(scenes, params.exposure)
+        scenes, log_gains = balance_exposure(scenes)
         if log_gains.any():
             notes.append(f"exposures differed by up to {np.ptp(log_gains, axis=0).max() / np.log(2):.2f} stops")
     wanted = render_references(
@@ -204,11 +166,14 @@ def merge(
         params.longest_side_px,
         settled,
         lambda fraction, text: progress(0.2 * fraction, text),
-        params.references,
+        max_views=params.max_views,
+        photo_weight=params.photo_weight,
     )
     # One capture alone shows nothing twice and is what its pictures show: thinned or fitted to them it could but lose.
     alone = sum(bool(inside(scene.gaussians.means, bounds, params.halo_m).any()) for scene in scenes) < 2
-    start, origin, new = _start(scenes, wanted, settled, replace(params, keep=1.0) if alone else params, bounds)
+    start, origin, new = _start(
+        scenes, wanted, settled, replace(params, kept_fraction=1.0) if alone else params, bounds
+    )
     if len(wanted) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
@@ -257,14 +222,14 @@ def _start(
         # What lies behind the newest wins it no cell.
         behind = np.concatenate(settled.behind)[near][heaviest]
         votes = np.where(behind, np.minimum(visible, WEIGHT_UNIT), visible)
-        stays &= one_owner_per_cell(merged, origin, votes, params.cell_m, params.cover_m)
+        stays &= one_owner_per_cell(merged, origin, votes, _OWNER_CELL_M, _COVER_M)
     stays &= visible >= WEIGHT_UNIT * params.min_weight
     stays |= new
     stays[beside(merged.means, origin, new, _BESIDE_M)] = False
     mine = inside(merged.means, bounds)
-    count = max(int(params.keep * inside(gaussians.means, bounds).sum()) - int((new & mine).sum()), 1)
+    count = max(int(params.kept_fraction * inside(gaussians.means, bounds).sum()) - int((new & mine).sum()), 1)
     many = stays & mine & ~new
-    if params.keep == 1 or many.sum() <= count:
+    if params.kept_fraction == 1 or many.sum() <= count:
         return merged[stays], origin[stays], new[stays]
     from gsmap.geometry.decimate import decimate  # with scipy, which naming a recipe does without
 
@@ -288,37 +253,40 @@ def _fit(
     backend: str,
 ) -> tuple[Gaussians, int, bool]:
     """The start fitted to the references; steps taken; whether time ran out."""
-    stopping = params.stopping
-    one_pass = max(stopping.min_pass_steps, round(wanted.view_weights.sum()))
-    steps = params.steps if params.steps is not None else round(params.passes * one_pass)
-    options = FitOptions(
-        ssim_weight=params.ssim_weight, huber_delta=params.huber_delta, betas=(params.rates.momentum, 0.999)
-    )
+    one_pass = max(_MIN_PASS_STEPS, round(wanted.view_weights.sum()))
+    steps = params.steps if params.steps is not None else round(params.max_passes * one_pass)
+    options = FitOptions(ssim_weight=params.ssim_weight, huber_delta=params.huber_delta, betas=(params.momentum, 0.999))
     fitter = make_fitter(start, frozen=frozen, options=options, backend=backend)
     cameras = [wanted.cameras[v] for v in range(len(wanted))]
     pictures = [fitter.load(image[None]) for image in wanted.images]
     weights = [fitter.load(weight[None]) for weight in wanted.weights]
     size_m = float(np.exp(np.median(start.log_scales.max(1))))
     losses: list[Any] = []  # as the fitter returns them: numbers, once somebody asks
-    for step, view in enumerate(view_schedule(wanted.view_weights, steps, params.seed)):
+    for step, view in enumerate(view_schedule(wanted.view_weights, steps, _SEED)):
         if deadline is not None and time.monotonic() > deadline:
             return fitter.gaussians(), step, True
-        fitter.learning_rates = params.rates.at(step / steps, size_m)
+        fitter.learning_rates = _rates(step / steps, size_m)
         losses.append(fitter.step(cameras[view], pictures[view], weights[view]))
         if step % 20 == 0:
             progress(0.2 + 0.8 * step / steps, f"optimising, loss {_mean(losses[-20:]):.4f}")
-        if params.steps is None and step > stopping.sure_share * steps and _gains_nothing(losses, one_pass, stopping):
+        if params.steps is None and step > _SURE_FRACTION * steps and _gains_nothing(losses, one_pass):
             break
     return fitter.gaussians(), len(losses), False
+
+
+def _rates(progress: float, size_m: float) -> LearningRates:
+    """Learning rates at a fraction of the optimization, for Gaussians of a median size."""
+    first = vars(_FIRST) | {"means": _FIRST.means * size_m}
+    return LearningRates(**{name: rate * _LAST**progress for name, rate in first.items()})
 
 
 def _mean(losses: list[Any]) -> float:
     return float(np.mean([float(loss) for loss in losses]))
 
 
-def _gains_nothing(losses: list[Any], one_pass: int, stopping: Stopping) -> bool:
+def _gains_nothing(losses: list[Any], one_pass: int) -> bool:
     """Whether the last pass over all views was hardly better than the one before."""
     if len(losses) % one_pass or len(losses) < 2 * one_pass:
         return False
     before, now = _mean(losses[-2 * one_pass : -one_pass]), _mean(losses[-one_pass:])
-    return now > (1 - stopping.min_gain) * before
+    return now > (1 - _MIN_GAIN) * before

@@ -19,10 +19,11 @@ RENDERS = False
 
 @dataclass(frozen=True)
 class Params:
-    """Concatenation.
+    """Settings of concatenation.
 
     Args:
-        prefer: who is shown where captures of other dates disagree: the ``newest``, who saw it ``best``, or ``both``.
+        prefer: Scene that is shown where scenes of different dates disagree: the ``newest``, the ``best`` observed one,
+            or ``both``.
     """
 
     prefer: Prefer = "both"

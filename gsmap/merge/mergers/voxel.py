@@ -20,11 +20,12 @@ RENDERS = False
 
 @dataclass(frozen=True)
 class Params:
-    """Moment-preserving voxelisation.
+    """Settings of voxelization.
 
     Args:
-        voxel_m: side of a voxel.
-        prefer: who is shown where captures of other dates disagree: the ``newest``, who saw it ``best``, or ``both``.
+        voxel_m: Edge in metres, positive, of the voxels whose Gaussians become one; larger leaves fewer.
+        prefer: Scene that is shown where scenes of different dates disagree: the ``newest``, the ``best`` observed one,
+            or ``both``.
     """
 
     voxel_m: float = 0.01
