@@ -199,6 +199,6 @@ def test_what_is_around_photographs_that_stand_together_is_read_once():
     params = replace(default_params("tto"), steps=0)
     bounds = np.array([[-1.5, -2, -2], [0.5, 2, 2]])
     merge_tile([lazy(a, S, without), lazy(b, S, [])], "tto", params, bounds=bounds)
-    notes = merge_tile([lazy(a, S, with_photos, *photos), lazy(b, S, [])], "tto", params, bounds=bounds).notes
+    notes = merge_tile([lazy(a, S, with_photos, *kept), lazy(b, S, [])], "tto", params, bounds=bounds).notes
     assert "3 photographs were reproduced as well" in notes
     assert len(with_photos) - len(without) == 1

@@ -56,8 +56,8 @@ class Params:
     """Settings of test-time optimization.
 
     Args:
-        min_weight: Smallest blending weight in [0, 1] that a Gaussian must reach in some view of its scene to be kept;
-            larger removes more Gaussians.
+        min_weight: Smallest blending weight in [0, 1] that a Gaussian must reach in some view of its scene to be kept,
+            unless it has the largest weight of some pixel; larger removes more Gaussians.
         kept_fraction: Largest number of Gaussians that a tile starts from, as a fraction in [0, 1] of its scenes'
             Gaussians; smaller merges more of the most similar pairs, and 1 merges none.
         voxel_m: Edge in metres, positive, of the voxels in which Gaussians are merged first; larger leaves fewer.
