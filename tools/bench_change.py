@@ -189,14 +189,11 @@ def merge(place: Place, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def drops(place: Place) -> Iterator[dict[str, Any]]:
     """What merging drops of each older capture before it fits anything."""
-    try:
-        from gsmap.merge.changes import settle as dropping  # the newest is preferred
-    except ImportError:
-        from gsmap.merge.changes import remove_disappeared as dropping
+    from gsmap.merge.changes import settle
+
     poses = place.poses()
     scenes = [place.placed(t, poses[t]) for t in place.times]
-    settled = dropping(scenes)
-    left = settled[0] if isinstance(settled, tuple) else settled.scenes
+    left = settle(scenes).scenes  # the newest is preferred
     for time_, before, after in zip(place.times[:-1], scenes, left, strict=False):
         dropped = ~scores.kept_rows(before.gaussians.means, after.gaussians.means)
         yield {"way": f"drops of {time_}", **scores.score_drops(place.truth, place.times[-1], time_, dropped)}

@@ -30,7 +30,7 @@ from PIL import Image
 import gsmap
 from gsmap.geometry.rotations import angle_between, quats_to_matrices
 from gsmap.map import Map
-from gsmap.types.rows import ScanRow
+from gsmap.types.rows.localize_scan import ScanRow
 from gsmap_synthetic import Place, film, make_captures, make_place, walk
 from gsmap_synthetic.capture import Frames
 
