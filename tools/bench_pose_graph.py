@@ -147,9 +147,8 @@ def peer(method: str, world):
     import gtsam
 
     from gsmap.geometry.similarities import Similarities
-    from gsmap.optimize import Params
     from gsmap.optimize.cycles import vote
-    from gsmap.optimize.gtsam_solve import from_gtsam, gauge_sigmas, to_gtsam
+    from gsmap.optimize.gtsam_solve import GAUGE_SIGMAS, from_gtsam, to_gtsam
     from gsmap.optimize.measurements import measurements
     from gsmap.optimize.robust import spanning_tree_init
     from gsmap.optimize.structure import component_labels
@@ -174,11 +173,7 @@ def peer(method: str, world):
             gtsam.BetweenFactorPose3(int(m.targets[k]), int(m.sources[k]), to_gtsam(m.measured, k, 6), noise)
         )
     anchor = int(scenes[0])
-    graph.push_back(
-        gtsam.PriorFactorPose3(
-            anchor, gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(gauge_sigmas(Params().gauge)[:6])
-        )
-    )
+    graph.push_back(gtsam.PriorFactorPose3(anchor, gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(GAUGE_SIGMAS[:6])))
     if method == "oracle":
         start = gtsam.Values()
         for k in scenes.tolist():

@@ -81,7 +81,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(96, 72), help="of a frame, pixels")
     parser.add_argument("--report", action="store_true", help="make nothing more")
     parser.add_argument("--solves", type=int, metavar="N", help="only time solving N captures, N + 1, ...")
-    parser.add_argument("--full-scenes", type=int, default=500, help="of --solves: optimize.limits.full_scenes")
+    parser.add_argument("--full-scenes", type=int, default=500, help="of --solves: optimize.max_full_scenes")
     args = parser.parse_args()
     gc.set_threshold(COLLECT_AFTER)  # as the command line does
     args.cache.mkdir(parents=True, exist_ok=True)
@@ -256,7 +256,7 @@ def print_solves(args: argparse.Namespace) -> None:
     """Solve the street's edges again as its captures came, from ``--solves`` of them on."""
     with gsmap.map.open(args.cache / "map.gsmap", "r") as m:
         given, params = optimize.pose_inputs(m.store, m.settings), m.settings.optimize
-    params = replace(params, limits=replace(params.limits, full_scenes=args.full_scenes))
+    params = replace(params, max_full_scenes=args.full_scenes)
     answer, seconds, methods = None, [], Counter[str]()
     for count in range(args.solves, len(given.scenes) + 1):
         some = set(given.scenes[:count])

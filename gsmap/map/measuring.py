@@ -175,10 +175,8 @@ class _Solved:
 
     def joint(self, component: int | None, scenes: list[str]) -> np.ndarray | None:
         """Covariance of the world and these scenes together; None where it cannot be computed."""
-        given, params = self._given, self.settings.optimize
-        return optimize.joint_covariance(
-            self.graph, given.edges, given.priors, given.survey, scenes, component or 0, params
-        )
+        given = self._given
+        return optimize.joint_covariance(self.graph, given.edges, given.priors, given.survey, scenes, component or 0)
 
 
 def _pose_variance(solved: _Solved, placed: list[_Placed]) -> float:

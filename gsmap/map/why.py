@@ -73,7 +73,7 @@ def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[st
 
 def _held(store: Store, settings: Settings) -> list[tuple[str, str]]:
     """The pairs whose edge stands and is not in doubt."""
-    bar = settings.optimize.aliasing.max_disagreement
+    bar = settings.optimize.max_disagreement
     return [
         (one.target, one.source)
         for one in store.registrations.tried()
@@ -86,7 +86,7 @@ def _steps(pair: PairReport, settings: Settings) -> list[WhyStep]:
         return []
     steps = []
     if pair.proposer:
-        steps += _evidence(pair, settings.register.verdict, settings.optimize.aliasing.max_disagreement)
+        steps += _evidence(pair, settings.register.verdict, settings.optimize.max_disagreement)
     steps.append(WhyStep(name="verdict", value=pair.status, bar="accepted", passed=pair.status == "accepted"))
     if pair.review:
         steps.append(WhyStep(name="review", value=pair.review))

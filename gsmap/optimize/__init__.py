@@ -118,7 +118,6 @@ def joint_covariance(
     survey: Survey | None,
     scenes: Sequence[str],
     component: int,
-    params: Params | None = None,
 ) -> np.ndarray | None:
     """(7 + 7 S, 7 + 7 S) covariance of ``S_world_map`` and the poses of some scenes of a component, together.
 
@@ -133,4 +132,4 @@ def joint_covariance(
     """
     from gsmap.optimize.survey import joint_of_answer
 
-    return joint_of_answer(answer, edges, priors, survey or Survey(), scenes, component, params or Params())
+    return joint_of_answer(answer, edges, priors, survey or Survey(), scenes, component)

@@ -10,7 +10,7 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.contradictions import contested, part_contradicted
+from gsmap.optimize.contradictions import CONTRADICTION_GATES, contested, part_contradicted
 from gsmap.optimize.cycles import Vote, vote
 from gsmap.optimize.doubt import find_doubtful, find_doubtful_in_map, take_in_doubtful
 from gsmap.optimize.final import solve_components
@@ -29,6 +29,9 @@ from gsmap.types import Edge, PoseGraph, Prior, Provenance
 from gsmap.types.progress import Progress
 from gsmap.types.world import Survey
 
+_GNC_START_GATES = 16.0  # width at which the robust kernel of graduated non-convexity starts
+_MAX_ROUNDS = 30  # of taking edges in and refining
+
 
 def solve_batch(
     scene_ids: Sequence[str],
@@ -46,7 +49,7 @@ def solve_batch(
     gate = float(chi2_quantile(params.gate_probability, m.dim))
 
     terms = PriorTerms.stack(m.scene_ids, priors)
-    doubtful = find_doubtful(m, params.aliasing.max_disagreement)
+    doubtful = find_doubtful(m, params.max_disagreement)
     state, votes = _grown_from(m, ~doubtful, terms, gate, params, progress)
     if (m.disagreement > 0).any() and not state.accepted.all():
         stricter = find_doubtful_in_map(m, state, doubtful, gate, params)
@@ -57,7 +60,7 @@ def solve_batch(
         # What can be believed makes the map; only then is what may be of other places held against it.
         take_in_doubtful(m, state, doubtful, gate, params)
     _reconsider(m, state, gate)
-    _check_confirmed(m, state, gate, params)
+    _check_confirmed(m, state, gate)
 
     solved = solve_components(
         m, state, _ages(m, scene_ids), previous, params, lambda f, text: progress(0.75 + 0.25 * f, text), survey
@@ -88,19 +91,19 @@ def _grown(m: Measurements, terms: PriorTerms, gate: float, params: Params, prog
     progress(0.05, "voting on cycles")
     votes = vote(m, params.gate_probability)
     state = initial_state(m, votes, terms, params)
-    refine(m, state, gate, params.gnc_start, params)
-    for turn in range(params.max_rounds):
-        progress(0.1 + 0.6 * turn / params.max_rounds, "growing components")
+    refine(m, state, gate, _GNC_START_GATES)
+    for turn in range(_MAX_ROUNDS):
+        progress(0.1 + 0.6 * turn / _MAX_ROUNDS, "growing components")
         if take_in_agreeing(m, state, params):
             cut_weak_bridges(m, state, params)
-            refine(m, state, gate, 1.0, params)
+            refine(m, state, gate)
         elif close_through_singles(m, state, params):
-            refine(m, state, gate, 1.0, params)
+            refine(m, state, gate)
         elif not _part_aliased(m, votes, state, gate, params):
             break
     attach_singles(m, state, params)
     while part_contradicted(m, state, params):
-        refine(m, state, gate, 1.0, params)
+        refine(m, state, gate)
         take_in(m, state, params)
     state.ambiguous |= contested(m, state, params)
     return state, votes
@@ -135,7 +138,7 @@ def _part_aliased(m: Measurements, votes: Vote, state: State, gate: float, param
     settled = state.undecided | state.rejected
     found = resolve_aliased_loops(m, state.accepted, settled, state.poses, votes, params)
     if len(state.terms):
-        elsewhere, outweighed = contradicted_priors(m, state.accepted, state.poses, votes, state.terms, params)
+        elsewhere, outweighed = contradicted_priors(m, state.accepted, state.poses, votes, state.terms)
         found.wrong |= elsewhere
         state.terms = state.terms[np.flatnonzero(~outweighed)]
     if not (found.wrong | found.undecided).any():
@@ -144,7 +147,7 @@ def _part_aliased(m: Measurements, votes: Vote, state: State, gate: float, param
     state.undecided |= found.undecided
     state.rejected |= found.wrong
     state.failures[found.right] = 0
-    refine(m, state, gate, 1.0, params)
+    refine(m, state, gate)
     return True
 
 
@@ -155,12 +158,12 @@ def _reconsider(m: Measurements, state: State, gate: float) -> None:
     state.accepted |= inside & ~state.undecided & ~state.rejected & (chi_squares(m, state.poses) < gate)
 
 
-def _check_confirmed(m: Measurements, state: State, gate: float, params: Params) -> None:
+def _check_confirmed(m: Measurements, state: State, gate: float) -> None:
     """Confirmed edges are never voted out, so they must at least not contradict each other."""
     rows = np.flatnonzero(m.confirmed)
     if len(rows) < 2:
         return
-    off = chi_squares(m[rows], state.poses) > params.contradiction * gate
+    off = chi_squares(m[rows], state.poses) > CONTRADICTION_GATES * gate
     if not off.any():
         return
     # They may only be at odds with edges that nobody confirmed: solve them alone.
@@ -168,11 +171,10 @@ def _check_confirmed(m: Measurements, state: State, gate: float, params: Params)
     labels = component_labels(alone, np.arange(len(rows)))
     fixed = np.zeros(m.num_scenes, dtype=bool)
     fixed[roots(labels)] = True
-    fill_blocks = params.limits.fill_blocks
-    start = chordal(alone, fixed, Similarities.identity(m.num_scenes), fill_blocks)
-    poses = Descent(alone, fixed, fill_blocks).fit(start)
+    start = chordal(alone, fixed, Similarities.identity(m.num_scenes))
+    poses = Descent(alone, fixed).fit(start)
     worst = chi_squares(alone, poses)
-    if worst.max() > params.contradiction * gate:
+    if worst.max() > CONTRADICTION_GATES * gate:
         target, source = alone.keys[int(np.argmax(worst))]
         raise InputError(
             f"confirmed edge {target}:{source} contradicts the other confirmed edges: reject it, or one of them"

@@ -6,6 +6,8 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
+_MAX_FILL_BLOCKS = 500_000  # above it conjugate gradients are cheaper; only maps that fill a volume have so many
+
 
 class BlockSystem:
     """``min_x sum_e |A_e x_target + B_e x_source + r_e|^2_W`` over the scenes that are not fixed (those stay 0).
@@ -16,10 +18,9 @@ class BlockSystem:
         targets, sources: (E,) scenes of each edge.
         fixed: (N,) bool; also true for scenes that no edge reaches.
         dim: unknowns per scene.
-        fill_blocks: blocks of fill above which a factorisation costs more than conjugate gradients.
     """
 
-    def __init__(self, targets: np.ndarray, sources: np.ndarray, fixed: np.ndarray, dim: int, fill_blocks: int) -> None:
+    def __init__(self, targets: np.ndarray, sources: np.ndarray, fixed: np.ndarray, dim: int) -> None:
         self.targets, self.sources, self.dim = targets, sources, dim
         self.free = np.flatnonzero(~fixed)
         self.row = np.full(len(fixed), -1)
@@ -31,15 +32,15 @@ class BlockSystem:
         cols = np.concatenate([np.arange(n), a[a >= 0], b[b >= 0], b[self._both], a[self._both]])
         keys, self._slot = np.unique(rows * n + cols, return_inverse=True)
         self._indices, self._indptr = keys % max(n, 1), np.searchsorted(keys, np.arange(n + 1) * n)
-        self._order, self._direct = self._ordering(n, fill_blocks)
+        self._order, self._direct = self._ordering(n)
 
-    def _ordering(self, n: int, fill_blocks: int) -> tuple[np.ndarray, bool]:
+    def _ordering(self, n: int) -> tuple[np.ndarray, bool]:
         if n < 3:
             return np.arange(n), True
         graph = sp.csc_matrix((np.full(len(self._indices), -1.0), self._indices, self._indptr), shape=(n, n))
         graph = (graph + sp.diags(np.diff(self._indptr) + 1.0)).tocsc()
         factor = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
-        return np.argsort(factor.perm_c), factor.L.nnz <= fill_blocks
+        return np.argsort(factor.perm_c), factor.L.nnz <= _MAX_FILL_BLOCKS
 
     def solve(
         self,

@@ -23,6 +23,9 @@ from gsmap.optimize.params import Params
 from gsmap.optimize.state import State
 from gsmap.optimize.structure import bridges, component_labels
 
+CONTRADICTION_GATES = 10.0  # chi-square, in gates, beyond which an edge contradicts the edges that it makes a loop with
+MAX_SUSPECTS = 4  # if more may be wrong, none is excluded: the wrong one is not likely among them
+
 
 def part_contradicted(m: Measurements, state: State, params: Params) -> bool:
     """Let go of the edges of contradictory loops that are, or may be, wrong; poses are left as they are.
@@ -60,30 +63,30 @@ def contradicting(m: Measurements, state: State, params: Params) -> np.ndarray:
     rows = np.flatnonzero(inside & ~settled & np.isfinite(m.log_odds_wrong))
     if not len(rows):
         return rows
-    drift, probability = state.drift(m, params), params.gate_probability
-    return rows[~consistent_with_component(m, rows, drift, probability, params.contradiction)]
+    drift, probability = state.drift(m), params.gate_probability
+    return rows[~consistent_with_component(m, rows, drift, probability, CONTRADICTION_GATES)]
 
 
 def contested(m: Measurements, state: State, params: Params) -> np.ndarray:
     """(E,) bool: edges of known likelihood that would tie two components, and contradict others that would as well."""
     out = np.zeros(len(m), dtype=bool)
-    rows = state.open(params.max_failures)
+    rows = state.open()
     rows = rows[np.isfinite(m.log_odds_wrong[rows])]
     if len(rows):
-        for join in find_joins(m, rows, state.drift(m, params), params.gate_probability):
+        for join in find_joins(m, rows, state.drift(m), params.gate_probability):
             out[join.offered] = join.rival > 0
     return out
 
 
 def _let_go(m: Measurements, state: State, row: int, loop: np.ndarray, params: Params) -> bool:
     """Decide between an edge and the accepted edges that it contradicts; whether any of these was let go."""
-    aliasing, suspects = params.aliasing, np.r_[row, loop]
+    suspects = np.r_[row, loop]
     probability = np.exp(m.log_odds_wrong[suspects] - m.log_odds_wrong[suspects].max())
     probability /= probability.sum()
     order = np.argsort(-probability, kind="stable")
     # The fewest that surely hold the wrong one. Where those are many, parting all would lose what is known.
-    count = 1 + int(np.searchsorted(probability[order].cumsum(), aliasing.sure - 1e-9))
-    found = suspects[order[: count if count <= aliasing.max_suspects else 1]]
+    count = 1 + int(np.searchsorted(probability[order].cumsum(), params.min_wrong_probability - 1e-9))
+    found = suspects[order[: count if count <= MAX_SUSPECTS else 1]]
     if count == 1:
         state.rejected[found] = found != row  # the map stands where it is the contradicting edge
     else:

@@ -30,6 +30,7 @@ from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.state import State, refine
 from gsmap.optimize.structure import component_labels
 
+_MAX_CHANCE_ALIKE = 0.5  # doubtful edges join nothing where more of the map's decided ones were of two places
 _COST = 10.0  # right edges in doubt that a wrong one believed is as bad as
 _LEAST_SPREAD = 0.15  # of logarithms of disagreements, where few are known
 _SCENE_STEPS, _FEWEST_STEPS = 2000, 8  # large maps take more in at a step, for each costs them a solve
@@ -55,16 +56,16 @@ def find_doubtful_in_map(
     Args:
         state: of the map that the edges without doubt make.
     """
-    bar = params.aliasing.max_disagreement
+    bar = params.max_disagreement
     inside = _within(m, state.accepted)
     fits = np.zeros(len(m), dtype=bool)
     rows = np.flatnonzero(inside & doubtful)
     if len(rows):
-        fits[rows] = consistent_with_component(m, rows, state.drift(m, params), params.gate_probability)
+        fits[rows] = consistent_with_component(m, rows, state.drift(m), params.gate_probability)
     contradicted = inside & doubtful & ~fits
     alike = chance_alike(int((inside & doubtful & fits).sum()), int(contradicted.sum()))
     believed = state.accepted & (m.disagreement > 0)
-    if alike > params.aliasing.max_chance_alike and believed.any():
+    if alike > _MAX_CHANCE_ALIKE and believed.any():
         bar = min(bar, dividing_bar(m.disagreement[believed], m.disagreement[contradicted]))
     found = find_doubtful(m, bar)
     if not (state.accepted | state.ambiguous | doubtful).all():
@@ -95,7 +96,7 @@ def first_contradicted(
         eligible: (E,) bool, edges that are taken in; the others decide nothing.
     """
     rank, known = _ranked(m)
-    tying = replace(params, joining=replace(params.joining, small_component=m.num_scenes + 1))
+    tying = replace(params, min_large_component=m.num_scenes + 1)
     state = State.fresh(m, Similarities.identity(m.num_scenes), np.zeros(len(m), dtype=bool), terms)
     agrees, contradicted = np.zeros((2, len(m)), dtype=bool)
     steps = np.unique(rank[eligible])
@@ -106,16 +107,13 @@ def first_contradicted(
         new = (rank > below) & ~state.rejected
         tied = _within(m, state.accepted)
         take_in(m, state, tying)
-        refine(m, state, gate, 1.0, tying)
+        refine(m, state, gate)
         agrees |= new & tied & state.accepted
         contradicted |= new & _within(m, state.accepted) & ~state.accepted
         below = step
     for bar in np.unique(rank[contradicted & known]).tolist():
         above = rank >= bar
-        if (
-            chance_alike(int((agrees & above).sum()), int((contradicted & above).sum()))
-            > params.aliasing.max_chance_alike
-        ):
+        if chance_alike(int((agrees & above).sum()), int((contradicted & above).sum())) > _MAX_CHANCE_ALIKE:
             return above & known
     return np.zeros(len(m), dtype=bool)
 
@@ -134,21 +132,21 @@ def _ranked(m: Measurements) -> tuple[np.ndarray, np.ndarray]:
 def take_in_doubtful(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> None:
     """Take in the doubtful edges that the map bears out, and by the others what nothing else ties, if this map's
     record allows it."""
-    most, state.doubtful = params.aliasing.max_chance_alike, doubtful
+    state.doubtful = doubtful
     if close_loops(m, state, params):
-        refine(m, state, gate, 1.0, params)
+        refine(m, state, gate)
     inside = doubtful & _within(m, state.accepted)
     borne_out = int((inside & state.accepted).sum())
     tying = doubtful & ~inside
     one_visit = tying & m.same_visit
     state.undecided |= one_visit
-    if chance_alike(borne_out, int((inside & ~state.accepted).sum())) <= most:
+    if chance_alike(borne_out, int((inside & ~state.accepted).sum())) <= _MAX_CHANCE_ALIKE:
         before = replace(state, accepted=state.accepted.copy(), failures=state.failures.copy())
         take_in(m, state, params)
-        refine(m, state, gate, 1.0, params)
+        refine(m, state, gate)
         # Look-alikes that are taken for one place contradict each other sooner or later: then none of them tie.
         contradicted = int((doubtful & _within(m, state.accepted) & ~state.accepted).sum())
-        if chance_alike(borne_out, contradicted) > most:
+        if chance_alike(borne_out, contradicted) > _MAX_CHANCE_ALIKE:
             state.accepted, state.failures, state.poses = before.accepted, before.failures, before.poses
     apart = tying & ~_within(m, state.accepted)
     state.undecided |= apart

@@ -12,6 +12,8 @@ from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.structure import component_labels, roots
 
+_MAX_EXACT_HOPS = 20_000_000  # shortest paths (scenes times sources); beyond it hops are estimated from the distance
+
 
 @dataclass(frozen=True, eq=False)
 class DriftModel:
@@ -30,7 +32,6 @@ class DriftModel:
         depth: (N,) hops to the first scene of its component.
         step: (4,) median variances of an edge in rotation, translation and log scale, and its length in map units.
         poses: N.
-        exact_hops: see `Limits`.
     """
 
     graph: sp.csr_matrix
@@ -38,10 +39,9 @@ class DriftModel:
     depth: np.ndarray
     step: np.ndarray
     poses: Similarities
-    exact_hops: int
 
     @classmethod
-    def over(cls, edges: Measurements, rows: np.ndarray, poses: Similarities, exact_hops: int) -> DriftModel:
+    def over(cls, edges: Measurements, rows: np.ndarray, poses: Similarities) -> DriftModel:
         n = edges.num_scenes
         labels = component_labels(edges, rows)
         a, b = edges.targets[rows], edges.sources[rows]
@@ -50,7 +50,7 @@ class DriftModel:
         depth = dijkstra(graph, directed=False, indices=roots(labels), unweighted=True, min_only=True)
         rows = rows if len(rows) else np.arange(len(edges))
         if not len(edges):
-            return cls(graph, labels, depth, np.zeros(4), poses, exact_hops)
+            return cls(graph, labels, depth, np.zeros(4), poses)
         diagonal = np.einsum("eii->ei", edges.covariance[rows])
         unit = np.exp(poses.log_scales[edges.sources[rows]])
         length = np.linalg.norm(edges.measured.translations[rows], axis=1) * np.exp(
@@ -64,7 +64,7 @@ class DriftModel:
                 np.median(length),
             ]
         )
-        return cls(graph, labels, depth, step, poses, exact_hops)
+        return cls(graph, labels, depth, step, poses)
 
     def bound(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Hops from a to b at most: through the root of their component."""
@@ -74,7 +74,7 @@ class DriftModel:
         """Hops between scenes of one component."""
         out = np.zeros(len(a))
         starts, which = np.unique(a, return_inverse=True)
-        if len(starts) * len(self.depth) > self.exact_hops:
+        if len(starts) * len(self.depth) > _MAX_EXACT_HOPS:
             distance = np.linalg.norm(self.poses.translations[a] - self.poses.translations[b], axis=1)
             guess = 2 + 1.5 * distance / max(self.step[3], 1e-9)
             return np.where(a == b, 0.0, np.minimum(guess, self.bound(a, b)))

@@ -69,7 +69,7 @@ def solve_components(
     missing: list[tuple[int, int, str]] = []
     ties: list[tuple[int, WorldTie]] = []
     world: int | None = None
-    most = params.limits.marginal_scenes if params.marginals else 0
+    most = params.max_marginal_scenes if params.marginals else 0
     for index, label in enumerate(order):
         progress(index / len(order), "final solve")
         scenes, mine = members[label], edge_members[label]
@@ -79,22 +79,22 @@ def solve_components(
         old = previous.poses.get(m.scene_ids[anchor]) if previous else None
         poses = onto_anchor(poses, scenes, anchor, old.S_map_scene if old else Sim3.identity())
         if len(own):
-            poses = onto_priors(poses, scenes, anchor, own, m.dim, params.gauge.loose)
-            if not len(open_gauge(poses, scenes, anchor, own, m.dim, params.gauge.loose)):
+            poses = onto_priors(poses, scenes, anchor, own, m.dim)
+            if not len(open_gauge(poses, scenes, anchor, own, m.dim)):
                 # Fully known to the outside: it shares the world's frame with every other such component.
                 component[scenes] = world = index if world is None else world
         if len(mine) or len(own):
-            solution = solve(m[mine], poses, anchor, own, params.gauge, most)
+            solution = solve(m[mine], poses, anchor, own, most)
             poses = solution.poses
             if solution.covariances is not None:
                 covariances[scenes] = solution.covariances[scenes]
             elif params.marginals:
-                why = solution.problem or f"more than limits.marginal_scenes, {most}"
+                why = solution.problem or f"more than max_marginal_scenes, {most}"
                 missing.append((int(scenes[0]), len(scenes), why))
         if survey:
-            held = held_directions(m[mine], poses, scenes, anchor, own, params.gauge)
+            held = held_directions(m[mine], poses, scenes, anchor, own)
             whole = Component(scenes, m[mine], own, anchor, held)
-            surveyed = tie_component(whole, poses, survey, index, params.survey, most)
+            surveyed = tie_component(whole, poses, survey, index, most)
             if surveyed is not None:
                 poses = surveyed.poses
                 ties.append((int(scenes[0]), surveyed.tie))

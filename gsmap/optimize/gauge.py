@@ -11,9 +11,13 @@ from gsmap.errors import InputError
 from gsmap.geometry.directions import rotation_between
 from gsmap.geometry.similarities import Similarities, exp, rotation_vectors
 from gsmap.geometry.umeyama import umeyama
-from gsmap.optimize.params import Gauge
 from gsmap.optimize.priors import UP, PriorTerms
 from gsmap.types import PoseGraph, Sim3
+
+_LOOSE = 10.0  # directions that priors fix no better (radians, component sizes) are held by the anchor
+_OUTLIER_SIGMAS = 5.0  # a prior is an outlier if it stays off by more than so many of its standard deviations,
+_OUTLIER_ROTATION_DEG = 10.0  # and by more than this, so that drift is not mistaken for an outlier
+_OUTLIER_DRAWS = 200  # random triples of position priors that are tried as the frame of a component
 
 
 def anchor_of(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGraph | None) -> int:
@@ -33,16 +37,11 @@ def anchor_of(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGrap
     return int(known[components.index(surviving)])
 
 
-def open_gauge(
-    poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int, loose: float
-) -> np.ndarray:
+def open_gauge(poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int) -> np.ndarray:
     """(K, dim) directions, as steps of the anchor's scene, in which the whole component moves unseen by its priors.
 
     All of them (K = dim) without priors; none if the priors fix rotation, position and, in a graph of similarities,
     scale.
-
-    Args:
-        loose: see `Gauge`.
     """
     if not len(priors):
         return np.eye(dim)
@@ -53,7 +52,7 @@ def open_gauge(
     carry = (poses[priors.scenes].inverse() @ poses[np.full(len(priors), anchor)]).adjoint()
     moved = (J @ carry)[:, :, :dim] * unit
     values, vectors = np.linalg.eigh(np.einsum("pij,pik->jk", moved, moved))
-    return vectors[:, values < loose**-2].T / unit
+    return vectors[:, values < _LOOSE**-2].T / unit
 
 
 def onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose: Sim3) -> Similarities:
@@ -63,9 +62,7 @@ def onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose: Sim3
     return poses.replaced(scenes, (move @ poses[scenes]).orthonormalised())
 
 
-def onto_priors(
-    poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int, loose: float
-) -> Similarities:
+def onto_priors(poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int) -> Similarities:
     """Move a component as one to where its priors want it; what they leave open stays as it is.
 
     A closed-form guess from full poses, positions or up directions, then Gauss-Newton over the component's own degrees
@@ -75,7 +72,7 @@ def onto_priors(
         return poses
     poses = _guess(poses, scenes, priors, dim)
     for _ in range(20):
-        held = open_gauge(poses, scenes, anchor, priors, dim, loose)
+        held = open_gauge(poses, scenes, anchor, priors, dim)
         r, J = priors.linearised(poses)
         carry = (poses[priors.scenes].inverse() @ poses[np.full(len(priors), anchor)]).adjoint()
         moved = (J @ carry)[:, :, :dim]
@@ -89,11 +86,11 @@ def onto_priors(
     return poses
 
 
-def outlier_priors(poses: Similarities, priors: PriorTerms, length: float, params: Gauge) -> np.ndarray:
+def outlier_priors(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarray:
     """(P,) bool: priors that stay far off under the one motion of the component that satisfies most of them.
 
-    What counts as far is in `Gauge`. The motions tried are those of single full poses and of triples of positions,
-    drawn with a fixed seed.
+    Far is more than `_OUTLIER_SIGMAS`, and than `_OUTLIER_ROTATION_DEG` or a typical edge's length. The motions tried
+    are those of single full poses and of triples of positions, drawn with a fixed seed.
 
     Args:
         length: of a typical edge.
@@ -105,7 +102,7 @@ def outlier_priors(poses: Similarities, priors: PriorTerms, length: float, param
         motions.append(Sim3(want.rotation, want.translation, have.scale) @ have.inverse())
     placed = np.flatnonzero(knows[:, 3:6].all(1))
     rng = np.random.default_rng(0)
-    for _ in range(params.outlier_draws if len(placed) >= 4 else 0):
+    for _ in range(_OUTLIER_DRAWS if len(placed) >= 4 else 0):
         three = placed[rng.choice(len(placed), 3, replace=False)]
         try:
             motions.append(umeyama(priors.expected.translations[three], poses.translations[priors.scenes[three]]))
@@ -116,10 +113,8 @@ def outlier_priors(poses: Similarities, priors: PriorTerms, length: float, param
         moved = Similarities.stack([S] * len(priors)) @ poses[priors.scenes]
         shift = np.linalg.norm(moved.translations - priors.expected.translations, axis=1)
         with np.errstate(divide="ignore"):
-            allowed = np.maximum(length, params.outlier_sigmas / priors.root_weights[:, 3:6].min(1))
-            turn = np.maximum(
-                np.radians(params.outlier_rotation_deg), params.outlier_sigmas / priors.root_weights[:, :3].min(1)
-            )
+            allowed = np.maximum(length, _OUTLIER_SIGMAS / priors.root_weights[:, 3:6].min(1))
+            turn = np.maximum(np.radians(_OUTLIER_ROTATION_DEG), _OUTLIER_SIGMAS / priors.root_weights[:, :3].min(1))
         angle = np.linalg.norm(rotation_vectors(priors.expected.rotations.transpose(0, 2, 1) @ moved.rotations), axis=1)
         good = (shift < allowed) & (angle < turn)
         # Of motions that satisfy as many, the one that does it better: positions along a line allow two.

@@ -9,13 +9,15 @@ import numpy as np
 
 from gsmap.geometry.directions import rotation_to_z
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.params import Gravity
+from gsmap.optimize.params import Params
 from gsmap.types import PoseGraph, ScenePose, Sim3
 from gsmap.types.world import WorldTie
 
+_MIN_AGREEMENT = 0.5  # length of the median of unit up directions below which scenes do not agree on what is up
+
 
 def gravity_align(
-    graph: PoseGraph, ups: Mapping[str, np.ndarray], fixed: Collection[str] = (), params: Gravity | None = None
+    graph: PoseGraph, ups: Mapping[str, np.ndarray], fixed: Collection[str] = (), params: Params | None = None
 ) -> PoseGraph:
     """The same answer with every component turned as a whole so that up is +z, unless it nearly is already.
 
@@ -24,9 +26,9 @@ def gravity_align(
     Args:
         ups: (3,) direction against gravity in the scene's frame, by scene id; scenes that cannot tell are left out.
         fixed: scenes held by a prior; their components stay as they are.
-        params: see `Gravity`.
+        params: ``max_tilt_deg`` is used.
     """
-    params = params or Gravity()
+    params = params or Params()
     components: dict[int, list[ScenePose]] = {}
     for pose in graph.poses.values():
         components.setdefault(pose.component, []).append(pose)
@@ -38,7 +40,7 @@ def gravity_align(
             continue
         up = np.median(votes, axis=0)  # one scene that took a wall for the floor must not tilt the map
         length = np.linalg.norm(up)
-        if length < params.min_agreement:
+        if length < _MIN_AGREEMENT:
             continue
         if np.arccos(np.clip(up[2] / length, -1, 1)) < np.radians(params.max_tilt_deg):
             continue

@@ -51,10 +51,10 @@ def close_through_singles(m: Measurements, state: State, params: Params) -> bool
 
 def close_loops(m: Measurements, state: State, params: Params) -> bool:
     """Take in the edges inside a component that agree with what the component predicts for them."""
-    rows = state.open(params.max_failures)
+    rows = state.open()
     if not len(rows):
         return False
-    drift = state.drift(m, params)
+    drift = state.drift(m)
     fits = rows[consistent_with_component(m, rows, drift, params.gate_probability)]
     state.accepted[fits] = True
     return len(fits) > 0
@@ -62,17 +62,17 @@ def close_loops(m: Measurements, state: State, params: Params) -> bool:
 
 def join_components(m: Measurements, state: State, params: Params, *, single: bool) -> bool:
     """Join components where edges agree, or, with ``single``, where one edge attaches a small component."""
-    rows = state.open(params.max_failures)
+    rows = state.open()
     if not len(rows):
         return False
-    drift = state.drift(m, params)
+    drift = state.drift(m)
     sizes = np.bincount(drift.labels)
     offers = find_joins(m, rows, drift, params.gate_probability)
-    decisions = [join_decision(join, m, sizes, params.joining, params.aliasing.sure) for join in offers]
+    decisions = [join_decision(join, m, sizes, params) for join in offers]
     wanted = "single" if single else "agreed"
     fitting = [join for join, decision in zip(offers, decisions, strict=True) if decision == wanted]
     if single:
-        chosen = attaching_joins(fitting, sizes, params.joining.small_component)
+        chosen = attaching_joins(fitting, sizes, params.min_large_component)
     else:
         chosen = spanning_joins(fitting, len(sizes))
     state.pending = {
@@ -96,7 +96,7 @@ def cut_weak_bridges(m: Measurements, state: State, params: Params) -> None:
     """
     single = bridges(m, state.accepted) & ~m.confirmed
     blocks = component_labels(m, np.flatnonzero(state.accepted & ~single))
-    solid = np.bincount(blocks) >= params.joining.small_component
+    solid = np.bincount(blocks) >= params.min_large_component
     graph = networkx.Graph()
     rows = np.flatnonzero(single)
     ends = np.stack([blocks[m.targets[rows]], blocks[m.sources[rows]]], axis=1)

@@ -11,8 +11,10 @@ import numpy as np
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.gauge import open_gauge
 from gsmap.optimize.measurements import Measurements
-from gsmap.optimize.params import Gauge
 from gsmap.optimize.priors import PriorTerms
+
+GAUGE_SIGMAS = np.array([1e-4] * 3 + [1e-3] * 3 + [1e-4])
+"""(7,) standard deviations with which an anchor is held: radians, its own unit, log scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +33,7 @@ class Solution:
     problem: str = ""
 
 
-def solve(
-    edges: Measurements, poses: Similarities, anchor: int, priors: PriorTerms, gauge: Gauge, marginal_scenes: int
-) -> Solution:
+def solve(edges: Measurements, poses: Similarities, anchor: int, priors: PriorTerms, marginal_scenes: int) -> Solution:
     """Optimise the scenes that ``edges`` reach, from a good guess, with one gauge prior on ``anchor``.
 
     The cost is gtsam's: half the sum of ``xi^T information xi`` with ``xi = Log(S_target_source^-1 S_target^-1
@@ -46,7 +46,7 @@ def solve(
     scenes = np.unique(np.r_[edges.targets, edges.sources, anchor])
     factors = _factors(edges, dim)
     start = poses[np.array([anchor])]
-    root = held_directions(edges, poses, scenes, anchor, priors, gauge)
+    root = held_directions(edges, poses, scenes, anchor, priors)
     if len(root):
         factors.push_back(_gauge_factor(anchor, start, root, dim))
     for k in range(len(priors)):
@@ -69,20 +69,13 @@ def solve(
 
 
 def held_directions(
-    edges: Measurements, poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, gauge: Gauge
+    edges: Measurements, poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms
 ) -> np.ndarray:
     """(K, D) whitened steps of the anchor's scene in which it is held: those that no prior decides."""
-    held = open_gauge(poses, scenes, anchor, priors, edges.dim, gauge.loose)
+    held = open_gauge(poses, scenes, anchor, priors, edges.dim)
     full = len(held) == edges.dim
-    out: np.ndarray = held / (
-        gauge_sigmas(gauge)[: edges.dim] if full else np.full(edges.dim, gauge.rotation_sigma_rad)
-    )
+    out: np.ndarray = held / (GAUGE_SIGMAS[: edges.dim] if full else np.full(edges.dim, GAUGE_SIGMAS[0]))
     return out
-
-
-def gauge_sigmas(gauge: Gauge) -> np.ndarray:
-    """(7,) standard deviations with which an anchor is held."""
-    return np.array([gauge.rotation_sigma_rad] * 3 + [gauge.translation_sigma] * 3 + [gauge.log_scale_sigma])
 
 
 def _factors(edges: Measurements, dim: int) -> gtsam.NonlinearFactorGraph:

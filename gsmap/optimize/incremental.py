@@ -25,6 +25,8 @@ from gsmap.optimize.structure import component_labels
 from gsmap.types import Edge, EdgeOutcome, PoseGraph, Prior, ScenePose, Sim3
 from gsmap.types.world import Survey
 
+_NEIGHBOURHOOD_HOPS = 2  # around a new scene's neighbours, that give way to it; the outermost scenes stay
+
 
 def place_new(
     scene_ids: Sequence[str],
@@ -37,9 +39,9 @@ def place_new(
     """The previous answer with the new scenes placed in it, or None where only a full solve will do.
 
     A full solve is due when scenes, measurements between old scenes or the recipe changed, when the map grew by
-    ``params.growth`` since the last one, or when a new scene ties components together, closes a long loop or comes with
-    edges that are in doubt or contradict each other. Poses placed here are provisional: only the surroundings of a new
-    scene give way to it.
+    ``params.max_growth`` since the last one, or when a new scene ties components together, closes a long loop or comes
+    with edges that are in doubt or contradict each other. Poses placed here are provisional: only the surroundings of a
+    new scene give way to it.
     """
     new = _to_place(scene_ids, previous, params)
     if not new or not {*survey.scenes(), *(prior.scene for prior in priors)} <= set(previous.poses):
@@ -81,7 +83,7 @@ def surroundings(
         beside.setdefault(a, []).append(b)
         beside.setdefault(b, []).append(a)
     ring = set(reached)
-    for _ in range(1 + params.neighbourhood + 2):
+    for _ in range(1 + _NEIGHBOURHOOD_HOPS + 2):
         ring = {b for a in ring for b in beside.get(a, ())} - reached
         reached |= ring
     return reached, ring
@@ -91,11 +93,11 @@ def _to_place(scene_ids: Sequence[str], previous: PoseGraph, params: Params) -> 
     """The new scenes; none where there are none, or they may not be placed one by one."""
     known, provenance = previous.poses, previous.provenance
     new = [scene for scene in scene_ids if scene not in known]
-    if provenance.recipe != recipe_key(params).recipe or not provenance.measured or params.growth <= 0:
+    if provenance.recipe != recipe_key(params).recipe or not provenance.measured or params.max_growth <= 0:
         return []
     if len(known) + len(new) != len(scene_ids) or len(set(scene_ids)) != len(scene_ids):
         return []
-    many = params.limits.full_scenes < len(scene_ids) <= (1 + params.growth) * provenance.batch_scenes
+    many = params.max_full_scenes < len(scene_ids) <= (1 + params.max_growth) * provenance.batch_scenes
     return new if many else []
 
 
@@ -124,14 +126,12 @@ def _place_all(
 
 
 def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, params: Params) -> PoseGraph | None:
-    near, rim, around = _surroundings(scene, own, taken, params.neighbourhood)
+    near, rim, around = _surroundings(scene, own, taken, _NEIGHBOURHOOD_HOPS)
     m = measurements([*near, scene], around + own, rigid=all_rigid([*around, *own], (), previous))
     poses = Similarities.stack([previous.poses[s].S_map_scene for s in near] + [Sim3.identity()])
     accepted = np.r_[np.ones(len(around), dtype=bool), m.confirmed[len(around) :]]
-    if (
-        m.confirmed[len(around) :].any()
-        or find_doubtful(m[np.arange(len(around), len(m))], params.aliasing.max_disagreement).any()
-    ):
+    own_edges = m[np.arange(len(around), len(m))]
+    if own_edges.confirmed.any() or find_doubtful(own_edges, params.max_disagreement).any():
         return None
     before = component_labels(m, np.flatnonzero(accepted))
     nothing = np.zeros(len(m), dtype=np.int64)
@@ -159,7 +159,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
         fixed = np.r_[np.array([s in rim for s in near], dtype=bool), False] | (after != after[-1])
         if fixed[mine].all() or not fixed[mine].any():
             fixed[mine] = True
-        descent = Descent(m[rows], fixed, params.limits.fill_blocks)
+        descent = Descent(m[rows], fixed)
         state.poses = descent.fit(state.poses, max_steps=5)
         components[-1] = components[first[0]]
         covariances[-1] = _covariance(len(near), rows, m, state.poses, [previous.poses[s] for s in near])

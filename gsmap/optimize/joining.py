@@ -14,7 +14,10 @@ from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.consistency import agreeing_pairs
 from gsmap.optimize.drift import DriftModel
 from gsmap.optimize.measurements import Measurements
-from gsmap.optimize.params import Joining
+from gsmap.optimize.params import Params
+
+_MIN_RIVAL_EDGES = 2  # contradicting edges that agree among themselves count as a place that looks alike from so many
+_RIVAL_FACTOR = 3  # such a rival must be outnumbered so many times before large components join
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,19 +83,21 @@ def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probabi
     return out
 
 
-def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Joining, sure: float = 0.9) -> str:
+def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Params) -> str:
     """``agreed``, ``single`` or, where the evidence does not suffice, the reason in words.
 
-    For what is assumed of edges that agree see `Joining`.
+    Modelling assumption: independent mistakes do not agree with each other, so agreeing edges are either right or come
+    from a place that looks like another. It fails where one mistake is made several times over: scenes cut from one
+    capture, or furniture of which there are many.
 
-    Args:
-        sure: as many edges as contradict them suffice where their evidence makes them right this probably.
+    As many edges as contradict them suffice where ``params.min_wrong_probability`` separates them by their evidence.
     """
     rows = join.edges
     if edges.confirmed[join.offered].any():
         return "agreed"
-    large = min(sizes[join.target], sizes[join.source]) >= params.small_component
-    aliased = join.rival >= params.rival_edges and len(rows) < params.rival_factor * join.rival
+    large = min(sizes[join.target], sizes[join.source]) >= params.min_large_component
+    aliased = join.rival >= _MIN_RIVAL_EDGES and len(rows) < _RIVAL_FACTOR * join.rival
+    sure = params.min_wrong_probability
     outweighed = len(rows) <= join.rival - int(join.log_odds >= np.log(sure / (1 - sure)))
     if outweighed or (large and aliased):
         return f"{len(rows)} edges agree and {join.rival} others contradict them: undecided"
@@ -100,11 +105,12 @@ def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Jo
     high = np.maximum(edges.targets[rows], edges.sources[rows])
     pairs = len(np.unique(low * edges.num_scenes + high))
     if large:
-        if pairs >= params.bridge_edges:
+        if pairs >= params.min_bridge_edges:
             return "agreed"
         return (
-            f"would join two components of {params.small_component} or more scenes: needs {params.bridge_edges} "
-            f"agreeing edges over {params.bridge_edges} scene pairs, or one that is confirmed, has {pairs}"
+            f"would join two components of {params.min_large_component} or more scenes: needs "
+            f"{params.min_bridge_edges} agreeing edges over {params.min_bridge_edges} scene pairs, or one that is "
+            f"confirmed, has {pairs}"
         )
     return "agreed" if pairs >= 2 else "single"
 
@@ -158,7 +164,7 @@ def spanning_joins(offers: list[Join], count: int) -> list[Join]:
     return [order[int(k) - 1] for k in np.sort(tree.data)]
 
 
-def attaching_joins(offers: list[Join], sizes: np.ndarray, small_component: int) -> list[Join]:
+def attaching_joins(offers: list[Join], sizes: np.ndarray, min_large: int) -> list[Join]:
     """Joins by single edges: each takes in one small component, the likeliest join first (a minimum spanning forest as
     Prim's); of equals those of the largest component, from it outwards."""
     ties: dict[int, list[tuple[int, Join]]] = {}
@@ -166,7 +172,7 @@ def attaching_joins(offers: list[Join], sizes: np.ndarray, small_component: int)
         ties.setdefault(join.target, []).append((join.source, join))
         ties.setdefault(join.source, []).append((join.target, join))
     starts = sorted(ties, key=lambda label: (-sizes[label], label))
-    taken = {label for label in starts if sizes[label] >= small_component}
+    taken = {label for label in starts if sizes[label] >= min_large}
     out: list[Join] = []
     front: list[tuple[float, int, int, int, Join]] = []
     pushed = itertools.count()
@@ -176,12 +182,12 @@ def attaching_joins(offers: list[Join], sizes: np.ndarray, small_component: int)
             heapq.heappush(front, (join.log_odds_wrong, rank, next(pushed), there, join))
 
     for rank, start in enumerate(starts):
-        if start in taken and sizes[start] < small_component:
+        if start in taken and sizes[start] < min_large:
             continue
         taken.add(start)
         reach(start, rank)
         # Components that are not small reach out together: what lies between goes to the likelier.
-        if rank + 1 < len(starts) and sizes[starts[rank + 1]] >= small_component:
+        if rank + 1 < len(starts) and sizes[starts[rank + 1]] >= min_large:
             continue
         while front:
             _, mine, _, there, join = heapq.heappop(front)

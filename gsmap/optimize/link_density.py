@@ -10,7 +10,12 @@ from scipy.special import betaln
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
-from gsmap.optimize.params import LinkDensityParams
+
+_SINGLE_WRONG = 0.3  # prior probability that a link of one edge is wrong
+_GROUP_WRONG = 0.01  # the same of a link of several edges that agree
+_NEAR_LENGTHS = 1.25  # scenes nearer than so many typical edges are near each other
+_CONCENTRATION = 20.0  # of the Beta distribution of the density of true links, in pairs
+_SPARSER = 3.0  # factor by which links between places that look alike are sparser than true ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +46,10 @@ class LinkDensity:
     Args:
         length: up to which scenes count as near each other, in map units.
         share: of near pairs, that is tied.
-        params: see `LinkDensityParams`.
     """
 
     length: float
     share: float
-    params: LinkDensityParams
 
     @classmethod
     def of(
@@ -55,9 +58,8 @@ class LinkDensity:
         accepted: np.ndarray,
         labels: np.ndarray,
         poses: Similarities,
-        params: LinkDensityParams,
     ) -> LinkDensity:
-        length = params.near_lengths * typical_length(edges, poses)
+        length = _NEAR_LENGTHS * typical_length(edges, poses)
         # Components have frames of their own: a fourth coordinate keeps them apart.
         apart = np.c_[poses.translations, 10.0 * length * labels]
         near = cKDTree(apart).query_pairs(length, output_type="ndarray")
@@ -66,18 +68,17 @@ class LinkDensity:
         busy = pairs > 0
         # The median scene's: where the map is folded, scenes that are not neighbours lie together.
         share = np.median(tied[busy] / pairs[busy]) if busy.any() else 0.5
-        return cls(length, float(np.clip(share, 0.05, 0.9)), params)
+        return cls(length, float(np.clip(share, 0.05, 0.9)))
 
     def link(self, edges: Measurements, rows: np.ndarray, moving: np.ndarray, poses: Similarities) -> Link:
         """A link by its rows, and the log odds that it is wrong."""
-        params = self.params
         ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
         still = cKDTree(poses.translations[ends[~moving[ends]]])
         pairs = int(still.count_neighbors(cKDTree(poses.translations[ends[moving[ends]]]), self.length))
         tied = min(pairs, len(_tied(edges, rows, poses, self.length)))
-        true = params.concentration * self.share, params.concentration * (1 - self.share)
-        alike = 1.0, params.sparser / self.share - 1.0
-        wrong = params.alone_wrong if len(rows) == 1 else params.group_wrong
+        true = _CONCENTRATION * self.share, _CONCENTRATION * (1 - self.share)
+        alike = 1.0, _SPARSER / self.share - 1.0
+        wrong = _SINGLE_WRONG if len(rows) == 1 else _GROUP_WRONG
         evidence = [betaln(a + tied, b + pairs - tied) - betaln(a, b) for a, b in (alike, true)]
         return Link(rows, moving, float(evidence[0] - evidence[1] + np.log(wrong / (1 - wrong))))
 

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.consistency import DirectedEdges
+from gsmap.optimize.contradictions import MAX_SUSPECTS
 from gsmap.optimize.cycles import Vote
 from gsmap.optimize.drift import DriftModel
 from gsmap.optimize.gauge import outlier_priors
@@ -29,6 +30,16 @@ from gsmap.optimize.params import Params
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.structure import component_labels
 
+_SPARE_RATIO = 3.0  # where no link is surely wrong, links so many times less probable than the likeliest are spared
+_WELL_SUPPORTED = 0.5  # edges with this share of the median support lie within a place, and are considered first
+_CUT_DEPTH = 5  # recursion to either side of the lightest cut of a loop
+_SUPPORT_POWER = 3.0  # an edge weighs this power of its share of agreeing neighbours when a loop is cut
+_PRIOR_SUPPORT_POWER = 2.0  # the same where contradicting priors are separated
+_MIN_MOTION_LENGTHS = 2.0  # a group matters if it demands a motion of more than so many typical edges
+_GROUP_LENGTHS = 1.0  # edges that demand motions within so many typical edges may be one group
+_CONTESTED_RATIO = 3  # scenes of which more than one edge in so many crosses a wrong link belong to neither side
+_PRIOR_EDGES = 10.0  # a prior weighs as much as so many edges without a triangle,
+_PRIOR_FACTOR = 2.0  # and is outweighed by a cut of more than so many times its weight
 MAX_WEIGHT = 20_000  # sums of weights must stay within 32 bits
 # The side of this direction tells a motion from its inverse; motions are hardly ever at right angles to odd numbers.
 _GENERIC = np.array([0.8164, 0.5213, 0.2483])
@@ -78,19 +89,17 @@ def resolve_aliased_loops(
     if not len(rows):
         return found
     length = typical_length(edges, poses)
-    density = LinkDensity.of(edges, accepted, labels, poses, params.aliasing.link)
-    drift = DriftModel.over(edges, np.flatnonzero(accepted), poses, params.limits.exact_hops)
+    density = LinkDensity.of(edges, accepted, labels, poses)
+    drift = DriftModel.over(edges, np.flatnonzero(accepted), poses)
     # A torn place and the look-alikes that tore it ask for one motion: the place's own edges are those that their
     # neighbours support, and come first.
-    supported = votes.support >= params.aliasing.well_supported * np.median(votes.support[accepted])
-    for group in _groups(edges, rows, drift, length, params):
+    supported = votes.support >= _WELL_SUPPORTED * np.median(votes.support[accepted])
+    for group in _groups(edges, rows, drift, length, params.gate_probability):
         inner = supported[group.rows]
         for candidate in (group,) if inner.all() else (group[inner], group):
             if found.wrong.any() or found.undecided.any() or len(np.unique(np.r_[candidate.near, candidate.far])) < 3:
                 continue
-            links = _links(
-                edges, accepted, votes, density, poses, candidate.near, candidate.far, params, params.aliasing.cut_depth
-            )
+            links = _links(edges, accepted, votes, density, poses, candidate.near, candidate.far, _CUT_DEPTH)
             if links:
                 hypothesis = candidate.hypothesis(edges, density, poses)
                 _decide(found, edges, accepted, group, candidate, [hypothesis, *links], params)
@@ -107,35 +116,30 @@ def _decide(
     params: Params,
 ) -> None:
     """Which link of a loop is wrong; the first of ``loop`` is the candidate itself, all or a part of the group."""
-    aliasing = params.aliasing
     log_odds = np.array([link.log_odds_wrong for link in loop])
     probability = np.exp(log_odds - log_odds.max())
     probability /= probability.sum()
     worst = int(probability.argmax())
-    if probability[worst] >= aliasing.sure and worst > 0:
+    if probability[worst] >= params.min_wrong_probability and worst > 0:
         # What too few edges speak against is not called wrong; the parts that they tie stay apart.
         least = loop[worst].rows
-        verdict = (
-            found.wrong if len(candidate.rows) >= params.joining.bridge_edges or len(least) == 1 else found.undecided
-        )
+        verdict = found.wrong if len(candidate.rows) >= params.min_bridge_edges or len(least) == 1 else found.undecided
         verdict[least] = True
-        found.undecided |= _contested(edges, accepted, least, aliasing.contested_ratio)
+        found.undecided |= _contested(edges, accepted, least)
         found.right[candidate.rows] = True
     elif candidate is not group:
         return
-    elif probability[worst] >= aliasing.sure:
-        found.undecided |= _contested(edges, accepted, group.rows, aliasing.contested_ratio)
+    elif probability[worst] >= params.min_wrong_probability:
+        found.undecided |= _contested(edges, accepted, group.rows)
     else:
         suspects = [
-            link
-            for link, p in zip(loop[1:], probability[1:], strict=True)
-            if p * aliasing.spare_ratio > probability[worst]
+            link for link, p in zip(loop[1:], probability[1:], strict=True) if p * _SPARE_RATIO > probability[worst]
         ]
         # Where hardly any stands out the wrong one is not among them: parting all would lose what is known.
-        suspects = suspects if len(suspects) <= aliasing.max_suspects else []
+        suspects = suspects if len(suspects) <= MAX_SUSPECTS else []
         for link in suspects:
             found.undecided[link.rows] = True
-            found.undecided |= _contested(edges, accepted, link.rows, aliasing.contested_ratio)
+            found.undecided |= _contested(edges, accepted, link.rows)
         # A link deep in the loop may leave other ways round: then the group asks again.
         parts = component_labels(edges, np.flatnonzero(accepted & ~found.undecided))
         if not suspects or (parts[group.near] != parts[group.far]).all():
@@ -162,13 +166,13 @@ class Group:
         return density.link(edges, self.rows, ends, poses.replaced(self.far, moved))
 
 
-def _contested(edges: Measurements, accepted: np.ndarray, link: np.ndarray, ratio: int) -> np.ndarray:
-    """(E,) bool: edges of scenes of which more than one edge in ``ratio`` crosses a link; they go to neither side."""
+def _contested(edges: Measurements, accepted: np.ndarray, link: np.ndarray) -> np.ndarray:
+    """(E,) bool: edges of scenes of which one edge in `_CONTESTED_RATIO` or more crosses a link; they join no side."""
     n = edges.num_scenes
     across = np.bincount(np.r_[edges.targets[link], edges.sources[link]], minlength=n)
     rows = np.union1d(np.flatnonzero(accepted), link)
     whole = np.bincount(np.r_[edges.targets[rows], edges.sources[rows]], minlength=n)
-    contested = (across > 0) & (ratio * across > whole)
+    contested = (across > 0) & (_CONTESTED_RATIO * across > whole)
     out = np.zeros(len(edges), dtype=bool)
     out[rows] = contested[edges.targets[rows]] | contested[edges.sources[rows]]
     return out
@@ -182,12 +186,10 @@ def _links(
     poses: Similarities,
     near: np.ndarray,
     far: np.ndarray,
-    params: Params,
     depth: int,
 ) -> list[Link]:
     """The weak links on the way between two sets of scenes: the lightest cut, and then those on either side of it."""
-    power = params.aliasing.support_power
-    parts = smallest_cut(edges, accepted, votes, near, far, power) if depth else None
+    parts = smallest_cut(edges, accepted, votes, near, far, _SUPPORT_POWER) if depth else None
     if parts is None:
         return []
     rows, moving = parts
@@ -198,35 +200,34 @@ def _links(
     before = ~moving[edges.targets] & ~moving[edges.sources]
     still_end, moving_end = ends[~moving[ends]], ends[moving[ends]]
     return [
-        *_links(edges, accepted & before, votes, density, poses, near, still_end, params, depth - 1),
+        *_links(edges, accepted & before, votes, density, poses, near, still_end, depth - 1),
         density.link(edges, rows, moving, poses),
-        *_links(edges, accepted & beyond, votes, density, poses, moving_end, far, params, depth - 1),
+        *_links(edges, accepted & beyond, votes, density, poses, moving_end, far, depth - 1),
     ]
 
 
 def contradicted_priors(
-    edges: Measurements, accepted: np.ndarray, poses: Similarities, votes: Vote, priors: PriorTerms, params: Params
+    edges: Measurements, accepted: np.ndarray, poses: Similarities, votes: Vote, priors: PriorTerms
 ) -> tuple[np.ndarray, np.ndarray]:
     """Edges to let go because priors at either end of them contradict each other; priors that are outweighed.
 
     The priors of a component are compared under the motion of the component that satisfies most of them. Those it
     leaves far off either name a part that belongs elsewhere, and the smallest cut to it is let go, or they are wrong
-    themselves, if that cut weighs ``prior_factor`` times as much; see `Gauge`.
+    themselves, if that cut weighs more than `_PRIOR_FACTOR` times as much.
 
     Returns:
         (E,) bool: cut edges; (P,) bool: outweighed priors.
     """
     cut, outweighed = np.zeros(len(edges), dtype=bool), np.zeros(len(priors), dtype=bool)
     labels = component_labels(edges, np.flatnonzero(accepted))
-    gauge = params.gauge
     for label in np.unique(labels[priors.scenes]):
         mine = np.flatnonzero(labels[priors.scenes] == label)
-        off = outlier_priors(poses, priors[mine], typical_length(edges, poses), gauge)
+        off = outlier_priors(poses, priors[mine], typical_length(edges, poses))
         if not off.any() or off.all():
             continue
         near, far = priors.scenes[mine[~off]], priors.scenes[mine[off]]
-        parts = smallest_cut(edges, accepted, votes, near, far, params.aliasing.prior_support_power)
-        bearable = gauge.prior_factor * gauge.prior_edges * off.sum()
+        parts = smallest_cut(edges, accepted, votes, near, far, _PRIOR_SUPPORT_POWER)
+        bearable = _PRIOR_FACTOR * _PRIOR_EDGES * off.sum()
         if parts is not None and (1 + votes.agree[parts[0]]).sum() <= bearable:
             cut[parts[0]] = True
         else:
@@ -234,7 +235,7 @@ def contradicted_priors(
     return cut, outweighed
 
 
-def _groups(edges: Measurements, rows: np.ndarray, drift: DriftModel, length: float, params: Params) -> list[Group]:
+def _groups(edges: Measurements, rows: np.ndarray, drift: DriftModel, length: float, probability: float) -> list[Group]:
     """Edges of one component that ask for the same motion."""
     poses, labels = drift.poses, drift.labels
     a, b = edges.targets[rows], edges.sources[rows]
@@ -247,11 +248,11 @@ def _groups(edges: Measurements, rows: np.ndarray, drift: DriftModel, length: fl
     directed = DirectedEdges.of(edges, rows, turned)
     corners = middle + 10 * length * np.eye(3)
     feature = np.concatenate([motion.apply(np.tile(c, (len(rows), 1))) - c for c in corners], axis=1)
-    off = np.abs(feature).max(1) > params.aliasing.min_motion_lengths * length
+    off = np.abs(feature).max(1) > _MIN_MOTION_LENGTHS * length
     # Motions that are nearly alike, and then those that are the same within what the map knows.
-    pairs = cKDTree(feature).query_pairs(params.aliasing.group_lengths * length, p=np.inf, output_type="ndarray")
+    pairs = cKDTree(feature).query_pairs(_GROUP_LENGTHS * length, p=np.inf, output_type="ndarray")
     pairs = pairs[off[pairs].all(1) & (labels[a[pairs[:, 0]]] == labels[a[pairs[:, 1]]])]
-    pairs = pairs[directed.pairwise_consistent(pairs[:, 0], pairs[:, 1], drift, params.gate_probability)]
+    pairs = pairs[directed.pairwise_consistent(pairs[:, 0], pairs[:, 1], drift, probability)]
     graph = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
     which = connected_components(graph, directed=False)[1]
     order = np.argsort(which, kind="stable")

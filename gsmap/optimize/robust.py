@@ -14,6 +14,8 @@ from gsmap.optimize.blocks import BlockSystem
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.structure import component_labels, roots
 
+_GNC_SHRINK = 4.0  # factor by which the robust kernel narrows from one width to the next
+
 
 def spanning_tree_init(edges: Measurements, rows: np.ndarray, cost: np.ndarray, poses: Similarities) -> Similarities:
     """Poses by following the cheapest spanning forest of the edges at ``rows`` from each component's first scene.
@@ -79,7 +81,7 @@ def chi_squares(edges: Measurements, poses: Similarities) -> np.ndarray:
     return np.einsum("ed,edf,ef->e", r, edges.information, r)
 
 
-def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities, fill_blocks: int) -> Similarities:
+def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Similarities:
     """Least-squares poses without a starting guess; fixed scenes keep theirs.
 
     Rotations by the chordal relaxation (Martinec and Pajdla 2007; Carlone et al. 2015, sec. III-B): solve
@@ -97,7 +99,7 @@ def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities, fill_bl
     def solve(A: np.ndarray, B: np.ndarray, weight: np.ndarray, r: np.ndarray, known: np.ndarray) -> np.ndarray:
         """x over all scenes, from 0 at the unknown ones and ``known`` at the fixed ones."""
         start = np.where(still[:, None, None], known, 0.0)
-        system = BlockSystem(a, b, still, A.shape[2], fill_blocks)
+        system = BlockSystem(a, b, still, A.shape[2])
         W = weight[:, None, None] * np.eye(A.shape[1])
         return start + system.solve(A, B, W, A @ start[a] + B @ start[b] + r)
 
@@ -126,19 +128,17 @@ class Descent:
     Args:
         edges: what to fit.
         fixed: (N,) scenes that stay where they are.
-        fill_blocks: see `Limits`.
     """
 
     edges: Measurements
     fixed: np.ndarray
-    fill_blocks: int
 
     @cached_property
     def system(self) -> BlockSystem:
         touched = np.zeros(self.edges.num_scenes, dtype=bool)
         touched[self.edges.targets] = touched[self.edges.sources] = True
         still = self.fixed | ~touched
-        return BlockSystem(self.edges.targets, self.edges.sources, still, self.edges.dim, self.fill_blocks)
+        return BlockSystem(self.edges.targets, self.edges.sources, still, self.edges.dim)
 
     def step(self, poses: Similarities, weights: np.ndarray, r: np.ndarray) -> np.ndarray:
         """(N, D) Gauss-Newton step from residuals ``r`` and a weight per edge."""
@@ -166,13 +166,11 @@ class Descent:
                 break
         return poses
 
-    def solve_gnc(
-        self, poses: Similarities, gate: float, widest: float, shrink: float, trusted: np.ndarray
-    ) -> Similarities:
+    def solve_gnc(self, poses: Similarities, gate: float, widest: float, trusted: np.ndarray) -> Similarities:
         """Iteratively reweighted least squares with Geman-McClure weights, from wide to the width of the gate.
 
-        ``w = (c / (c + chi2))^2``; c starts at ``widest`` gates and shrinks by ``shrink`` (graduated non-convexity,
-        Yang et al. 2020, with a start that the vote makes narrow). ``trusted`` edges keep weight 1.
+        ``w = (c / (c + chi2))^2``; c starts at ``widest`` gates and shrinks by a factor (graduated non-convexity,
+        Yang et al. 2020, with a start that cycle consistency makes narrow). ``trusted`` edges keep weight 1.
         """
         c = gate * max(1.0, widest)
         noise = float(np.sqrt(np.median(np.einsum("eii->ei", self.edges.covariance)[:, :3])))
@@ -188,7 +186,7 @@ class Descent:
                     break
             if c <= gate:
                 return poses
-            c = max(gate, c / shrink)
+            c = max(gate, c / _GNC_SHRINK)
 
     def _cost(self, poses: Similarities) -> float:
         return float(chi_squares(self.edges, poses).sum())

@@ -16,6 +16,9 @@ from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import Descent, chi_squares, chordal, spanning_tree_init
 from gsmap.optimize.structure import component_labels, roots
 
+_MAX_FAILURES = 2  # an edge that was excluded so often is not taken in again
+_RESTART_GATES = 4.0  # poses from which an edge is further off are no start for Gauss-Newton; chordal relaxation is
+
 
 @dataclass(eq=False)
 class State:
@@ -68,14 +71,14 @@ class State:
             put(self.ambiguous),
         )
 
-    def open(self, max_failures: int) -> np.ndarray:
+    def open(self) -> np.ndarray:
         """Rows of the edges that may still be taken in."""
         settled = self.accepted | self.undecided | self.rejected
-        return np.flatnonzero(~settled & (self.failures < max_failures))
+        return np.flatnonzero(~settled & (self.failures < _MAX_FAILURES))
 
-    def drift(self, m: Measurements, params: Params) -> DriftModel:
+    def drift(self, m: Measurements) -> DriftModel:
         """How far predictions along the accepted edges may be off."""
-        return DriftModel.over(m, np.flatnonzero(self.accepted), self.poses, params.limits.exact_hops)
+        return DriftModel.over(m, np.flatnonzero(self.accepted), self.poses)
 
 
 def initial_state(m: Measurements, votes: Vote, terms: PriorTerms, params: Params) -> State:
@@ -89,12 +92,12 @@ def initial_state(m: Measurements, votes: Vote, terms: PriorTerms, params: Param
     cost[order] = np.arange(1, len(rows) + 1)
     poses = spanning_tree_init(m, rows, cost, Similarities.identity(m.num_scenes))
     if len(rows):
-        drift = DriftModel.over(m, rows, poses, params.limits.exact_hops)
+        drift = DriftModel.over(m, rows, poses)
         accepted[rows] = consistent_with_component(m, rows, drift, params.gate_probability) | m.confirmed[rows]
     return State.fresh(m, poses, accepted, terms)
 
 
-def refine(m: Measurements, state: State, gate: float, widest: float, params: Params) -> None:
+def refine(m: Measurements, state: State, gate: float, widest: float = 1.0) -> None:
     """Robust poses of every component from its accepted edges; edges that do not fit are let go.
 
     Args:
@@ -107,11 +110,10 @@ def refine(m: Measurements, state: State, gate: float, widest: float, params: Pa
     fixed = np.zeros(m.num_scenes, dtype=bool)
     fixed[roots(component_labels(m, rows))] = True
     edges = m[rows]
-    fill_blocks = params.limits.fill_blocks
-    if (chi_squares(edges, state.poses) > params.restart * gate).any():
-        state.poses = chordal(edges, fixed, state.poses, fill_blocks)
-    descent = Descent(edges, fixed, fill_blocks)
-    state.poses = descent.solve_gnc(state.poses, gate, widest, params.gnc_shrink, edges.confirmed)
+    if (chi_squares(edges, state.poses) > _RESTART_GATES * gate).any():
+        state.poses = chordal(edges, fixed, state.poses)
+    descent = Descent(edges, fixed)
+    state.poses = descent.solve_gnc(state.poses, gate, widest, edges.confirmed)
     bad = (chi_squares(edges, state.poses) > gate) & ~edges.confirmed
     state.accepted[rows[bad]] = False
     state.failures[rows[bad]] += 1

@@ -11,6 +11,7 @@ from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.params import Params
 from gsmap.types import Edge, EdgeOutcome, PoseGraph, ScenePose, Sim3
 
+_MAX_VARIANCE_CHANGE = 1e-2  # of covariances as a fraction of the variances, and of chi-squares of edges
 _ROUNDING = 1e-9  # rad, scene units, log scale: a step that no pose was ever known to
 _ROUNDS = 20  # of letting go what a group of scenes that moved tears at; then none of the component stays
 _SEAM = 10.0  # times what an edge may be off inside: around a group of scenes that moved, the small steps add up
@@ -19,10 +20,10 @@ _SEAM = 10.0  # times what an edge may be off inside: around a group of scenes t
 def kept_still(answer: PoseGraph, previous: PoseGraph | None, edges: Sequence[Edge], params: Params) -> PoseGraph:
     """The answer, with poses, covariances and chi-squares of the previous one where they are the same for all purposes.
 
-    A scene keeps its pose where the new one is within ``params.still_sigmas`` of its standard deviations, and where
-    that holds of its place beside each neighbour, too, by what the edge between them leaves open: far from the anchor
-    a rounding turns all scenes together, which moves each by more than neighbours are known to each other, and none
-    beside another. Scenes that did move are put to those that stay as the answer has them beside each other.
+    A scene keeps its pose where the new one is within ``params.max_unchanged_sigmas`` of its standard deviations, and
+    where that holds of its place beside each neighbour, too, by what the edge between them leaves open: far from the
+    anchor a rounding turns all scenes together, which moves each by more than neighbours are known to each other, and
+    none beside another. Scenes that did move are put to those that stay as the answer has them beside each other.
 
     What is kept is compared with an answer from all edges every time, so that small steps do not add up.
 
@@ -30,7 +31,7 @@ def kept_still(answer: PoseGraph, previous: PoseGraph | None, edges: Sequence[Ed
         previous: the last answer; None keeps nothing.
         edges: those that the answer rests on; at least those of all scenes whose pose is not the very object of before,
             and of those beside them that give way.
-        params: ``still_sigmas`` and ``still_variance``.
+        params: ``max_unchanged_sigmas`` is used.
     """
     if previous is None or not answer.poses:
         return answer
@@ -38,16 +39,16 @@ def kept_still(answer: PoseGraph, previous: PoseGraph | None, edges: Sequence[Ed
     # Where new scenes were placed one by one, all but a few poses are the very ones of before.
     changed = {scene for scene, pose in answer.poses.items() if previous.poses.get(scene) is not pose}
     graph = _Both.of(answer, previous, changed.union(*((e.target, e.source) for e in used)), used)
-    still = graph.still(answer, params.still_sigmas)
+    still = graph.still(answer, params.max_unchanged_sigmas)
     poses = dict(answer.poses)
-    for row, S_map_scene in graph.beside(still, params.still_sigmas).items():
+    for row, S_map_scene in graph.beside(still, params.max_unchanged_sigmas).items():
         scene = graph.scenes[row]
         poses[scene] = replace(poses[scene], S_map_scene=S_map_scene)
     for row in np.flatnonzero(still).tolist():
         scene = graph.scenes[row]
-        poses[scene] = _kept(poses[scene], previous.poses[scene], params.still_variance)
+        poses[scene] = _kept(poses[scene], previous.poses[scene], _MAX_VARIANCE_CHANGE)
     outcomes = {
-        pair: _kept_outcome(outcome, previous.outcomes.get(pair), params.still_variance)
+        pair: _kept_outcome(outcome, previous.outcomes.get(pair), _MAX_VARIANCE_CHANGE)
         for pair, outcome in answer.outcomes.items()
     }
     return replace(answer, poses=poses, outcomes=outcomes)

@@ -17,7 +17,6 @@ from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.gtsam_solve import held_directions
 from gsmap.optimize.measurements import all_rigid, measurements
-from gsmap.optimize.params import Params, SurveyParams
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.survey_groups import Refusal, solve_groups
 from gsmap.optimize.survey_report import active_of, lengths_only, report
@@ -43,7 +42,7 @@ class Surveyed:
 
 
 def tie_component(
-    whole: Component, poses: Similarities, survey: Survey, index: int, params: SurveyParams, marginal_scenes: int
+    whole: Component, poses: Similarities, survey: Survey, index: int, marginal_scenes: int
 ) -> Surveyed | None:
     """Solve a component with its observations, from poses that its edges alone gave; None where it has none.
 
@@ -55,7 +54,7 @@ def tie_component(
     terms = SurveyTerms.of(survey, own.edges.scene_ids, own.dim)
     if not terms:
         return None
-    system = System(own, terms, poses[whole.scenes], params)
+    system = System(own, terms, poses[whole.scenes])
     try:
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # what is not finite is caught below
             surveyed = _surveyed(system, whole, poses, survey, index, marginal_scenes)
@@ -93,7 +92,6 @@ def joint_of_answer(
     survey: Survey,
     scenes: Sequence[str],
     component: int,
-    params: Params,
 ) -> np.ndarray | None:
     """See `gsmap.optimize.joint_covariance`. Nothing is solved but for what the observations alone hold."""
     ids = sorted(scene for scene, pose in answer.poses.items() if pose.component == component)
@@ -107,11 +105,11 @@ def joint_of_answer(
     # The scene that holds the frame is the one that is known best.
     sure = [answer.poses[scene].covariance for scene in ids]
     anchor = int(np.argmin([np.inf if c is None else float(np.trace(c)) for c in sure]))
-    held = held_directions(m, poses, rows, anchor, terms, params.gauge)
+    held = held_directions(m, poses, rows, anchor, terms)
     tie = answer.tie(component)
     tied = tie is not None and tie.S_world_map is not None
     own = SurveyTerms.of(survey if tied else Survey(), m.scene_ids, m.dim)
-    system = System(Component(rows, m, terms, anchor, held), own, poses, params.survey)
+    system = System(Component(rows, m, terms, anchor, held), own, poses)
     x = own.start(poses, tie.S_world_map if tie is not None and tie.S_world_map is not None else Sim3.identity())
     row = {scene: k for k, scene in enumerate(ids)}
     wanted = [row[scene] for scene in scenes]

@@ -29,8 +29,8 @@ from gsmap.optimize.survey_shifts import (
     reason_of,
     shift_of,
 )
-from gsmap.optimize.survey_snooping import first_points, weakness, without_outliers
-from gsmap.optimize.survey_system import Active, Factor, System
+from gsmap.optimize.survey_snooping import MAX_ROUNDS, first_points, weakness, without_outliers
+from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, System
 from gsmap.optimize.survey_terms import Unknowns
 from gsmap.types import Sim3
 from gsmap.types.world import UNSOLVED, Contradiction, WorldFrame
@@ -96,7 +96,6 @@ def solve_groups(system: System, frame: WorldFrame | None) -> Solution | Refusal
 class _Groups:
     def __init__(self, system: System, places: Places, frame: WorldFrame) -> None:
         self.system, self.places, self.frame = system, places, frame
-        self.params = system.params
         self.verdicts = _Verdicts()
 
     def solve(self) -> Solution | Refusal:
@@ -124,7 +123,7 @@ class _Groups:
                 some = self.places[rows]
                 terms = self.system.terms.observations(reference.x)
                 shift = shift_of(self.system, terms, reference.factor, some, used=False)
-                if shift.log_p < np.log(1 - self.params.gate_probability):
+                if shift.log_p < np.log(1 - GATE_PROBABILITY):
                     why = causes(some, replace(shift, shaped=True), self.frame, self._ground(reference.rows))
                     found = contradiction(some, self._scenes(rows), shift, own, why, "against")
                     others = tuple(dict.fromkeys([*found.other_causes, "split", *one.other_causes]))
@@ -198,15 +197,15 @@ class _Groups:
     def _alone(self, rows: np.ndarray, *, bars: bool = False) -> _Tie | Contradiction | str:
         """The tie by some places alone, why they contradict each other, or what they do not determine."""
         some = self.places[rows]
-        if (missing := some.missing(self.params)) is not None:
+        if (missing := some.missing()) is not None:
             return missing
         try:
-            world, near = some.robust_fit(self.params)
+            world, near = some.robust_fit()
         except InputError:
-            return some.missing(self.params, Sim3.identity()) or NOTHING
+            return some.missing(Sim3.identity()) or NOTHING
         if not near.all() and (split := self._in_feet(rows)) is not None:
             return split
-        missing = some[near].missing(self.params, world)
+        missing = some[near].missing(world)
         if missing is not None:
             return missing if near.all() else self._contradicted(rows[~near], rows[near], world, missing)
         x = self.system.terms.start(self.system.scenes, world)
@@ -272,12 +271,12 @@ class _Groups:
         self, x: Unknowns, active: Active, rows: np.ndarray
     ) -> tuple[Unknowns, Active, Factor, np.ndarray]:
         """Data snooping by captures: photos whose common error is beyond what they state go, the worst first."""
-        for _ in range(self.params.max_rounds):
+        for _ in range(MAX_ROUNDS):
             factor, terms = self.system.factor(x, self.system.as_weights(active)), self.system.terms.observations(x)
             use = rows[self._is_active(active, rows)]
             use = use[self.places.kinds[use] == "photos"]
             units = np.unique(self.places.units[use])
-            worst, out = np.log((1 - self.params.gate_probability) / max(1, len(units))), None
+            worst, out = np.log((1 - GATE_PROBABILITY) / max(1, len(units))), None
             for unit in units:
                 mine = use[self.places.units[use] == unit]
                 if len(mine) >= 2:
@@ -310,7 +309,7 @@ class _Groups:
         dropped = [rows[unit == k] for k in np.flatnonzero(~kept).tolist()]
         terms = self.system.terms.observations(tie.x)
         shifts = [shift_of(self.system, terms, tie.factor, self.places[mine], used=False) for mine in dropped]
-        groups = clusters(shifts, self.params.gate_probability)
+        groups = clusters(shifts, GATE_PROBABILITY)
         largest = max(len(groups[0]), self._elsewhere(np.concatenate(dropped)))
         if kept.sum() > len(dropped) and (largest == 1 or kept.sum() >= _EQUAL * largest):
             for group in groups:
@@ -345,7 +344,7 @@ class _Groups:
         if len(rows) < 4:
             return 0
         try:
-            _, near = self.places[rows].robust_fit(self.params)
+            _, near = self.places[rows].robust_fit()
         except InputError:
             return 0
         return len(np.unique(self.places.units[rows[near]])) if near.sum() >= 4 else 0
@@ -389,7 +388,7 @@ class _Groups:
         for mine in self._sources(left[~np.isin(self.places.sources[left], sources)]):
             units = [mine[self.places.units[mine] == unit] for unit in np.unique(self.places.units[mine])]
             shifts = [shift_of(self.system, terms, reference.factor, self.places[unit], used=False) for unit in units]
-            alpha = np.log((1 - self.params.gate_probability) / len(units))
+            alpha = np.log((1 - GATE_PROBABILITY) / len(units))
             bad = [k for k, one in enumerate(shifts) if one.log_p < alpha or not one.shaped]
             # What is common to a source takes along those of its units that alone are just below the gate.
             bad += [k for k, one in enumerate(shifts) if k not in bad and any(_like(one, shifts[j]) for j in bad)]
@@ -406,7 +405,7 @@ class _Groups:
         unshaped = [k for k, one in enumerate(shifts) if not one.shaped]
         shaped = [k for k in range(len(shifts)) if k not in unshaped]
         sets = [np.array(unshaped)] if unshaped else []
-        sets += [np.array(shaped)[one] for one in clusters([shifts[k] for k in shaped], self.params.gate_probability)]
+        sets += [np.array(shaped)[one] for one in clusters([shifts[k] for k in shaped], GATE_PROBABILITY)]
         out = []
         for some in sets:
             rows = np.concatenate([units[k] for k in some.tolist()])
@@ -524,7 +523,7 @@ class _Groups:
             return np.zeros(0, dtype=bool)
         terms = self.system.terms.observations(reference.x)[3]
         tests = self.system.tests(reference.x, reference.active, reference.factor)
-        bad = tests.log_p[3] < np.log(1 - self.params.gate_probability)
+        bad = tests.log_p[3] < np.log(1 - GATE_PROBABILITY)
         if not bad.any():
             return ~bad
         # Both whitened: the residual, and the derivative of a bar's length in the map by the log scale.

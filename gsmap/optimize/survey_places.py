@@ -11,7 +11,6 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.geometry.rotations import skew
 from gsmap.geometry.umeyama import umeyama
-from gsmap.optimize.params import SurveyParams
 from gsmap.optimize.survey_system import System
 from gsmap.types import Sim3
 from gsmap.types.world import Fix
@@ -20,6 +19,10 @@ NOTHING = (
     "position, rotation and scale are not determined: it takes three control points that photos of the map show, or "
     "positions of cameras or scenes, that are not on one line"
 )
+MAX_ROTATION_SIGMA_DEG = 5.0  # a component whose rotation is less certain is not tied
+MAX_LOG_SCALE_SIGMA = 0.1  # the same of its log scale
+_DRIFT_SHARE = 0.03  # of a map's extent, by which it may be bent before its edges give way
+_DRAWS = 500  # triples of places that are tried as a first guess where there are too many to try all
 SURVEYED = "survey"  # the name of a fix of a scene's origin; other fixes are photos
 
 
@@ -62,7 +65,7 @@ class Places:
         out[:, 2] = np.hypot(out[:, 2], self.sea_m)
         return out
 
-    def missing(self, params: SurveyParams, S: Sim3 | None = None) -> str | None:
+    def missing(self, S: Sim3 | None = None) -> str | None:
         """What they do not determine, and what would; None where they determine everything.
 
         Args:
@@ -77,9 +80,9 @@ class Places:
                 "world; add two more that are not on one line with it"
             )
         best = float((1 / self.own_m.max(1) ** 2).mean() ** -0.5)
-        limit = np.radians(params.max_rotation_sigma_deg)
+        limit = np.radians(MAX_ROTATION_SIGMA_DEG)
         turns, scale = (np.array([0.0, 0.0, np.pi]), 0.0) if S is None else self._sigmas(S)
-        if scale > params.max_log_scale_sigma or turns[1] > limit:
+        if scale > MAX_LOG_SCALE_SIGMA or turns[1] > limit:
             return (
                 f"rotation and scale are not determined: {_listed(self.names)} lie at one place within their errors; "
                 f"add others further off than {3 * best:.2g} m"
@@ -117,7 +120,7 @@ class Places:
         turns = np.sqrt(np.maximum(0, np.linalg.eigvalsh(covariance[:3, :3]))) / size
         return turns, float(np.sqrt(max(0.0, covariance[6, 6]))) / size
 
-    def robust_fit(self, params: SurveyParams) -> tuple[Sim3, np.ndarray]:
+    def robust_fit(self) -> tuple[Sim3, np.ndarray]:
         """``S_world_map`` that most of them agree with, and (P,) bool which do.
 
         Every triple is tried, or so many of them; what agrees is what lies within its error and the drift of a map.
@@ -131,8 +134,8 @@ class Places:
         extent = 2 * float(np.median(np.linalg.norm(self.in_world - middle, axis=1)))
         reach = self.own_m.max(1) + (self.common_m.max(1) if len(np.unique(self.units)) > 1 else 0.0)
         reach = np.hypot(reach, self.sea_m if self.sea_m.min() == 0 else 0.0)
-        bar = 5 * reach + params.drift_share * extent
-        triples = list(itertools.combinations(range(n), 3)) if n <= 15 else self._drawn(params.draws)
+        bar = 5 * reach + _DRIFT_SHARE * extent
+        triples = list(itertools.combinations(range(n), 3)) if n <= 15 else self._drawn(_DRAWS)
         best, least = None, np.inf
         for three in triples:
             rows = list(three)

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gsmap.geometry.chi_square import chi2_quantile
-from gsmap.optimize.survey_system import Active, Factor, System, Tests
+from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, System, Tests
 from gsmap.optimize.survey_terms import Terms, Unknowns
 from gsmap.types.world import Contradiction, Residual, Survey, WorldFrame, WorldTie
 
+_MIN_CHECKS = 2.5  # redundancy of points, fixes and bars below which a note warns of unchecked observations
 _CONTRADICTS = "it contradicts the other observations"
 
 
@@ -77,7 +78,7 @@ def report(system: System, solved: Solution, index: int, frame: WorldFrame | Non
             f"observations and edges disagree by {np.sqrt(factor_of):.2g} times what they claim: the covariance "
             "is widened by that"
         )
-    if sum(float(tests.redundancies[kind].sum()) for kind in (0, 2, 3)) < system.params.min_checks:
+    if sum(float(tests.redundancies[kind].sum()) for kind in (0, 2, 3)) < _MIN_CHECKS:
         notes.append("hardly anything checks these observations: a blunder in one of them could not be told")
     world = x.world.item(0)
     return WorldTie(
@@ -110,12 +111,12 @@ def lengths_only(system: System, index: int, survey: Survey, refusal: Refusal) -
         picked = sum((s * pose.scale) ** 2 for s, pose in zip(bar.point_sigmas, poses, strict=True))
         logs.append(np.log(bar.length_m / across))
         variances.append((bar.sigma_m / bar.length_m) ** 2 + picked / across**2)
-    log, use = _agreed(np.array(logs), np.array(variances), system.params.gate_probability)
+    log, use = _agreed(np.array(logs), np.array(variances), GATE_PROBABILITY)
     weights = use / np.array(variances)
     sigma = float(weights.sum() ** -0.5)
     free = int(use.sum()) - 1
     off = float((weights * (np.array(logs) - log) ** 2).sum())
-    if free > 0 and off > chi2_quantile(system.params.gate_probability, free):
+    if free > 0 and off > chi2_quantile(GATE_PROBABILITY, free):
         sigma *= float(np.sqrt(off / free))
     for bar, one, variance, used in zip(terms.bars, logs, variances, use, strict=True):
         error = bar.length_m * (np.exp(log - one) - 1)
@@ -149,7 +150,7 @@ def _variance_factor(system: System, x: Unknowns, active: Active, tests: Tests) 
     )
     unknown = 7 + 3 * len({int(k) for k in system.terms.image_points[active[1]]})
     free = count - unknown
-    if free <= 0 or total <= chi2_quantile(system.params.gate_probability, free):
+    if free <= 0 or total <= chi2_quantile(GATE_PROBABILITY, free):
         return 1.0
     return total / free
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.geometry.chi_square import chi2_log_survival, chi2_quantile
 from gsmap.optimize.survey_places import Places
-from gsmap.optimize.survey_system import Factor, System
+from gsmap.optimize.survey_system import GATE_PROBABILITY, MIN_REDUNDANCY, Factor, System
 from gsmap.optimize.survey_terms import Terms
 from gsmap.types.world import Contradiction, WorldFrame
 
@@ -80,7 +80,7 @@ def shift_of(system: System, all_terms: Sequence[Terms], factor: Factor, places:
         return Shift(shift, covariance, log_p, agree, _shaped(system, factor, terms, mine, apart[agree], W, own))
     root = np.sqrt(own)
     values, axes = np.linalg.eigh((np.diag(own) - V) / root / root[:, None])
-    checked = values > system.params.min_redundancy
+    checked = values > MIN_REDUNDANCY
     along = axes.T @ (b / root)
     shift = (axes[:, checked] @ (along[checked] / values[checked])) / root
     spread = np.where(checked, 1 / np.maximum(values, 1e-300), 1e12)
@@ -106,7 +106,7 @@ def _shaped(
     system: System, factor: Factor, terms: Terms, rows: np.ndarray, apart: np.ndarray, W: np.ndarray, own: np.ndarray
 ) -> bool:
     """Whether places lie beside each other as the map has them, within their own errors and the map's."""
-    gate = chi2_quantile(system.params.gate_probability, 3)
+    gate = chi2_quantile(GATE_PROBABILITY, 3)
     mean = (W**2 * apart).sum(0) / own
     if len(rows) < 3 or np.median((((apart - mean) * W) ** 2).sum(1)) <= gate:
         return True

@@ -8,9 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from gsmap.geometry.chi_square import chi2_quantile
+from gsmap.optimize.survey_places import MAX_LOG_SCALE_SIGMA, MAX_ROTATION_SIGMA_DEG
 from gsmap.optimize.survey_report import world_covariance
-from gsmap.optimize.survey_system import Active, Factor, System, Tests
+from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, System, Tests
 from gsmap.optimize.survey_terms import Terms, Unknowns
+
+MAX_ROUNDS = 50  # of leaving out the worst observation and solving again
 
 
 def first_points(system: System, x: Unknowns) -> np.ndarray:
@@ -27,7 +30,7 @@ def without_outliers(system: System, x: Unknowns, allowed: Active, gross: Active
     """
     active: Active = tuple(use & ~bad for use, bad in zip(allowed, gross, strict=True))  # type: ignore[assignment]
     x = system.fit(replace(x, points=system.points_at(x, active)), system.as_weights(active), max_steps=3)
-    bars = [chi2_quantile(system.params.gate_probability, t.residuals.shape[1]) for t in system.terms.observations(x)]
+    bars = [chi2_quantile(GATE_PROBABILITY, t.residuals.shape[1]) for t in system.terms.observations(x)]
     wide = max((float((t.squares[a] / b).max(initial=0)) for t, a, b in _seen(system, x, active, bars)), default=1.0)
     while True:
         for _ in range(3):
@@ -40,7 +43,7 @@ def without_outliers(system: System, x: Unknowns, allowed: Active, gross: Active
         wide = max(1.0, wide / 4)
     active = tuple(a & (t.squares < 4 * b) & t.valid for t, a, b in _seen(system, x, active, bars))  # type: ignore[assignment]
     failures = [np.zeros(len(a), dtype=np.int64) for a in active]
-    for _ in range(system.params.max_rounds):
+    for _ in range(MAX_ROUNDS):
         x = system.fit(replace(x, points=system.points_at(x, active)), system.as_weights(active))
         tests = system.tests(x, active, system.factor(x, system.as_weights(active)))
         if not _exchange(system, active, allowed, tests, failures):
@@ -55,7 +58,7 @@ def _seen(system: System, x: Unknowns, active: Active, bars: Sequence[float]) ->
 def _exchange(system: System, active: Active, allowed: Active, tests: Tests, failures: list[np.ndarray]) -> bool:
     """Leave out the observation that contradicts the others most, or take back one that does not; whether any."""
     worst, place = 0.0, None
-    alpha = np.log(1 - system.params.gate_probability)
+    alpha = np.log(1 - GATE_PROBABILITY)
     for kind, (use, log_p) in enumerate(zip(active, tests.log_p, strict=True)):
         for k in np.flatnonzero(use & (log_p < alpha)).tolist():
             # Of two that say the same the survey of the point is doubted first: it is named first.
@@ -80,13 +83,13 @@ def weakness(system: System, factor: Factor) -> str:
     covariance = world_covariance(system, factor)
     values, axes = np.linalg.eigh(covariance[:3, :3])
     turn = float(np.degrees(np.sqrt(max(0.0, values[-1]))))
-    if turn > system.params.max_rotation_sigma_deg:
+    if turn > MAX_ROTATION_SIGMA_DEG:
         axis = ", ".join(f"{v:.2f}" for v in axes[:, -1])
         return (
             f"rotation about the map's axis ({axis}) is not determined (known to {turn:.2g} deg): add control "
             "points or positions far from the others, across that axis"
         )
-    if np.sqrt(covariance[6, 6]) > system.params.max_log_scale_sigma:
+    if np.sqrt(covariance[6, 6]) > MAX_LOG_SCALE_SIGMA:
         return (
             f"scale is not determined (known to {100 * np.sqrt(covariance[6, 6]):.2g} %): add control points or "
             "positions further apart, or a scale bar"

@@ -13,10 +13,12 @@ from scipy.sparse.linalg import splu
 from gsmap.geometry.chi_square import chi2_log_survival
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
-from gsmap.optimize.params import SurveyParams
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import linearised, residuals
 from gsmap.optimize.survey_terms import SurveyTerms, Terms, Unknowns
+
+GATE_PROBABILITY = 0.999  # quantile of the chi-square of an observation against all others; beyond it is an outlier
+MIN_REDUNDANCY = 1e-3  # directions of an observation that the others check by no more than this are not tested
 
 Active = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Which points, images, fixes and bars are solved from, each (G,) bool."""
@@ -115,8 +117,8 @@ class Tests:
 class System:
     """One component and what was observed of it."""
 
-    def __init__(self, own: Component, terms: SurveyTerms, scenes: Similarities, params: SurveyParams) -> None:
-        self.own, self.terms, self.params = own, terms, params
+    def __init__(self, own: Component, terms: SurveyTerms, scenes: Similarities) -> None:
+        self.own, self.terms = own, terms
         self.scenes = scenes
         self.start = scenes[np.array([own.anchor])]
         self.roots = np.linalg.cholesky(own.edges.information).transpose(0, 2, 1) if len(own.edges) else None
@@ -255,7 +257,7 @@ class System:
                 Q = np.eye(m) + np.where(use[rows], -1.0, 1.0)[:, None, None] * (own + own.transpose(0, 2, 1)) / 2
                 values, vectors = np.linalg.eigh(Q)
                 along = np.einsum("gab,ga->gb", vectors, some.residuals)
-                checked = values > self.params.min_redundancy
+                checked = values > MIN_REDUNDANCY
                 T[rows] = np.where(checked, along**2 / np.where(checked, values, 1.0), 0.0).sum(1)
                 dof[rows] = np.maximum(0, checked.sum(1) - (~real).sum(1))
                 redundancy[rows] = np.maximum(0, np.einsum("gaa->g", Q) - (~real).sum(1))

@@ -158,7 +158,7 @@ def test_a_scene_placed_by_what_lies_around_it_lies_where_all_edges_put_it(
     monkeypatch.setattr(Registrations, "usable", counted)
     for name, inputs in (("around", optimize._inputs), ("all", optimize.pose_inputs)):
         with filled(tmp_path / name, 40, tiny_pattern()) as one, one.standing_in():
-            one.map.with_settings({"optimize.limits.full_scenes": 10})
+            one.map.with_settings({"optimize.max_full_scenes": 10})
             one.map.optimize()
             monkeypatch.setattr(optimize, "_inputs", inputs)
             read.clear()
@@ -185,7 +185,7 @@ def test_all_is_solved_anew_where_an_older_edge_changed_as_well(tmp_path: Path) 
 
 def _changes_with_a_scene(alone: Filled) -> None:
     m = alone.map
-    m.with_settings({"optimize.limits.full_scenes": 10})
+    m.with_settings({"optimize.max_full_scenes": 10})
     m.optimize()
     names = m.store.scenes.names()
     methods = []

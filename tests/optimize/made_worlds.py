@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from gsmap.evaluate.registration import absolute_trajectory_error
 from gsmap.geometry import similarities
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.params import Limits, Params
+from gsmap.optimize.params import Params
 from gsmap.types import Edge, PoseGraph
 
-PLACING = Params(limits=Limits(full_scenes=0))
+PLACING = Params(max_full_scenes=0)
 """New scenes are placed one by one in maps of any size."""
 ROT_RAD, TRANS_M, STIFF = np.radians(0.5), 0.05, 1e10
 

@@ -61,7 +61,7 @@ def test_two_islands_stay_two_until_a_bridge_of_three_edges_joins_them():
     apart = optimize(ids, inside)
     assert [apart.poses[s].component for s in ids] == [0] * 5 + [1] * 5
     for weak in (bridge[:1], bridge[:2]):
-        still = optimize(ids, inside + weak, previous=apart, params=Params(growth=0))
+        still = optimize(ids, inside + weak, previous=apart, params=Params(max_growth=0))
         assert [still.poses[s].component for s in ids] == [0] * 5 + [1] * 5
         assert set(still.undecided) == {(e.target, e.source) for e in weak}
         assert "needs 3 agreeing edges" in still.outcomes[(weak[0].target, weak[0].source)].reason

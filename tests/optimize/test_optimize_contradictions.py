@@ -169,7 +169,7 @@ def test_what_ties_a_scene_first_is_the_likeliest(names):
 
 def test_a_new_scene_that_one_edge_ties_and_another_contradicts_is_for_the_whole_map_to_place():
     ids, right, wrong = front()
-    params = replace(PLACING, growth=1.0, marginals=False)
+    params = replace(PLACING, max_growth=1.0, marginals=False)
     before = optimize(ids[:3], right[:2], params=params)
     after = optimize(ids, [*right, wrong], (), before, params)
     assert after.provenance.method == "batch"

@@ -20,7 +20,7 @@ def test_placing_scenes_one_by_one_agrees_with_solving_at_once():
         answer = optimize(*known(world, count), previous=answer, params=PLACING)
         methods.append(answer.provenance.method)
     assert methods.count("incremental") >= 8
-    full = optimize(*known(world, 120), params=Params(growth=0))
+    full = optimize(*known(world, 120), params=Params(max_growth=0))
     assert full.provenance.method == "batch"
     away = []
     for scene in world.ids:
@@ -41,7 +41,7 @@ def test_a_placed_scene_has_an_honest_covariance():
     before = optimize(*known(world, 99), params=PLACING)
     after = optimize(*known(world, 100), previous=before, params=PLACING)
     assert after.provenance.method == "incremental"
-    full = optimize(*known(world, 100), params=Params(growth=0))
+    full = optimize(*known(world, 100), params=Params(max_growth=0))
     scene = world.ids[99]
     ratio = np.sqrt(np.diag(after.poses[scene].covariance)[:6] / np.diag(full.poses[scene].covariance)[:6])
     assert (ratio > 0.7).all()
@@ -82,7 +82,7 @@ def test_growth_by_a_tenth_and_joined_islands_are_solved_in_full():
 
     rng = np.random.default_rng(0)
     inside = [[a, b] for a in range(10) for b in range(a + 1, 10) if a // 5 == b // 5]
-    growing = replace(PLACING, growth=1)
+    growing = replace(PLACING, max_growth=1)
     apart = optimize(world.ids[:10], true_edges(world.truth, inside, rng, world.ids), params=growing)
     assert len({p.component for p in apart.poses.values()}) == 2
     ties = true_edges(world.truth, [[0, 10], [1, 10], [2, 10], [5, 10], [6, 10], [7, 10]], rng, world.ids)

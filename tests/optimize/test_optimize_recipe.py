@@ -34,7 +34,8 @@ def test_the_key_names_versions_and_the_solver(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "values", [{"aliasing.sure": 1.5}, {"joining.bridge_edges": 0}, {"gauge.loose": 0.0}, {"gnc_shrink": 1.0}]
+    "values",
+    [{"min_wrong_probability": 1.5}, {"min_bridge_edges": 0}, {"max_unchanged_sigmas": -1.0}, {"max_tilt_deg": -1.0}],
 )
 def test_odd_settings_are_refused(values):
     with pytest.raises(ConfigError):
@@ -67,7 +68,7 @@ def test_missing_covariances_are_noted():
     world = city(40, 0.0, seed=1)
     assert optimize(world.ids, world.edges).notes == ()
     assert optimize(world.ids, world.edges, params=Params(marginals=False)).notes == ()
-    few = Params(limits=replace(PLACING.limits, marginal_scenes=10))
+    few = replace(PLACING, max_marginal_scenes=10)
     answer = optimize(world.ids, world.edges, params=few)
     large = [p.component for p in answer.poses.values()].count(0)
     assert answer.poses[world.ids[0]].covariance is None

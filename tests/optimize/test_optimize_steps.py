@@ -11,7 +11,6 @@ from gsmap.geometry.similarities import Similarities
 from gsmap.optimize import Params, optimize
 from gsmap.optimize.joining import Join, join_decision, spanning_joins
 from gsmap.optimize.measurements import measurements
-from gsmap.optimize.params import Joining
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import chi_squares
 from gsmap.optimize.state import State, refine
@@ -33,7 +32,7 @@ def with_one_wrong(confirmed=False):
 
 def test_refining_lets_go_of_what_lies_beyond_the_gate():
     m, state = with_one_wrong()
-    refine(m, state, GATE, 16.0, Params())
+    refine(m, state, GATE, 16.0)
     assert not state.accepted[-1]
     assert state.failures[-1] == 1
     assert state.accepted[:-1].mean() > 0.97
@@ -42,7 +41,7 @@ def test_refining_lets_go_of_what_lies_beyond_the_gate():
 
 def test_refining_keeps_what_is_confirmed():
     m, state = with_one_wrong(confirmed=True)
-    refine(m, state, GATE, 16.0, Params())
+    refine(m, state, GATE, 16.0)
     assert chi_squares(m, state.poses)[-1] > GATE
     assert state.accepted.all()
     assert not state.failures.any()
@@ -84,7 +83,7 @@ def edges_between(pairs, confirmed=()):
 def test_when_components_join(agreeing, rival, sizes, confirmed, decision):
     m = edges_between([[k, 6 + k] for k in range(6)], confirmed)
     join = Join(0, 1, np.arange(agreeing), rival, np.arange(6))
-    assert decision in join_decision(join, m, np.array(sizes), Joining())
+    assert decision in join_decision(join, m, np.array(sizes), Params())
 
 
 def test_the_same_pair_of_scenes_counts_once_towards_a_bridge():
@@ -92,7 +91,7 @@ def test_the_same_pair_of_scenes_counts_once_towards_a_bridge():
     pose = Sim3.identity()
     edges = [Edge("s0", "s6", pose, information()), Edge("s6", "s0", pose, information())]
     m = measurements(ids, [*edges, Edge("s1", "s7", pose, information())])
-    decision = join_decision(Join(0, 1, np.arange(3), 0, np.arange(3)), m, np.array([6, 6]), Joining())
+    decision = join_decision(Join(0, 1, np.arange(3), 0, np.arange(3)), m, np.array([6, 6]), Params())
     assert "has 2" in decision
 
 
@@ -113,7 +112,7 @@ def test_joins_form_no_cycle_and_those_of_most_edges_come_first():
 
 def test_a_component_keeps_its_frame_when_it_is_solved_again():
     world = city(40, 0.0, seed=2)
-    params = Params(growth=0)
+    params = Params(max_growth=0)
     first = optimize(world.ids, world.edges, params=params)
     away = Sim3(poses_at(np.zeros((1, 3)), 5).rotations[0], np.array([100.0, 20, -5]))
     moved = {s: replace(p, S_map_scene=away @ p.S_map_scene) for s, p in first.poses.items()}

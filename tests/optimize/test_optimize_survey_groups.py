@@ -11,7 +11,6 @@ import pytest
 
 from gsmap.errors import CorruptError
 from gsmap.optimize import optimize
-from gsmap.optimize.params import SurveyParams
 from gsmap.optimize.survey_places import Places
 from gsmap.store.ties import tie_value, ties_of
 from gsmap.types import Sim3
@@ -182,15 +181,15 @@ def test_poor_places_take_no_information_away() -> None:
     poor = rng.uniform(0, 10, (40, 3))
     alone, S = places([0.01] * 4, good), Sim3.identity()
     together = places([0.01] * 4 + [50.0] * 40, np.concatenate([good, poor]))
-    assert alone.missing(SurveyParams(), S) is None
-    assert together.missing(SurveyParams(), S) is None
+    assert alone.missing(S) is None
+    assert together.missing(S) is None
     (turns, scale), (more_turns, more_scale) = alone._sigmas(S), together._sigmas(S)
     assert (more_turns <= turns * (1 + 1e-6)).all()
     assert more_scale <= scale * (1 + 1e-6)
     # Independent truth: the squared distances of the corners to an axis through their middle add up to 100 m2.
     assert turns[-1] == pytest.approx(0.01 / 10, rel=1e-6)
     line = np.stack([np.linspace(0, 10, 5), np.zeros(5), np.zeros(5)], axis=1)
-    assert "is not determined" in str(places([0.01] * 5, line).missing(SurveyParams(), S))
+    assert "is not determined" in str(places([0.01] * 5, line).missing(S))
 
 
 def test_contradictions_are_kept_with_the_tie() -> None:

@@ -70,7 +70,7 @@ def test_a_new_scene_moves_only_its_surroundings(street):
     far = moved(before, kept)
     assert set(street.ids) - ids <= far
     assert len(far) < 20
-    assert apart(answer, kept, street.edges) < 10 * PARAMS.still_sigmas
+    assert apart(answer, kept, street.edges) < 10 * PARAMS.max_unchanged_sigmas
     for scene, pose in kept.poses.items():
         assert pose.component == answer.poses[scene].component
         assert pose.status == answer.poses[scene].status
@@ -85,12 +85,12 @@ def test_keeping_again_and_again_does_not_drift():
         street.grow()
         answer = street.solved(kept)
         kept = kept_still(answer, kept, street.edges, PARAMS)
-        assert apart(answer, kept, street.edges) < 10 * PARAMS.still_sigmas
+        assert apart(answer, kept, street.edges) < 10 * PARAMS.max_unchanged_sigmas
     fresh = street.solved()
     steps = [fresh.poses[s].S_map_scene.inverse() @ kept.poses[s].S_map_scene for s in street.ids]
     sigma = [np.sqrt(np.diag(fresh.poses[s].covariance)) for s in street.ids]
     off = np.abs(Similarities.stack(steps).log()) - 1e-9
-    assert (off <= 20 * PARAMS.still_sigmas * np.array(sigma)).all()
+    assert (off <= 20 * PARAMS.max_unchanged_sigmas * np.array(sigma)).all()
 
 
 def test_a_loop_that_closes_moves_what_it_holds(street):
@@ -99,7 +99,7 @@ def test_a_loop_that_closes_moves_what_it_holds(street):
     answer = street.solved(before)
     kept = kept_still(answer, before, street.edges, PARAMS)
     assert len(moved(before, kept)) > len(street.ids) // 2
-    assert apart(answer, kept, street.edges) < 10 * PARAMS.still_sigmas
+    assert apart(answer, kept, street.edges) < 10 * PARAMS.max_unchanged_sigmas
 
 
 def test_without_an_answer_before_nothing_is_kept(street):

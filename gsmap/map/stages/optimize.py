@@ -75,7 +75,7 @@ def pose_basis(store: Store, settings: Settings, observed: Survey | None = None)
     """
     living, priors = store.scenes.brief(), store.priors.list()
     captured = {scene.id: None if scene.captured_at is None else parsed(scene.captured_at) for scene in living}
-    hours = settings.optimize.aliasing.same_visit_h
+    hours = settings.optimize.same_visit_h
     named, same_visits = {}, set()
     # By id, not in the order in which workers happened to finish: the same key whenever they were made.
     for one in store.registrations.standing(usable=True):
@@ -223,7 +223,7 @@ def solve_observed(store: Store, settings: Settings, observed: Survey) -> Soluti
 
 
 def _upright(answer: PoseGraph, basis: PoseBasis, params: solver.Params) -> PoseGraph:
-    return solver.gravity_align(answer, basis.ups, {prior.scene for prior in basis.priors}, params.gravity)
+    return solver.gravity_align(answer, basis.ups, {prior.scene for prior in basis.priors}, params)
 
 
 def _grow(store: Store, given: _Growth, settings: Settings, progress: StageProgress) -> bool:

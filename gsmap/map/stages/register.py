@@ -152,7 +152,7 @@ class Known:
         """What stands of every pair, and whether it is what this recipe makes, or a person told."""
         by = (
             work.recipe.recipe,
-            work.settings.optimize.aliasing.max_disagreement,
+            work.settings.optimize.max_disagreement,
             {scene: key.digest for scene, key in work.graphs.items()},
         )
         tried = work.store.registrations.tried()
@@ -226,7 +226,7 @@ def _register_candidates(work: _Work, known: Known) -> list[Registration]:
     beside: dict[str, list[Pair]] = {}
     for pair in neighbours({s: at for s, at in placed_scenes(store).items() if s in work.described}, params):
         beside.setdefault(pair[0], []).append(pair)
-    bar = work.settings.optimize.aliasing.max_disagreement
+    bar = work.settings.optimize.max_disagreement
     # Next to all neighbours have been tried; a list with one that has not keeps them all, and so its order.
     proposed = [*lists.values(), *(pairs for pairs in beside.values() if not all(known.has(*pair) for pair in pairs))]
     tried = {pair for pairs in proposed for pair in pairs if known.has(*pair)}
