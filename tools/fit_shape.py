@@ -99,7 +99,7 @@ def of_place(seed: int, place: Place, own: list[DemoCapture], others: list[DemoC
             points = np.concatenate(
                 [lifted(frames.depths_m[i], frames.cameras.intrinsics_px[i], poses[i])[0] for i in range(len(frames))]
             )
-            gaussians = as_gaussians(Scan(points), 1.0)
+            gaussians = as_gaussians(Scan(points), 0.02)
             source = view("scan", gaussians, synthesise_cameras(gaussians))
             for capture, same in targets:
                 target = view(capture.name, capture.gaussians, capture.cameras)

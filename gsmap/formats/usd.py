@@ -19,7 +19,7 @@ import numpy as np
 from gsmap.errors import InputError, MissingDependencyError, NotGaussiansError
 from gsmap.formats.axes import PLY, change_axes
 from gsmap.formats.quantise import check_size, require_writable
-from gsmap.formats.scans.params import Params
+from gsmap.formats.scans.limits import Params
 from gsmap.formats.scans.process import asked
 from gsmap.formats.tiles3d import box_of
 from gsmap.geometry.transforms import placed
@@ -50,7 +50,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     if not 0 < size <= _MAX_FILE_BYTES:
         raise InputError(f"{path} has {size:,} bytes; gsmap reads USD of 1 to {_MAX_FILE_BYTES:,}")
     mib = size / _MIB
-    limits = Params(memory_mb=int(_FREE_MIB + _RATIO * mib), time_s=_TIME_S + mib / _MIB_A_SECOND)
+    limits = Params(max_memory_mb=int(_FREE_MIB + _RATIO * mib), max_seconds=_TIME_S + mib / _MIB_A_SECOND)
     told = asked(path, "usd", limits)
     if "refused" in told:
         raise InputError(f"{path}: {told['refused']}")

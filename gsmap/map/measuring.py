@@ -56,7 +56,7 @@ def measure(
     if component is not None and component not in components:
         raise NotFoundError(f"the map has no component {component}: it has {', '.join(map(str, components))}")
     solved = _Solved(store, settings, graph)
-    said = [place(store, text, settings) for text in (a, b)]
+    said = [place(store, text) for text in (a, b)]
     placed = [_where(store, one, graph, component) for one in said]
     frame = next((tie.frame for tie in graph.world if tie.S_world_map is not None), None)
     notes = []

@@ -9,8 +9,8 @@ import numpy as np
 
 from gsmap.errors import ConfigError
 from gsmap.map.seeing import picked_point
-from gsmap.map.settings import Settings
 from gsmap.store import Store
+from gsmap.world.params import DEPTH_SIGMA_FRACTION, PIXEL_SIGMA_PX
 
 HOW = (
     "X,Y,Z (in the map), SCENE:X,Y,Z, SCENE:CAMERA@COLUMN,ROW (a pixel), or world:X,Y,Z (in the map's CRS; "
@@ -38,7 +38,7 @@ class Place:
     crs: str | None = None
 
 
-def place(store: Store, text: str, settings: Settings) -> Place:
+def place(store: Store, text: str) -> Place:
     """A point from what a person wrote.
 
     Raises:
@@ -58,15 +58,14 @@ def place(store: Store, text: str, settings: Settings) -> Place:
     camera, at, pixel = rest.rpartition("@")
     if colon and at and (numbers := _numbers(pixel, 2)) is not None:
         scene = store.scenes.get(scene_name).id
-        params = settings.world
-        found = picked_point(store, scene, camera, numbers, params.depth_sigma_share, params.pixel_sigma_px)
+        found = picked_point(store, scene, camera, numbers, DEPTH_SIGMA_FRACTION, PIXEL_SIGMA_PX)
         return Place(text, *found, scene=scene)
     raise ConfigError(f"{text!r} is no point: give {HOW}")
 
 
-def place_in_scene(store: Store, text: str, settings: Settings) -> Place:
+def place_in_scene(store: Store, text: str) -> Place:
     """A point that stays with a scene, whatever the next solve does to the map."""
-    found = place(store, text, settings)
+    found = place(store, text)
     if found.scene is None:
         raise ConfigError(
             f"{text!r} is a point of the {'world' if found.crs else 'map'}, whose frame the solve moves: pick it in a "

@@ -1,4 +1,4 @@
-"""The settings of georeferencing."""
+"""Settings of georeferencing."""
 
 from __future__ import annotations
 
@@ -6,35 +6,38 @@ from dataclasses import dataclass
 
 from gsmap.errors import ConfigError
 
+PIXEL_SIGMA_PX = 1.0
+"""Standard deviation of a control point in a photo, of picking it and of the camera."""
+
+DEPTH_SIGMA_FRACTION = 0.005
+"""Standard deviation of a rendered depth, per depth: splats lie around surfaces."""
+
+BAR_SIGMA_FRACTION = 0.002
+"""Standard deviation of a scale bar without a given one, per length."""
+
 
 @dataclass(frozen=True)
 class Params:
-    """How observations of the world are read. How they are weighed in the solve is in ``optimize.survey``.
+    """Default uncertainties of georeferencing; ``optimize.survey`` holds the settings of the solver.
 
     Args:
-        area_margin_deg: points may lie this far outside the area that a CRS is meant for: maps of Bavaria go beyond
-            their zone by two degrees; swapped axes and wrong systems go by more.
-        gcp_sigma_m: standard deviation of a control point where nobody gives one, horizontal and vertical.
-        pixel_sigma_px: of a control point in a photo: picking, and the camera that it was picked in.
-        depth_sigma_share: of a depth that was rendered, as a share of it: splats lie around surfaces, not on them.
-        gnss_sigma_m: of a position in EXIF that does not say how good it is, from photo to photo.
-        gnss_common_sigma_m: what all positions of a capture are off by together.
-        gnss_height_factor: heights by satellites are worse by this.
-        sea_level_sigma_m: EXIF gives heights above sea level, which is about so far from the ellipsoid, all over a map.
-        survey_sigma_m: of a scene's surveyed position where nobody gives one.
-        bar_sigma_share: of a scale bar, as a share of it, where nobody gives its sigma.
+        area_margin_deg: Distance in degrees, positive, by which points may lie outside the area of use of their CRS;
+            larger values accept more points, and swapped axes among them.
+        gcp_sigma_m: Standard deviation in metres, positive, of control points that are given without one; larger
+            values lower their weight.
+        gnss_sigma_m: Standard deviation in metres, positive, of EXIF positions that are given without one, independent
+            from photo to photo; larger values lower their weight.
+        gnss_common_sigma_m: Standard deviation in metres, positive, of the error that all EXIF positions of a scene
+            share; larger values lower their weight.
+        survey_sigma_m: Standard deviation in metres, positive, of surveyed scene positions that are given without one;
+            larger values lower their weight.
     """
 
     area_margin_deg: float = 2.0
     gcp_sigma_m: float = 0.01
-    pixel_sigma_px: float = 1.0
-    depth_sigma_share: float = 0.005
     gnss_sigma_m: float = 1.5
     gnss_common_sigma_m: float = 3.0
-    gnss_height_factor: float = 2.0
-    sea_level_sigma_m: float = 40.0
     survey_sigma_m: float = 1.0
-    bar_sigma_share: float = 0.002
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -14,7 +14,7 @@ from PIL import Image
 from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats import scans
-from gsmap.formats.scans import Params
+from gsmap.formats.scans import Params, limits
 from gsmap.types import Gaussians
 
 FAR = np.array([500_000.25, 5_400_000.5, 300.125])
@@ -68,9 +68,10 @@ def test_points_that_are_not_finite_are_left_out_and_told(tmp_path: Path) -> Non
         scans.read(write_ply(tmp_path / "b.ply", np.full((5, 3), np.inf), None))
 
 
-def test_of_many_points_an_even_share_is_taken(tmp_path: Path) -> None:
+def test_of_many_points_an_even_share_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points, _ = cloud(1000)
-    found = scans.read(write_ply(tmp_path / "a.ply", points, None), Params(max_points=300))
+    monkeypatch.setattr(limits, "MAX_POINTS", 300)
+    found = scans.read(write_ply(tmp_path / "a.ply", points, None))
     np.testing.assert_array_equal(found.points, points[::4])
     assert "250 of its 1,000" in found.notes[0]
 
@@ -194,10 +195,11 @@ def square(path: Path) -> Path:
     return path
 
 
-def test_a_textured_mesh_is_sampled_evenly_and_coloured(tmp_path: Path) -> None:
+def test_a_textured_mesh_is_sampled_evenly_and_coloured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = square(tmp_path / "a.glb")
     assert not scans.holds_splat(path)
-    found = scans.read(path, Params(max_points=4000))
+    monkeypatch.setattr(limits, "MAX_POINTS", 4000)
+    found = scans.read(path)
     assert found.kind == "mesh"
     assert len(found) == 4000
     np.testing.assert_allclose(found.points[:, 2], 0, atol=1e-6)
@@ -211,18 +213,19 @@ def test_a_textured_mesh_is_sampled_evenly_and_coloured(tmp_path: Path) -> None:
     ]:
         assert 900 < where.sum() < 1100  # a quarter each: by area
         np.testing.assert_allclose(found.colours[where], np.tile(colour, (where.sum(), 1)), atol=1e-6)
-    again = scans.read(path, Params(max_points=4000))
+    again = scans.read(path)
     np.testing.assert_array_equal(found.points, again.points)
 
 
-def test_meshes_and_clouds_that_open3d_reads(tmp_path: Path) -> None:
+def test_meshes_and_clouds_that_open3d_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nf 1 2 3\n")
-    found = scans.read(tmp_path / "a.obj", Params(max_points=500))
+    monkeypatch.setattr(limits, "MAX_POINTS", 500)
+    found = scans.read(tmp_path / "a.obj")
     assert found.colours is None
     assert (found.points[:, :2].sum(1) <= 2 + 1e-9).all()
     stl = ["solid a", "facet normal 0 0 1", "outer loop", "vertex 0 0 0", "vertex 2 0 0", "vertex 0 2 0"]
     (tmp_path / "a.stl").write_text("\n".join([*stl, "endloop", "endfacet", "endsolid a", ""]))
-    assert len(scans.read(tmp_path / "a.stl", Params(max_points=500))) == 500
+    assert len(scans.read(tmp_path / "a.stl")) == 500
     head = ["VERSION .7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1", "WIDTH 3", "HEIGHT 1"]
     (tmp_path / "a.pcd").write_text("\n".join([*head, "POINTS 3", "DATA ascii", "0 0 0", "1 2 3", "4 5 6", ""]))
     np.testing.assert_allclose(scans.read(tmp_path / "a.pcd").points, [[0, 0, 0], [1, 2, 3], [4, 5, 6]])
@@ -238,7 +241,7 @@ def test_what_no_library_reads_is_refused(tmp_path: Path, name: str) -> None:
 def test_a_mesh_that_takes_too_long_is_given_up(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nf 1 2 3\n")
     with pytest.raises(InputError, match="takes longer than"):
-        scans.read(tmp_path / "a.obj", Params(time_s=0.01))
+        scans.read(tmp_path / "a.obj", Params(max_seconds=0.01))
 
 
 def test_splats_are_told_from_scans(tmp_path: Path) -> None:
@@ -297,5 +300,5 @@ def test_depth_pictures_that_make_no_sense(tmp_path: Path) -> None:
     (tmp_path / "e.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match="picture"):
         scans.read_depth(tmp_path / "e.png", (50, 50, 32, 24))
-    with pytest.raises(ConfigError, match="max_points"):
-        Params(max_points=0)
+    with pytest.raises(ConfigError, match="max_memory_mb"):
+        Params(max_memory_mb=0)

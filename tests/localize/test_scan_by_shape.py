@@ -55,7 +55,7 @@ def pair() -> tuple[SceneView, SceneView, np.ndarray]:
     frames = film(place, walk(place, (0,), 8, seed=5), size_px=(144, 108))
     from scanned_flat import world_points
 
-    gaussians = as_gaussians(Scan(world_points(frames)[0]), 1.0)
+    gaussians = as_gaussians(Scan(world_points(frames)[0]), 0.02)
     target = view("capture", capture.gaussians, capture.cameras)
     return target, view("scan", gaussians, synthesise_cameras(gaussians)), capture.T_scene_world
 

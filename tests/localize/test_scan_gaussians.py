@@ -21,7 +21,7 @@ def plane(count: int = 4000, colours: bool = True) -> Scan:
 
 
 def test_discs_lie_in_the_surface() -> None:
-    found = as_gaussians(plane(), 1.0)
+    found = as_gaussians(plane(), 0.02)
     normals = quats_to_matrices(found.quats)[:, :, 2]
     assert np.abs(normals @ TURN[:, 2]).min() > 0.99
     np.testing.assert_allclose(found.log_scales[:, 2] - found.log_scales[:, 0], np.log(0.1), atol=1e-5)
@@ -31,23 +31,23 @@ def test_discs_lie_in_the_surface() -> None:
 
 
 def test_cells_are_metres_and_grow_where_there_are_too_many() -> None:
-    assert 1700 < len(as_gaussians(plane(20_000), 1.0)) < 3600
-    coarse = as_gaussians(plane(20_000), 2.0)  # 1 unit is 2 m: cells of 1 cm
+    assert 1700 < len(as_gaussians(plane(20_000), 0.02)) < 3600
+    coarse = as_gaussians(plane(20_000), 0.01)
     assert len(coarse) > 6000
-    few = as_gaussians(plane(20_000), 1.0, Params(max_points=300))
+    few = as_gaussians(plane(20_000), 0.02, max_points=300)
     assert 100 < len(few) <= 300
-    again = as_gaussians(plane(20_000), 1.0, Params(max_points=300))
+    again = as_gaussians(plane(20_000), 0.02, max_points=300)
     np.testing.assert_array_equal(few.means, again.means)
 
 
 def test_without_colours_it_is_grey() -> None:
-    found = as_gaussians(plane(colours=False), 1.0)
+    found = as_gaussians(plane(colours=False), 0.02)
     np.testing.assert_allclose(rgb_of_sh0(found.sh), NEUTRAL)
 
 
 def test_few_points_and_none() -> None:
-    assert len(as_gaussians(Scan(np.zeros((1, 3))), 1.0)) == 1
-    assert np.isfinite(as_gaussians(Scan(np.arange(9.0).reshape(3, 3)), 1.0).log_scales).all()
+    assert len(as_gaussians(Scan(np.zeros((1, 3))), 0.02)) == 1
+    assert np.isfinite(as_gaussians(Scan(np.arange(9.0).reshape(3, 3)), 0.02).log_scales).all()
     with pytest.raises(InputError, match="at least one point"):
         Scan(np.zeros((0, 3)))
     with pytest.raises(InputError, match="has colours"):

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.scans.depth import read_depth
-from gsmap.formats.scans.params import Params
+from gsmap.formats.scans.limits import Params
 from gsmap.types.scan import Scan
 
 SUFFIXES = (".ply", ".pcd", ".xyz", ".las", ".laz", ".obj", ".stl", ".glb")
@@ -85,12 +85,12 @@ def _read(path: Path, suffix: str, params: Params) -> Scan:
     if suffix == ".xyz":
         from gsmap.formats.scans import text
 
-        return text.read(path, params)
+        return text.read(path)
     if suffix == ".ply":
         from gsmap.formats.scans import ply_points
 
         if not ply_points.is_mesh(path):
-            return ply_points.read(path, params)
+            return ply_points.read(path)
     from gsmap.formats.scans import meshes
 
     return meshes.read(path, params)

@@ -10,11 +10,12 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.formats.pictures import open_picture
-from gsmap.formats.scans.params import Params
 from gsmap.types.cameras import Cameras
 from gsmap.types.scan import Scan
 
 _DEPTHS = ("I;16", "I;16B", "I;16L", "I", "F")
+MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 10.0  # depth sensors measure noise outside of this range
+EDGE_FRACTION = 0.04  # of the depth: larger steps between pixels are edges, where sensors put points in mid-air
 _MAX_PIXELS = 1 << 25  # 30 times those of depth cameras; each takes some forty bytes on the way to points
 
 
@@ -24,7 +25,6 @@ def read_depth(
     *,
     colour: str | os.PathLike[str] | None = None,
     units_per_m: float = 1000.0,
-    params: Params | None = None,
 ) -> Scan:
     """What one view of a depth camera shows, in the camera's own frame (OpenCV axes), metres.
 
@@ -39,7 +39,7 @@ def read_depth(
         InputError: not a depth picture, of another shape than the colours, intrinsics that make no sense, or no pixel
             that shows anything.
     """
-    path, params = Path(path), params or Params()
+    path = Path(path)
     picture, mode = _picture(path)
     if mode not in _DEPTHS:
         raise InputError(f"{path} is a picture of mode {mode}: a depth picture has one channel of 16 bits or floats")
@@ -48,12 +48,12 @@ def read_depth(
     fx, fy, cx, cy = _checked(intrinsics_px)
     depth = picture.astype(np.float64) / units_per_m
     height, width = depth.shape
-    good = np.isfinite(depth) & (depth > params.min_depth) & (depth < params.max_depth)
-    steep = _steep(np.where(good, depth, np.nan), params.edge)
+    good = np.isfinite(depth) & (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M)
+    steep = _steep(np.where(good, depth, np.nan), EDGE_FRACTION)
     rows, columns = np.nonzero(good & ~steep)
     if not len(rows):
         raise InputError(
-            f"{path}: no pixel shows a surface between {params.min_depth:g} and {params.max_depth:g} m when "
+            f"{path}: no pixel shows a surface between {MIN_DEPTH_M:g} and {MAX_DEPTH_M:g} m when "
             f"{units_per_m:g} units are a metre: is the depth scale right?"
         )
     z = depth[rows, columns]

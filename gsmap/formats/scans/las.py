@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError, MissingDependencyError
-from gsmap.formats.scans.params import Params
+from gsmap.formats.scans import limits
 from gsmap.formats.scans.points import scan_of
 from gsmap.formats.scans.process import asked
 from gsmap.types.scan import Scan
@@ -19,7 +19,7 @@ _RECORD_BYTES, _EXTENDED_BYTES = 54, 60  # of the header of a record of variable
 _SIXTEEN_BITS, _EIGHT_BITS = 65535.0, 255.0
 
 
-def read(path: Path, params: Params) -> Scan:
+def read(path: Path, params: limits.Params) -> Scan:
     """The points with their colours, about an origin near them.
 
     Raises:

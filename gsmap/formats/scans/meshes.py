@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats.scans.params import Params
+from gsmap.formats.scans import limits
 from gsmap.formats.scans.points import scan_of
 from gsmap.formats.scans.process import asked
 from gsmap.types.scan import Scan
@@ -19,7 +19,7 @@ from gsmap.types.scan import Scan
 _SEED = 0
 
 
-def read(path: Path, params: Params) -> Scan:
+def read(path: Path, params: limits.Params) -> Scan:
     """The points of a cloud, or points of a mesh.
 
     Raises:
@@ -39,9 +39,9 @@ def read(path: Path, params: Params) -> Scan:
         raise InputError(f"{path} holds no {'points' if kind == 'cloud' else 'mesh'} that open3d can read")
     if not len(triangles):
         total = len(vertices)
-        rows = slice(None, None, -(-total // params.max_points))
+        rows = slice(None, None, -(-total // limits.MAX_POINTS))
         return scan_of(vertices[rows], None if colours is None else np.clip(colours[rows], 0, 1), path, total)
-    return _sampled(path, found, vertices, colours, params.max_points)
+    return _sampled(path, found, vertices, colours, limits.MAX_POINTS)
 
 
 def _sampled(path: Path, found: dict[str, Any], vertices: np.ndarray, colours: np.ndarray | None, count: int) -> Scan:

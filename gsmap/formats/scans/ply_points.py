@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.formats import ply
-from gsmap.formats.scans.params import Params
+from gsmap.formats.scans import limits
 from gsmap.formats.scans.points import scan_of
 from gsmap.types.scan import Scan
 
@@ -21,7 +21,7 @@ def is_mesh(path: Path) -> bool:
     return any(name in elements and elements[name].count for name in ("face", "tristrips"))
 
 
-def read(path: Path, params: Params) -> Scan:
+def read(path: Path) -> Scan:
     """The points of the element ``vertex``, with ``red green blue`` where they have them.
 
     Raises:
@@ -33,7 +33,7 @@ def read(path: Path, params: Params) -> Scan:
     if not {"x", "y", "z"} <= names:
         raise InputError(f"{path}: its vertices lack x, y or z: it is no point cloud")
     total = len(rows)
-    rows = rows[:: -(-total // params.max_points)]
+    rows = rows[:: -(-total // limits.MAX_POINTS)]
     points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
     colours = None
     for channels in _COLOURS:

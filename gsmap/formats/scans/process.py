@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats.scans import child
-from gsmap.formats.scans.params import Params
+from gsmap.formats.scans import child, limits
 
 _MIB = 1 << 20
 
 
-def asked(path: Path, kind: str, params: Params) -> dict[str, np.ndarray]:
+def asked(path: Path, kind: str, params: limits.Params) -> dict[str, np.ndarray]:
     """What a library reads of a file, in a process of its own that ends when it takes too long or too much memory.
 
     Args:
@@ -33,7 +32,7 @@ def asked(path: Path, kind: str, params: Params) -> dict[str, np.ndarray]:
     command = [sys.executable, "-P", child.__file__, str(out), str(path.resolve()), kind]
     with os.fdopen(end, "rb") as pipe:
         process = subprocess.Popen(
-            [*command, str(params.memory_mb * _MIB), str(params.max_points)],
+            [*command, str(params.max_memory_mb * _MIB), str(limits.MAX_POINTS)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -51,24 +50,24 @@ def asked(path: Path, kind: str, params: Params) -> dict[str, np.ndarray]:
             return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(
-            f"{path} cannot be read: its reader gave it up, or needs more than {params.memory_mb} MB: it is damaged "
-            "or too large; convert it to a .ply"
+            f"{path} cannot be read: its reader gave it up, or needs more than {params.max_memory_mb} MB: it is "
+            "damaged or too large; convert it to a .ply"
         ) from error
 
 
-def _until_end(pipe: Any, process: subprocess.Popen[bytes], params: Params, path: Path) -> bytes:
+def _until_end(pipe: Any, process: subprocess.Popen[bytes], params: limits.Params, path: Path) -> bytes:
     """All that the process writes, before its time is up."""
-    timer = threading.Timer(params.time_s, process.kill)
+    timer = threading.Timer(params.max_seconds, process.kill)
     timer.start()
     parts, size = [], 0
     try:
         while part := pipe.read(_MIB):
             parts.append(part)
             size += len(part)
-            if size > params.memory_mb * _MIB:
-                raise InputError(f"{path} is larger than {params.memory_mb} MB in memory: thin it first")
+            if size > params.max_memory_mb * _MIB:
+                raise InputError(f"{path} is larger than {params.max_memory_mb} MB in memory: thin it first")
         if not timer.is_alive():
-            raise InputError(f"{path} takes longer than {params.time_s:g} s to read: thin it first")
+            raise InputError(f"{path} takes longer than {params.max_seconds:g} s to read: thin it first")
     finally:
         timer.cancel()
     return b"".join(parts)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats.scans.params import Params
+from gsmap.formats.scans import limits
 from gsmap.formats.scans.points import scan_of
 from gsmap.types.scan import Scan
 
@@ -18,7 +18,7 @@ _MOST_BYTES = 4 << 30  # beyond it a text takes longer to read than anybody wait
 _BYTE = 255.0
 
 
-def read(path: Path, params: Params) -> Scan:
+def read(path: Path) -> Scan:
     """Three columns are a point; three more that are whole numbers from 0 to 255, behind it or behind an intensity, are
     its colour. Columns are parted by spaces, commas or semicolons; lines before the first point are left out, and so
     are those that begin with ``#`` or ``//``.
@@ -37,7 +37,7 @@ def read(path: Path, params: Params) -> Scan:
         except ValueError as error:
             raise InputError(f"{path}: its rows cannot be read as {width} numbers each: {error}") from error
     total = len(rows)
-    rows = rows[:: -(-total // params.max_points)] if total else rows
+    rows = rows[:: -(-total // limits.MAX_POINTS)] if total else rows
     points, rest = rows[:, :3], rows[:, 3:]
     notes: tuple[str, ...] = ()
     colours = next((c for c in (rest[:, :3], rest[:, 1:4]) if _are_bytes(c)), None)

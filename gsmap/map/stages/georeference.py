@@ -26,6 +26,7 @@ from gsmap.types.world import UNSOLVED, ControlPoint, Fix, ImagePoint, ScaleBar,
 from gsmap.world.crs import WGS84, crs
 from gsmap.world.exif import read_folder
 from gsmap.world.frame import frame_at, of_frame, to_frame
+from gsmap.world.params import BAR_SIGMA_FRACTION, DEPTH_SIGMA_FRACTION, PIXEL_SIGMA_PX
 from gsmap.world.survey import check_area, frame_for, in_frame
 
 SURVEYED = "survey"
@@ -93,7 +94,7 @@ def georeference(
     if request.exif is not None:
         _read_exif(store, Path(request.exif), settings, before, noted)
     for one in request.bars:
-        noted.items.append(_bar(store, *one, request.bar_sigma_m, settings))
+        noted.items.append(_bar(store, *one, request.bar_sigma_m))
     if request.check is not None:
         _hold_out(before, set(request.check), noted)
     places = [one for one in noted.items if isinstance(one, (ControlPoint, Fix))]
@@ -236,9 +237,7 @@ def _read_gcp(
         if (earlier := picked.setdefault((line.name, scene, named), where)) is not where:
             raise InputError(f"{where}: point {line.name} in {line.image} again, as on {earlier}")
         seen.append(
-            ImagePoint(
-                line.name, named, scene, pixel, params.pixel_sigma_px, np.array(pose), np.array(intrinsics), covariance
-            )
+            ImagePoint(line.name, named, scene, pixel, PIXEL_SIGMA_PX, np.array(pose), np.array(intrinsics), covariance)
         )
     if not seen:
         raise NotFoundError(
@@ -256,7 +255,7 @@ def _read_gcp(
         points[line.name] = ControlPoint(line.name, found.crs, position, sigma, line.name in held)
     noted.items += points.values()
     for shown in views.values():
-        noted.items += [_with_depth(store, shown[0], settings)] if len(shown) == 1 else shown
+        noted.items += [_with_depth(store, shown[0])] if len(shown) == 1 else shown
 
 
 def _pixel(
@@ -295,13 +294,13 @@ class _Cameras:
         return scene, cameras[[camera[1]]]
 
 
-def _with_depth(store: Store, image: ImagePoint, settings: Settings) -> ImagePoint:
+def _with_depth(store: Store, image: ImagePoint) -> ImagePoint:
     """A point that one photo alone shows is where its ray meets the rendered surface."""
     size = np.ceil(np.maximum(image.pixel + 1, 2 * image.intrinsics_px[2:])).astype(np.int64)
     camera = Cameras(image.T_scene_camera[None], image.intrinsics_px[None], size[None], (image.image,))
     try:
         gaussians = store.scenes.gaussians(image.scene)
-        seen = surface_at(gaussians, camera, image.pixel, settings.world.depth_sigma_share)
+        seen = surface_at(gaussians, camera, image.pixel, DEPTH_SIGMA_FRACTION)
     except GsmapError:
         return image  # of a pruned or damaged scene; the ray alone still counts
     return image if seen is None else replace(image, depth=seen[0], depth_sigma=seen[1])
@@ -415,10 +414,10 @@ def _refuse_other_days(store: Store, photos: Sequence[tuple[str, Fix]]) -> None:
                 )
 
 
-def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None, settings: Settings) -> ScaleBar:
+def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None) -> ScaleBar:
     if not (np.isfinite(metres) and metres > 0):
         raise ConfigError(f"a scale bar is so many metres long, got {metres:g}")
-    ends: list[Place] = [place_in_scene(store, text, settings) for text in (a, b)]
+    ends: list[Place] = [place_in_scene(store, text) for text in (a, b)]
     scenes = (str(ends[0].scene), str(ends[1].scene))
     sigmas = [float(np.sqrt(np.trace(end.covariance) / 3)) for end in ends]
     # Nothing is picked to better than a ten-thousandth of what it is picked on.
@@ -426,7 +425,7 @@ def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None, set
         max(sigma, 1e-4 * float(np.ptp(store.scenes.get(s).bounds))) for sigma, s in zip(sigmas, scenes, strict=True)
     ]
     points = np.stack([end.point for end in ends])
-    sigma = sigma_m or settings.world.bar_sigma_share * metres
+    sigma = sigma_m or BAR_SIGMA_FRACTION * metres
     return ScaleBar(f"{a} to {b}", scenes, points, (sigmas[0], sigmas[1]), metres, sigma)
 
 

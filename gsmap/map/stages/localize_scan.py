@@ -16,7 +16,7 @@ from gsmap.errors import ConfigError, NotFoundError
 from gsmap.formats import scans
 from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.ingest import read_captures
-from gsmap.localize.scan import as_gaussians
+from gsmap.localize.scan import AGREE_SIGMAS, as_gaussians
 from gsmap.localize.scan_joining import Joined, OnePlace, Support, join
 from gsmap.map import models
 from gsmap.map.looking_up import ask_once
@@ -114,7 +114,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     if not sought.coloured:
         # The index knows scenes by their colours, and shapes repeat: all are asked, and all have a say.
         rest = sorted(set(known) - set(candidates))
-        candidates = [*candidates, *rest][: settings.scan.most_by_shape]
+        candidates = [*candidates, *rest][: settings.scan.max_scenes_by_shape]
         if len(candidates) < len(known):
             notes.append(
                 f"{len(candidates)} of {len(known)} scenes were compared: without colours nothing tells which are the "
@@ -138,7 +138,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
         names = {scene.id: scene.name for scene in scenes.values()}
         metres = metres_of_scenes(store, settings, poses)[supports[0].scene]
         same = settings.register.same_pose
-        one = OnePlace(same.rotation_deg, same.distance_m / metres, same.log_scale, settings.scan.agree_sigmas)
+        one = OnePlace(same.rotation_deg, same.distance_m / metres, same.log_scale, AGREE_SIGMAS)
         joined = join(supports, source.centre, one, names)
     seconds = time.process_time() - began
     remarks = (*graph.notes, *notes) if sought.coloured else tuple(notes)
@@ -147,14 +147,12 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
 
 def _read(request: Request, settings: Settings) -> _Sought:
     """The scan, from whatever it is."""
-    reading = settings.scan.reading
     if request.intrinsics_px is not None:
         scan = scans.read_depth(
             request.file,
             request.intrinsics_px,
             colour=request.colour,
             units_per_m=request.units_per_m,
-            params=reading,
         )
         return _of_scan(scan, request.scale or "known", settings)
     if scans.holds_splat(request.file):
@@ -166,13 +164,13 @@ def _read(request: Request, settings: Settings) -> _Sought:
         gaussians, cameras = capture.gaussians, capture.cameras
         return _Sought(gaussians, cameras, "splat", capture.scale_policy, True, gaussians.origin, notes)
     policy = "auto" if request.file.suffix.lower() in _OF_NO_UNIT else "known"
-    return _of_scan(scans.read(request.file, reading), request.scale or policy, settings)
+    return _of_scan(scans.read(request.file, settings.scan.reading), request.scale or policy, settings)
 
 
 def _of_scan(scan: Scan, policy: str, settings: Settings) -> _Sought:
     few = scan.points[:: max(1, len(scan) // 20_000)]
     unit_m = 1.0 if policy == "known" else estimate_unit_m(few, None, None, settings.describe.unit)
-    gaussians = as_gaussians(scan, unit_m, settings.scan)
+    gaussians = as_gaussians(scan, settings.scan.cell_m / unit_m)
     cameras = synthesise_cameras(gaussians) if scan.camera is None else scan.camera
     notes = list(scan.notes)
     if scan.colours is None:

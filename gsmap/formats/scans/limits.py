@@ -1,0 +1,28 @@
+"""Limits within which scans are read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from gsmap.errors import ConfigError
+
+MAX_POINTS = 2_000_000
+"""Points that are kept of a cloud (an even share of more), and samples of a mesh."""
+
+
+@dataclass(frozen=True)
+class Params:
+    """Limits of the process that reads a mesh or a LAS file.
+
+    Args:
+        max_seconds: Wall time in seconds, positive, after which the process is ended; larger values admit larger files.
+        max_memory_mb: Memory in MiB, positive, that the process may take; larger values admit larger files.
+    """
+
+    max_seconds: float = 120.0
+    max_memory_mb: int = 8192
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not getattr(self, field.name) > 0:
+                raise ConfigError(f"scan.reading.{field.name} must be positive, got {getattr(self, field.name)}")
