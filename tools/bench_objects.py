@@ -32,7 +32,7 @@ from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.objects.things import find_things
 from gsmap.objects import Capture, Eyes, changed_thing, make_objects, open_eyes
-from gsmap.types import MapObject, PlacedScene, Things
+from gsmap.types import MapObject, PlacedScene, Segments
 
 _SHOWN = 60  # Gaussians of a piece that a capture shows, or else it says little of it
 _MOVED_M = 0.02
@@ -100,7 +100,7 @@ def _told(truth: Truth, captures: list[Capture]) -> tuple[list[Any], list[Any]]:
     return moved, parted
 
 
-def _pieces(counts: Counter[str], states: list[dict[str, Any]], things: Things, owner: np.ndarray) -> None:
+def _pieces(counts: Counter[str], states: list[dict[str, Any]], things: Segments, owner: np.ndarray) -> None:
     for state in states:
         mine = owner == state["id"]
         if state["kind"] not in _KINDS or mine.sum() < _SHOWN:

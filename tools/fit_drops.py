@@ -2,7 +2,7 @@
 
     tools/make_change.py DEV --set dev
     tools/make_change.py SEEN --set seen
-    tools/fit_drops.py DEV/* SEEN/2* --set things._MAX_COLOUR_DISTANCE=.04,.05 --set things._ADJACENT_M=.2,.5
+    tools/fit_drops.py DEV/* SEEN/2* --set segments._MAX_COLOUR_DISTANCE=.04,.05 --set segments._ADJACENT_M=.2,.5
 
 For each value of each constant (of the module that uses it), the others as they are: the share of the Gaussians of
 removed and of painted things that is dropped, and of those of others, at worst and in the mean over the places (see
@@ -23,7 +23,7 @@ import change_scores as scores
 import numpy as np
 from change_truth import Truth
 
-from gsmap.compare import things
+from gsmap.compare import segments
 from gsmap.merge.changes import settle
 from gsmap.types import PlacedScene
 
@@ -37,7 +37,7 @@ def main() -> int:
     args = parser.parse_args()
     places = [Truth(folder) for folder in args.places]
     captures = [[_placed(truth, time) for time in truth.times[:2]] for truth in places]
-    tried: list[tuple[str, Any, str, float]] = [("defaults", things, "_ADJACENT_M", things._ADJACENT_M)]
+    tried: list[tuple[str, Any, str, float]] = [("defaults", segments, "_ADJACENT_M", segments._ADJACENT_M)]
     for text in args.set:
         path, values = text.split("=")
         module, name = import_module(f"gsmap.compare.{path.split('.')[0]}"), path.split(".")[1]

@@ -1,7 +1,7 @@
-"""How probable it is that a change is one, by what speaks for it.
+"""Probability of a detected change, from its evidence.
 
-Weights are fitted by ``tools/fit_change.py`` on made places that changed, and on others that were only seen again, by
-night or with another exposure.
+Weights are fitted by ``tools/fit_change.py`` on synthetic places that changed, and on places that were captured again
+unchanged, by night or with another exposure.
 """
 
 from __future__ import annotations
@@ -11,25 +11,26 @@ from typing import Literal
 
 import numpy as np
 
-_MANY = 200  # cells, and
-_OFTEN = 6  # views of each, more of which prove nothing more
+_MANY = 200  # cells; more prove nothing more
+_OFTEN = 6  # views of each cell; more prove nothing more
 
 BASES = {"looked through": -4.99, "painted": -4.03}
 WEIGHTS = {
     "looked through": {"cells": 0.38, "views": 4.2, "on": -1.27, "slender": -5.3},
     "painted": {"cells": 0.85, "colour": 0.39},
 }
-"""Log-odds before any evidence, and what each of the `pieces` adds; right and wrong alike frequent."""
+"""Log-odds without evidence, and the weight of each of the `pieces`, at a prior of one half."""
 
 
 def pieces(evidence: Mapping[str, float]) -> tuple[Literal["looked through", "painted"], dict[str, float]]:
-    """What speaks for a change, as numbers that add up.
+    """Compute the features of the log-odds of a change.
 
     Args:
         evidence: of `gsmap.types.change.Change`.
 
     Returns:
-        Whether any of it was looked through, or all was seen in another colour; and the numbers by name.
+        ``looked through`` if a part lies in free space of the other capture, ``painted`` if only colours differ; and
+        the features by name.
     """
     if evidence["looked_through"] > 0:
         return "looked through", {
@@ -45,7 +46,7 @@ def pieces(evidence: Mapping[str, float]) -> tuple[Literal["looked through", "pa
 
 
 def confidence(evidence: Mapping[str, float]) -> float:
-    """Probability in (0, 1) that something changed there, where as many candidates are right as are wrong."""
+    """Return the probability in (0, 1) of a change, at a prior of one half."""
     way, numbers = pieces(evidence)
     odds = BASES[way] + sum(WEIGHTS[way][name] * value for name, value in numbers.items())
     return float(1 / (1 + np.exp(-odds)))

@@ -1,4 +1,4 @@
-"""What kind of change a thing underwent."""
+"""Classification of changes by kind."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.change.sides import Side
-from gsmap.change.things import Paint, Thing
+from gsmap.change.segments import ChangedSegment, ColourChange
+from gsmap.change.surface_cells import SurfaceCells
 from gsmap.types import Sim3
 from gsmap.types.change import ChangeKind
 
-_RING_M = 0.15  # what lies this close around a change of colour on the same plane is what it is compared with
+_RING_M = 0.15  # width of the surroundings on the same plane that a change of colour is compared with
 _PLANE_M = 0.04
-_STANDS_OUT = 0.45  # an edge this much fainter than in the other capture is none
+_STANDS_OUT = 0.45  # contrast of an edge, relative to the other capture, below which it is none
 _FEWEST = 6  # cells of a ring
-_FLAT_M2 = 1.5  # on a wall a larger change of colour is paint and no picture
-_FEWEST_MOVED, _REPAINTED = 8, 0.03  # where fewer cells, or a smaller share, were looked through, a thing was painted
-_GONE = 0.5  # share of what changed that was looked through, from which a thing went or came as a whole
-_ONE_PLACE = 0.4  # share of the larger footprint that both cover, if one took the other's place
+_FLAT_M2 = 1.5  # on a wall, a larger change of colour is paint and no picture
+_FEWEST_MOVED, _REPAINTED = 8, 0.03  # cells, and their fraction, in free space, below which an object was repainted
+_GONE = 0.5  # fraction of the changed cells in free space, from which an object disappeared or appeared as a whole
+_ONE_PLACE = 0.4  # fraction of the larger footprint that both cover, if one object replaced the other
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """A change, before it becomes one of the report: what each capture shows of it."""
+class DetectedChange:
+    """A detected change before it becomes an entry of the report: segments of both captures, or a change of colour."""
 
     kind: ChangeKind
-    things: tuple[Thing | None, Thing | None]
-    paint: Paint | None = None
+    segments: tuple[ChangedSegment | None, ChangedSegment | None]
+    paint: ColourChange | None = None
     S_after_before: Sim3 | None = None
     symmetry: Literal["none", "half", "any"] = "none"
     evidence: dict[str, float] = field(default_factory=dict)
 
 
-def kind_of_paint(paint: Paint, sides: tuple[Side, Side]) -> ChangeKind:
-    """``disappeared`` and ``appeared`` where a flat thing's edges are gone or new, else ``recoloured``."""
+def classify_colour_change(paint: ColourChange, sides: tuple[SurfaceCells, SurfaceCells]) -> ChangeKind:
+    """Classify a change of colour: ``disappeared`` or ``appeared`` by the edges of a flat object, or ``recoloured``."""
     upright = np.median(np.abs(sides[0].normals[paint.cells[0], 2])) < 0.7
     if upright and paint.area_m2 > _FLAT_M2:
         return "recoloured"
@@ -51,8 +51,8 @@ def kind_of_paint(paint: Paint, sides: tuple[Side, Side]) -> ChangeKind:
     return "recoloured"
 
 
-def _edge(side: Side, inside: np.ndarray, other: Side, other_inside: np.ndarray) -> float | None:
-    """How far colours inside differ from those around, on the same plane; None where nothing is around."""
+def _edge(side: SurfaceCells, inside: np.ndarray, other: SurfaceCells, other_inside: np.ndarray) -> float | None:
+    """Return the contrast of colours inside to those around, on the same plane; None without surroundings."""
     if not len(inside):
         return None
     changed = np.zeros(len(side), dtype=bool)
@@ -70,12 +70,12 @@ def _edge(side: Side, inside: np.ndarray, other: Side, other_inside: np.ndarray)
     outside, row = outside[flat], row[flat]
     if len(outside) < _FEWEST:
         return None
-    # Cells at the very border are mixtures: those one cell farther in and out are compared.
+    # Cells at the border are mixtures: those one cell farther in and out are compared.
     return float(np.median(np.linalg.norm(side.colours[outside] - _deeper(side, inside, row), axis=1)))
 
 
-def _deeper(side: Side, inside: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Mean colours of the cells inside around the ones named."""
+def _deeper(side: SurfaceCells, inside: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Return mean colours of the inside cells around the given rows."""
     points = side.points[inside]
     _, near = cKDTree(points).query(points[row], k=min(6, len(points)))
     near = near.reshape(len(row), -1)
@@ -83,8 +83,8 @@ def _deeper(side: Side, inside: np.ndarray, row: np.ndarray) -> np.ndarray:
     return out
 
 
-def are_two(older: Thing, newer: Thing, both: tuple[Side, Side]) -> bool:
-    """Whether what went and what came only touch: then neither took the other's place."""
+def are_separate(older: ChangedSegment, newer: ChangedSegment, both: tuple[SurfaceCells, SurfaceCells]) -> bool:
+    """Return whether a disappeared and an appeared segment only touch, so that neither replaced the other."""
     if min(len(t.moved) / max(len(t.changed), 1) for t in (older, newer)) < _GONE:
         return False
     boxes = [
@@ -95,15 +95,17 @@ def are_two(older: Thing, newer: Thing, both: tuple[Side, Side]) -> bool:
     return shared < _ONE_PLACE * max(float(np.prod((box[1] - box[0])[:2])) for box in boxes)
 
 
-def kind_in_place(older: Thing | None, newer: Thing | None, both: tuple[Side, Side]) -> ChangeKind:
-    """What happened where one capture or both show something that changed."""
+def classify_in_place(
+    older: ChangedSegment | None, newer: ChangedSegment | None, both: tuple[SurfaceCells, SurfaceCells]
+) -> ChangeKind:
+    """Classify the change at a place where one capture or both have a changed segment."""
     moved = tuple(len(t.moved) if t is not None else 0 for t in (older, newer))
     changed = sum(len(t.changed) for t in (older, newer) if t is not None)
     if sum(moved) < min(_FEWEST_MOVED, changed / 2) or sum(moved) < _REPAINTED * changed:
         return "recoloured"
     if older is None or newer is None:
         return "appeared" if older is None else "disappeared"
-    # What a thing stood on or before is seen in another light without it, and is no thing in its place.
+    # The background of a removed object is lit differently without it, and is no object in its place.
     gone = [len(t.moved) / max(len(t.changed), 1) for t in (older, newer)]
     if max(gone) >= _GONE and min(gone) < _REPAINTED:
         return "appeared" if moved[1] > moved[0] else "disappeared"
@@ -115,8 +117,8 @@ def kind_in_place(older: Thing | None, newer: Thing | None, both: tuple[Side, Si
     return "replaced"
 
 
-def _is_slight(a: tuple[Side, Thing], b: tuple[Side, Thing]) -> bool:
-    """Whether a thing is much less than another, or much flatter."""
-    (side_a, thing_a), (side_b, thing_b) = a, b
-    flat = np.ptp(side_a.points[thing_a.cells, 2]) < 0.3 * np.ptp(side_b.points[thing_b.cells, 2])
-    return bool(flat or len(thing_a.cells) < 0.35 * len(thing_b.cells))
+def _is_slight(a: tuple[SurfaceCells, ChangedSegment], b: tuple[SurfaceCells, ChangedSegment]) -> bool:
+    """Return whether a segment is much smaller or flatter than another."""
+    (side_a, segment_a), (side_b, segment_b) = a, b
+    flat = np.ptp(side_a.points[segment_a.cells, 2]) < 0.3 * np.ptp(side_b.points[segment_b.cells, 2])
+    return bool(flat or len(segment_a.cells) < 0.35 * len(segment_b.cells))

@@ -1,4 +1,4 @@
-"""Changes as they are reported: where, of what, and how sure."""
+"""Assembly of reported changes: boxes, voxels, members, confidence and evidence."""
 
 from __future__ import annotations
 
@@ -9,32 +9,35 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.change.confidence import confidence
-from gsmap.change.kinds import Found
+from gsmap.change.kinds import DetectedChange
 from gsmap.change.params import Params
-from gsmap.change.sides import Side
-from gsmap.change.things import LIT_OTHERWISE, Cells
+from gsmap.change.segments import LIT_OTHERWISE, CellLabels
+from gsmap.change.surface_cells import SurfaceCells
 from gsmap.compare import Balance
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.types.change import Change
 
-_GAIN = 0.08  # logarithm of a gain from which the light is said to differ
-_BY_M = 0.15  # what lies so close to a larger change of its kind is a piece of it, if half of it does
-_SLIVER_M = 0.07  # what is thinner than this in two directions is an edge that two trainings put elsewhere
+_GAIN = 0.08  # logarithm of an exposure gain that counts as different lighting
+_BY_M = 0.15  # a change is a piece of a larger one of its kind if half of it is this near
+_SLIVER_M = 0.07  # changes thinner than this in two directions are edges that two trainings place differently
 
 
-def change_of(one: Found, both: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params) -> Change:
+def make_change(
+    one: DetectedChange, both: tuple[SurfaceCells, SurfaceCells], cells: tuple[CellLabels, CellLabels], params: Params
+) -> Change:
+    """Make the entry of the report of a detected change."""
     rows, seen = [], []
     for k in (0, 1):
-        thing = one.things[k]
+        segment = one.segments[k]
         parts = [one.paint.cells[k]] if one.paint is not None else []
-        parts += [thing.cells, thing.behind] if thing is not None else []
+        parts += [segment.cells, segment.behind] if segment is not None else []
         rows.append(np.unique(np.concatenate(parts)) if parts else np.zeros(0, np.int64))
         seen.append(rows[k][cells[k].judged[rows[k]]])
     members = [side.rows[np.isin(side.label, r)] for side, r in zip(both, rows, strict=True)]
     points = np.concatenate([side.points[r] for side, r in zip(both, seen, strict=True)])
     grid = np.floor(points / params.voxel_m)
     voxels = (group_means(grid, *cell_labels(grid)) + 0.5) * params.voxel_m
-    moved = [t.moved if t is not None else np.zeros(0, np.int64) for t in one.things]
+    moved = [t.moved if t is not None else np.zeros(0, np.int64) for t in one.segments]
     through = sum(float(side.through[m].sum()) for side, m in zip(both, moved, strict=True))
     on = sum(float(side.on[m].sum()) for side, m in zip(both, moved, strict=True))
     count = sum(len(m) for m in moved)
@@ -62,8 +65,8 @@ def change_of(one: Found, both: tuple[Side, Side], cells: tuple[Cells, Cells], p
     )
 
 
-def with_pieces(changes: Sequence[Change], params: Params) -> list[Change]:
-    """Changes, those of one kind that lie by a larger one joined to it; what moved has found its pieces already."""
+def merge_pieces(changes: Sequence[Change], params: Params) -> list[Change]:
+    """Merge changes into larger ones of their kind near by; moved objects have their pieces already."""
     out: list[Change] = []
     for change in sorted(changes, key=lambda c: (-len(c.voxels), c.box.tolist())):
         if change.kind != "moved" and len(change.voxels):
@@ -80,7 +83,7 @@ def with_pieces(changes: Sequence[Change], params: Params) -> list[Change]:
 
 
 def _joined(whole: Change, piece: Change, params: Params) -> Change:
-    """A change with a piece more; as sure as it was."""
+    """Merge a piece into a change, whose confidence stays."""
     every = np.concatenate([whole.voxels, piece.voxels])
     _, first = np.unique(np.floor(every / params.voxel_m), axis=0, return_index=True)
     return replace(
@@ -92,17 +95,17 @@ def _joined(whole: Change, piece: Change, params: Params) -> Change:
     )
 
 
-def _confidence(one: Found, evidence: dict[str, float]) -> float:
-    """In [0, 1]; of what moved also by how well it fits where it stands."""
+def _confidence(one: DetectedChange, evidence: dict[str, float]) -> float:
+    """Return the confidence in [0, 1]; of a moved object it includes the fit at its new place."""
     sure = confidence(evidence)
     return sure * float(np.clip(evidence["fit"] / 0.8, 0, 1)) if one.kind == "moved" else sure
 
 
-def lighting(both: tuple[Side, Side], line: Balance, spread: float) -> Change | None:
-    """The one change of a place whose light, or whose camera's exposure, is another; None where it is the same.
+def detect_lighting_change(both: tuple[SurfaceCells, SurfaceCells], line: Balance, spread: float) -> Change | None:
+    """Detect a change of lighting or exposure of the whole place; None without one.
 
     Args:
-        spread: how unlike the light falls, see `gsmap.change.things.light`.
+        spread: spread of the lighting difference, see `gsmap.change.segments.lighting_spread`.
     """
     gains = np.abs(np.log(line.gains()))
     sure = float(1 - np.exp(-max(gains.max() / _GAIN, spread / LIT_OTHERWISE)))

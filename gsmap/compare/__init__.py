@@ -1,25 +1,25 @@
-"""Two captures seen from the same cameras: where they agree, where they disagree, and what neither can say."""
+"""Per-Gaussian and per-pixel comparison of two captures of one place, rendered from the cameras of both."""
 
 from __future__ import annotations
 
+from gsmap.compare.capture_views import MAX_VIEWS, CaptureViews, View, render_views
 from gsmap.compare.colours import Balance
-from gsmap.compare.comparing import (
+from gsmap.compare.combined_views import combine_views, mask_outdated
+from gsmap.compare.comparison import (
     AGREE,
     COLOUR,
-    OTHER_BEFORE,
     OTHER_BEHIND,
+    OTHER_IN_FRONT,
     UNSURE,
+    ComparedView,
     Comparison,
-    Pictured,
     compare,
 )
-from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, Evidence
-from gsmap.compare.joining import joined, outdated
-from gsmap.compare.looks import MAX_VIEWS, Looks, View, look
-from gsmap.compare.neighbourhoods import grown, ranges
+from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, ChangeEvidence
+from gsmap.compare.neighbourhoods import dilate, local_ranges
 
 VERSION = 4
-"""Raised whenever two captures come out otherwise for the same input."""
+"""Raised whenever the comparison of the same two captures changes."""
 
 __all__ = [
     "AGREE",
@@ -27,7 +27,7 @@ __all__ = [
     "GONE",
     "HIDDEN",
     "MAX_VIEWS",
-    "OTHER_BEFORE",
+    "OTHER_IN_FRONT",
     "OTHER_BEHIND",
     "REPAINTED",
     "SAME",
@@ -36,14 +36,14 @@ __all__ = [
     "VERSION",
     "Balance",
     "Comparison",
-    "Evidence",
-    "Looks",
-    "Pictured",
+    "ChangeEvidence",
+    "CaptureViews",
+    "ComparedView",
     "View",
     "compare",
-    "grown",
-    "joined",
-    "look",
-    "outdated",
-    "ranges",
+    "dilate",
+    "combine_views",
+    "render_views",
+    "mask_outdated",
+    "local_ranges",
 ]

@@ -1,4 +1,4 @@
-"""Colours of two captures, compared after exposure, white balance and the strength of light are taken out."""
+"""Colour differences of two captures after exposure and white balance are balanced."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ import numpy as np
 
 from gsmap._native import tones_apart
 
-FLOOR = 0.03  # added before logarithms: what is darker is noise
+FLOOR = 0.03  # added before logarithms: darker colours are noise
 _SAMPLES = 40_000  # pixels that a line is fitted to
 _ROUNDS = 6
-_FEWEST = 200  # pixels with which a line is fitted at all
+_FEWEST = 200  # pixels for a line to be fitted
 _MIN_CHROMA, _MIN_LIGHTNESS = 0.06, 0.2  # smallest differences, of colours in [0, 1], that may be a change
 _CHROMA_SIGMAS, _LIGHTNESS_SIGMAS = 3.0, 5.0  # robust standard deviations that exposure and noise may leave
 
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """How the colours of one capture become those of another: ``log b = slope * log a + offset``, per channel.
+    """Map from the colours of one capture to another's: ``log b = slope * log a + offset``, per channel.
 
-    A display colour that was multiplied and raised to a power stays on such a line, so gain, gamma and white balance
-    are in it.
+    The line models gain, gamma and white balance of display colours.
 
     Args:
         slope, offset: (3,) of the line.
-        chroma_spread, lightness_spread: robust standard deviation of what is left over where both captures agree.
+        chroma_spread, lightness_spread: robust standard deviations of the residuals where both captures agree.
     """
 
     slope: np.ndarray
@@ -34,29 +33,29 @@ class Balance:
     lightness_spread: float
 
     def gains(self) -> np.ndarray:
-        """(3,) by which a middle grey of the first is multiplied to look like the second's."""
+        """Return (3,) the factors that take a middle grey of the first capture to the second."""
         grey = np.log(0.5)
         out: np.ndarray = np.exp((self.slope - 1) * grey + self.offset)
         return out
 
     def applied(self, colour: np.ndarray) -> np.ndarray:
-        """Colours (..., 3) of the first as the second would show them."""
+        """Return colours (..., 3) of the first capture in the exposure of the second."""
         logs = np.log(np.clip(colour, 0, 1) + np.float32(FLOOR))
         out = np.exp(logs * self.slope.astype(np.float32) + self.offset.astype(np.float32)) - np.float32(FLOOR)
         return np.clip(out, 0, 1).astype(np.float32)
 
     def differences(self, a: np.ndarray, b: np.ndarray, both: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far two pictures (H, W, 3) of one view differ: chroma (H, W, 2) and lightness (H, W), as seen in [0, 1].
+        """Return the differences of two images (H, W, 3) of one view: chroma (H, W, 2) and lightness (H, W).
 
-        Ratios, so that shading cancels in the chroma, times the brightness, for nobody sees the hue of what is black.
-        Only what no pixel nearby explains counts: texture that lies half a pixel off is no paint.
+        Ratios, so that shading cancels in the chroma, times the brightness, as the hue of black is not visible.
+        A difference that a neighbouring pixel explains is dropped: texture half a pixel off is no change of colour.
 
         Args:
-            both: (H, W) bool, pixels that show one surface; others explain nothing.
+            both: (H, W) bool, pixels that show one surface in both images; only these explain a difference.
         """
         apart, brightest = tones_apart(
-            a=logarithms(a),
-            b=logarithms(b),
+            a=log_colours(a),
+            b=log_colours(b),
             both=both,
             slope=self.slope.astype(np.float32),
             offset=self.offset.astype(np.float32),
@@ -65,7 +64,7 @@ class Balance:
         return np.ascontiguousarray(apart[..., :2]), np.ascontiguousarray(apart[..., 2])
 
     def left_over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Differences of single colours (K, 3): chroma (K, 2) and lightness (K,)."""
+        """Return the differences of single colours (K, 3): chroma (K, 2) and lightness (K,)."""
         log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(FLOOR)) for v in (a, b))
         log_a = log_a * self.slope + self.offset
         bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
@@ -73,20 +72,20 @@ class Balance:
         return np.stack([red, blue], axis=-1), light
 
 
-def logarithms(colour: np.ndarray) -> np.ndarray:
-    """Of colours (..., 3) float32, as they are compared."""
+def log_colours(colour: np.ndarray) -> np.ndarray:
+    """Return the logarithms of colours (..., 3) float32 that are compared."""
     out: np.ndarray = np.log(np.clip(colour, 0, 1) + np.float32(FLOOR))
     return out
 
 
 def _largest(values: np.ndarray) -> np.ndarray:
-    """(...,) largest of three channels (..., 3)."""
+    """Return (...,) the largest of three channels (..., 3)."""
     out: np.ndarray = np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
     return out
 
 
 def _tones(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Red over green, blue over green, and lightness, of logarithms of colours (..., 3)."""
+    """Return red over green, blue over green, and lightness of logarithms of colours (..., 3)."""
     red, green, blue = logs[..., 0], logs[..., 1], logs[..., 2]
     return red - green, blue - green, (red + green + blue) / 3
 
@@ -95,7 +94,7 @@ IDENTITY = Balance(np.ones(3), np.zeros(3), 0.0, 0.0)
 
 
 def balance(a: np.ndarray, b: np.ndarray) -> Balance:
-    """The robust line from colours a (K, 3) to b (K, 3) of the same surfaces; the identity where there are too few."""
+    """Fit a robust line from colours a (K, 3) to b (K, 3) of the same surfaces; the identity for too few pixels."""
     if len(a) < _FEWEST:
         return IDENTITY
     step = max(1, len(a) // _SAMPLES)
@@ -104,12 +103,12 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
     for channel in range(3):
         for _ in range(_ROUNDS):
             left = y[:, channel] - slope[channel] * x[:, channel] - offset[channel]
-            # Cauchy weights: what changed its colour may be a third of what is seen, and must not bend the line.
+            # Cauchy weights: recoloured surfaces may be a third of the pixels, and must not bend the line.
             scale = max(1.4826 * float(np.median(np.abs(left))), 1e-4)
             weight = 1 / (1 + (left / (1.5 * scale)) ** 2)
             mean_x, mean_y = np.average(x[:, channel], weights=weight), np.average(y[:, channel], weights=weight)
             centred = x[:, channel] - mean_x
-            # A prior towards slope 1: a place of one colour tells an offset and no slope.
+            # A prior towards slope 1: a place of one colour determines an offset and no slope.
             prior = 0.01 * weight.sum()
             covariance = (weight * centred * (y[:, channel] - mean_y)).sum() + prior
             slope[channel] = np.clip(covariance / ((weight * centred**2).sum() + prior), 0.4, 2.5)
@@ -120,16 +119,16 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
     return Balance(slope, offset, spread, 1.4826 * float(np.median(np.abs(lightness))))
 
 
-def limits(line: Balance) -> tuple[float, float]:
-    """Differences of chroma and of lightness that light and noise explain."""
+def difference_limits(line: Balance) -> tuple[float, float]:
+    """Return the largest differences of chroma and of lightness that lighting and noise explain."""
     return (
         max(_MIN_CHROMA, _CHROMA_SIGMAS * line.chroma_spread),
         max(_MIN_LIGHTNESS, _LIGHTNESS_SIGMAS * line.lightness_spread),
     )
 
 
-def differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray) -> np.ndarray:
-    """Where colours differ by more than light and noise explain."""
+def colours_differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray) -> np.ndarray:
+    """Return a mask of colours that differ by more than lighting and noise explain."""
     most = np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1]))
-    out: np.ndarray = (most > limits(line)[0]) | (np.abs(lightness) > limits(line)[1])
+    out: np.ndarray = (most > difference_limits(line)[0]) | (np.abs(lightness) > difference_limits(line)[1])
     return out

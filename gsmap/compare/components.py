@@ -1,4 +1,4 @@
-"""Clusters of points."""
+"""Single-linkage clusters of points."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from gsmap._native import clusters
 
 
 def components(points: np.ndarray, reach_m: float, kind: np.ndarray | None = None) -> np.ndarray:
-    """(N,) int64 label of the cluster of each point (N, 3): those within reach of each other are of one. Labels count
-    from 0 in the order of the clusters' first points.
+    """Return (N,) int64 cluster labels of points (N, 3); points within reach of each other share one.
+
+    Labels count from 0 in the order of the clusters' first points.
 
     Args:
         kind: (N,) integers; points of different kinds are never linked.
@@ -22,7 +23,7 @@ def components(points: np.ndarray, reach_m: float, kind: np.ndarray | None = Non
 def groups(
     points: np.ndarray, rows: np.ndarray, reach_m: float, fewest: int, kind: np.ndarray | None = None
 ) -> list[np.ndarray]:
-    """The rows of points by cluster, large ones first, those of fewer than ``fewest`` points left out."""
+    """Return the rows of each cluster of at least ``fewest`` points, the largest first."""
     labels = components(points[rows], reach_m, None if kind is None else kind[rows])
     order = np.argsort(labels, kind="stable")
     cuts = np.flatnonzero(np.diff(labels[order])) + 1

@@ -1,7 +1,7 @@
-"""One probability of many pieces of evidence: an additive model over log-odds.
+"""Additive log-odds model: the probability of a hypothesis from several pieces of evidence.
 
-Every piece is worth so much for or against, by a piecewise linear curve, and the sum passes through a logistic. Curves
-are fitted on made places by tools, and stored beside the room that asks them.
+Each piece of evidence adds log-odds by a piecewise linear curve, and the sum passes through a logistic function. Curves
+are fitted on synthetic places by tools, and stored beside the module that uses them.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Curve:
-    """What one piece of evidence is worth.
+    """Piecewise linear log-odds of one piece of evidence.
 
     Args:
-        knots: values of the evidence, rising.
-        worth: log-odds at each knot; straight between, constant beyond.
-        missing: log-odds where the evidence could not be had.
+        knots: values of the evidence, increasing.
+        worth: log-odds at each knot; linear between, constant beyond.
+        missing: log-odds of missing evidence.
     """
 
     knots: tuple[float, ...]
@@ -29,19 +29,18 @@ class Curve:
     missing: float
 
     def at(self, value: float) -> float:
-        """Log-odds for what is judged (below 0: against it)."""
+        """Return the log-odds of a value; NaN is missing evidence."""
         return self.missing if np.isnan(value) else float(np.interp(value, self.knots, self.worth))
 
 
 @dataclass(frozen=True)
 class Odds:
-    """The fitted curves by the name of their evidence, and what none of them explains.
+    """Fitted log-odds model.
 
     Args:
-        curves: of each piece of evidence.
-        base: log-odds before any evidence, where right is as frequent as wrong.
-        least: probabilities lower than this, and higher than one minus it, were never seen often enough to be told
-            apart: the answer stays within.
+        curves: by the name of the evidence.
+        base: log-odds without evidence, at a prior of one half.
+        least: lowest probability, and one minus the highest: more extreme ones were too rare to be calibrated.
     """
 
     curves: dict[str, Curve]
@@ -50,23 +49,23 @@ class Odds:
 
     @classmethod
     def of_json(cls, text: str) -> Self:
-        """From what `to_json` wrote."""
+        """Load a model from JSON text."""
         return cls.of_stored(json.loads(text))
 
     @classmethod
     def of_stored(cls, stored: Mapping[str, Any]) -> Self:
-        """From what was written as JSON among other things."""
+        """Load a model from parsed JSON."""
         curves = {
             name: Curve(tuple(c["knots"]), tuple(c["worth"]), c["missing"]) for name, c in stored["curves"].items()
         }
         return cls(curves, stored["base"], stored["least"])
 
     def worth(self, evidence: Mapping[str, float]) -> dict[str, float]:
-        """Log-odds that each piece adds, by its name."""
+        """Return the log-odds that each piece of evidence adds, by its name."""
         return {name: self.curves[name].at(value) for name, value in evidence.items()}
 
     def shortfalls(self, evidence: Mapping[str, float]) -> list[str]:
-        """The names of the evidence that could be had, what lacks most of what it could be worth first."""
+        """Return the names of the present evidence, farthest below its best log-odds first."""
         lacks = {}
         for name, value in evidence.items():
             if not np.isnan(value):
@@ -74,19 +73,19 @@ class Odds:
         return sorted(lacks, key=lambda name: -lacks[name])
 
     def probability(self, evidence: Mapping[str, float], prior: float) -> float:
-        """How probable it is, in (0, 1).
+        """Return the probability in (0, 1).
 
         Args:
-            prior: share of what is judged that is right before anything is known of it.
+            prior: probability without evidence.
         """
         odds = self.log_odds(evidence) + np.log(prior / (1 - prior))
         return float(np.clip(1 / (1 + np.exp(-odds)), self.least, 1 - self.least))
 
     def log_odds(self, evidence: Mapping[str, float], *, at_best: bool = False) -> float:
-        """Of what is judged, where right is as frequent as wrong.
+        """Return the log-odds at a prior of one half.
 
         Args:
-            at_best: what is not named is as good as can be, else it is worth nothing.
+            at_best: unnamed evidence counts at its best value; by default it counts nothing.
         """
         rest = sum(max(curve.worth) for name, curve in self.curves.items() if name not in evidence) if at_best else 0.0
         return self.base + sum(self.worth(evidence).values()) + rest

@@ -1,4 +1,4 @@
-"""Floors, ceilings and walls: what things stand on and before, and what no thing grows into."""
+"""Detection of the building shell: floors, ceilings and walls, as planes of surface cells."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from gsmap.compare.components import components
 from gsmap.geometry.neighbours import nearest_of
 
 _BIN_M = 0.03
-_THICK_M = 0.045  # skirting boards, picture frames and the noise of a plane belong to it
-_LEVEL_M2, _WALL_M2 = 4.0, 0.5  # a smaller plane is a table or a cupboard
+_THICK_M = 0.045  # of a plane with its skirting boards, picture frames and noise
+_LEVEL_M2, _WALL_M2 = 4.0, 0.5  # least areas; a smaller plane is a table or a cupboard
 _REACH_M = 0.16  # cells of one plane are linked over such gaps
-_WALL_M = 1.8  # a wall is at least this high, and ...
-_TO_CEILING_M = 0.2  # ... comes this close to the ceiling, where there is one
+_WALL_M = 1.8  # least height of a wall
+_TO_CEILING_M = 0.2  # largest gap between a wall and the ceiling, where there is one
 _THROUGH_M = 0.15  # from one face of a wall between rooms to the other
-_PIECE_M2 = 0.1  # of a wall that furniture hides, pieces at least so large are looked at
-_BESIDE_M = 0.3  # what lies so close to a wall, in its plane, is wall
+_PIECE_M2 = 0.1  # least visible piece of a wall behind furniture
+_BESIDE_M = 0.3  # cells this near to a wall, in its plane, are part of it
 _MOST_PLANES = 24
 _NORMAL_OF = 12  # neighbours
 
 
 def normals_of(points: np.ndarray) -> np.ndarray:
-    """(M, 3) unit normals of a surface in cells; signs mean nothing."""
+    """Estimate (M, 3) unit normals of surface cells; signs are arbitrary."""
     if len(points) < 4:
         return np.tile([0.0, 0.0, 1.0], (len(points), 1))
     normals: np.ndarray = PointTree(np.ascontiguousarray(points, np.float64)).normals(_NORMAL_OF)
@@ -30,7 +30,7 @@ def normals_of(points: np.ndarray) -> np.ndarray:
 
 
 def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray:
-    """(M,) int: the plane of each cell, from 0, levels first; -1 for what is on none.
+    """Return (M,) int the plane of each cell, counted from 0, level planes first; -1 off all planes.
 
     Args:
         points, normals: (M, 3) of a surface in cells of ``cell_m``, z up.
@@ -67,7 +67,7 @@ def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray
 
 
 def _wall(points: np.ndarray, rows: np.ndarray, ceiling: float, cell_m: float) -> np.ndarray:
-    """Those cells of an upright plane that are wall: large pieces up to the ceiling, and what little lies by them."""
+    """Return the cells of an upright plane that are wall: large pieces up to the ceiling, and pieces beside."""
     pieces = _pieces(points, rows, _PIECE_M2 / cell_m**2)
     tall = [p for p in pieces if np.ptp(points[p, 2]) > _WALL_M or points[p, 2].max() > ceiling - _TO_CEILING_M]
     if not tall:
@@ -82,7 +82,7 @@ def _wall(points: np.ndarray, rows: np.ndarray, ceiling: float, cell_m: float) -
 
 
 def _peaks(values: np.ndarray, fewest: float) -> list[float]:
-    """Places on a line where at least so many values lie, densest first, each taking what lies about it."""
+    """Return the peaks of the density of values on a line, densest first, each suppressing its neighbourhood."""
     if not len(values):
         return []
     low = values.min() - _BIN_M
@@ -100,7 +100,7 @@ def _peaks(values: np.ndarray, fewest: float) -> list[float]:
 
 
 def _directions(normals: np.ndarray) -> list[float]:
-    """Yaws (radians, of half a turn) that many upright surfaces face, most first."""
+    """Return the yaws (radians, modulo half a turn) of many upright normals, most frequent first."""
     if not len(normals):
         return []
     yaw = np.degrees(np.arctan2(normals[:, 1], normals[:, 0])) % 180
@@ -120,7 +120,7 @@ def _directions(normals: np.ndarray) -> list[float]:
 
 
 def _pieces(points: np.ndarray, rows: np.ndarray, fewest: float) -> list[np.ndarray]:
-    """Connected parts of a plane that are large enough."""
+    """Return the connected parts of a plane that are large enough."""
     if len(rows) < fewest:
         return []
     labels = components(points[rows], _REACH_M)

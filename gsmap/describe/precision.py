@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap.types import NodeLayer, SceneGraph, Things
+from gsmap.types import NodeLayer, SceneGraph, Segments
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def _layer(layer: NodeLayer, step: float, params: Params) -> NodeLayer:
     )
 
 
-def _things(things: Things, step: float, params: Params) -> Things:
+def _things(things: Segments, step: float, params: Params) -> Segments:
     return replace(
         things,
         positions=_to(things.positions, step),

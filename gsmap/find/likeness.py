@@ -17,7 +17,7 @@ from importlib.resources import files
 import numpy as np
 
 from gsmap.geometry.directions import level_frame
-from gsmap.types import Things
+from gsmap.types import Segments
 
 _FILE = "likeness.json"
 _LEAST_M = 0.04  # half a cell of a thing's samples: nothing is told to be thinner
@@ -67,7 +67,7 @@ class Look:
     stands: float
 
 
-def looks_of(things: Things, up: np.ndarray) -> list[Look]:
+def looks_of(things: Segments, up: np.ndarray) -> list[Look]:
     """What is compared of each of the things of a capture.
 
     Args:

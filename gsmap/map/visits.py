@@ -1,4 +1,4 @@
-"""Which captures of a place are compared with which: each with the visits just before it."""
+"""Selection of the pairs of visits that are compared for changes: each visit with the latest ones before it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import box_corners, moved_box
 from gsmap.types import Sim3
 
-_SAMPLES = 12  # points along each axis of a capture's box at which it is asked who was there before
-_COVERED = 0.99  # of these points: the box is covered
+_SAMPLES = 12  # points along each axis of a visit's box by which its coverage is estimated
+_COVERED = 0.99  # fraction of these points of a covered box
 MAX_SHIFT_M = 0.02  # a pair that moved farther against each other, anywhere in what both show, is compared again
 _MAX_TURN_DEG = 0.2  # and one that turned further
 
@@ -41,15 +41,15 @@ class Params:
 
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """A dated capture that has a place in the map.
+    """A dated scene with a pose in the map.
 
     Args:
         scene: its id.
-        when: it was captured.
-        component: whose frame it is placed in.
-        S_map_scene: where it lies, the unit of that frame made the metre.
+        when: time of the capture.
+        component: component that it is placed in.
+        S_map_scene: its pose, scaled to metres.
         bounds: (2, 3) box of its Gaussians, scene frame.
-        metres_per_unit: of that frame.
+        metres_per_unit: of the component's frame.
     """
 
     scene: str
@@ -60,15 +60,15 @@ class Visit:
     metres_per_unit: float = 1.0
 
     def box(self) -> np.ndarray:
-        """(2, 3) around its box, map frame."""
+        """Return the (2, 3) box around its box, map frame."""
         return moved_box(self.bounds, self.S_map_scene)
 
 
 def pairs_of_visits(visits: Sequence[Visit], params: Params) -> list[tuple[str, str]]:
-    """(older, newer) scene ids: every capture with the newest earlier ones that together show what it shows.
+    """Return pairs (older, newer) of scene ids: every visit with the latest earlier ones that together cover it.
 
-    Not all pairs: what changed over several visits is what changed from each to the next. Boxes alone decide, so that
-    nothing is read; captures of one moment are of one visit, and not compared.
+    Not all pairs, as changes over several visits follow from those between consecutive ones. Only boxes are used, and
+    no array is read; scenes of one moment are one visit, and not compared.
     """
     found: list[tuple[str, str]] = []
     ordered = sorted(visits, key=lambda visit: (visit.when, visit.scene))
@@ -91,7 +91,7 @@ def pairs_of_visits(visits: Sequence[Visit], params: Params) -> list[tuple[str, 
 
 
 def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3) -> bool:
-    """Whether two captures lie otherwise to each other than ``S_newer_older`` says, by more than they may."""
+    """Return whether the relative pose of two visits differs from ``S_newer_older`` by more than the tolerance."""
     now = newer.S_map_scene.inverse() @ older.S_map_scene
     turn = now.rotation @ S_newer_older.rotation.T
     sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
@@ -107,7 +107,7 @@ def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3) -> bool:
 
 
 def _samples(visit: Visit) -> np.ndarray:
-    """(N, 3) points all over a capture's box, map frame."""
+    """Return (N, 3) points throughout a visit's box, map frame."""
     low, high = np.asarray(visit.bounds, dtype=np.float64)
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     grid = np.array(np.meshgrid(steps, steps, steps, indexing="ij")).reshape(3, -1).T

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from gsmap import compare
-from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, SAME, UNSEEN, Comparison, Looks
+from gsmap.compare import GONE, HIDDEN, OTHER_IN_FRONT, REPAINTED, SAME, UNSEEN, CaptureViews, Comparison
 from gsmap.geometry.neighbours import nearest_of
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.merge.exposure import apply_balance
@@ -65,7 +65,7 @@ class Settled:
             return np.zeros((height, width), dtype=bool)
         shows = render(flagged, small, depth=False, dominant_id=False).colour[0, ..., 0] > _SHOWS
         # A Gaussian's skirts reach beyond the pixels in which it shows.
-        shows = compare.grown(shows)
+        shows = compare.dilate(shows)
         rows = ((np.arange(height) + 0.5) * shows.shape[0] / height).astype(int)
         columns = ((np.arange(width) + 0.5) * shows.shape[1] / width).astype(int)
         out: np.ndarray = shows[np.ix_(rows, columns)]
@@ -121,12 +121,12 @@ def settle(
     for group in groups:
         added = []
         for i in group:
-            looks = compare.look(scenes[i], max_views=max_views)
+            looks = compare.render_views(scenes[i], max_views=max_views)
             parts = [one for one in truth if overlapping(one.looks.scene, scenes[i])]
             if not parts:
                 added.append(_Standing(i, looks, np.ones(len(looks.gaussians), dtype=bool)))
                 continue
-            joined = compare.joined([(one.looks, one.shows) for one in parts], scenes[i], max_views)
+            joined = compare.combine_views([(one.looks, one.shows) for one in parts], scenes[i], max_views)
             found = compare.compare(looks, joined)
             verdict = _verdict(looks, joined, found, prefer)
             exposures[i] = _exposure(found)
@@ -149,7 +149,9 @@ def settle(
                 continue  # Nothing is compared with the oldest.
             # Truth grows by what is new to it alone, so that it stays as large as the place.
             shows = keeps[i] & looks.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
-            added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), exposures[i]), shows))
+            added.append(
+                _Standing(i, _in_one_exposure(compare.mask_outdated(looks, found, keeps[i]), exposures[i]), shows)
+            )
         truth += added
     return Settled(
         [_left(s, k, e if one_exposure else None) for s, k, e in zip(scenes, keeps, exposures, strict=True)],
@@ -166,7 +168,7 @@ class _Standing:
     """A capture among the newer ones: which, its looks, and (N,) which of its Gaussians add to what is shown."""
 
     scene: int
-    looks: Looks
+    looks: CaptureViews
     shows: np.ndarray
 
 
@@ -179,7 +181,7 @@ class _Verdict:
     beaten: np.ndarray
 
 
-def _verdict(older: Looks, newer: Looks, found: Comparison, prefer: Prefer) -> _Verdict:
+def _verdict(older: CaptureViews, newer: CaptureViews, found: Comparison, prefer: Prefer) -> _Verdict:
     lost = np.isin(found.older.state, (GONE, REPAINTED))
     changed = np.isin(found.newer.state, (GONE, REPAINTED))
     changed |= (found.newer.state != SAME) & _revealed(newer, found)
@@ -191,20 +193,20 @@ def _verdict(older: Looks, newer: Looks, found: Comparison, prefer: Prefer) -> _
     return _Verdict(lost, changed, beaten)
 
 
-def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
+def _revealed(newer: CaptureViews, found: Comparison) -> np.ndarray:
     """(M,) which Gaussians of the newer show where the older had a thing before them."""
     count = len(newer.gaussians)
     shown, bared = np.zeros(count), np.zeros(count)
     for picture in found.newer_views:
         dominant = picture.own.dominant_id
         shown += np.bincount(dominant[dominant >= 0], minlength=count)
-        bare = (picture.outcome == OTHER_BEFORE) & (dominant >= 0)
+        bare = (picture.outcome == OTHER_IN_FRONT) & (dominant >= 0)
         bared += np.bincount(dominant[bare], minlength=count)
     out: np.ndarray = (bared >= 2) & (bared >= 0.2 * shown)
     return out
 
 
-def _beside(older: np.ndarray, newer: Looks, verdict: _Verdict) -> np.ndarray:
+def _beside(older: np.ndarray, newer: CaptureViews, verdict: _Verdict) -> np.ndarray:
     """(N,) which of the older's Gaussians (N, 3) lie beside what left or what is new."""
     disputed = np.concatenate([older[verdict.lost], newer.gaussians.means[verdict.changed]])
     if not len(disputed):
@@ -213,7 +215,7 @@ def _beside(older: np.ndarray, newer: Looks, verdict: _Verdict) -> np.ndarray:
     return out
 
 
-def _intruders(older: Gaussians, asked: np.ndarray, newer: Looks) -> np.ndarray:
+def _intruders(older: Gaussians, asked: np.ndarray, newer: CaptureViews) -> np.ndarray:
     """(N,) which of the older's Gaussians that are asked would show, in pictures of the newer, where these look
     otherwise.
 
@@ -233,7 +235,7 @@ def _intruders(older: Gaussians, asked: np.ndarray, newer: Looks) -> np.ndarray:
         seen = render(together, view.camera, depth=False)
         shown = seen.dominant_id[0]
         theirs = view.opaque & (shown >= count)
-        low, high = compare.ranges(view.colour)
+        low, high = compare.local_ranges(view.colour)
         colour = np.clip(seen.colour[0][theirs], 0, 1)
         worse = (np.maximum(low[theirs] - colour, colour - high[theirs]) > _INTRUDES).any(1)
         shown = shown[theirs] - count
@@ -261,7 +263,7 @@ def _left(scene: PlacedScene, stays: np.ndarray, exposure: compare.Balance | Non
     return replace(scene, sights=None, gaussians=_exposed(scene.gaussians[stays], exposure))
 
 
-def _in_one_exposure(looks: Looks, exposure: compare.Balance | None) -> Looks:
+def _in_one_exposure(looks: CaptureViews, exposure: compare.Balance | None) -> CaptureViews:
     return replace(looks, scene=_left(looks.scene, np.ones(len(looks.gaussians), dtype=bool), exposure))
 
 

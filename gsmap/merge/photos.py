@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.compare import colours
-from gsmap.compare.neighbourhoods import grown
+from gsmap.compare.neighbourhoods import dilate
 from gsmap.render import render
 from gsmap.types import Cameras, KeptPhoto, PlacedScene
 
@@ -63,8 +63,8 @@ def shown(photo: KeptPhoto, scene: PlacedScene, longest_side_px: int) -> Shown |
         chroma_spread=min(line.chroma_spread, _MAX_SPREAD),
         lightness_spread=min(line.lightness_spread, _MAX_SPREAD),
     )
-    differ = colours.differ(line, *line.differences(picture, seen.colour[0], opaque))
-    counts = opaque & ~grown(differ & opaque, _MARGIN_PX)
+    differing = colours.colours_differ(line, *line.differences(picture, seen.colour[0], opaque))
+    counts = opaque & ~dilate(differing & opaque, _MARGIN_PX)
     if counts.sum() < _MIN_AGREEMENT * opaque.sum():
         return None
     image = np.round(line.applied(picture) * 255).astype(np.uint8)

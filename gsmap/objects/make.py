@@ -11,7 +11,7 @@ from gsmap import render
 from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects.fuse import Node, Placed, fuse
 from gsmap.objects.looks import Eyes, glance, judge
-from gsmap.types import MapObject, Sighting, SightingState, Sim3, Things
+from gsmap.types import MapObject, Segments, Sighting, SightingState, Sim3
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
@@ -58,7 +58,7 @@ class Capture:
 
     scene: str
     S_map_scene: Sim3
-    things: Things
+    things: Segments
 
 
 def make_objects(

@@ -16,7 +16,7 @@ from gsmap.errors import CorruptError
 from gsmap.store.layout import Shape
 from gsmap.store.matrices import from_array, to_array
 from gsmap.store.narrow import narrow, shape_of, widen
-from gsmap.types import NodeLayer, SceneGraph, Things
+from gsmap.types import NodeLayer, SceneGraph, Segments
 from gsmap.types.plain import plain
 
 _THINGS = ("members", "positions", "extents", "colours", "samples", "sample_colours", "sample_counts")
@@ -83,7 +83,7 @@ def from_arrays(scene_id: str, about: Mapping[str, Any], stored: Mapping[str, np
         things = None
         if (told := about.get("things")) is not None:
             own: dict[str, Any] = {name: whole[f"things.{name}"] for name in _THINGS}
-            things = Things(**own, unit_m=told["unit_m"])
+            things = Segments(**own, unit_m=told["unit_m"])
     except (KeyError, ValueError, TypeError) as error:
         raise CorruptError(f"the graph of scene {scene_id[:12]} does not fit its row ({error!r})") from error
     return SceneGraph(scene_id, layers, up, unit_m, tuple(about["notes"]), things, working_m)

@@ -1,4 +1,4 @@
-"""Which captures newer ones supersede, and what of such a capture has to be kept."""
+"""Thinning of superseded scenes: observed fraction, visible Gaussians and fidelity."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.compare import HIDDEN, UNSEEN, Looks, compare, look
-from gsmap.compare.looks import CELL_M, best_of_cell
+from gsmap.compare import HIDDEN, UNSEEN, CaptureViews, compare, render_views
+from gsmap.compare.capture_views import CELL_M, max_per_cell
 from gsmap.errors import ConfigError
 from gsmap.render import render
 from gsmap.types import Gaussians, PlacedScene
 
-__all__ = ["Params", "fidelity_db", "look", "seen_again", "shown"]
+__all__ = ["Params", "measure_fidelity_db", "render_views", "observed_fraction", "find_visible"]
 
 
 @dataclass(frozen=True)
@@ -49,29 +49,28 @@ class Params:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
 
 
-def seen_again(older: PlacedScene, newer: Sequence[Looks]) -> float:
-    """Share of a capture's surface that newer captures of the same frame looked at, whatever they found there.
+def observed_fraction(older: PlacedScene, newer: Sequence[CaptureViews]) -> float:
+    """Return the fraction of a scene's surface that newer scenes of the same frame observed, changed or not.
 
-    What stands behind what they show, they did not look at; what lies a little behind in a cell of which they saw the
-    rest is of the surface that they saw.
+    Occluded surfaces are not observed; Gaussians slightly behind an observed surface in one cell are part of it.
 
     Args:
         older: in metres, with its cameras.
-        newer: see `gsmap.compare.look`.
+        newer: see `gsmap.compare.render_views`.
     """
-    mine = look(older)
+    mine = render_views(older)
     surface = mine.surface & (mine.times_seen > 0)
     if not surface.any():
         return 0.0
     seen = np.zeros(len(older.gaussians), dtype=bool)
     for other in newer:
         seen |= ~np.isin(compare(mine, other).older.state, (UNSEEN, HIDDEN))
-    seen = best_of_cell(older.gaussians.means, seen, CELL_M)
+    seen = max_per_cell(older.gaussians.means, seen, CELL_M)
     return float(seen[surface].mean())
 
 
-def shown(scene: PlacedScene, params: Params) -> np.ndarray:
-    """(N,) bool, which Gaussians show in any of a capture's own pictures; all where its cameras are none or made up."""
+def find_visible(scene: PlacedScene, params: Params) -> np.ndarray:
+    """Return (N,) bool, Gaussians visible in some own view of a scene; all if cameras are missing or synthesized."""
     if scene.cameras is None or not len(scene.cameras) or scene.cameras.synthesised:
         return np.ones(len(scene.gaussians), dtype=bool)
     largest = np.zeros(len(scene.gaussians), dtype=np.float32)
@@ -83,10 +82,10 @@ def shown(scene: PlacedScene, params: Params) -> np.ndarray:
     return out
 
 
-def fidelity_db(scene: PlacedScene, kept: Gaussians, params: Params) -> float:
-    """PSNR in dB, colours in [0, 1], of what is kept of a capture against all of it, over its own pictures.
+def measure_fidelity_db(scene: PlacedScene, kept: Gaussians, params: Params) -> float:
+    """Measure the PSNR in dB, colours in [0, 1], of the kept Gaussians against all, over the scene's own views.
 
-    Infinite where nothing differs, NaN where it has no cameras.
+    Infinite for equal views, NaN without cameras.
     """
     if scene.cameras is None or not len(scene.cameras):
         return float("nan")

@@ -10,7 +10,7 @@ from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Pri
 from gsmap.types.registration import Proposal, Registration
 from gsmap.types.room import Room
 from gsmap.types.scene import Scene
-from gsmap.types.scene_graph import NodeLayer, SceneGraph, Things
+from gsmap.types.scene_graph import NodeLayer, SceneGraph, Segments
 from gsmap.types.sim3 import Sim3
 from gsmap.types.source import GaussianSource
 from gsmap.types.thinning import Thinning
@@ -48,6 +48,6 @@ __all__ = [
     "SightingState",
     "Sim3",
     "Thinning",
-    "Things",
+    "Segments",
     "Tile",
 ]

@@ -24,7 +24,7 @@ class Sighting:
     Args:
         scene: id of the capture.
         state: see `SightingState`.
-        thing: of the capture's graph (`gsmap.types.Things`); -1 where it is none of its own there.
+        thing: of the capture's graph (`gsmap.types.Segments`); -1 where it is none of its own there.
         box: (2, 3) float64 around it, the map's frame; None where it was not seen.
         looked: share of its place that the capture looked at or through; 1 where it shows the thing itself.
         asked: id of the capture whose thing was looked for there; empty where none was, since the capture shows one of

@@ -69,7 +69,7 @@ class NodeLayer:
 
 
 @dataclass(frozen=True, eq=False)
-class Things:
+class Segments:
     """Which Gaussians of a capture are one thing: furniture, lamps, pictures.
 
     Args:
@@ -106,18 +106,18 @@ class Things:
         for name, shape in shapes.items():
             array = getattr(self, name)
             if array.shape != shape:
-                raise InputError(f"Things.{name} must have shape {shape}, got {array.shape}")
+                raise InputError(f"Segments.{name} must have shape {shape}, got {array.shape}")
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise InputError(f"Things.{name} holds NaN or infinity")
+                raise InputError(f"Segments.{name} holds NaN or infinity")
         counted = int(self.sample_counts.sum())
         if (self.sample_counts < 0).any() or not self.samples.shape == self.sample_colours.shape == (counted, 3):
-            raise InputError(f"Things has counts of {counted} samples and {self.samples.shape} of them")
+            raise InputError(f"Segments has counts of {counted} samples and {self.samples.shape} of them")
         if not (np.isfinite(self.samples).all() and np.isfinite(self.sample_colours).all()):
-            raise InputError("Things.samples holds NaN or infinity")
+            raise InputError("Segments.samples holds NaN or infinity")
         if self.members.size and not (self.members.min() >= -1 and self.members.max() < m):
-            raise InputError(f"Things.members names things outside -1 to {m - 1}")
+            raise InputError(f"Segments.members names things outside -1 to {m - 1}")
         if not (np.isfinite(self.unit_m) and self.unit_m > 0):
-            raise InputError(f"Things.unit_m must be positive, got {self.unit_m}")
+            raise InputError(f"Segments.unit_m must be positive, got {self.unit_m}")
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -148,7 +148,7 @@ class SceneGraph:
     up: np.ndarray | None = None
     unit_m: float = 1.0
     notes: tuple[str, ...] = ()
-    things: Things | None = None
+    things: Segments | None = None
     working_m: float = 1.0
 
     @property

@@ -13,7 +13,7 @@ from gsmap.view.change_picture import draw_change
 STAYS = box(2.2, 2.5, 0.6, 0.5, 0.7, 5)
 
 
-def things(report):
+def segments(report):
     return [c for c in report.changes if c.kind != "lighting"]
 
 
@@ -36,7 +36,7 @@ def test_a_box_that_went_or_came(appears):
     room = [*shell(), *STAYS]
     scenes = [capture([*room, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6)], 1), capture(room, 2)]
     report = change.compare(*(reversed(scenes) if appears else scenes))
-    (found,) = things(report)
+    (found,) = segments(report)
     assert found.kind == ("appeared" if appears else "disappeared")
     assert share_near(found.voxels, (0.9, 1.2, 0.3), (0.25, 0.2, 0.3)) > 0.95
     assert np.abs(found.box - [[0.65, 1.0, 0.0], [1.15, 1.4, 0.6]]).max() < 0.12
@@ -58,7 +58,7 @@ def test_a_box_that_moved_is_one_change_with_its_pose(yaw, to):
         capture([*room, *box(0.9, 1.2, 0.6, 0.4, 0.5, 6)], 1),
         capture([*room, *box(*to, 0.6, 0.4, 0.5, 6, yaw=yaw)], 2),
     )
-    (found,) = things(report)
+    (found,) = segments(report)
     assert found.kind == "moved"
     assert found.symmetry == "none"
     truth = moved_by(yaw, (0.9, 1.2), to)
@@ -76,7 +76,7 @@ def test_a_box_of_one_colour_says_that_half_a_turn_is_not_known():
         capture([*room, *box(0.9, 1.2, 0.7, 0.35, 0.5, 6, paint=grey)], 1),
         capture([*room, *box(1.9, 0.9, 0.7, 0.35, 0.5, 6, yaw=0.8, paint=grey)], 2),
     )
-    (found,) = things(report)
+    (found,) = segments(report)
     assert (found.kind, found.symmetry) == ("moved", "half")
 
 
@@ -86,18 +86,18 @@ def test_another_box_elsewhere_is_not_the_one_that_went():
         capture([*room, *box(0.9, 1.2, 0.6, 0.4, 0.5, 6)], 1),
         capture([*room, *box(2.0, 1.0, 0.6, 0.4, 0.5, 9)], 2),
     )
-    assert sorted(c.kind for c in things(report)) == ["appeared", "disappeared"]
+    assert sorted(c.kind for c in segments(report)) == ["appeared", "disappeared"]
 
 
 def test_paint_is_no_move_and_its_cells_are_the_wall_or_the_box():
-    thing = (0.9, 1.2, 0.5, 0.4, 0.6)
-    room = [*shell(), *STAYS, *box(*thing, 6)]
+    segment = (0.9, 1.2, 0.5, 0.4, 0.6)
+    room = [*shell(), *STAYS, *box(*segment, 6)]
     older = capture(room, 1)
-    (wall,) = things(change.compare(older, capture([*shell(plain(0.2, 0.3, 0.7)), *STAYS, *box(*thing, 6)], 2)))
+    (wall,) = segments(change.compare(older, capture([*shell(plain(0.2, 0.3, 0.7)), *STAYS, *box(*segment, 6)], 2)))
     assert wall.kind == "recoloured"
     assert (wall.voxels[:, 1] > 2.8).mean() > 0.95
-    painted = [*shell(), *STAYS, *box(*thing, 6, paint=plain(0.9, 0.8, 0.1))]
-    (repainted,) = things(change.compare(older, capture(painted, 2)))
+    painted = [*shell(), *STAYS, *box(*segment, 6, paint=plain(0.9, 0.8, 0.1))]
+    (repainted,) = segments(change.compare(older, capture(painted, 2)))
     assert repainted.kind == "recoloured"
     assert share_near(repainted.voxels, (0.9, 1.2, 0.3), (0.25, 0.2, 0.3)) > 0.95
 
@@ -107,7 +107,7 @@ def test_what_one_capture_did_not_see_has_not_changed():
     room = [*shell(), *STAYS]
     newer = capture(room, 2, toward=(2.9, 2.9, 0.9), angles=(0.1, 0.5))
     away = change.compare(capture([*room, *box(0.5, 0.5, 0.4, 0.4, 0.5, 6)], 1), newer)
-    assert things(away) == []
+    assert segments(away) == []
     assert away.seen_share < 0.9
     blind = change.compare(capture(room, 1), PlacedScene(capture(room, 2).gaussians, None, "b"))
     assert blind.changes == ()
@@ -118,8 +118,8 @@ def test_what_one_capture_did_not_see_has_not_changed():
 def test_a_capture_that_shows_nothing_or_a_wall_alone_says_nothing(count):
     whole = capture(shell(), 1)
     none = PlacedScene(whole.gaussians[:count], whole.cameras, "b")
-    assert things(change.compare(whole, none)) == []
-    assert things(change.compare(none, whole)) == []
+    assert segments(change.compare(whole, none)) == []
+    assert segments(change.compare(none, whole)) == []
 
 
 def test_any_vertical_and_any_frame():
@@ -131,7 +131,7 @@ def test_any_vertical_and_any_frame():
     # y down, as many trainers have it.
     S = Sim3(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([3.0, -2, 5]))
     turned = [PlacedScene(transform_gaussians(s.gaussians, S), transform_cameras(s.cameras, S)) for s in scenes]
-    (found,) = things(change.compare(*turned, up=np.array([0, -2.0, 0])))
+    (found,) = segments(change.compare(*turned, up=np.array([0, -2.0, 0])))
     truth = S @ moved_by(1.2, (0.9, 1.2), (1.9, 1.0)) @ S.inverse()
     middle = S.apply(np.array([[0.9, 1.2, 0.25]]))
     assert np.linalg.norm(found.S_after_before.apply(middle) - truth.apply(middle)) < 0.05

@@ -5,10 +5,10 @@ import pytest
 
 from gsmap.change import Params
 from gsmap.change.confidence import confidence
-from gsmap.change.moving import Move, _stays
-from gsmap.change.reporting import with_pieces
-from gsmap.change.sides import Side
-from gsmap.change.things import Thing, judge, things_of
+from gsmap.change.relocations import Relocation, _is_stationary
+from gsmap.change.reporting import merge_pieces
+from gsmap.change.segments import ChangedSegment, classify_cells, find_segments
+from gsmap.change.surface_cells import SurfaceCells
 from gsmap.types import Sim3
 from gsmap.types.change import Change
 
@@ -39,7 +39,7 @@ def test_pieces_of_one_kind_that_lie_by_a_larger_change_are_a_part_of_it():
     far = change("recoloured", [[0.45, 0.85, 0.05]], [9])
     came = change("appeared", [[0.45, 0.15, 0.05]], [7])
     moved = [change("moved", wall.voxels, [5]), change("moved", piece.voxels, [6])]
-    found = with_pieces([piece, came, *moved, far, wall], Params())
+    found = merge_pieces([piece, came, *moved, far, wall], Params())
     assert sorted(c.kind for c in found) == ["appeared", "moved", "moved", "recoloured", "recoloured"]
     (whole,) = (c for c in found if c.kind == "recoloured" and len(c.voxels) > 1)
     assert whole.before.tolist() == [1, 2, 3, 4]
@@ -53,7 +53,7 @@ def test_a_smooth_thing_of_few_cells_is_one_thing():
     points = np.array([[0.09 * x, 0.09 * y, 0.3] for x in range(3) for y in range(3)])
     count = len(points)
     seen, none = np.full(count, 4.0), np.zeros(count)
-    side = Side(
+    side = SurfaceCells(
         np.arange(count),
         np.arange(count),
         points,
@@ -65,12 +65,12 @@ def test_a_smooth_thing_of_few_cells_is_one_thing():
         none,
         none,
     )
-    cells, _ = judge((side, side))
-    (thing,) = things_of(side, cells, np.zeros(count, dtype=bool), Params())
-    assert len(thing.moved) == count
+    cells, _ = classify_cells((side, side))
+    (segment,) = find_segments(side, cells, np.zeros(count, dtype=bool), Params())
+    assert len(segment.moved) == count
 
 
 @pytest.mark.parametrize(("looked_through", "stays"), [(5, True), (40, False)])
 def test_what_was_hardly_looked_through_did_not_move(looked_through, stays):
-    thing = Thing(np.arange(100), np.arange(looked_through), np.arange(0))
-    assert _stays(Move(thing, thing, Sim3.identity(), 0.9, 0.3, "none")) is stays
+    segment = ChangedSegment(np.arange(100), np.arange(looked_through), np.arange(0))
+    assert _is_stationary(Relocation(segment, segment, Sim3.identity(), 0.9, 0.3, "none")) is stays

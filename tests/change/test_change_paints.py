@@ -3,8 +3,8 @@
 import numpy as np
 
 from gsmap.change.params import Params
-from gsmap.change.sides import Side
-from gsmap.change.things import Cells, paints
+from gsmap.change.segments import CellLabels, find_colour_changes
+from gsmap.change.surface_cells import SurfaceCells
 
 
 def test_paint_that_no_pixel_compared_is_none():
@@ -12,7 +12,7 @@ def test_paint_that_no_pixel_compared_is_none():
     points = np.stack([*np.meshgrid(np.arange(0, 0.5, 0.05), np.arange(0, 0.5, 0.05)), np.zeros((10, 10))], -1)
     points = points.reshape(-1, 3)
     none, zero = np.zeros(len(points)), np.zeros(len(points), dtype=np.int64)
-    side = Side(zero, zero, points, np.ones_like(points), none, none, none, np.zeros_like(points), none, none)
+    side = SurfaceCells(zero, zero, points, np.ones_like(points), none, none, none, np.zeros_like(points), none, none)
     painted = np.ones(len(points), dtype=bool)
-    cells = Cells(zero, zero - 1, ~painted, painted, painted, none, none)
-    assert paints((side, side), (cells, cells), Params()) == []
+    cells = CellLabels(zero, zero - 1, ~painted, painted, painted, none, none)
+    assert find_colour_changes((side, side), (cells, cells), Params()) == []

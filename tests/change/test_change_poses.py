@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap._native import FeatureTree, vote_shifts
-from gsmap.change.poses import about_up, features, settled, voted
+from gsmap.change.poses import features, refine_pose, rotation_about_up, vote_poses
 from gsmap.types import Sim3
 
 
@@ -21,10 +21,10 @@ def chair():
 
 def test_a_pose_is_voted_for_and_settled(chair):
     points, colours = chair
-    truth = Sim3(about_up(0.6), np.array([0.8, -0.3, 0.0]))
+    truth = Sim3(rotation_about_up(0.6), np.array([0.8, -0.3, 0.0]))
     there = truth.apply(points)
-    start = voted(points, colours, there, colours, 24)[0][1]
-    found = settled(
+    start = vote_poses(points, colours, there, colours, 24)[0][1]
+    found = refine_pose(
         features(points, colours), FeatureTree(features(there, colours)), start, (0.12, 0.1, 0.08, 0.06, 0.04, 0.03)
     )
     np.testing.assert_allclose(found.apply(points), there, atol=0.01)
@@ -33,15 +33,15 @@ def test_a_pose_is_voted_for_and_settled(chair):
 def test_what_stands_on_a_floor_does_not_rise(chair):
     points, colours = chair
     tree = FeatureTree(features(points + np.array([0, 0, 0.2]), colours))
-    found = settled(features(points, colours), tree, Sim3.identity(), (0.3,) * 5)
+    found = refine_pose(features(points, colours), tree, Sim3.identity(), (0.3,) * 5)
     assert found.translation[2] == pytest.approx(0.04)
 
 
 def test_where_nothing_is_near_the_start_stays(chair):
     points, colours = chair
-    start = Sim3(about_up(0.3), np.array([0.1, 0.2, 0.0]))
+    start = Sim3(rotation_about_up(0.3), np.array([0.1, 0.2, 0.0]))
     far = FeatureTree(features(points + np.array([9, 0, 0]), colours))
-    found = settled(features(points, colours), far, start, (0.2, 0.1))
+    found = refine_pose(features(points, colours), far, start, (0.2, 0.1))
     np.testing.assert_array_equal(found.matrix(), start.matrix())
     assert np.isinf(far.distances(features(points, colours), 1.0)).all()
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gsmap import compare
-from gsmap.compare import AGREE, COLOUR, GONE, HIDDEN, OTHER_BEFORE, OTHER_BEHIND, REPAINTED, SAME, UNSEEN
+from gsmap.compare import AGREE, COLOUR, GONE, HIDDEN, OTHER_BEHIND, OTHER_IN_FRONT, REPAINTED, SAME, UNSEEN
+from gsmap.compare.capture_views import MAX_TOLERANCE_M, MIN_TOLERANCE_M
 from gsmap.compare.colours import IDENTITY, balance
-from gsmap.compare.looks import MAX_TOLERANCE_M, MIN_TOLERANCE_M
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
 SH_C0 = 0.28209479177387814
@@ -40,7 +40,7 @@ def cameras(xs, distance=1.2):
 
 def looks(*parts, xs=None, distance=1.2):
     own = cameras(np.linspace(-0.6, 0.6, 7) if xs is None else xs, distance)
-    return compare.look(PlacedScene(Gaussians.concatenate(list(parts)), own))
+    return compare.render_views(PlacedScene(Gaussians.concatenate(list(parts)), own))
 
 
 def wall(seed, **options):
@@ -72,20 +72,20 @@ def test_a_capture_knows_what_it_saw_well():
 
 def test_a_thing_that_went_and_one_that_came():
     boxed, bare = looks(wall(0), box(5)), looks(wall(1))
-    thing = boxed.gaussians.means[:, 2] < -0.3
+    segment = boxed.gaussians.means[:, 2] < -0.3
     for found, of_box, of_wall, seen in (
-        (compare.compare(boxed, bare), "older", "newer", OTHER_BEFORE),
+        (compare.compare(boxed, bare), "older", "newer", OTHER_IN_FRONT),
         (compare.compare(bare, boxed), "newer", "older", OTHER_BEHIND),
     ):
         state = getattr(found, of_box).state
-        assert (state[thing] == GONE).all()
-        assert not (state[~thing] >= REPAINTED).any()
+        assert (state[segment] == GONE).all()
+        assert not (state[~segment] >= REPAINTED).any()
         assert not (getattr(found, of_wall).state >= REPAINTED).any()
         middle = found.newer_views[3].outcome  # looks straight at the box
         assert (middle[20:28, 28:36] == seen).any()
         assert not np.isin(middle[20:28, 28:36], (AGREE, COLOUR)).any()
         assert (middle[:, :8] == AGREE).mean() > 0.5
-        assert not np.isin(middle[:, :8], (COLOUR, OTHER_BEFORE, OTHER_BEHIND)).any()
+        assert not np.isin(middle[:, :8], (COLOUR, OTHER_IN_FRONT, OTHER_BEHIND)).any()
 
 
 def test_what_stands_behind_something_new_is_hidden_and_not_gone():
@@ -154,12 +154,12 @@ def test_a_line_of_colours_is_not_bent_by_what_was_painted():
 
 
 def test_a_capture_without_cameras_says_nothing_and_is_told():
-    blind = compare.look(PlacedScene(Gaussians.concatenate([wall(0), box(5)])))
+    blind = compare.render_views(PlacedScene(Gaussians.concatenate([wall(0), box(5)])))
     seeing = looks(wall(1))
     assert not blind.views
     found = compare.compare(blind, seeing)
     assert (found.older.state[blind.gaussians.means[:, 2] < -0.3] == GONE).all()
     assert (compare.compare(seeing, blind).older.state == UNSEEN).all()
     assert compare.compare(blind, blind).balance.slope.tolist() == [1, 1, 1]
-    nothing = compare.look(PlacedScene(Gaussians.empty(), cameras([0.0])))
+    nothing = compare.render_views(PlacedScene(Gaussians.empty(), cameras([0.0])))
     assert (compare.compare(seeing, nothing).older.state == UNSEEN).all()

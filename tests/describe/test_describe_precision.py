@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap.describe.precision import Params, rounded
-from gsmap.types import NodeLayer, SceneGraph, Things
+from gsmap.types import NodeLayer, SceneGraph, Segments
 
 RNG = np.random.default_rng(3)
 
@@ -23,7 +23,7 @@ def graph(unit: float = 1.0) -> SceneGraph:
     layer = NodeLayer(positions, embeddings, np.zeros(60), weights, extents, features, np.zeros(60), "d")
     samples = rng.uniform(-5, 5, (9, 3)) * unit
     lab = rng.uniform(-60, 90, (9, 3))
-    things = Things(np.zeros(4), samples[:1], np.stack([samples[:2]]), lab[:1], samples, lab, np.array([9]), 1 / unit)
+    things = Segments(np.zeros(4), samples[:1], np.stack([samples[:2]]), lab[:1], samples, lab, np.array([9]), 1 / unit)
     return SceneGraph("a", {"landmarks": layer}, None, 1.0, (), things, 1 / unit)
 
 

@@ -11,7 +11,7 @@ from gsmap.describe.gravity import Params as GravityParams
 from gsmap.describe.objects.things import find_things
 from gsmap.errors import InputError
 from gsmap.geometry.rotations import matrices_to_quats
-from gsmap.types import Gaussians, SceneGraph, Sim3, Things
+from gsmap.types import Gaussians, SceneGraph, Segments, Sim3
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -124,7 +124,7 @@ def test_things_that_do_not_fit_together_are_refused(change):
         "sample_colours": np.zeros((1, 3)),
         "sample_counts": np.array([1]),
     }
-    assert len(Things(**good)) == 1
-    assert SceneGraph("a", things=Things(**good)).num_nodes == 0  # they are no nodes: nothing is registered by them
+    assert len(Segments(**good)) == 1
+    assert SceneGraph("a", things=Segments(**good)).num_nodes == 0  # they are no nodes: nothing is registered by them
     with pytest.raises(InputError):
-        Things(**good | change)
+        Segments(**good | change)

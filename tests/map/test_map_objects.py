@@ -29,7 +29,7 @@ from gsmap.methods import RecipeKey
 from gsmap.store import Store, schema
 from gsmap.store.graphs import Graphs
 from gsmap.store.scenes import Scenes
-from gsmap.types import Change, ChangeReport, MapObject, PoseGraph, ScenePose, Sighting, Sim3, Things
+from gsmap.types import Change, ChangeReport, MapObject, PoseGraph, ScenePose, Segments, Sighting, Sim3
 
 FRAMES = {
     "may": Sim3(exp_so3(np.array([0, 0, 0.4])), np.array([3.0, 1, 0.2])),
@@ -331,12 +331,12 @@ def test_a_number_stays_when_captures_are_described_otherwise(site: Map) -> None
         np.testing.assert_allclose(after[name], position, atol=0.1)
 
 
-def reordered(things: Things, order: np.ndarray) -> Things:
+def reordered(things: Segments, order: np.ndarray) -> Segments:
     """The same with other numbers, each a few centimetres larger."""
     place = np.append(np.argsort(order), -1)
     starts = np.concatenate([[0], np.cumsum(things.sample_counts)])
     rows = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in order])
-    return Things(
+    return Segments(
         place[things.members],
         things.positions[order],
         things.extents[order] + np.array([[-0.03], [0.03]]),

@@ -166,7 +166,7 @@ def test_captures_are_compared_in_linear_time(monkeypatch):
         calls.append(len(cameras))
         return render(gaussians, cameras, **options)
 
-    for module in (changes, compare.looks, compare.comparing):
+    for module in (changes, compare.capture_views, compare.comparison):
         monkeypatch.setattr(module, "render", counted)
     spent = {}
     for count in (4, 8, 16):
@@ -180,9 +180,9 @@ def test_captures_are_compared_in_linear_time(monkeypatch):
 
 def test_looks_of_many_captures_together_are_those_that_add_coverage():
     many = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(6)]
-    looks = [compare.look(scene) for scene in many[::-1]]
+    looks = [compare.render_views(scene) for scene in many[::-1]]
     stays = [np.ones(len(one.gaussians), dtype=bool) for one in looks]
-    joined = compare.joined(list(zip(looks, stays, strict=True)), many[0], max_views=3)
+    joined = compare.combine_views(list(zip(looks, stays, strict=True)), many[0], max_views=3)
     assert len(joined.views) == 6
     assert len(joined.gaussians) == sum(len(scene.gaussians) for scene in many)
     for view in joined.views:

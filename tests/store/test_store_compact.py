@@ -14,7 +14,7 @@ from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.store import Store, compact, purging, schema
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.merging import merge
-from gsmap.types import Gaussians, SceneGraph, Things
+from gsmap.types import Gaussians, SceneGraph, Segments
 
 
 def sorted_gaussians(n=500, degree=1, seed=0) -> Gaussians:
@@ -160,9 +160,9 @@ def test_a_merge_that_makes_a_scene_whole_brings_its_graph_instead_of_the_compac
 BOX = [[0.0, 0, 0], [1, 1, 1]]
 
 
-def things_of(members) -> Things:
+def things_of(members) -> Segments:
     z = np.zeros
-    return Things(members, z((2, 3)), z((2, 2, 3)), z((2, 3)), z((0, 3)), z((0, 3)), z(2))
+    return Segments(members, z((2, 3)), z((2, 2, 3)), z((2, 3)), z((0, 3)), z((0, 3)), z(2))
 
 
 def two_captures(store, n=60):

@@ -9,7 +9,7 @@ from gsmap.describe.precision import rounded
 from gsmap.errors import CorruptError
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
 from gsmap.store.narrow import narrow, shape_of, widen
-from gsmap.types import NodeLayer, SceneGraph, Things
+from gsmap.types import NodeLayer, SceneGraph, Segments
 
 RNG = np.random.default_rng(0)
 
@@ -75,7 +75,7 @@ def layer(m, width, features, *, exact=True):
 
 def things(n=200):
     members = RNG.integers(-1, 2, n)
-    return Things(
+    return Segments(
         members, RNG.normal(size=(2, 3)), RNG.normal(size=(2, 2, 3)), RNG.normal(size=(2, 3)),
         RNG.normal(size=(9, 3)), RNG.normal(size=(9, 3)), np.array([4, 5]), 1.5,
     )  # fmt: skip

@@ -9,7 +9,7 @@ from synthetic_walls import cameras_facing, wall
 from gsmap.errors import ConfigError
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.render import render
-from gsmap.thin import Params, fidelity_db, look, seen_again, shown
+from gsmap.thin import Params, find_visible, measure_fidelity_db, observed_fraction, render_views
 from gsmap.types import Gaussians, PlacedScene, Sim3
 
 
@@ -21,7 +21,7 @@ def older():
 @pytest.mark.parametrize(("middles", "low", "high"), [((-1.5, 1.5), 0.75, 1.0), ((-1.5, -1.0), 0.1, 0.6)])
 def test_how_much_newer_captures_saw(older, middles, low, high):
     newer = PlacedScene(wall(2, -2, 2), cameras_facing(np.linspace(*middles, 9)), "new")
-    assert low <= seen_again(older, [look(newer)]) <= high
+    assert low <= observed_fraction(older, [render_views(newer)]) <= high
 
 
 def test_captures_add_up_and_none_saw_nothing(older):
@@ -29,9 +29,9 @@ def test_captures_add_up_and_none_saw_nothing(older):
         PlacedScene(wall(2, -2, 2), cameras_facing(np.linspace(low, high, 9)), f"new{low}")
         for low, high in ((-1.5, -0.5), (0.5, 1.5))
     ]
-    alone = [seen_again(older, [look(half)]) for half in halves]
-    assert seen_again(older, [look(half) for half in halves]) > max(alone) + 0.1
-    assert seen_again(older, []) == 0.0
+    alone = [observed_fraction(older, [render_views(half)]) for half in halves]
+    assert observed_fraction(older, [render_views(half) for half in halves]) > max(alone) + 0.1
+    assert observed_fraction(older, []) == 0.0
 
 
 def test_what_is_behind_a_wall_was_not_looked_at():
@@ -39,7 +39,7 @@ def test_what_is_behind_a_wall_was_not_looked_at():
     beyond = transform_cameras(cameras_facing(along), Sim3(np.eye(3), np.array([0, 0, 0.6])))
     older = PlacedScene(wall(3, -2, 2, z=0.6), beyond, "the next room")
     newer = PlacedScene(wall(2, -2, 2), cameras_facing(along), "before the wall")
-    assert seen_again(older, [look(newer)]) == 0.0
+    assert observed_fraction(older, [render_views(newer)]) == 0.0
 
 
 def test_what_lies_a_little_behind_a_surface_that_was_seen_is_of_it(older):
@@ -47,13 +47,13 @@ def test_what_lies_a_little_behind_a_surface_that_was_seen_is_of_it(older):
     means[np.floor(means[:, 0] / 0.08) % 4 == 0, 2] += 0.05  # narrow grooves, that a newer training smoothed
     rough = PlacedScene(replace(older.gaussians, means=means), older.cameras, "rough")
     newer = PlacedScene(wall(2, -2, 2), older.cameras, "new")
-    assert seen_again(rough, [look(newer)]) > 0.9
+    assert observed_fraction(rough, [render_views(newer)]) > 0.9
 
 
 def test_what_no_picture_shows_goes_and_the_pictures_stay(older):
     behind = wall(3, -2, 2, z=0.4)
     both = PlacedScene(Gaussians.concatenate([older.gaussians, behind]), older.cameras, "both")
-    stays = shown(both, Params())
+    stays = find_visible(both, Params())
     n = len(older.gaussians)
     assert stays[:n].mean() > 0.5
     assert stays[n:].mean() < 0.2
@@ -61,23 +61,23 @@ def test_what_no_picture_shows_goes_and_the_pictures_stay(older):
     camera = both.cameras[4].resized(480)
     before, after = (np.clip(render(g, camera).colour, 0, 1) for g in (both.gaussians, kept))
     error = ((before - after) ** 2).mean()
-    assert fidelity_db(both, kept, Params(max_views=100, longest_side_px=480)) == pytest.approx(
+    assert measure_fidelity_db(both, kept, Params(max_views=100, longest_side_px=480)) == pytest.approx(
         -10 * np.log10(error), abs=6
     )
-    assert fidelity_db(both, both.gaussians, Params()) == float("inf")
-    assert fidelity_db(both, both.gaussians[: n // 2], Params()) < 30
+    assert measure_fidelity_db(both, both.gaussians, Params()) == float("inf")
+    assert measure_fidelity_db(both, both.gaussians[: n // 2], Params()) < 30
 
 
 def test_without_cameras_all_stays_and_nothing_is_known():
     bare = PlacedScene(wall(1, -1, 1), None, "bare")
-    assert shown(bare, Params()).all()
-    assert np.isnan(fidelity_db(bare, bare.gaussians, Params()))
+    assert find_visible(bare, Params()).all()
+    assert np.isnan(measure_fidelity_db(bare, bare.gaussians, Params()))
 
 
 def test_with_made_up_cameras_all_stays(older):
     behind = Gaussians.concatenate([older.gaussians, wall(3, -2, 2, z=0.4)])
     made_up = replace(older.cameras, synthesised=True)
-    assert shown(PlacedScene(behind, made_up, "both"), Params()).all()
+    assert find_visible(PlacedScene(behind, made_up, "both"), Params()).all()
 
 
 def test_settings_that_cannot_be():

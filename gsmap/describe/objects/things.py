@@ -18,7 +18,7 @@ from gsmap.geometry.directions import level_frame
 from gsmap.geometry.neighbours import nearest_neighbours, nearest_of
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.sh import rgb_of_sh0
-from gsmap.types import Gaussians, Things
+from gsmap.types import Gaussians, Segments
 from gsmap.types.views import Cloud
 
 VERSION = 1
@@ -72,7 +72,7 @@ class Params:
 
 def find_things(
     gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: float, params: Params | None = None
-) -> Things:
+) -> Segments:
     """The things of a capture, the largest first; none where up is unknown.
 
     Deterministic: the same Gaussians in the same order give the same things. Takes half a CPU second for 50,000.
@@ -96,7 +96,7 @@ def find_things(
     labels, counts = cell_labels(np.column_stack([of, cell_labels(cells)[0], np.zeros(len(rows), np.int64)]))
     of_cell = np.empty(len(counts), np.int64)
     of_cell[labels] = of
-    return Things(
+    return Segments(
         members,
         np.array([means[p].mean(0) for p in parts]).reshape(-1, 3),
         np.array([[means[p].min(0), means[p].max(0)] for p in parts]).reshape(-1, 2, 3),

@@ -22,7 +22,7 @@ from gsmap.objects.fuse import Node
 from gsmap.store import Store
 from gsmap.store.objects import ObjectSet, Places
 from gsmap.texts import few
-from gsmap.types import Gaussians, PoseGraph, Room, Scene, SceneGraph, SightingState, Sim3, Things
+from gsmap.types import Gaussians, PoseGraph, Room, Scene, SceneGraph, Segments, SightingState, Sim3
 from gsmap.types.progress import Progress, StageProgress
 
 
@@ -245,7 +245,7 @@ def _rooms(store: Store, settings: Settings, poses: Mapping[str, Sim3], up: np.n
     return find_rooms(captures, np.concatenate(eyes), settings.objects.min_room_area_m2)
 
 
-def _digest(things: Things) -> str:
+def _digest(things: Segments) -> str:
     return text_digest(things.extents.tobytes().hex())
 
 

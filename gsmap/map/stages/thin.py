@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
-from gsmap.compare import Looks
+from gsmap.compare import CaptureViews
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.metres import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -15,7 +15,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, compact
-from gsmap.thin import fidelity_db, look, seen_again, shown
+from gsmap.thin import find_visible, measure_fidelity_db, observed_fraction, render_views
 from gsmap.types import PlacedScene, PoseGraph, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import ThinReport, ThinRow
@@ -77,9 +77,9 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
                 rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why))
                 continue
             own = PlacedScene(store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id), scene.id)
-            stays = shown(own, settings.thin)
+            stays = find_visible(own, settings.thin)
             kept = compact.rounded(own.gaussians[stays])
-            fidelity = fidelity_db(own, kept, settings.thin)
+            fidelity = measure_fidelity_db(own, kept, settings.thin)
             if fidelity < settings.thin.min_fidelity_db:
                 why = f"compact, its pictures would keep {fidelity:.1f} dB"
                 rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why, fidelity))
@@ -136,7 +136,7 @@ def _superseded(
     """
     bar = settings.thin.min_seen_again
     metres = metres_of_scenes(store, settings, graph)
-    looks: dict[str, Looks] = {}
+    looks: dict[str, CaptureViews] = {}
     stay: list[Scene] = []
     shares: dict[str, float] = {}
 
@@ -152,8 +152,8 @@ def _superseded(
         ]
         for other in newer:
             if other.id not in looks:
-                looks[other.id] = look(placed(other))
-        return seen_again(placed(scene), [looks[other.id] for other in newer]) if newer else 0.0
+                looks[other.id] = render_views(placed(other))
+        return observed_fraction(placed(scene), [looks[other.id] for other in newer]) if newer else 0.0
 
     for done, scene in enumerate(reversed(known)):
         progress("thin", 0.5 * done / len(known), f"looking at {scene.name}")

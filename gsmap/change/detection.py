@@ -1,4 +1,4 @@
-"""From two captures to a report of what changed."""
+"""Pipeline of change detection: from two captures to a report of changes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from gsmap import compare as comparison
 from gsmap import render
-from gsmap.change.finding import find_changes
+from gsmap.change.candidates import find_changes
 from gsmap.change.params import Params
-from gsmap.change.reporting import change_of, lighting, with_pieces
-from gsmap.change.sides import sides
-from gsmap.change.things import judge, light
+from gsmap.change.reporting import detect_lighting_change, make_change, merge_pieces
+from gsmap.change.segments import classify_cells, lighting_spread
+from gsmap.change.surface_cells import compare_surfaces
 from gsmap.errors import InputError
 from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -23,11 +23,11 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
 VERSION = 2
-"""Raised whenever a report comes out otherwise for the same two captures."""
+"""Raised whenever the report on the same two captures changes."""
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
-    """What names every report that is made in this way; the two captures are added by whoever knows them."""
+    """Return the recipe of a report, without its inputs, the two captures."""
     version = {"change": VERSION, "compare": comparison.VERSION}
     return RecipeKey("change", "evidence", version, plain(params or Params()), render.backend())
 
@@ -40,45 +40,44 @@ def compare(
     *,
     up: np.ndarray | None = None,
 ) -> ChangeReport:
-    """What changed from an older capture of a place to a newer one.
+    """Detect the changes from an older capture of a place to a newer one.
 
-    Only what both captures saw is judged. What one of them hides behind something, or never looked at, has not changed
-    as far as anybody can tell, and is not reported.
+    Only surfaces that both captures observed are judged: what is occluded or unobserved in one of them is not reported.
 
     Args:
         older, newer: both in one metric frame.
         params: see `Params`.
-        progress: told the fraction done in [0, 1] and what is being done.
-        up: (3,) the frame's vertical; z for None. Things move along the floor and turn about it.
+        progress: called with the fraction done in [0, 1] and the current step.
+        up: (3,) the frame's vertical, about which objects turn and across which they move; None for z.
 
     Returns:
         The report, in the frame of the captures.
 
     Raises:
-        InputError: a vertical of length zero, or not finite.
+        InputError: the vertical has length zero, or is not finite.
     """
     params, report = params or Params(), progress or silent
     upright = _upright(up)
     if upright is not None:
-        older, newer = (_turned(scene, upright) for scene in (older, newer))
+        older, newer = (_rotated(scene, upright) for scene in (older, newer))
     report(0.0, "looking at the older capture")
-    looks_older = comparison.look(older, longest_side_px=params.longest_side_px, max_views=params.max_views)
+    views_older = comparison.render_views(older, longest_side_px=params.longest_side_px, max_views=params.max_views)
     report(0.15, "looking at the newer capture")
-    looks_newer = comparison.look(newer, longest_side_px=params.longest_side_px, max_views=params.max_views)
+    views_newer = comparison.render_views(newer, longest_side_px=params.longest_side_px, max_views=params.max_views)
     report(0.3, "comparing what both show")
-    found = comparison.compare(looks_older, looks_newer)
+    found = comparison.compare(views_older, views_newer)
     report(0.7, "finding what changed")
-    both = sides(looks_older, looks_newer, found)
-    cells = judge(both)
-    unlike = light(both)
-    ones = find_changes(both, cells, unlike, (looks_older, looks_newer), params)
-    changes = [change_of(one, both, cells, params) for one in ones]
-    changes = with_pieces([c for c in changes if c.confidence >= params.min_confidence], params)
-    other_light = lighting(both, found.balance, unlike)
+    both = compare_surfaces(views_older, views_newer, found)
+    cells = classify_cells(both)
+    unlike = lighting_spread(both)
+    ones = find_changes(both, cells, unlike, (views_older, views_newer), params)
+    changes = [make_change(one, both, cells, params) for one in ones]
+    changes = merge_pieces([c for c in changes if c.confidence >= params.min_confidence], params)
+    other_light = detect_lighting_change(both, found.balance, unlike)
     changes += [other_light] if other_light is not None else []
     changes.sort(key=lambda c: (-c.confidence, c.box.tolist()))
     if upright is not None:
-        changes = [_back(change, upright.inverse()) for change in changes]
+        changes = [_transformed(change, upright.inverse()) for change in changes]
     report(1.0, "changes found")
     seen = float(cells[0].judged.mean()) if len(both[0]) else 0.0
     return ChangeReport(tuple(changes), seen, found.balance.gains(), _notes(older, newer, seen))
@@ -98,7 +97,7 @@ _LITTLE = 0.2
 
 
 def _upright(up: np.ndarray | None) -> Sim3 | None:
-    """The turn that brings a vertical to z; None where it is z already."""
+    """Return the rotation of a vertical to z; None where it is z already."""
     if up is None:
         return None
     up = np.asarray(up, dtype=np.float64).reshape(-1)
@@ -113,13 +112,13 @@ def _upright(up: np.ndarray | None) -> Sim3 | None:
     return Sim3(np.stack([x, np.cross(z, x), z]), np.zeros(3))
 
 
-def _turned(scene: PlacedScene, S: Sim3) -> PlacedScene:
+def _rotated(scene: PlacedScene, S: Sim3) -> PlacedScene:
     cameras = None if scene.cameras is None else transform_cameras(scene.cameras, S)
     return replace(scene, gaussians=transform_gaussians(scene.gaussians, S), cameras=cameras)
 
 
-def _back(change: Change, S: Sim3) -> Change:
-    """A change in another frame; its box is the one around the turned box."""
+def _transformed(change: Change, S: Sim3) -> Change:
+    """Transform a change to another frame; its box becomes the one around the rotated box."""
     moved = change.S_after_before
     return replace(
         change,

@@ -1,4 +1,4 @@
-"""What several captures are sure of together, as if it were one capture: views chosen by coverage, newest first."""
+"""Views of several captures combined as if of one capture, selected by coverage."""
 
 from __future__ import annotations
 
@@ -7,24 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmap.compare.comparing import AGREE, OTHER_BEHIND, UNSURE, Comparison
-from gsmap.compare.looks import MAX_TOLERANCE_M, MAX_VIEWS, NEAREST_M, Looks, place
+from gsmap.compare.capture_views import MAX_TOLERANCE_M, MAX_VIEWS, NEAREST_M, CaptureViews, project_points
+from gsmap.compare.comparison import AGREE, OTHER_BEHIND, UNSURE, Comparison
 from gsmap.types import Gaussians, PlacedScene
 
-_SAMPLE = 1500  # points of a capture by which views of others are chosen
+_SAMPLE = 1500  # points of a capture by which views of the other captures are selected
 _ENOUGH = 8  # views of a point: more add little
-_VIEWS = 2  # times as many as of one capture: what several show together is larger than what one does
+_VIEWS = 2  # times as many views as of one capture: several captures together show more
 
 
-def joined(parts: Sequence[tuple[Looks, np.ndarray]], of: PlacedScene, max_views: int = MAX_VIEWS) -> Looks:
-    """The looks of several captures as one, with those views alone that look at what ``of`` shows.
+def combine_views(
+    parts: Sequence[tuple[CaptureViews, np.ndarray]], of: PlacedScene, max_views: int = MAX_VIEWS
+) -> CaptureViews:
+    """Combine the views of several captures into those of one, selecting the views that show the place of ``of``.
 
     Args:
-        parts: captures from the newest to the oldest, and of each (N,) which Gaussians still stand; rows of the answer
-            are these, one capture after another.
-        of: the capture that is going to be compared.
+        parts: captures from the newest to the oldest, each with a mask (N,) of the Gaussians that are valid still; the
+            result holds these, one capture after another.
+        of: the capture to be compared with the result.
+        max_views: of one capture; the result has at most twice as many.
     """
-    chosen = _chosen([looks for looks, _ in parts], of, max_views)
+    chosen = _select_views([looks for looks, _ in parts], of, max_views)
     views, sure, placed, first = [], [], [], 0
     for (looks, stays), picked in zip(parts, chosen, strict=True):
         row = np.where(stays, np.cumsum(stays) - 1 + first, -1).astype(np.int32)
@@ -44,16 +47,16 @@ def joined(parts: Sequence[tuple[Looks, np.ndarray]], of: PlacedScene, max_views
         for name in ("surface", "times_seen", "sharpness")
     )
     scene = PlacedScene(gaussians, scene_id="+".join(looks.scene.scene_id for looks, _ in parts))
-    return Looks(scene, tuple(views), surface, times_seen, sharpness, tuple(sure), tuple(placed))
+    return CaptureViews(scene, tuple(views), surface, times_seen, sharpness, tuple(sure), tuple(placed))
 
 
-def outdated(looks: Looks, comparison: Comparison, stays: np.ndarray) -> Looks:
-    """The looks of the older capture of a comparison, which show nothing where a newer one disagrees.
+def mask_outdated(looks: CaptureViews, comparison: Comparison, stays: np.ndarray) -> CaptureViews:
+    """Mask the views of the older capture of a comparison where a newer capture disagrees.
 
-    Its colours are brought to the newer's, so that captures before it are compared with one exposure.
+    Its colours are balanced to the newer's, so that earlier captures are compared with one exposure.
 
     Args:
-        stays: (N,) which of its Gaussians still stand.
+        stays: (N,) bool, its Gaussians that are valid still.
     """
     sure, views = [], []
     for own, picture in zip(looks.sure, comparison.older_views, strict=True):
@@ -68,8 +71,8 @@ def outdated(looks: Looks, comparison: Comparison, stays: np.ndarray) -> Looks:
     return replace(looks, views=tuple(views), sure=tuple(sure))
 
 
-def _chosen(captures: Sequence[Looks], of: PlacedScene, max_views: int) -> list[list[int]]:
-    """Of each capture the views to take: at most twice ``max_views`` in all, one after another what adds most."""
+def _select_views(captures: Sequence[CaptureViews], of: PlacedScene, max_views: int) -> list[list[int]]:
+    """Select views of each capture greedily by coverage, at most twice ``max_views`` in all."""
     chosen: list[list[int]] = [[] for _ in captures]
     points = of.gaussians.means[:: max(1, len(of.gaussians) // _SAMPLE)]
     names = [(c, v) for c, looks in enumerate(captures) for v in range(len(looks.views))]
@@ -78,10 +81,10 @@ def _chosen(captures: Sequence[Looks], of: PlacedScene, max_views: int) -> list[
     sees = np.zeros((len(names), len(points)), dtype=np.float32)
     for i, (c, v) in enumerate(names):
         view = captures[c].views[v]
-        at = place(points, view, NEAREST_M)
-        # What is behind a surface is not seen, whatever stands in the picture's frame.
+        at = project_points(points, view, NEAREST_M)
+        # Points behind a surface are occluded.
         seen = at.z < view.far[at.row, at.column] + MAX_TOLERANCE_M
-        # Among views that see as much, the newest.
+        # Among views of equal coverage, the newest.
         sees[i, at.index[seen]] = 1 + 0.2 * (len(captures) - c) / len(captures)
     wanting = np.full(len(points), _ENOUGH, dtype=np.float32)
     for _ in range(min(_VIEWS * max_views, len(names))):

@@ -1,4 +1,4 @@
-"""A capture through its own cameras: what it is sure of, and how well it saw each of its Gaussians."""
+"""Renders of a capture from its own cameras, with how well each surface and Gaussian was observed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap._native import place_points
-from gsmap.compare.neighbourhoods import extremes, shrunk
+from gsmap.compare.neighbourhoods import depth_extremes, erode
 from gsmap.geometry.voxels import voxel_labels
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
@@ -23,17 +23,17 @@ CELL_M = 0.12  # Gaussians this near vote together
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One small picture of a capture.
+    """A render of a capture in reduced size.
 
     Args:
         camera: one camera, the frame of the comparison.
         colour: (H, W, 3) float32, in [0, 1].
         depth: (H, W) float32 camera-space z, metres.
-        near, far: (H, W) float32 lowest and highest depth over 3 x 3 pixels: at an edge a depth is a mixture of what
-            lies before and behind it, and proves nothing between the two.
-        opaque: (H, W) bool, shows a surface.
-        solid: (H, W) bool, so it does, and so do the eight neighbours.
-        dominant_id: (H, W) int32 Gaussian of the capture that shows most, -1 for none.
+        near, far: (H, W) float32 lowest and highest depth over 3 x 3 pixels: at an edge a depth mixes foreground and
+            background, and proves nothing between the two.
+        opaque: (H, W) bool, pixels that show a surface.
+        solid: (H, W) bool, opaque pixels with eight opaque neighbours.
+        dominant_id: (H, W) int32 Gaussian with the largest blending weight, -1 for none.
     """
 
     camera: Cameras
@@ -46,14 +46,14 @@ class View:
     dominant_id: np.ndarray
 
     def pixels_a_metre(self, z: np.ndarray) -> np.ndarray:
-        """How finely the picture shows what lies at depths z."""
+        """Return the resolution of the view at depths z, in pixels per metre."""
         out: np.ndarray = (self.camera.intrinsics_px[0, 0] / z).astype(np.float32)
         return out
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """Which points fall in a picture (``index``), on which pixels, at which depth ``z``."""
+class ProjectedPoints:
+    """Points in a view: their rows ``index``, pixels and depths ``z``."""
 
     index: np.ndarray
     row: np.ndarray
@@ -62,18 +62,18 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
-    """One capture, rendered once from a bounded number of its own cameras.
+class CaptureViews:
+    """A capture, rendered once from a bounded number of its own cameras.
 
     Args:
         scene: the capture.
-        views: V pictures of it.
-        surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen;
-            all of a capture without pictures.
-        times_seen: (N,) int32 pictures in which a Gaussian lies on the surface that is shown.
-        sharpness: (N,) float32 sum over these of (pixels a metre)^2: more looks and nearer ones see better.
-        sure: per view (H, W) bool, solid, and a surface that enough of the capture's views saw.
-        placed: per view, where its own Gaussians fall in it.
+        views: V renders of it.
+        surface: (N,) bool, Gaussians that are visible in the views, the rest being floaters or unobserved; all of a
+            capture without views.
+        times_seen: (N,) int32 views in which a Gaussian lies on the visible surface.
+        sharpness: (N,) float32 sum over these of (pixels per metre)^2: more and nearer views observe it better.
+        sure: per view (H, W) bool, solid pixels of a surface that enough of the capture's views observed.
+        placed: per view, the projections of the capture's own Gaussians.
     """
 
     scene: PlacedScene
@@ -82,37 +82,39 @@ class Looks:
     times_seen: np.ndarray
     sharpness: np.ndarray
     sure: tuple[np.ndarray, ...]
-    placed: tuple[Placed, ...]
+    placed: tuple[ProjectedPoints, ...]
 
     @property
     def gaussians(self) -> Gaussians:
         return self.scene.gaussians
 
 
-def look(scene: PlacedScene, *, longest_side_px: int = LONGEST_SIDE_PX, max_views: int = MAX_VIEWS) -> Looks:
-    """Render a capture from its own cameras; one without cameras has no views and says nothing of others."""
+def render_views(
+    scene: PlacedScene, *, longest_side_px: int = LONGEST_SIDE_PX, max_views: int = MAX_VIEWS
+) -> CaptureViews:
+    """Render a capture from its own cameras; one without cameras has no views, and is no evidence on others."""
     count = len(scene.gaussians)
     largest = np.zeros(count, dtype=np.float32)
     views = []
-    for camera in own_cameras(scene, longest_side_px, max_views):
+    for camera in select_cameras(scene, longest_side_px, max_views):
         view, weight = _view(scene.gaussians, camera)
         views.append(view)
         np.maximum(largest, weight, out=largest)
     times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
-    placed = tuple(place(scene.gaussians.means, view, NEAREST_M) for view in views)
+    placed = tuple(project_points(scene.gaussians.means, view, NEAREST_M) for view in views)
     for view, at in zip(views, placed, strict=True):
         margin = MIN_TOLERANCE_M
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
         times_seen[at.index[on]] += 1
         sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
-    well = best_of_cell(scene.gaussians.means, times_seen, CELL_M) >= MIN_VIEWS
+    well = max_per_cell(scene.gaussians.means, times_seen, CELL_M) >= MIN_VIEWS
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
     surface = largest >= MIN_WEIGHT if views else np.ones(count, dtype=bool)
-    return Looks(scene, tuple(views), surface, times_seen, sharpness, sure, placed)
+    return CaptureViews(scene, tuple(views), surface, times_seen, sharpness, sure, placed)
 
 
-def best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
-    """(N,) the largest count in each point's cell: a place was seen as often as what shows it best."""
+def max_per_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
+    """Return (N,) the largest count in each point's cell."""
     if not len(points):
         return counts
     cell = voxel_labels(points, cell_m)
@@ -122,19 +124,19 @@ def best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.nd
     return out
 
 
-def own_cameras(scene: PlacedScene, longest_side_px: int, max_views: int) -> list[Cameras]:
-    """At most ``max_views`` cameras of a capture, evenly along its path, small; none where nobody knows what it saw."""
+def select_cameras(scene: PlacedScene, longest_side_px: int, max_views: int) -> list[Cameras]:
+    """Select at most ``max_views`` cameras of a capture, evenly along its path; none if they were synthesized."""
     if scene.cameras is None or scene.cameras.synthesised or not len(scene.cameras) or not len(scene.gaussians):
         return []
     small = scene.cameras.evenly(max_views).resized(longest_side_px)
     return [small[i] for i in range(len(small))]
 
 
-def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
-    """Points (N, 3) in a view, those alone that lie in the picture and beyond ``nearest_m``."""
+def project_points(points: np.ndarray, view: View, nearest_m: float) -> ProjectedPoints:
+    """Project points (N, 3) into a view; points outside, or nearer than ``nearest_m``, are dropped."""
     camera = view.camera
     width, height = (int(v) for v in camera.sizes_px[0])
-    return Placed(
+    return ProjectedPoints(
         *place_points(
             points=np.ascontiguousarray(points, np.float32),
             pose=np.ascontiguousarray(camera.T_camera_frame[0], np.float64),
@@ -148,18 +150,18 @@ def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
 
 def _view(gaussians: Gaussians, camera: Cameras) -> tuple[View, np.ndarray]:
     seen = render(gaussians, camera, max_weight=True)
-    return view_of(seen.colour[0], seen.alpha[0], seen.depth[0], seen.dominant_id[0], camera), seen.max_weight
+    return make_view(seen.colour[0], seen.alpha[0], seen.depth[0], seen.dominant_id[0], camera), seen.max_weight
 
 
-def view_of(
+def make_view(
     colour: np.ndarray,
     alpha: np.ndarray,
     depth: np.ndarray,
     dominant_id: np.ndarray,
     camera: Cameras,
 ) -> View:
-    """A picture with what its neighbourhoods say."""
+    """Make a view of a render, with depth ranges and opacity masks."""
     opaque = alpha > MIN_ALPHA
-    near, far = extremes(depth, opaque)
-    solid = opaque & shrunk(opaque)
+    near, far = depth_extremes(depth, opaque)
+    solid = opaque & erode(opaque)
     return View(camera, np.clip(colour, 0, 1), depth, near, far, opaque, solid, dominant_id)

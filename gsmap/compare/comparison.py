@@ -1,4 +1,4 @@
-"""Two captures seen from the cameras of both."""
+"""Comparison of two captures by renders of both from the cameras of both."""
 
 from __future__ import annotations
 
@@ -7,18 +7,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap._native import add_colours, count_looks
-from gsmap.compare.colours import Balance, balance, differ
-from gsmap.compare.evidence import REPAINTED, Evidence, Tally
-from gsmap.compare.looks import MAX_TOLERANCE_M, MIN_TOLERANCE_M, NEAREST_M, Looks, Placed, View, place, view_of
+from gsmap.compare.capture_views import (
+    MAX_TOLERANCE_M,
+    MIN_TOLERANCE_M,
+    NEAREST_M,
+    CaptureViews,
+    ProjectedPoints,
+    View,
+    make_view,
+    project_points,
+)
+from gsmap.compare.colours import Balance, balance, colours_differ
+from gsmap.compare.evidence import REPAINTED, ChangeEvidence, EvidenceCounts
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.render import render
 from gsmap.types import Gaussians
 
-UNSURE, AGREE, COLOUR, OTHER_BEFORE, OTHER_BEHIND = 0, 1, 2, 3, 4
-"""Outcomes of a pixel of one capture's own view. ``UNSURE``: one of them shows nothing there, an edge, or a surface
-that was not seen well. ``AGREE``: one surface, one colour. ``COLOUR``: one surface in two colours. ``OTHER_BEFORE``:
-the other capture has a thing where this one looked through. ``OTHER_BEHIND``: this one has a thing before what the
-other shows, which proves nothing by itself: the other's cameras may never have seen the place from here."""
+UNSURE, AGREE, COLOUR, OTHER_IN_FRONT, OTHER_BEHIND = 0, 1, 2, 3, 4
+"""Outcomes of a pixel of one capture's own view. ``UNSURE``: one capture shows nothing there, an edge, or a poorly
+observed surface. ``AGREE``: one surface, one colour. ``COLOUR``: one surface in two colours. ``OTHER_IN_FRONT``: the
+other capture has a surface in this one's free space. ``OTHER_BEHIND``: this capture has a surface in front of the
+other's, which proves nothing: the other's cameras may never have observed the place from here."""
 
 
 _TOLERANCE_SIGMAS = 3.5  # robust standard deviations of the depths that agree
@@ -26,16 +35,16 @@ _TOLERANCE_PER_DEPTH = 0.01  # further tolerance in metres per metre of depth
 
 
 @dataclass(frozen=True, eq=False)
-class Pictured:
-    """One view of a capture with what the other capture shows from there.
+class ComparedView:
+    """A view of one capture and the render of the other capture from the same camera.
 
     Args:
         own: the capture's own view.
-        other: the other's surfaces from the same camera.
+        other: the surfaces of the other capture from the same camera.
         outcome: (H, W) uint8, one of the five outcomes.
-        one: (H, W) bool, both show one surface, well seen or not.
-        covered: (H, W) bool, the other has a thing before what this one shows, though perhaps at an edge.
-        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour there, newer less older.
+        one: (H, W) bool, both captures show one surface, well observed or not.
+        covered: (H, W) bool, the other capture has a surface in front, perhaps at an edge.
+        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour, newer minus older.
     """
 
     own: View
@@ -49,30 +58,34 @@ class Pictured:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What two captures say of each other.
+    """Result of comparing two captures.
 
     Args:
-        older, newer: evidence of each one's Gaussians, by the views of the other.
-        older_views, newer_views: each capture's own views, with the other rendered from there.
-        balance: brings the older's colours to the newer's.
-        tolerance_m: (base, share): depths differ when by more than ``base + share * depth``.
+        older, newer: evidence on each capture's Gaussians, from the views of the other.
+        older_views, newer_views: each capture's own views, with renders of the other capture.
+        balance: from the older capture's colours to the newer's.
+        tolerance_m: (base, slope): depths differ if by more than ``base + slope * depth``.
     """
 
-    older: Evidence
-    newer: Evidence
-    older_views: tuple[Pictured, ...]
-    newer_views: tuple[Pictured, ...]
+    older: ChangeEvidence
+    newer: ChangeEvidence
+    older_views: tuple[ComparedView, ...]
+    newer_views: tuple[ComparedView, ...]
     balance: Balance
     tolerance_m: tuple[float, float]
 
 
-def compare(older: Looks, newer: Looks) -> Comparison:
-    """Compare two captures that lie in one metric frame.
+def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
+    """Compare two captures in one metric frame.
 
-    Each is rendered from the other's cameras once, its surfaces alone: from where its own cameras never stood its haze
-    hides everything.
+    Each capture is rendered once from the other's cameras, its surfaces only: from positions without own cameras,
+    floaters would hide them.
     """
-    from gsmap.compare.things import Side, remnants, shells  # with scipy, which naming a recipe does without
+    from gsmap.compare.segments import (  # with scipy, which naming a recipe does without
+        SegmentedCapture,
+        find_remnants,
+        label_shells,
+    )
 
     surfaces = {id(one): _surface(one) for one in (older, newer)}
     crossed = [
@@ -85,14 +98,14 @@ def compare(older: Looks, newer: Looks) -> Comparison:
         [_outcomes(own, sure, other, line, sign, tolerance) for own, sure, other in pairs]
         for pairs, sign in zip(crossed, (-1, 1), strict=True)
     ]
-    tallies = Tally(len(older.gaussians)), Tally(len(newer.gaussians))
+    tallies = EvidenceCounts(len(older.gaussians)), EvidenceCounts(len(newer.gaussians))
     for judged, judge, by, of in ((tallies[0], tallies[1], newer, older), (tallies[1], tallies[0], older, newer)):
         for picture, sure, own in zip(pictured[by is newer], by.sure, by.placed, strict=True):
-            at = place(of.gaussians.means, picture.own, NEAREST_M)
+            at = project_points(of.gaussians.means, picture.own, NEAREST_M)
             _count(judged, at, picture, sure, tolerance)
             _count_colour(judge, own, picture, tolerance)
     both = older, newer
-    walls = shells([(one.gaussians.means, one.surface) for one in both])
+    walls = label_shells([(one.gaussians.means, one.surface) for one in both])
     evidence = [
         tally.evidence(
             one.gaussians.means,
@@ -105,21 +118,21 @@ def compare(older: Looks, newer: Looks) -> Comparison:
         for tally, one, other, shell in zip(tallies, both, both[::-1], walls, strict=True)
     ]
     older_end, newer_end = (
-        Side(
+        SegmentedCapture(
             one.gaussians.means,
             np.clip(rgb_of_sh0(one.gaussians.sh[:, 0]), 0, 1),
-            found.thing,
+            found.segment,
             found.state >= REPAINTED,
             found.framed,
         )
         for one, found in zip(both, evidence, strict=True)
     )
-    for found, rest in zip(evidence, remnants((older_end, newer_end)), strict=True):
+    for found, rest in zip(evidence, find_remnants((older_end, newer_end)), strict=True):
         found.state[rest] = REPAINTED
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
 
 
-def _surface(looks: Looks) -> tuple[Gaussians, np.ndarray]:
+def _surface(looks: CaptureViews) -> tuple[Gaussians, np.ndarray]:
     rows = np.flatnonzero(looks.surface)
     return (looks.gaussians if len(rows) == len(looks.surface) else looks.gaussians[rows]), rows
 
@@ -128,11 +141,11 @@ def _seen_by(view: View, gaussians: Gaussians, rows: np.ndarray) -> View:
     seen = render(gaussians, view.camera)
     dominant = seen.dominant_id[0]
     whole = np.where(dominant >= 0, rows[np.maximum(dominant, 0)] if len(rows) else -1, -1).astype(np.int32)
-    return view_of(seen.colour[0], seen.alpha[0], seen.depth[0], whole, view.camera)
+    return make_view(seen.colour[0], seen.alpha[0], seen.depth[0], whole, view.camera)
 
 
 def _tolerance(pairs: list[tuple[View, np.ndarray, View]]) -> tuple[float, float]:
-    """Base and share of the depth: what the pair's own surfaces scatter by, within limits."""
+    """Return the depth tolerance, base and slope, from the scatter of the surfaces that agree."""
     found = []
     for own, sure, other in pairs:
         both = (sure & other.solid)[::2, ::2]
@@ -146,7 +159,7 @@ def _tolerance(pairs: list[tuple[View, np.ndarray, View]]) -> tuple[float, float
 
 
 def _line(crossed: list[list[tuple[View, np.ndarray, View]]], tolerance: tuple[float, float]) -> Balance:
-    """The older's colours to the newer's, from all pixels on one surface."""
+    """Fit the balance from the older capture's colours to the newer's, by all pixels on one surface."""
     older, newer = [], []
     for pairs, own_is_newer in zip(crossed, (False, True), strict=True):
         for own, sure, other in pairs:
@@ -170,8 +183,8 @@ def _outcomes(
     line: Balance,
     sign: int,
     tolerance: tuple[float, float],
-) -> Pictured:
-    """``line`` takes the older's colours to the newer's."""
+) -> ComparedView:
+    """Classify the pixels of a view; ``line`` takes the older capture's colours to the newer's."""
     base, share = tolerance
     gap = base + share * own.depth
     one = own.solid & other.solid & _one_surface(own, other, tolerance)
@@ -181,15 +194,17 @@ def _outcomes(
     chroma, lightness = line.differences(older.colour, newer.colour, one)
     outcome = np.full(own.depth.shape, UNSURE, dtype=np.uint8)
     outcome[one & sure] = AGREE
-    outcome[one & sure & differ(line, chroma, lightness)] = COLOUR
-    # Beyond both neighbourhoods' extremes: a pixel off at an edge proves nothing.
-    outcome[both & (other.far < own.near - gap)] = OTHER_BEFORE
+    outcome[one & sure & colours_differ(line, chroma, lightness)] = COLOUR
+    # Beyond the extremes of both neighbourhoods: an edge that is a pixel off proves nothing.
+    outcome[both & (other.far < own.near - gap)] = OTHER_IN_FRONT
     outcome[both & (other.near > own.far + gap)] = OTHER_BEHIND
-    return Pictured(own, other, outcome, one, covered, chroma, lightness)
+    return ComparedView(own, other, outcome, one, covered, chroma, lightness)
 
 
-def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolerance: tuple[float, float]) -> None:
-    """Where the Gaussians of one capture lie in a view of the other, and its colours of those on its surface."""
+def _count(
+    tally: EvidenceCounts, at: ProjectedPoints, picture: ComparedView, sure: np.ndarray, tolerance: tuple[float, float]
+) -> None:
+    """Count where the Gaussians of one capture lie in a view of the other, and add the colours of its surface."""
     view, (base, share) = picture.own, tolerance
     count_looks(
         at.index,
@@ -222,8 +237,10 @@ def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolera
     )
 
 
-def _count_colour(tally: Tally, at: Placed, picture: Pictured, tolerance: tuple[float, float]) -> None:
-    """What a capture's own view says of the colours of its own Gaussians."""
+def _count_colour(
+    tally: EvidenceCounts, at: ProjectedPoints, picture: ComparedView, tolerance: tuple[float, float]
+) -> None:
+    """Add the colour differences in a capture's own view to its Gaussians."""
     base, share = tolerance
     add_colours(
         at.index,

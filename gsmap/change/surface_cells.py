@@ -1,4 +1,4 @@
-"""What both captures' pictures say of the cells of each one's surface."""
+"""Surface cells of two captures with their evidence of change from the views of both."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from gsmap._native import beyond_ranges
 from gsmap.change.poses import tints
-from gsmap.compare import Comparison, Looks, Pictured, View
-from gsmap.compare.colours import FLOOR, Balance, logarithms
+from gsmap.compare import CaptureViews, ComparedView, Comparison, View
+from gsmap.compare.colours import FLOOR, Balance, log_colours
 from gsmap.compare.structure import normals_of
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.sh import rgb_of_sh0
@@ -20,22 +20,23 @@ from gsmap.geometry.sh import rgb_of_sh0
 CELL_M = 0.05  # surfaces are judged by cells of this size
 _MIN_CHROMA, _MIN_LIGHTNESS = 0.05, 0.15  # smallest differences, of colours in [0, 1], that may be a change
 _COLOUR_SIGMAS = 3.0  # robust standard deviations that exposure and noise may leave
-_CLIP_M = 0.15  # offsets beyond are other surfaces, not noise
-_STEEPEST = 0.2  # cosine below which a surface is seen too flat to measure an offset
+_CLIP_M = 0.15  # larger offsets are other surfaces, not noise
+_STEEPEST = 0.2  # least cosine of the viewing angle at which an offset is measured
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
-    """The surface of one capture in M cells, and what the pictures of both say of each.
+class SurfaceCells:
+    """The surface of one capture in M cells, with evidence from the views of both captures.
 
     Args:
-        rows: (R,) Gaussians of the capture that are surface, and ``label`` (R,) the cell of each.
+        rows: (R,) Gaussians of the capture on surfaces, and ``label`` (R,) the cell of each.
         points, colours: (M, 3) means.
-        through, on: (M,) views of the other capture, summed over the cell's Gaussians.
-        offset_m: (M,) mean by which the other's surface lies behind this one, along its normal.
-        colour: (M, 3) mean difference to the other's colour, two of chroma and one of lightness: newer less older.
-        strength: (M,) the same as a multiple of what counts, texture that is off by a pixel forgiven.
-        looks: (M,) pixels that compared both.
+        through, on: (M,) views of the other capture with a Gaussian in free space or on the surface, summed over the
+            cell's Gaussians.
+        offset_m: (M,) mean distance of the other capture's surface behind this one, along its normal.
+        colour: (M, 3) mean difference of colour, two of chroma and one of lightness, newer minus older.
+        strength: (M,) the same relative to the least difference that counts, texture off by a pixel ignored.
+        looks: (M,) pixels that show the cell in both captures.
     """
 
     rows: np.ndarray
@@ -58,16 +59,16 @@ class Side:
 
     @cached_property
     def tints(self) -> np.ndarray:
-        """(M, 3) of the colours; see `gsmap.change.poses.tints`."""
+        """(M, 3) tints of the colours; see `gsmap.change.poses.tints`."""
         return tints(self.colours)
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """(M, 3) unit normals; signs mean nothing."""
+        """(M, 3) unit normals; signs are arbitrary."""
         return normals_of(self.points)
 
     def around(self, values: np.ndarray, radius_m: float) -> np.ndarray:
-        """(M, ...) sums of values over the cells within a radius of each."""
+        """Return (M, ...) sums of values over the cells within a radius of each."""
         return self._neighbours(radius_m) @ values
 
     def _neighbours(self, radius_m: float) -> Any:
@@ -84,7 +85,7 @@ class Side:
 
 @dataclass(eq=False)
 class _Sums:
-    """Sums over pixels by the Gaussian that shows most there."""
+    """Sums over pixels by their dominant Gaussian."""
 
     offset: np.ndarray
     colour: np.ndarray
@@ -96,11 +97,13 @@ class _Sums:
         return cls(np.zeros(count), np.zeros((count, 3)), np.zeros(count), np.zeros(count))
 
 
-def sides(older: Looks, newer: Looks, comparison: Comparison) -> tuple[Side, Side]:
-    """Both captures' surfaces with what is known of them."""
+def compare_surfaces(
+    older: CaptureViews, newer: CaptureViews, comparison: Comparison
+) -> tuple[SurfaceCells, SurfaceCells]:
+    """Accumulate the evidence on the surface cells of both captures."""
     sums = _Sums.zeros(len(older.gaussians)), _Sums.zeros(len(newer.gaussians))
     limits = _limits(comparison.balance)
-    # Every second view of each: neighbouring views of a walk show the same.
+    # Every second view of each capture, as neighbouring views of a walk show the same.
     for picture in comparison.newer_views[::2]:
         _add(sums, (picture.other, picture.own), picture, comparison, limits)
     for picture in comparison.older_views[1::2]:
@@ -115,7 +118,7 @@ def sides(older: Looks, newer: Looks, comparison: Comparison) -> tuple[Side, Sid
 
 
 def _limits(line: Balance) -> tuple[float, float]:
-    """Chroma and lightness from which on colours differ."""
+    """Return the least differences of chroma and lightness that count."""
     return (
         max(_MIN_CHROMA, _COLOUR_SIGMAS * line.chroma_spread),
         max(_MIN_LIGHTNESS, _COLOUR_SIGMAS * line.lightness_spread),
@@ -125,11 +128,11 @@ def _limits(line: Balance) -> tuple[float, float]:
 def _add(
     sums: tuple[_Sums, _Sums],
     views: tuple[View, View],
-    picture: Pictured,
+    picture: ComparedView,
     comparison: Comparison,
     limits: tuple[float, float],
 ) -> None:
-    """Add what one camera shows of the older and of the newer capture."""
+    """Add the views of the older and the newer capture from one camera."""
     a, b = views
     base, share = comparison.tolerance_m
     one = a.solid & b.solid & (a.dominant_id >= 0) & (b.dominant_id >= 0)
@@ -147,13 +150,15 @@ def _add(
 
 
 def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
-    """Differences of colour (H, W, 3), two of chroma and one of lightness, and how far they go beyond what a shift by
-    a pixel explains (H, W), as multiples of the limits."""
-    log_a = logarithms(a) * line.slope.astype(np.float32) + line.offset.astype(np.float32)
-    log_b = logarithms(b)
+    """Return differences of colour (H, W, 3), two of chroma and one of lightness, and their strength (H, W).
+
+    The strength is relative to the limits, after subtracting what a shift by a pixel explains.
+    """
+    log_a = log_colours(a) * line.slope.astype(np.float32) + line.offset.astype(np.float32)
+    log_b = log_colours(b)
     bright = np.minimum(np.exp(np.maximum(log_a.max(-1), log_b.max(-1))), 1)
     plain = _opponent(log_b - log_a, bright)
-    # A texture that is off by a pixel, or blurred in one of the captures, stays within what the other shows around.
+    # Texture that is off by a pixel, or blurred in one capture, stays within the other's range around the pixel.
     strengths = []
     for x, y in ((log_a, log_b), (log_b, log_a)):
         beyond = _opponent(beyond_ranges(x, y), bright)
@@ -162,14 +167,14 @@ def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, fl
 
 
 def _opponent(ratio: np.ndarray, bright: np.ndarray) -> np.ndarray:
-    """Red and blue against green, and the mean: as `gsmap.compare.Balance.differences` has them."""
+    """Return red and blue relative to green, and the mean, as in `gsmap.compare.Balance.differences`."""
     green = ratio[..., 1]
     parts = [ratio[..., 0] - green, ratio[..., 2] - green, ratio.mean(-1)]
     return np.stack(parts, axis=-1) * bright[..., None]
 
 
 def _along_normal(view: Any) -> np.ndarray:
-    """(H, W) metres along the surface's normal per metre of depth."""
+    """Return (H, W) metres along the surface normal per metre of depth."""
     fx, fy, cx, cy = view.camera.intrinsics_px[0]
     height, width = view.depth.shape
     x = np.broadcast_to((np.arange(width) + 0.5 - cx) / fx, (height, width))
@@ -181,11 +186,11 @@ def _along_normal(view: Any) -> np.ndarray:
     down[1:-1] = points[2:] - points[:-2]
     normal = np.cross(across, down)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    # The distance between two planes across the ray is the depth between them times |n . ray|, rays of unit depth.
+    # The distance of two planes along the normal is their depth difference times |n . ray|, for rays of unit depth.
     return np.clip(np.abs((normal * rays).sum(-1)), _STEEPEST, 1.0)
 
 
-def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None) -> Side:
+def _side(looks: CaptureViews, evidence: Any, sums: _Sums, line: Balance | None) -> SurfaceCells:
     rows = np.flatnonzero(looks.surface)
     gaussians = looks.gaussians
     points = gaussians.means[rows].astype(np.float64)
@@ -195,7 +200,7 @@ def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None) -> Sid
         colours = np.clip(np.exp(np.log(colours + FLOOR) * line.slope + line.offset) - FLOOR, 0, 1)
     total = lambda values: np.bincount(label, values[rows], len(counts))  # noqa: E731
     looked = total(sums.looks)
-    return Side(
+    return SurfaceCells(
         rows,
         label,
         group_means(points, label, counts),

@@ -1,0 +1,251 @@
+"""Propagation of change evidence over segments: connected groups of Gaussians that are one physical object.
+
+Evidence of single Gaussians and their neighbours errs both ways. Thin objects, edges and lighting make a few Gaussians
+of an unchanged object look changed; and if an object is replaced by a similar one, most of its Gaussians lie on the new
+surface in nearly its colour. So a change needs roots, Gaussians that changed beyond doubt, and from a segment much of
+which changed the change spreads to Gaussians that differ slightly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, cKDTree
+
+from gsmap.compare.components import components
+from gsmap.compare.structure import normals_of, planes
+from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.neighbours import nearest_of, neighbours_of
+
+_CELL_M = 0.05  # edge of the surface cells in which planes are detected
+_FEWEST = 5  # points of a hull
+_ASKED = 5  # nearest judged neighbours that vote
+_CHANGE_LINK_M = 0.1  # changed Gaussians this near on one shell plane, or off all planes, are one change
+MIN_ROOTS, MIN_ROOT_FRACTION = 8, 0.2  # Gaussians beyond doubt, and their fraction, that prove a change
+_ISOLATED_COLOUR = 4.0  # times the least difference of colour, that counts beside a change without neighbours
+_ADJACENT_M = 0.35  # largest distance from a proven change at which such a Gaussian joins it
+_SEGMENT_LINK_M = 0.08  # Gaussians this near are of one segment
+_MIN_CHANGED_FRACTION = 0.2  # of a segment, from which on the change spreads over it
+_WEAK_COLOUR = 0.2  # times the least difference of colour, that counts there
+_NEIGHBOUR_M = 0.15  # within which most neighbours on the segment must have changed
+_NEAR_SHELL_M = 0.1  # what is this near to the shell may be a frame or skirting board of it
+MAX_OUTSIDE_HULL_M = 0.05  # such a part joins a segment's change only this far outside of the hull of that
+_MIN_REMNANT_FRACTION = 0.5  # of a segment that must have changed for the rest to be tested
+_MIN_REMNANT_SCORE = 0.7  # mean score from which on the rest changed, too
+_MAX_COLOUR_DISTANCE = 0.05  # in [0, 1], to the colours that changed on the segment, for a score of 1
+_NEW_WEIGHT = 0.5  # score for the fraction that is new of the other capture's segment
+
+
+def label_shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+    """Return, for each capture, (N,) the floor, ceiling or wall of each Gaussian, -1 for none; numbered jointly.
+
+    Gaussians off surfaces take the label of the nearest on a surface. z is up: frames that are not upright have no
+    shell.
+
+    Args:
+        captures: of each, points (N, 3) and a mask (N,) of those on surfaces.
+    """
+    surface = np.concatenate([points[shows] for points, shows in captures]).astype(np.float64)
+    label, counts = cell_labels(np.floor(surface / _CELL_M))
+    means = group_means(surface, label, counts)
+    plane = planes(means, normals_of(means), _CELL_M)
+    out, first = [], 0
+    for points, shows in captures:
+        found = np.full(len(points), -1, dtype=np.int64)
+        last = first + int(shows.sum())
+        found[shows] = plane[label[first:last]]
+        if len(means) and not shows.all():
+            found[~shows] = plane[nearest_of(means, points[~shows])[1]]
+        out.append(found)
+        first = last
+    return out
+
+
+def label_segments(points: np.ndarray, shell: np.ndarray) -> np.ndarray:
+    """Return (N,) int64 labels of connected segments off floors, ceilings and walls, from 0; -1 on these."""
+    out = np.full(len(points), -1, dtype=np.int64)
+    loose = np.flatnonzero(shell < 0)
+    out[loose] = components(points[loose], _SEGMENT_LINK_M)
+    return out
+
+
+def adjoins_shell(points: np.ndarray, shell: np.ndarray) -> np.ndarray:
+    """Return (N,) bool, points adjacent to the shell without being part of it, such as frames of doors and windows."""
+    return (shell < 0) & ~is_clear(points, points[shell >= 0], _NEAR_SHELL_M)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeLabels:
+    """Labels of the N Gaussians of a capture before changes are propagated over segments.
+
+    Args:
+        points: (N, 3).
+        shell: (N,) see `label_shells`.
+        segment: (N,) see `label_segments`.
+        changed: (N,) bool, gone or repainted by their own evidence.
+        sure: (N,) bool, changed beyond doubt.
+        judged: (N,) bool, observed by the other capture.
+        hidden: (N,) bool, occluded in the other capture.
+        differs: (N,) difference of colour, relative to the least that counts.
+        framed: (N,) bool, see `adjoins_shell`.
+    """
+
+    points: np.ndarray
+    shell: np.ndarray
+    segment: np.ndarray
+    changed: np.ndarray
+    sure: np.ndarray
+    judged: np.ndarray
+    hidden: np.ndarray
+    differs: np.ndarray
+    framed: np.ndarray
+
+
+def find_rooted(labels: ChangeLabels) -> np.ndarray:
+    """Return (N,) bool, members of connected changes, on one shell plane or off all, with enough roots beyond doubt.
+
+    Light that a new colour reflects onto the next wall has no roots, nor have misaligned edges. Isolated Gaussians that
+    changed beyond doubt join a change near by.
+    """
+    rows = np.flatnonzero(labels.changed)
+    label = components(labels.points[rows], _CHANGE_LINK_M, labels.shell[rows])
+    size = np.bincount(label)
+    roots = np.bincount(label, labels.sure[rows])
+    out = np.zeros(len(labels.changed), dtype=bool)
+    out[rows] = ((roots >= MIN_ROOTS) & (roots >= MIN_ROOT_FRACTION * size))[label]
+    alone = (labels.changed & labels.sure) | (labels.differs >= _ISOLATED_COLOUR)
+    beyond, found = np.flatnonzero(alone & ~out), np.flatnonzero(out)
+    while len(beyond) and len(found):
+        near = nearest_of(labels.points[found], labels.points[beyond], _ADJACENT_M)[0]
+        found, beyond = beyond[np.isfinite(near)], beyond[np.isinf(near)]
+        out[found] = True
+    return out
+
+
+def spread_changes(labels: ChangeLabels) -> np.ndarray:
+    """Return (N,) bool, the changed Gaussians and those that the change spreads to.
+
+    On segments much of which changed, the change spreads to connected Gaussians that differ slightly, and to those most
+    of whose neighbours on the segment changed; but not to frames of doors and windows outside of the changed hull.
+    """
+    segment, loose = labels.segment, np.flatnonzero(labels.segment >= 0)
+    count = int(segment.max(initial=-1)) + 1
+    out = labels.changed.copy()
+    for wall in np.unique(labels.shell[out & labels.judged & (labels.shell >= 0)]):
+        on, hidden = labels.judged & (labels.shell == wall), labels.hidden & (labels.shell == wall)
+        if out[on].mean() >= _MIN_CHANGED_FRACTION:
+            out[_with_most(labels, on, hidden & ~out, out, _ADJACENT_M)] = True
+    if not count:
+        return out
+    judged = np.bincount(segment[loose], labels.judged[loose], count)
+    changed = np.bincount(segment[loose], labels.changed[loose], count)
+    much = (changed >= _MIN_CHANGED_FRACTION * judged) & (changed >= MIN_ROOTS)
+    of_these = loose[much[segment[loose]]]
+    weak = of_these[labels.changed[of_these] | (labels.differs[of_these] >= _WEAK_COLOUR)]
+    label = components(labels.points[weak], _CHANGE_LINK_M, segment[weak])
+    tied = np.bincount(label, labels.changed[weak]) >= _MIN_CHANGED_FRACTION * np.bincount(label)
+    out[weak[tied[label]]] = True
+    mine = np.zeros(len(out), dtype=bool)
+    mine[of_these] = True
+    out[_with_most(labels, mine & labels.judged, mine & ~labels.judged & ~out, out, _NEIGHBOUR_M)] = True
+    out[_with_most(labels, mine, mine & ~out, out, _NEIGHBOUR_M)] = True
+    asked = np.flatnonzero(out & ~labels.changed & labels.framed)
+    for k in np.unique(segment[asked]):
+        rows = asked[segment[asked] == k]
+        changed = labels.points[labels.changed & (segment == k)]
+        out[rows[~in_hull(labels.points[rows], changed, MAX_OUTSIDE_HULL_M)]] = False
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedCapture:
+    """A capture of a pair, after `spread_changes`.
+
+    Args:
+        points, colours: (N, 3), colours in [0, 1].
+        segment: (N,) see `label_segments`.
+        changed: (N,) bool.
+        framed: (N,) bool, see `adjoins_shell`.
+    """
+
+    points: np.ndarray
+    colours: np.ndarray
+    segment: np.ndarray
+    changed: np.ndarray
+    framed: np.ndarray
+
+    def share(self) -> np.ndarray:
+        """Return (N,) the fraction of each Gaussian's segment that changed; 0 without a segment."""
+        out, loose = np.zeros(len(self.points)), np.flatnonzero(self.segment >= 0)
+        of = self.segment[loose]
+        out[loose] = (np.bincount(of, self.changed[loose]) / np.maximum(np.bincount(of), 1))[of]
+        return out
+
+
+def find_remnants(sides: tuple[SegmentedCapture, SegmentedCapture]) -> list[np.ndarray]:
+    """Return, for each of two captures, (N,) bool, unchanged remnants that belong to a mostly changed segment.
+
+    A sofa that was shifted by half its length shows its own colour where old and new place overlap. As touching objects
+    form one segment, the remnant may also be an object beside that stayed: colours, and the other capture's surface in
+    its place, decide.
+    """
+    shares = [side.share() for side in sides]
+    found = []
+    for one, other, share, new in zip(sides, sides[::-1], shares, shares[::-1], strict=True):
+        out = np.zeros(len(one.points), dtype=bool)
+        found.append(out)
+        segment = one.segment
+        left = np.flatnonzero((segment >= 0) & ~one.changed & (share >= _MIN_REMNANT_FRACTION))
+        if not len(left) or not len(other.points):
+            continue
+        nearest = nearest_of(other.points, one.points[left])[1]
+        stays = np.zeros(len(left), dtype=bool)
+        for k in np.unique(segment[left[one.framed[left]]]):
+            # The remnant of a shifted object lies between what changed in both captures.
+            beside = np.unique(other.segment[nearest[segment[left] == k]])
+            theirs = other.points[other.changed & np.isin(other.segment, beside[beside >= 0])]
+            changed = np.concatenate([one.points[one.changed & (segment == k)], theirs])
+            rows = np.flatnonzero((segment[left] == k) & one.framed[left])
+            stays[rows] = ~in_hull(one.points[left[rows]], changed, MAX_OUTSIDE_HULL_M)
+        score = _NEW_WEIGHT * new[nearest]
+        for k in np.unique(segment[left]):
+            changed, rows = one.colours[one.changed & (segment == k)], np.flatnonzero(segment[left] == k)
+            if len(changed) >= max(_ASKED, MIN_ROOTS):
+                score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < _MAX_COLOUR_DISTANCE
+        label = components(one.points[left], _SEGMENT_LINK_M, segment[left])
+        goes = (np.bincount(label, score) >= _MIN_REMNANT_SCORE * np.bincount(label))[label]
+        out[left[goes & ~stays]] = True
+    return found
+
+
+def in_hull(points: np.ndarray, others: np.ndarray, beyond_m: float) -> np.ndarray:
+    """Return (N,) bool, points (N, 3) in the convex hull of others (M, 3), or at most a distance beyond its planes."""
+    if len(others) < _FEWEST or not len(points):
+        return np.zeros(len(points), dtype=bool)
+    planes = ConvexHull(others.astype(np.float64), qhull_options="QJ").equations
+    out: np.ndarray = (points @ planes[:, :3].T + planes[:, 3]).max(1) <= beyond_m
+    return out
+
+
+def is_clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarray:
+    """Return (N,) bool, points (N, 3) without any of the others (M, 3) within reach."""
+    if not len(points) or not len(others):
+        return np.ones(len(points), dtype=bool)
+    return np.isinf(nearest_of(others, points, reach_m)[0])
+
+
+def _with_most(
+    labels: ChangeLabels, judged: np.ndarray, others: np.ndarray, changed: np.ndarray, reach_m: float
+) -> np.ndarray:
+    """Return the rows of others most of whose judged neighbours changed. All masks are (N,).
+
+    Such as the occluded inside of a replaced object, or the rest of a painted wall.
+    """
+    asked, rows = np.flatnonzero(judged), np.flatnonzero(others)
+    if not len(asked) or not len(rows):
+        return rows[:0]
+    count = min(_ASKED, len(asked))
+    near = neighbours_of(labels.points[asked], labels.points[rows], count, reach_m)[1]
+    known = np.append(np.where(changed[asked], 1, -1), 0)
+    return rows[known[near].sum(1) > 0]
