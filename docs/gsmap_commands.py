@@ -1,4 +1,4 @@
-"""The command line, for the page that lists it (`tools/make_docs.py`)."""
+"""The command line, for the page that lists it (`tools/make/docs.py`)."""
 
 from gsmap.cli.app import build
 

@@ -5,7 +5,7 @@
 #   tools/build_wheels.sh try        those of dist/ installed in a fresh environment and a small map made with them, away
 #                                    from the sources
 #   tools/build_wheels.sh aarch64    the native module compiled for aarch64 by a cross compiler (g++-aarch64-linux-gnu),
-#                                    and run under qemu-user against this machine's numbers (tools/check_kernels.py)
+#                                    and run under qemu-user against this machine's numbers (tools/check/kernels.py)
 #
 # PYTHON=python3          the interpreter to build for, with what pyproject.toml builds with (and numpy for aarch64)
 # AARCH64_ROOT=folder     where an aarch64 Python of the same version lies, with numpy in its folder site/; made from
@@ -134,8 +134,8 @@ arm() {
     cp $build/_native*.so "$here/_native.so"
     aarch64-linux-gnu-readelf -h "$here/_native.so" | grep Machine
     native=$("$PYTHON" -c 'import sysconfig; print("gsmap/_native" + sysconfig.get_config_var("EXT_SUFFIX"))')
-    "$PYTHON" tools/check_kernels.py "$native" --write "$here/numbers.npz"
-    PYTHONPATH="$root/site" qemu-aarch64 -L "$root" "$root"/usr/bin/python3.[0-9]* tools/check_kernels.py \
+    "$PYTHON" tools/check/kernels.py "$native" --write "$here/numbers.npz"
+    PYTHONPATH="$root/site" qemu-aarch64 -L "$root" "$root"/usr/bin/python3.[0-9]* tools/check/kernels.py \
         "$here/_native.so" --compare "$here/numbers.npz"
 }
 

@@ -29,7 +29,7 @@ cat "$log"
 .venv/bin/ruff format --check . || status=1
 .venv/bin/mypy || status=1
 CHECK=1 tools/build_page.sh || status=1
-PATH=$PWD/.venv/bin:$PATH .venv/bin/python tools/make_docs.py --out build/site || status=1
+PATH=$PWD/.venv/bin:$PATH .venv/bin/python -m tools.make.docs --out build/site || status=1
 # The tests' closing line last, so that whoever reads only the end sees it.
 grep -E '^=+ .*(passed|failed|error).* =+$' "$log" | tail -n 1
 rm -f "$log"

@@ -1,6 +1,6 @@
 """Probability of a detected change, from its evidence.
 
-Weights are fitted by ``tools/fit_change.py`` on synthetic places that changed, and on places that were captured again
+Weights are fitted by ``tools/fit/change.py`` on synthetic places that changed, and on places that were captured again
 unchanged, by night or with another exposure.
 """
 

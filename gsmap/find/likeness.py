@@ -2,7 +2,7 @@
 
 No embedding takes part, so it is the same whichever embedder a map has. Ten differences of two things are each worth
 so much against their being of one kind, by a piecewise linear curve that only falls, and the worths are added: an
-additive model over log-odds, as `gsmap.register.probability` is one. The curves are fitted by ``tools/fit_find.py`` on
+additive model over log-odds, as `gsmap.register.probability` is one. The curves are fitted by ``tools/fit/find.py`` on
 made places, and stored beside this file.
 """
 

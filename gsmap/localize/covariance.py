@@ -21,7 +21,7 @@ class Params:
             on do.
         least_px: no patch is known better than this, at 480 pixels.
         hidden_m: standard deviation of a translation that leaves no residual: the splats of a capture lie beside the
-            surface that its photographs show; fitted on made places by ``tools/fit_localize.py``.
+            surface that its photographs show; fitted on made places by ``tools/fit/localize.py``.
         hidden_rad: the same of a rotation.
         swell: by how many times the standard deviations that residuals of patches tell are too small on made places,
             where a render agrees by one half with the photo.

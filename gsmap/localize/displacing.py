@@ -26,7 +26,7 @@ class Params:
 
     Args:
         share: of the way from a pixel to where the middles of the Gaussians lie that it shows, in their mean by what
-            each adds to it; the rest training took back. Made places say so (``tools/fit_localize.py PLACES
+            each adds to it; the rest training took back. Made places say so (``tools/fit/localize.py PLACES
             displaced``). 0 leaves it out.
         most_px: that way is cut off here in either direction, at a picture of 480 pixels: larger Gaussians show nothing
             that has a place.

@@ -2,7 +2,7 @@
 
 What looks like the place is the place, another one that shares nothing with it, or a room that looks alike: against
 either of the last two the evidence is worth something else, and how frequent they are is told apart
-(`gsmap.localize.verdict.Params`). The curves of `gsmap.compare.odds` are fitted by ``tools/fit_localize.py`` on made
+(`gsmap.localize.verdict.Params`). The curves of `gsmap.compare.odds` are fitted by ``tools/fit/localize.py`` on made
 places, photographed in other light by other lenses, some of them changed or with somebody in the picture, and on
 streets whose rooms look alike.
 """

@@ -24,7 +24,7 @@ class Params:
         max_scenes: that are rendered, those with most matches first.
         min_found: fewer patches say nothing of the pose.
         min_agreement: where a render that was laid over the photo once agrees with it less than this when it is laid
-            over it again, the photo shows another place; made places say where (``tools/fit_localize.py``).
+            over it again, the photo shows another place; made places say where (``tools/fit/localize.py``).
         settle_again_under: a pose from which a render agrees less than this is settled once more from where it came to
             lie; that is kept where the render agrees better then.
         again_px: scenes are rendered again once what they show has moved by more than this ...

@@ -2,7 +2,7 @@
 
 A room that looks like another one has its walls and its pictures and other furniture before them; the room itself, its
 doors open, or with somebody in it, differs in one part and agrees in the rest. So it is asked cell by cell, by a small
-network that ``tools/fit_localize.py`` fits on made places, where it is known what differs: a render is blurred where
+network that ``tools/fit/localize.py`` fits on made places, where it is known what differs: a render is blurred where
 cameras saw little, and shows the same all the same.
 """
 

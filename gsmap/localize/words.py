@@ -2,7 +2,7 @@
 
 A descriptor, shortened by principal components, goes to its nearest word; the signs of what is left over along 64 axes
 are its signature. Features of one place of a surface share words and most signs. Words, axes, and how often features of
-other places come so near are fitted on made places by ``tools/fit_localize.py`` and lie beside this file; for
+other places come so near are fitted on made places by ``tools/fit/localize.py`` and lie beside this file; for
 extractors that none were fitted for, they are drawn at random, always the same.
 """
 

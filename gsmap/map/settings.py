@@ -43,7 +43,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # test and joined over views by feature and box, context over three hops, the relative distance test, ICP on the
     # means, and plain L1 optimisation of the union on 1 cm voxels. A CLIP-like encoder is taken where the map has one;
     # SAM, where the map has it, by `describe.object.segmenter` = "sam". The verdict, the measured scale and the pose
-    # graph, which the paper has none of, stay gsmap's. `tools/bench_paper.py` shows each stage.
+    # graph, which the paper has none of, stay gsmap's. `tools/bench/paper.py` shows each stage.
     "paper": {
         "describe.landmarks": False,
         "describe.object.segmenter": "per_view",

@@ -6,7 +6,7 @@ leaves next to nothing in front of free space, and its colours agree closely. Th
 constant that all edges of a map share (how noisy its captures are) cancels where the edges of one loop are compared.
 
 Weights: conditional logistic regression of wrong against right poses of the same map, on made street fronts with
-exposure, bent and noisy geometry and floaters (``tools/bench_front.py --fit``). The number of false alarms has no part
+exposure, bent and noisy geometry and floaters (``tools/bench/front.py --fit``). The number of false alarms has no part
 in it: a repeated facade violates the independence that it assumes, and nothing corrects it for self-similarity.
 """
 

@@ -2,7 +2,7 @@
 
 Colour is most of what a verdict rests on, so what is left is judged by a model of its own: how many features agree, how
 much of the surfaces coincides, and how much of what both saw is not the same, each worth so much by a curve that only
-rises or only falls. The curves are fitted by ``tools/fit_shape.py`` on made flats, where rooms are boxes with
+rises or only falls. The curves are fitted by ``tools/fit/shape.py`` on made flats, where rooms are boxes with
 furniture along the walls, and a wrong turn by half looks fair; they are stored beside this file.
 """
 

@@ -32,7 +32,7 @@ _CLIP = 3.0  # standard deviations: what moved between captures is no error of t
 class Hidden:
     """How far poses are off by what leaves no residual (a trainer's bias, a sensor that bends what it measures).
 
-    A model, fitted on made places by ``tools/fit_covariance.py``. All are standard deviations.
+    A model, fitted on made places by ``tools/fit/covariance.py``. All are standard deviations.
 
     Args:
         shown: what residuals show of a pose's errors counts this many times (less than once where colours tell more).

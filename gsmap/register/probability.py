@@ -2,7 +2,7 @@
 
 An additive model over log-odds: every piece of evidence is worth so much for or against, by a piecewise linear curve
 that only rises (or only falls) with it, and the sum passes through a logistic. The curves are fitted by
-``tools/fit_verdict.py`` on made places, with every fault that people's captures have, and stored beside this file; no
+``tools/fit/verdict.py`` on made places, with every fault that people's captures have, and stored beside this file; no
 real capture had a part in it.
 """
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 AXES = Path(__file__).with_name("axes.npz")
-"""Mean and principal axes of the built-in descriptors' vectors, by dimension (`tools/fit_retrieve.py`)."""
+"""Mean and principal axes of the built-in descriptors' vectors, by dimension (`tools/fit/retrieve.py`)."""
 
 NUM_DIMS = 48  # of a code
 SCALE = 200  # of a unit vector's components; what is beyond 127 / 200 is cut off, which next to none is

@@ -1,6 +1,6 @@
 """A city as large as wanted, made chunk by chunk: blocks of houses along streets, never in memory as a whole.
 
-For measuring what grows with the number of Gaussians (`tools/bench_city.py`); nothing in it is trained.
+For measuring what grows with the number of Gaussians (`tools/bench/city.py`); nothing in it is trained.
 """
 
 from __future__ import annotations

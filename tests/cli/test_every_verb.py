@@ -13,7 +13,6 @@ import pytest
 import typer.main
 from cli_rooms import save_changes
 from PIL import Image
-from tiny_encoder import image_encoder
 
 import gsmap
 import gsmap.map
@@ -23,6 +22,7 @@ from gsmap.cli.app import build
 from gsmap.cli.objects import OBJECTS, Many, Maybe
 from gsmap.store import trust
 from gsmap.types.photo_sighting import PhotoSighting
+from tools.make.tiny_encoder import image_encoder
 
 Run = Callable[..., Any]
 

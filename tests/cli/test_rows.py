@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import typing
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,26 +15,15 @@ from gsmap.cli.console import json_object, print_facts, print_rows, print_table
 from gsmap.texts import shown
 from gsmap.types import Sim3, rows
 from gsmap.types.rows import Row
+from tools.make import json_docs as TOOL
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "json.md"
 TYPES = [cls for cls in vars(rows).values() if isinstance(cls, type) and issubclass(cls, Row) and is_dataclass(cls)]
 
 
-def make_json_docs() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_json_docs", ROOT / "tools" / "make_json_docs.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-TOOL = make_json_docs()
-
-
 def test_the_page_is_what_the_rows_say() -> None:
-    assert PAGE.read_text(encoding="utf-8") == TOOL.page(), "run python tools/make_json_docs.py"
+    assert PAGE.read_text(encoding="utf-8") == TOOL.page(), "run python -m tools.make.json_docs"
 
 
 @pytest.mark.parametrize("row", TYPES, ids=lambda row: row.__name__)

@@ -1,5 +1,4 @@
-"""Every reader of JSON, TOML or text from outside: damage that the fuzzer found (tools/fuzz_parsers.py) is refused with
-one of gsmap's errors, in one line."""
+"""Readers of JSON, TOML and text refuse damage that the fuzzer found (tools/check/fuzz_parsers.py) in one line."""
 
 from __future__ import annotations
 

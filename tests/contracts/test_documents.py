@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import make_docs
 import pytest
 import typer.main
 from test_families import _outside_package  # noqa: F401  # which docs/extending.md configures
@@ -17,6 +16,7 @@ from test_families import _outside_package  # noqa: F401  # which docs/extending
 from gsmap.cli.app import build
 from gsmap.map.settings import settings_of
 from gsmap.settings import parse
+from tools.make import docs as make_docs
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -134,7 +134,7 @@ def test_a_command_that_fails_ends_the_build(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_documents_build_and_every_command_works(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, ROOT / "tools" / "make_docs.py", "--out", tmp_path / "site", "--keep", tmp_path / "run"],
+        [sys.executable, "-m", "tools.make.docs", "--out", tmp_path / "site", "--keep", tmp_path / "run"],
         capture_output=True,
         text=True,
     )

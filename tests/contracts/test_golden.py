@@ -20,7 +20,7 @@ def outputs() -> dict[str, dict[str, Any]]:
 
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_output_is_that_of_its_version(name: str, outputs: dict[str, dict[str, Any]]) -> None:
-    assert name in KEPT, f"{name} has no stored output: run tools/make_golden.py"
+    assert name in KEPT, f"{name} has no stored output: run tools/make/golden.py"
     now, kept = outputs[name], KEPT[name]
     if "missing" in now:
         pytest.skip(now["missing"])
@@ -29,7 +29,7 @@ def test_output_is_that_of_its_version(name: str, outputs: dict[str, dict[str, A
         assert not changed, f"{name} gives other {', '.join(changed)} than before: raise VERSION or restore the output"
     else:
         assert not changed or now["version"] > kept["version"]
-        pytest.fail(f"{name} has VERSION {now['version']}, stored is {kept['version']}: run tools/make_golden.py")
+        pytest.fail(f"{name} has VERSION {now['version']}, stored is {kept['version']}: run tools/make/golden.py")
 
 
 def test_nothing_stored_is_without_its_case() -> None:

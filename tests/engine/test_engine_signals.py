@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from stop_sweep import alive
+
+from tools.check.stop_sweep import alive
 
 ROOT = Path(__file__).parents[2]
 ASKED = {signal.SIGINT: "", signal.SIGTERM: " by SIGTERM", signal.SIGHUP: " by SIGHUP"}

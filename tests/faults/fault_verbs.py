@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tiny_encoder import image_encoder
 
 import gsmap.map
 from gsmap import formats
 from gsmap.change import recipe_key
 from gsmap.cli import app
 from gsmap.types import Change, ChangeReport, Gaussians
+from tools.make.tiny_encoder import image_encoder
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"

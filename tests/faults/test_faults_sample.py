@@ -1,4 +1,4 @@
-"""A few points of every kind of verb, of the thousands that `tools/sweep_faults.py` goes through."""
+"""A few points of every kind of verb, of the thousands that `tools/check/disk_faults.py` goes through."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Every change of every verb, in every way: as `tools/sweep_faults.py`."""
+"""Every change of every verb, in every way: as `tools/check/disk_faults.py`."""
 
 import os
 

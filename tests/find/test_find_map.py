@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from find_room import CUPBOARD, DATES, FRAMES, RED, SETTINGS, TABLE, YELLOW, fill
 from PIL import Image
-from tiny_encoder import image_encoder
-from tiny_text import text_tower, tokenizer
 
 import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map import Map
 from gsmap.map.pictures import Pictures
 from gsmap.types.rows import FindHit, FindReport
+from tools.make.tiny_encoder import image_encoder
+from tools.make.tiny_text import text_tower, tokenizer
 
 
 def where(hit: FindHit) -> tuple[float, float]:

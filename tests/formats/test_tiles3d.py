@@ -14,7 +14,7 @@ from gsmap.errors import ConfigError, InputError
 from gsmap.formats import glb, tiles3d
 from gsmap.formats.tiles3d import TileNode
 
-TOOL = Path(__file__).resolve().parents[2] / "tools" / "validate_3dtiles.sh"
+TOOL = Path(__file__).resolve().parents[2] / "tools" / "check" / "validate_3dtiles.sh"
 
 
 def by_position(g):
@@ -281,7 +281,7 @@ def test_options_are_checked_and_an_older_export_stays_whole(tmp_path):
 
 def test_published_validators_find_no_fault(tmp_path):
     if shutil.which("node") is None:
-        pytest.skip("needs node and the npm package gltf-validator: see tools/validate_3dtiles.sh")
+        pytest.skip("needs node and the npm package gltf-validator: see tools/check/validate_3dtiles.sh")
     formats.write(tmp_path / "tileset.json", random_gaussians(3000), max_per_tile=500)
     formats.write(tmp_path / "a.glb", random_gaussians(30, degree=1))
     formats.write(tmp_path / "packed.glb", random_gaussians(30, degree=1), compressed=True)

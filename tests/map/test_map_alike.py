@@ -1,16 +1,12 @@
 """A street of rooms that look alike, through the whole pipeline."""
 
 import argparse
-import sys
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-sys.path.append(str(Path(__file__).resolve().parents[2] / "tools"))
-
-import bench_alike
+from tools.bench import alike as bench_alike
 
 
 @pytest.mark.slow

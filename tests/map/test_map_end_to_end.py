@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_encoder import image_encoder
 
 import gsmap
 import gsmap.map
@@ -21,6 +20,7 @@ from gsmap.export.manifest import FILE_NAME
 from gsmap.types import Prior, Sim3
 from gsmap.types.rows import GraphRow
 from gsmap_synthetic import make_captures, write_captures
+from tools.make.tiny_encoder import image_encoder
 
 
 @pytest.fixture(scope="module")

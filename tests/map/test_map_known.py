@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scale_maps import Filled, filled, tiny_pattern
 from sqlalchemy import delete
 
 from gsmap.map.stages.describe import graph_keys
@@ -16,6 +15,7 @@ from gsmap.map.stages.register import Known, _Work
 from gsmap.methods import RecipeKey
 from gsmap.store.schema import registrations, reviews
 from gsmap.types import Registration, Sim3
+from tools.make.large_maps import Filled, filled, tiny_pattern
 
 
 @pytest.fixture

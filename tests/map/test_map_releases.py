@@ -1,4 +1,4 @@
-"""Maps that releases wrote (`tools/make_release_map.py`): each opens, migrates, checks, lists, exports and goes on."""
+"""Maps that releases wrote (`tools/make/release_map.py`): each opens, migrates, checks, lists, exports and goes on."""
 
 from __future__ import annotations
 

@@ -9,7 +9,6 @@ from typing import Any
 from unittest import mock
 
 import pytest
-from scale_maps import TRIED, Filled, filled, tiny_pattern
 from sqlalchemy import select
 
 from gsmap.map import Map, sharing
@@ -18,6 +17,7 @@ from gsmap.store.matrices import pose_bytes
 from gsmap.store.registrations import Registrations, StoredRegistration
 from gsmap.store.schema import edges, poses
 from gsmap.types import PoseGraph, ScenePose
+from tools.make.large_maps import TRIED, Filled, filled, tiny_pattern
 
 SMALL, LARGE = 12, 100
 LOOKED_UP = False  # whether the map says which pairs to try; else these are given (`Filled.standing_in`)

@@ -1,10 +1,8 @@
-"""Groups of observations with common errors, beside truth; `tools/bench_survey_groups.py` runs them on many sites."""
+"""Groups of observations with common errors, beside truth; `tools/bench/survey_groups.py` runs them on many sites."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +14,7 @@ from gsmap.store.ties import tie_value, ties_of
 from gsmap.types import Sim3
 from gsmap.types.world import CAUSES, Contradiction, Survey, WorldFrame, WorldTie
 from gsmap_synthetic.surveyed import SiteParams, surveyed_site
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-import bench_survey_groups as bench
+from tools.bench import survey_groups as bench
 
 HILL = WorldFrame("EPSG:25832", 48.137, 11.575, 520.0)
 

@@ -1,11 +1,11 @@
-"""The methods that tools/bench_register.py compares run, and those that should find an easy pair do."""
+"""The methods that tools/bench/register.py compares run, and those that should find an easy pair do."""
 
 import pytest
 from register_worlds import splat_world
-from registration_methods import ABLATIONS, METHODS, Capture
 
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.types import Sim3
+from tools.bench.registration_methods import ABLATIONS, METHODS, Capture
 
 UNSURE = ("no-context", "no-distance", "no-clique", "fpfh-nodes")  # what may well miss
 

@@ -3,13 +3,13 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import check_flips
 import pytest
 from store_postgres import NoServer, make_database, running_server
 from store_samples import make_cameras, make_gaussians
 from store_swift import Swift, why_not
 
 from gsmap.store import Store
+from tools.check import flips as check_flips
 
 
 @pytest.fixture

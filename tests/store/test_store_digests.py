@@ -4,7 +4,6 @@ import random
 import shutil
 from pathlib import Path
 
-import check_flips
 import pytest
 import store_children
 from page_samples import PAGE, fill, flip
@@ -14,6 +13,7 @@ from gsmap.errors import CorruptError, DiskError
 from gsmap.store import Store, digests, sqlite
 from gsmap.store.handles import Handle
 from gsmap.store.wal import log_of, read_log
+from tools.check import flips as check_flips
 
 
 @pytest.mark.parametrize("count", [12, pytest.param(200, marks=pytest.mark.slow)])

@@ -1,4 +1,4 @@
-"""What tools/soak.py does for ten minutes: that it notices what is lost, and twenty seconds of it."""
+"""What tools/check/soak.py does for ten minutes: that it notices what is lost, and twenty seconds of it."""
 
 import importlib.util
 import json
@@ -12,7 +12,7 @@ import pytest
 
 import gsmap.map
 
-SOAK = Path(__file__).resolve().parents[2] / "tools" / "soak.py"
+SOAK = Path(__file__).resolve().parents[2] / "tools" / "check" / "soak.py"
 
 
 @pytest.fixture

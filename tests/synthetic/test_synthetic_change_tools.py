@@ -1,8 +1,7 @@
-"""tools/make_change.py and its scores: what is written is read back, truth scores full marks, and errors cost them."""
+"""tools/make/change.py and its scores: what is written is read back, truth scores full marks, and errors cost them."""
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +10,9 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.ingest import read_captures
 from gsmap.types import Gaussians, Sim3
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-import bench_change
-import change_scores as scores
-import make_change
+from tools.bench import change as bench_change
+from tools.bench import change_scores as scores
+from tools.make import change as make_change
 
 TINY = ["--steps", "0", "--frames", "16", "--gaussians", "6000", "--size", "96", "--texel", "0.05"]
 

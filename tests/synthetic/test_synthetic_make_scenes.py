@@ -1,9 +1,7 @@
-"""tools/make_scenes.py: a real RGB-D recording, and pictures with cameras, become captures in the house layout."""
+"""tools/make/scenes.py: a real RGB-D recording, and pictures with cameras, become captures in the house layout."""
 
-import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +13,9 @@ from gsmap_synthetic import make_captures, write_captures
 
 @pytest.fixture(scope="module")
 def tool():
-    path = Path(__file__).resolve().parents[2] / "tools" / "make_scenes.py"
-    spec = importlib.util.spec_from_file_location("make_scenes", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    from tools.make import scenes
+
+    return scenes
 
 
 def _run(tool, monkeypatch, *arguments):

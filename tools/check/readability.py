@@ -178,7 +178,7 @@ def prose_measures() -> Iterator[Measure]:
 
 
 def command_measures() -> Iterator[Measure]:
-    sys.path[:0] = [str(ROOT / "tests" / "contracts"), str(ROOT / "tests"), str(ROOT / "tools")]
+    sys.path[:0] = [str(ROOT / "tests" / "contracts"), str(ROOT / "tests"), str(ROOT)]
     import test_documents as documents
 
     lines = [(page, line, whole) for page in documents.PAGES for line, whole in documents.commands_in(page.read_text())]

@@ -146,7 +146,7 @@ def embed(context: np.ndarray, params: Params) -> np.ndarray:
 def metric(dim: int) -> np.ndarray:
     """(dim, dim) symmetric map under which differences of one landmark's embeddings in two captures are of equal size.
 
-    The inverse root of their scatter, with a share of the identity (`tools/fit_descriptor.py`, which writes the file):
+    The inverse root of their scatter, with a share of the identity (`tools/fit/descriptor.py`, which writes the file):
     directions in which true partners differ much count little (Mikolajczyk and Matas 2007; Hua, Brown and Winder 2007).
     `metric_digest` is part of the recipe of graphs that use it: a metric that is fitted anew needs no new version.
     """

@@ -1,0 +1,163 @@
+"""How well things and objects are told apart and followed, against exact truth.
+
+    python -m tools.make.change CHANGE/test --set test
+    python -m tools.bench.objects CHANGE/test/*
+
+Each PLACE is a folder that tools/make/change.py wrote; poses are the true ones. Of every capture:
+
+pieces    furniture (and pictures) of at least 60 Gaussians that one thing covers with an IoU of more than a half.
+
+Of the first two captures, of pieces that both show:
+
+kept      what stayed is one object of both captures.
+gone, new what left or came is absent where it was not.
+moved     what moved is one object, or absent from both places when it stood in the other.
+false     what stayed and is called absent, or was not seen and is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap import formats
+from gsmap.change import compare
+from gsmap.describe.cloud import surface_cloud
+from gsmap.describe.gravity import estimate_up
+from gsmap.describe.objects.things import find_things
+from gsmap.objects import Capture, Eyes, changed_thing, make_objects, open_eyes
+from gsmap.types import MapObject, PlacedScene, Segments
+from tools.make.change_truth import Truth, owners
+
+_SHOWN = 60  # Gaussians of a piece that a capture shows, or else it says little of it
+_MOVED_M = 0.02
+_KINDS = {"furniture": "furniture", "small": "furniture", "picture": "pictures"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("places", type=Path, nargs="+")
+    parser.add_argument("--changes", action="store_true", help="ask what changed, too, for what moved or left")
+    args = parser.parse_args()
+    total: Counter[str] = Counter()
+    for folder in args.places:
+        counts = score(Truth(folder), args.changes)
+        print(folder.name, _said(counts))
+        total += counts
+    print("all", _said(total))
+
+
+def score(truth: Truth, with_changes: bool) -> Counter[str]:
+    """Counts by what is scored; ``X`` of ``X of``."""
+    counts: Counter[str] = Counter()
+    captures, whose = [], []
+    for when in truth.times:
+        gaussians = formats.read(truth.folder / f"{when}.ply")
+        cameras = formats.read_cameras(truth.folder / f"{when}.cameras.json")
+        started = time.process_time()
+        cloud = surface_cloud(gaussians)
+        up = estimate_up(cloud.points, cameras)
+        between = time.process_time()
+        things = find_things(gaussians, cloud, up, 1.0)
+        counts["things ms"] += round(1000 * (time.process_time() - between))
+        counts["surface ms"] += round(1000 * (between - started))
+        counts["captures"] += 1
+        captures.append(Capture(when, truth.T_place_scene(when), things))
+        whose.append(owners(truth, when, truth.gaussians(when).means))
+        _pieces(counts, truth.states(when), things, whose[-1])
+
+    def eyes(capture: Capture) -> Eyes:
+        gaussians = formats.read(truth.folder / f"{capture.scene}.ply")
+        return open_eyes(gaussians, formats.read_cameras(truth.folder / f"{capture.scene}.cameras.json"))
+
+    moved, parted = _told(truth, captures) if with_changes else ([], [])
+    started = time.process_time()
+    objects = make_objects(captures, 0, eyes, moved=moved, parted=parted)
+    counts["objects ms"] += round(1000 * (time.process_time() - started))
+    _followed(counts, truth, captures, whose, objects)
+    return counts
+
+
+def _told(truth: Truth, captures: list[Capture]) -> tuple[list[Any], list[Any]]:
+    """What the changes between the first two captures say of their things, as `make_objects` takes it."""
+    sides = [
+        PlacedScene(truth.gaussians(when), truth.cameras(when), when, f"2026-01-0{i + 1}T00:00:00+00:00")
+        for i, when in enumerate(truth.times[:2])
+    ]
+    moved: list[Any] = []
+    parted: list[Any] = []
+    for change in compare(*sides).changes:
+        if change.kind in ("appeared", "disappeared", "replaced", "moved"):
+            before = 0, changed_thing(captures[0].things.members, change.before)
+            after = 1, changed_thing(captures[1].things.members, change.after)
+            parted += [(before, 1)] * (before[1] >= 0) + [(after, 0)] * (after[1] >= 0)
+            moved += [(before, after)] * (change.kind == "moved" and min(before[1], after[1]) >= 0)
+    return moved, parted
+
+
+def _pieces(counts: Counter[str], states: list[dict[str, Any]], things: Segments, owner: np.ndarray) -> None:
+    for state in states:
+        mine = owner == state["id"]
+        if state["kind"] not in _KINDS or mine.sum() < _SHOWN:
+            continue
+        found = things.members[mine & (things.members >= 0)]
+        shared = np.bincount(found, minlength=len(things))
+        union = np.bincount(things.members[things.members >= 0], minlength=len(things)) + mine.sum() - shared
+        counts[f"pieces: {_KINDS[state['kind']]} of"] += 1
+        counts[f"pieces: {_KINDS[state['kind']]}"] += int((shared / np.maximum(union, 1)).max(initial=0) > 0.5)
+
+
+def _followed(
+    counts: Counter[str], truth: Truth, captures: list[Capture], whose: list[np.ndarray], objects: list[MapObject]
+) -> None:
+    before, after = ({s["id"]: s for s in truth.states(when)} for when in truth.times[:2])
+    told = [[_of(captures[i], whose[i], thing.sightings[i].thing) for i in (0, 1)] for thing in objects]
+    said = [[thing.sightings[i].state for i in (0, 1)] for thing in objects]
+    for piece in sorted({*before, *after}):
+        shown = [int((owner == piece).sum()) for owner in whose[:2]]
+        was, is_ = (s.get(piece, {}).get("present", False) for s in (before, after))
+        kind = (after.get(piece) or before[piece])["kind"]
+        if kind not in _KINDS:
+            continue
+        older = [i for i, of in enumerate(told) if of[0] == piece]
+        newer = [i for i, of in enumerate(told) if of[1] == piece]
+        left, came = any(said[i][1] == "absent" for i in older), any(said[i][0] == "absent" for i in newer)
+        if was and is_ and min(shown) >= _SHOWN:
+            T = [np.array(s[piece]["T_place_object"]) for s in (before, after)]
+            if np.linalg.norm(T[0][:3, 3] - T[1][:3, 3]) > _MOVED_M:
+                what, right = "moved", (left and came) or bool({*older} & {*newer})
+            else:
+                what, right = f"kept {_KINDS[kind]}", bool({*older} & {*newer})
+                counts["false"] += left or came
+        elif was and not is_ and shown[0] >= _SHOWN:
+            what, right = "gone", left
+        elif is_ and not was and shown[1] >= _SHOWN:
+            what, right = "new", came
+        else:
+            continue
+        counts[f"{what} of"] += 1
+        counts[what] += right
+
+
+def _of(capture: Capture, owner: np.ndarray, thing: int) -> int:
+    """The piece that most of a thing's Gaussians are of."""
+    if thing < 0:
+        return -1
+    ids, counts = np.unique(owner[capture.things.members == thing], return_counts=True)
+    return int(ids[np.argmax(counts)])
+
+
+def _said(counts: Counter[str]) -> str:
+    shares = [f"{name} {counts[name]}/{counts[f'{name} of']}" for name in sorted(counts) if f"{name} of" in counts]
+    each = {name: counts[name] / counts["captures"] / 1000 for name in ("surface ms", "things ms", "objects ms")}
+    cost = ", ".join(f"{name[:-3]} {seconds:.2f}" for name, seconds in each.items())
+    return f"{'; '.join(shares)}; false {counts['false']}; CPU s a capture: {cost}"
+
+
+if __name__ == "__main__":
+    main()

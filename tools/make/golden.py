@@ -1,0 +1,28 @@
+"""Store what every method gives for its small input: tests/contracts/golden.json, which tests/contracts holds it to.
+
+Run it after raising the VERSION of a method whose output has changed on purpose::
+
+    python -m tools.make.golden
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def main() -> int:
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "contracts"))
+    import sketches
+
+    changed = sketches.write()
+    for name in changed:
+        print(name)
+    print(f"{len(changed)} of {len(sketches.cases())} changed", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
