@@ -88,9 +88,11 @@ def write_output(path: Path, write: Callable[[Path], object]) -> None:
     with contextlib.suppress(FileNotFoundError):
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
-            raise InputError(f"cannot write {path}: it is a folder; name a file in it")
+            raise InputError(f"cannot write {path}: it is a folder; name a file in it", code="target_is_a_folder")
         if not stat.S_ISREG(mode):
-            raise InputError(f"cannot write {path}: it is a socket or a block device; name a file, or a pipe")
+            raise InputError(
+                f"cannot write {path}: it is a socket or a block device; name a file, or a pipe", code="not_writable"
+            )
     target = Path(os.path.realpath(path))
     # A name that nobody can have put a link at, with the suffix that was asked for.
     _replace(target, target.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}"), write)
@@ -158,7 +160,7 @@ def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
             return
         except BlockingIOError:
             if time.monotonic() > deadline:
-                raise BusyError(f"{busy} for {patience_s:g} s; try again later") from None
+                raise BusyError(f"{busy} for {patience_s:g} s; try again later", code="lock_busy") from None
             time.sleep(0.01)
 
 
@@ -262,7 +264,10 @@ def open_file(path: Path) -> int:
     """
     if not is_file(path):
         path.lstat()  # says so where it is missing
-        raise CorruptError(f"{path} is no plain file (a link, folder, pipe or device): gsmap made none; remove it")
+        raise CorruptError(
+            f"{path} is no plain file (a link, folder, pipe or device): gsmap made none; remove it",
+            code="not_a_plain_file",
+        )
     return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
@@ -313,9 +318,13 @@ def _mode(name: str, folder: int) -> int | None:
 
 def _checked_name(root: Path, name: str) -> str:
     if name in ("", ".", "..") or "/" in name or "\0" in name:
-        raise CorruptError(f"{name!r} is not the name of anything in {root}: nothing is done with it")
+        raise CorruptError(
+            f"{name!r} is not the name of anything in {root}: nothing is done with it", code="invalid_stored_name"
+        )
     return name
 
 
 def _is_a_link(path: Path) -> CorruptError:
-    return CorruptError(f"{path} is a link: gsmap makes none and follows none here; put what it names in its place")
+    return CorruptError(
+        f"{path} is a link: gsmap makes none and follows none here; put what it names in its place", code="link_refused"
+    )

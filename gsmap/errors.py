@@ -17,7 +17,8 @@
     └── MissingDependencyError (ImportError)   an optional package is not installed
 
 `of_system` tells which of them an error of the operating system is. A message says what is wrong, where, and what to
-do, in one line. "No overlap", "ambiguous" and "not enough nodes" are results with a status and a reason, never errors.
+do, in one line; `GsmapError.code` names the cause for programs. "No overlap", "ambiguous" and "not enough nodes" are
+results with a status and a reason, never errors.
 """
 
 import errno
@@ -29,10 +30,20 @@ _MAX_MESSAGE = 1000  # characters; beyond it a message quotes what somebody put 
 
 
 class GsmapError(Exception):
-    """Root of every error that gsmap raises on purpose; its message is one printable line, whatever it quotes."""
+    """Root of every error that gsmap raises on purpose; its message is one printable line, whatever it quotes.
 
-    def __init__(self, *args: object) -> None:
+    Args:
+        args: the message.
+        code: the cause in lower_snake_case for programs, a key of `gsmap.reason_codes.ERRORS`; default: that of the
+            class. Codes stay as they are from version to version, messages do not.
+    """
+
+    code = "error"
+
+    def __init__(self, *args: object, code: str | None = None) -> None:
         super().__init__(*(_one_line(arg) if isinstance(arg, str) else arg for arg in args))
+        if code is not None:
+            self.code = code  # an attribute of the instance, which pickling keeps
 
 
 def _one_line(text: str) -> str:
@@ -45,53 +56,79 @@ def _one_line(text: str) -> str:
 class InputError(GsmapError, ValueError):
     """A file, array or argument cannot be used as given."""
 
+    code = "input"
+
 
 class NotGaussiansError(InputError):
     """A sound file that holds something other than Gaussians, such as a point cloud or a mesh."""
+
+    code = "not_gaussians"
 
 
 class NotPinholesError(InputError):
     """Cameras of lenses that no pinhole stands for, such as panoramas and wide fisheyes."""
 
+    code = "not_pinholes"
+
 
 class ConfigError(GsmapError, ValueError):
     """An option, or a combination of options, makes no sense."""
+
+    code = "config"
 
 
 class NotFoundError(GsmapError, LookupError):
     """A scene, edge, revision or file that is named does not exist."""
 
+    code = "not_found"
+
 
 class StoreError(GsmapError):
     """The map on disk cannot be read or written."""
+
+    code = "store"
 
 
 class CorruptError(StoreError):
     """Bytes on disk differ from what was written."""
 
+    code = "corrupt"
+
 
 class SchemaVersionError(StoreError):
     """The map was written by another version of gsmap."""
+
+    code = "schema_version"
 
 
 class BusyError(StoreError):
     """Another process holds the map."""
 
+    code = "busy"
+
 
 class DiskFullError(StoreError):
     """The disk, or a quota on it, is used up."""
+
+    code = "disk_full"
 
 
 class ReadOnlyError(StoreError):
     """The disk or the folder cannot be written."""
 
+    code = "read_only"
+
 
 class DiskError(StoreError):
     """The disk failed: an I/O error."""
 
+    code = "disk_failed"
+
 
 class MissingDependencyError(GsmapError, ImportError):
     """An optional package is not installed."""
+
+    code = "missing_dependency"
 
 
 def of_system(error: OSError) -> type[StoreError]:

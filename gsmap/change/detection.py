@@ -103,7 +103,9 @@ def _upright(up: np.ndarray | None) -> Sim3 | None:
     up = np.asarray(up, dtype=np.float64).reshape(-1)
     length = np.linalg.norm(up)
     if up.shape != (3,) or not np.isfinite(length) or length < 1e-9:
-        raise InputError(f"up must be three finite numbers that are not all zero, got {up.tolist()}")
+        raise InputError(
+            f"up must be three finite numbers that are not all zero, got {up.tolist()}", code="invalid_vector"
+        )
     z = up / length
     if z[2] > 1 - 1e-9:
         return None

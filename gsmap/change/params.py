@@ -34,4 +34,4 @@ class Params:
     def __post_init__(self) -> None:
         for name in ("longest_side_px", "max_views", "voxel_m"):
             if not getattr(self, name) > 0:
-                raise ConfigError(f"change.{name} must be positive, got {getattr(self, name)}")
+                raise ConfigError(f"change.{name} must be positive, got {getattr(self, name)}", code="out_of_range")

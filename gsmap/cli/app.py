@@ -17,7 +17,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import left, start_logging
+from gsmap.cli.console import expect_json, left, print_json_error, start_logging
 from gsmap.errors import ConfigError, GsmapError
 from gsmap.texts import escaped
 from gsmap.version import __version__
@@ -111,8 +111,11 @@ def run(arguments: list[str] | None = None) -> None:
         arguments: in place of those of the process.
     """
     left()
+    expect_json()
+    given = sys.argv[1:] if arguments is None else arguments
     # Attaching all verbs takes longer than most of them do.
-    first = next((one for one in (sys.argv[1:] if arguments is None else arguments) if not one.startswith("-")), "")
+    first = next((one for one in given if not one.startswith("-")), "")
+    reason = ""
     try:
         build((first,) if first in VERBS else VERBS)(arguments)
     except SystemExit as ended:
@@ -120,14 +123,16 @@ def run(arguments: list[str] | None = None) -> None:
             raise
         code = 3
     except ConfigError as error:
-        code, message = 2, str(error)
+        code, message, reason = 2, str(error), error.code
     except GsmapError as error:
-        code, message = 1, str(error)
+        code, message, reason = 1, str(error), error.code
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
-        code, message = 1, f"the system refused{where}: {error.strerror or error}"
+        code, message, reason = 1, f"the system refused{where}: {error.strerror or error}", "system_refused"
     except Exception as error:
-        code, message = 1, _internal_error(error)
+        code, message, reason = 1, _internal_error(error), "internal_error"
+    if reason and "--json" in given:
+        print_json_error(reason, message)
     print(escaped(f"gsmap: {message}"), file=sys.stderr)
     sys.exit(code)
 

@@ -36,7 +36,7 @@ def make_or_list(
     from gsmap.errors import ConfigError
 
     if (name is None and delete) or (name is not None and list_all):
-        raise ConfigError(f"name the {kind} to make or to delete, or give --list alone")
+        raise ConfigError(f"name the {kind} to make or to delete, or give --list alone", code="nothing_requested")
     with opened(map) as m:
         if name is None:
             rows: list[BranchRow] = m.branches(kind)

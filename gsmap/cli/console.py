@@ -103,13 +103,37 @@ def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: s
         title: of the table.
     """
     if json:
-        print(_json.dumps(json_object(verb, rows), indent=1, allow_nan=False), flush=True)
+        print_json(json_object(verb, rows))
         return
     from gsmap.cli.objects import OBJECTS
     from gsmap.types.rows import Row
 
     many = [] if rows is None else [rows] if isinstance(rows, Row) else list(rows)
     print_table(title or verb, OBJECTS[verb].type.columns, many)
+
+
+_has_printed_json = False
+
+
+def print_json(data: dict[str, Any]) -> None:
+    """Print one JSON object on stdout."""
+    global _has_printed_json
+    _has_printed_json = True
+    print(_json.dumps(data, indent=1, allow_nan=False), flush=True)
+
+
+def print_json_error(code: str, message: str) -> None:
+    """Print the JSON object of a command that failed; nothing where the command has printed its own object before."""
+    from gsmap.types.rows import SCHEMA
+
+    if not _has_printed_json:
+        print_json({"schema": SCHEMA, "error": {"code": code, "message": message}})
+
+
+def expect_json() -> None:
+    """Forget that JSON was printed: a new command begins."""
+    global _has_printed_json
+    _has_printed_json = False
 
 
 def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:

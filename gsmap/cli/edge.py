@@ -70,9 +70,9 @@ def read_pose(path: Path) -> Sim3:
             numbers = np.array(content.replace(",", " ").split(), dtype=np.float64)
         return Sim3.from_matrix(numbers.reshape(4, 4))
     except FileNotFoundError as error:
-        raise NotFoundError(f"no pose at {path}") from error
+        raise NotFoundError(f"no pose at {path}", code="file_not_found") from error
     except (OSError, *MALFORMED) as error:
-        raise InputError(f"{path} holds no pose, a 4x4 matrix as text or JSON: {error}") from error
+        raise InputError(f"{path} holds no pose, a 4x4 matrix as text or JSON: {error}", code="invalid_pose") from error
 
 
 def read_sigmas(text: str, pose: Sim3) -> np.ndarray:
@@ -90,8 +90,12 @@ def read_sigmas(text: str, pose: Sim3) -> np.ndarray:
     except ValueError:
         numbers = []
     if len(numbers) not in (2, 3) or not all(0 < number < float("inf") for number in numbers):
-        raise ConfigError(f"--sigma takes two or three positive numbers, DEG,M[,SCALE], got {text!r}")
+        raise ConfigError(
+            f"--sigma takes two or three positive numbers, DEG,M[,SCALE], got {text!r}", code="invalid_sigma"
+        )
     if len(numbers) == 2 and not pose.is_rigid:
-        raise ConfigError(f"the pose has scale {pose.scale:.6g}: give its deviation too, --sigma DEG,M,SCALE")
+        raise ConfigError(
+            f"the pose has scale {pose.scale:.6g}: give its deviation too, --sigma DEG,M,SCALE", code="invalid_sigma"
+        )
     log_scale = numbers[2] if len(numbers) == 3 else _RIGID_SIGMA
     return np.array([np.radians(numbers[0])] * 3 + [numbers[1]] * 3 + [log_scale])

@@ -50,13 +50,16 @@ def command(
     if name is None and note is None and not of_scene and not of_object:
         raise ConfigError(
             "say what to change: --name, --note, of a scene --captured-at, --tag, --untag or --metres-per-unit, of an "
-            "object --label or --same-as"
+            "object --label or --same-as",
+            code="nothing_requested",
         )
     metres = None if metres_per_unit is None else _metres(metres_per_unit)
     with opened(map, bars=True) as m:
         if m.is_object(scene) or of_object:
             if of_scene:
-                raise ConfigError(f"{scene} is an object: dates, tags and metres are of scenes")
+                raise ConfigError(
+                    f"{scene} is an object: dates, tags and metres are of scenes", code="option_not_applicable"
+                )
             done = m.edit_object(scene, name=name, label=label, note=note, same_as=same_as, author=author)
             print_rows("edit OBJECT", done, json, "object")
             return
@@ -80,7 +83,9 @@ def _metres(text: str) -> float:
     try:
         metres = 0.0 if text.strip().lower() == "none" else float(text)
     except ValueError as error:
-        raise ConfigError(f"--metres-per-unit is a number such as 0.3, or none, got {text!r}") from error
+        raise ConfigError(
+            f"--metres-per-unit is a number such as 0.3, or none, got {text!r}", code="invalid_metre"
+        ) from error
     if metres == 0.0 and text.strip().lower() != "none":
-        raise ConfigError("--metres-per-unit must be positive; none takes back what was said")
+        raise ConfigError("--metres-per-unit must be positive; none takes back what was said", code="invalid_metre")
     return metres

@@ -46,7 +46,7 @@ def command(
 
     if images is None and (tiles is not None or lpips is not None):
         option = "--tiles" if tiles is not None else "--lpips"
-        raise ConfigError(f"{option} compares images: give --images too")
+        raise ConfigError(f"{option} compares images: give --images too", code="missing_option")
     with opened(map, bars=images is not None) as m:
         report = m.evaluate(
             truth,

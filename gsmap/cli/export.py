@@ -177,7 +177,10 @@ def _write_page(
     from gsmap.types.rows import ExportReport
 
     if said := [option for option, value in asked.items() if value is not None]:
-        raise ConfigError(f"{said[0]} is of merged tiles; html shows the captures as the map has them: leave it out")
+        raise ConfigError(
+            f"{said[0]} is of merged tiles; html shows the captures as the map has them: leave it out",
+            code="conflicting_options",
+        )
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         written = m.write_page(out, megabytes=megabytes)
     for note in written.notes:
@@ -194,4 +197,6 @@ def _seconds(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ConfigError(f"--budget of tiles is in seconds, got {text!r}; a size goes with --for localize") from None
+        raise ConfigError(
+            f"--budget of tiles is in seconds, got {text!r}; a size goes with --for localize", code="invalid_budget"
+        ) from None

@@ -58,4 +58,4 @@ def _point(text: str | None) -> list[float] | None:
     try:
         return None if text is None else [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {text!r}") from error
+        raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {text!r}", code="invalid_point") from error

@@ -75,14 +75,18 @@ def command(
 
     said = any(one is not None for one in (crs, gcp, exif, scale_bar, check))
     if remove and said:
-        raise ConfigError("--remove takes back what was observed: leave out the other options, but --name")
+        raise ConfigError(
+            "--remove takes back what was observed: leave out the other options, but --name", code="conflicting_options"
+        )
     if name and not remove:
-        raise ConfigError("--name goes with --remove")
+        raise ConfigError("--name goes with --remove", code="conflicting_options")
     if not said and (sigma is not None or height_sigma is not None or photo_size is not None):
-        raise ConfigError("--sigma, --height-sigma and --photo-size go with --gcp or --scale-bar")
+        raise ConfigError(
+            "--sigma, --height-sigma and --photo-size go with --gcp or --scale-bar", code="conflicting_options"
+        )
     for value in (sigma, height_sigma, *(photo_size or ())):
         if value is not None and not value > 0:
-            raise ConfigError("--sigma, --height-sigma and --photo-size must be positive")
+            raise ConfigError("--sigma, --height-sigma and --photo-size must be positive", code="invalid_sigma")
     sigmas = None if sigma is None and height_sigma is None else (sigma or 0.01, height_sigma or sigma or 0.01)
     request = Request(
         crs=crs,
@@ -95,7 +99,7 @@ def command(
         photo_size_px=photo_size,
     )
     if photos is not None and gcp is None:
-        raise ConfigError("--photos goes with --gcp")
+        raise ConfigError("--photos goes with --gcp", code="conflicting_options")
     with opened(map, bars=True, sets=sets) as m:
         localise = None if photos is None else localiser(m.store, m.localize, photos)
         taken_back = tuple(name or ()) if remove else None

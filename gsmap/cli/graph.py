@@ -28,7 +28,9 @@ def command(
     from gsmap.types.rows import ObjectRow, RelationRow, RoomRow
 
     if format is not None and out is None:
-        raise ConfigError(f"name a file to write as {format}: gsmap graph {map} OUT --format {format}")
+        raise ConfigError(
+            f"name a file to write as {format}: gsmap graph {map} OUT --format {format}", code="missing_option"
+        )
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         if out is None:
             report = m.objects()

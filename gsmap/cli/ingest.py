@@ -52,7 +52,10 @@ def command(
 
     refuse_capture_as_map("ingest", map, paths or [])
     if not paths:
-        raise ConfigError(f"name the files or folders of captures: gsmap ingest {shlex.quote(map)} FILE_OR_FOLDER...")
+        raise ConfigError(
+            f"name the files or folders of captures: gsmap ingest {shlex.quote(map)} FILE_OR_FOLDER...",
+            code="nothing_requested",
+        )
     create = False
     if supersedes is None and not no_create:
         create = makes_map(map, paths, captured_at, cameras=cameras, name=name, scale=scale)
@@ -109,10 +112,13 @@ def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
     try:
         search_captures([given])
     except InputError as error:
-        raise ConfigError(f"{map} is not a gsmap map: {error}") from error
+        raise ConfigError(f"{map} is not a gsmap map: {error}", code="not_a_map") from error
     named = [path for path in paths if holds_catalog(Path(path))]
     near = named or sorted(path.name for path in Path().iterdir() if holds_catalog(path))
     guess = near[0] if len(near) == 1 else f"{given.resolve().stem or 'site'}.gsmap" if not near else "MAP"
     meant = ["gsmap", verb, guess, map, *(path for path in paths if path not in named)]
     also = f" (MAP is one of {', '.join(near)})" if len(near) > 1 else ""
-    raise ConfigError(f"{map} holds captures and is no map; MAP comes first. Did you mean: {shlex.join(meant)}{also}")
+    raise ConfigError(
+        f"{map} holds captures and is no map; MAP comes first. Did you mean: {shlex.join(meant)}{also}",
+        code="map_argument_first",
+    )

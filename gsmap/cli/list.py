@@ -86,7 +86,7 @@ def _rows(
         useless = {"--status": status, "--component": component, "--tag": tag, "--as-of": as_of}
     for option, value in useless.items():
         if value is not None:
-            raise ConfigError(f"{what} are not chosen by {option}: leave it out")
+            raise ConfigError(f"{what} are not chosen by {option}: leave it out", code="conflicting_options")
     if what is What.photos:
         return [row for row in m.photo_rows() if component is None or row.component == component]
     if what is What.tiles:

@@ -99,7 +99,9 @@ def command(
 
     if is_small(map):
         if changes or add or pictures is not None or captured_at is not None or depth is not None:
-            raise ConfigError("a small map places photographs, and no more: ask the map that it is of")
+            raise ConfigError(
+                "a small map places photographs, and no more: ask the map that it is of", code="not_in_small_map"
+            )
         with progress_bars() as progress:
             report = localize_small(
                 map,

@@ -40,7 +40,9 @@ def command(
     from gsmap.errors import ConfigError
 
     if format is not None and out is None:
-        raise ConfigError(f"name a file to write as {format}: gsmap poses {map} OUT --format {format}")
+        raise ConfigError(
+            f"name a file to write as {format}: gsmap poses {map} OUT --format {format}", code="missing_option"
+        )
     with opened(map) as m:
         rows = m.pose_rows(crs)
         if out is not None:

@@ -51,15 +51,16 @@ def command(
     world = [latitude, longitude, height]
     in_world = any(one is not None for one in world)
     if in_world and None in world:
-        raise ConfigError("a position in the world has --latitude, --longitude and --height")
+        raise ConfigError("a position in the world has --latitude, --longitude and --height", code="missing_option")
     said = [position is not None or scale is not None or up is not None, anchor, remove, in_world]
     if sum(said) != 1:
         raise ConfigError(
             "say where the scene lies (--position, --scale, --up, or --latitude, --longitude and --height), or "
-            "--anchor, or --remove"
+            "--anchor, or --remove",
+            code="nothing_requested",
         )
     if not sigma > 0 or (scale is not None and not scale > 0):
-        raise ConfigError("--sigma and --scale must be positive")
+        raise ConfigError("--sigma and --scale must be positive", code="invalid_sigma")
     sigmas = np.full(7, np.inf)
     if anchor:
         sigmas = np.r_[np.full(3, _ANCHOR_RAD), np.full(3, _ANCHOR_M), np.inf]

@@ -36,9 +36,14 @@ def command(
     from gsmap.errors import ConfigError
 
     if branches and not purge:
-        raise ConfigError("--branches goes with --purge: without it a branch keeps its own scenes")
+        raise ConfigError(
+            "--branches goes with --purge: without it a branch keeps its own scenes", code="conflicting_options"
+        )
     if photo and (purge or branches):
-        raise ConfigError("--photo goes alone: gsmap prune reclaims the picture of one that was taken back")
+        raise ConfigError(
+            "--photo goes alone: gsmap prune reclaims the picture of one that was taken back",
+            code="conflicting_options",
+        )
     with opened(map) as m:
         if photo:
             taken_back = m.remove_photo(scene)

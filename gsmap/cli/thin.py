@@ -65,4 +65,6 @@ def parse_size(text: str) -> int:
     try:
         return int(float(number) * _UNITS[unit])
     except (ValueError, KeyError, OverflowError) as error:
-        raise ConfigError(f"a size is a number and a unit, such as 500MB or 2GiB, got {text!r}") from error
+        raise ConfigError(
+            f"a size is a number and a unit, such as 500MB or 2GiB, got {text!r}", code="invalid_size"
+        ) from error

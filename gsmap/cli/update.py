@@ -39,7 +39,9 @@ def command(
     given_date(captured_at)  # refuses what is none before a map is made
     refuse_capture_as_map("update", map, paths or [])
     if not no_create and not paths and not Store.exists(map):
-        raise NotFoundError(f"no map at {map}: name captures to make one of, or run gsmap init {map}")
+        raise NotFoundError(
+            f"no map at {map}: name captures to make one of, or run gsmap init {map}", code="map_not_found"
+        )
     create = not no_create and makes_map(map, paths or [], captured_at)
     with opened(map, create=create, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         if create:

@@ -119,7 +119,9 @@ def describe(
     """
     params = params or Params()
     if scale_policy not in SCALE_POLICIES:
-        raise ConfigError(f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
+        raise ConfigError(
+            f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}", code="invalid_choice"
+        )
     progress(0.0, "surface")
     cloud = surface_cloud(gaussians, params.surface)
     up = estimate_up(cloud.points, cameras, params.gravity)

@@ -35,12 +35,17 @@ def embedded_picture(
     method = family("embedder").get(name)
     lacking = [kind for kind in method.MODELS if kind not in models]
     if lacking:
-        raise ConfigError(f"embedder {name} needs a model: gsmap models add MAP {lacking[0]} FILE.onnx")
+        raise ConfigError(
+            f"embedder {name} needs a model: gsmap models add MAP {lacking[0]} FILE.onnx", code="model_required"
+        )
     limited = {kind: replace(model, limits=params.limits) for kind, model in models.items()}
     nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), np.zeros(0, np.int64))
     embedder = method.make(SceneContext(nothing, 0, None, 1.0, limited), chosen.params.embedders[name])
     if not hasattr(embedder, "embed_picture"):
-        raise ConfigError(f"embedder {name} describes parts of captures alone: show one with --like SCENE:NODE")
+        raise ConfigError(
+            f"embedder {name} describes parts of captures alone: show one with --like SCENE:NODE",
+            code="option_not_applicable",
+        )
     vector, told = embedder.embed_picture(rgb)
     return np.asarray(vector, np.float32), np.asarray(told, bool)
 
@@ -58,7 +63,8 @@ def embedded_text(text: str, params: Params, models: Mapping[str, ModelSpec]) ->
         raise ConfigError(
             f"the embedder {name} knows no words: add an image encoder with a text tower (gsmap models add MAP clip "
             "IMAGE.onnx, then clip-text TEXT.onnx and clip-tokenizer tokenizer.json) and run gsmap update; or show a "
-            "thing: --picture FILE, --like SCENE:NODE, --at X,Y,Z"
+            "thing: --picture FILE, --like SCENE:NODE, --at X,Y,Z",
+            code="model_required",
         )
     limited = {kind: replace(model, limits=params.limits) for kind, model in models.items()}
     found: np.ndarray = method.embed_text(text, limited)
@@ -72,5 +78,7 @@ def _picture(path: Path) -> np.ndarray:
         picture.thumbnail((_MOST_PX, _MOST_PX))
         rgb = np.asarray(picture)
     if min(rgb.shape[:2]) < _LEAST_PX:
-        raise InputError(f"{path} has {rgb.shape[1]} x {rgb.shape[0]} pixels: too few to show a thing")
+        raise InputError(
+            f"{path} has {rgb.shape[1]} x {rgb.shape[0]} pixels: too few to show a thing", code="picture_too_small"
+        )
     return rgb

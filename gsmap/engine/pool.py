@@ -156,7 +156,9 @@ class Pool:
             if not worker.has_begun:
                 false_starts += 1
                 if false_starts > _FALSE_STARTS:
-                    raise GsmapError(f"worker processes end before they do anything: {died}") from died
+                    raise GsmapError(
+                        f"worker processes end before they do anything: {died}", code="workers_die"
+                    ) from died
                 (again if task.losses else ahead).appendleft(task)
                 return False
             task.losses += 1

@@ -33,7 +33,10 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
     image, reference = _pair(image, reference)
     if min(image.shape[:2]) <= 2 * _SSIM_RADIUS_PX:
-        raise InputError(f"SSIM needs images of at least 11 x 11 pixels, got {image.shape[1]} x {image.shape[0]}")
+        raise InputError(
+            f"SSIM needs images of at least 11 x 11 pixels, got {image.shape[1]} x {image.shape[0]}",
+            code="picture_too_small",
+        )
 
     def blur(values: np.ndarray) -> np.ndarray:
         r = _SSIM_RADIUS_PX
@@ -67,12 +70,14 @@ class Lpips:
                 "LPIPS needs network weights that gsmap does not ship: pass lpips.LPIPS exported to ONNX"
             )
         if not Path(path).is_file():
-            raise NotFoundError(f"no LPIPS network at {path}")
+            raise NotFoundError(f"no LPIPS network at {path}", code="file_not_found")
         refuse_external_data(Path(path))
         self._model = ModelProcess(str(path), limits or ModelLimits())
         self._inputs = [tensor.name for tensor in self._model.inputs]
         if len(self._inputs) != 2:
-            raise InputError(f"{path} takes {len(self._inputs)} inputs, an LPIPS network takes two images")
+            raise InputError(
+                f"{path} takes {len(self._inputs)} inputs, an LPIPS network takes two images", code="model_misfit"
+            )
 
     def __call__(self, image: np.ndarray, reference: np.ndarray) -> float:
         """Distance of images (H, W, 3) with values in [0, 1]."""
@@ -80,11 +85,15 @@ class Lpips:
         try:
             return float(np.mean(self._model.run(None, dict(zip(self._inputs, pair, strict=True)))[0]))
         except RuntimeError as error:
-            raise InputError(f"the LPIPS network {self._model.path} does not run on {image.shape}: {error}") from error
+            raise InputError(
+                f"the LPIPS network {self._model.path} does not run on {image.shape}: {error}", code="model_failed"
+            ) from error
 
 
 def _pair(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     image, reference = (np.clip(np.asarray(v, dtype=np.float64), 0, 1) for v in (image, reference))
     if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-        raise InputError(f"images to compare must both be (H, W, 3), got {image.shape} and {reference.shape}")
+        raise InputError(
+            f"images to compare must both be (H, W, 3), got {image.shape} and {reference.shape}", code="shape_mismatch"
+        )
     return image, reference

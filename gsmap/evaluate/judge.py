@@ -59,12 +59,15 @@ class Params:
     def __post_init__(self) -> None:
         if not (self.max_rre_deg > 0 and self.max_rte_m > 0):
             raise ConfigError(
-                f"an edge is wrong beyond a positive angle and distance, got {self.max_rre_deg} deg, {self.max_rte_m} m"
+                "an edge is wrong beyond a positive angle and distance, "
+                f"got {self.max_rre_deg} deg, {self.max_rte_m} m",
+                code="out_of_range",
             )
         if not (0 <= self.truth_sigma_deg < np.inf and 0 <= self.truth_sigma_m < np.inf):
             raise ConfigError(
                 "standard deviations of the truth must not be negative, got "
-                f"{self.truth_sigma_deg} deg, {self.truth_sigma_m} m"
+                f"{self.truth_sigma_deg} deg, {self.truth_sigma_m} m",
+                code="out_of_range",
             )
 
 

@@ -37,7 +37,9 @@ def scene_centroid(gaussians: Gaussians, min_opacity: float = 0.3) -> np.ndarray
     """(3,) median of the opaque Gaussians' centres: the point at which translation errors are measured."""
     opaque = gaussians.means[gaussians.opacities > min_opacity]
     if not len(opaque):
-        raise InputError("the scene has no opaque Gaussian, so no centroid: measure at another point")
+        raise InputError(
+            "the scene has no opaque Gaussian, so no centroid: measure at another point", code="no_opaque_gaussians"
+        )
     return np.median(opaque.astype(np.float64), axis=0)
 
 
@@ -132,7 +134,9 @@ def absolute_trajectory_error(
     """
     estimated, true = np.asarray(estimated, float), np.asarray(true, float)
     if estimated.shape != true.shape or estimated.ndim != 2 or estimated.shape[1] != 3 or not len(true):
-        raise InputError(f"ATE needs two (N, 3) trajectories, N >= 1; got {estimated.shape} and {true.shape}")
+        raise InputError(
+            f"ATE needs two (N, 3) trajectories, N >= 1; got {estimated.shape} and {true.shape}", code="shape_mismatch"
+        )
     squares = np.empty(len(true))
     for rows in segments if segments is not None else [np.arange(len(true))]:
         moved = estimated[rows]

@@ -46,7 +46,7 @@ def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, P
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise NotFoundError(f"no folder of images at {folder}")
+        raise NotFoundError(f"no folder of images at {folder}", code="folder_not_found")
     index = {_stem(name): i for i, name in enumerate(cameras.names)}
     found: dict[int, Path] = {}
     for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file()):
@@ -54,10 +54,15 @@ def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, P
         if at is None:
             continue
         if at in found:
-            raise InputError(f"camera {cameras.names[at]} has two images: {found[at]} and {path}")
+            raise InputError(
+                f"camera {cameras.names[at]} has two images: {found[at]} and {path}", code="ambiguous_image"
+            )
         found[at] = path
     if not found:
-        raise NotFoundError(f"no image in {folder} is named like a camera (such as {', '.join(cameras.names[:3])})")
+        raise NotFoundError(
+            f"no image in {folder} is named like a camera (such as {', '.join(cameras.names[:3])})",
+            code="image_not_found",
+        )
     return found
 
 
@@ -110,7 +115,8 @@ def _at_size(camera: Cameras, width: int, height: int) -> Cameras:
     if abs(old[0] * ratio[1] - width) > 2:
         raise InputError(
             f"image of camera {camera.names[0]} is {width} x {height}, its camera says {old[0]} x {old[1]}: "
-            "the shapes differ"
+            "the shapes differ",
+            code="size_mismatch",
         )
     return Cameras(
         camera.T_frame_camera,

@@ -51,7 +51,7 @@ class Params:
     def __post_init__(self) -> None:
         for name in ("views", "steps"):
             if getattr(self, name) < 0:
-                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}", code="out_of_range")
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,7 +44,7 @@ def folder_lock(out: Path, *, wait: bool = False, waiting: Callable[[str], None]
     try:
         handle, fresh = _locked(out, wait, waiting)
     except OSError as error:
-        raise StoreError(f"cannot write the export to {out}: {error.strerror or error}") from error
+        raise StoreError(f"cannot write the export to {out}: {error.strerror or error}", code="not_writable") from error
     try:
         yield
     finally:
@@ -78,7 +78,8 @@ def _locked(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> tup
             os.close(handle)
             if not wait:
                 raise BusyError(
-                    f"{out}: {who} is exporting to it; wait until it has ended, or let this wait for it with --wait"
+                    f"{out}: {who} is exporting to it; wait until it has ended, or let this wait for it with --wait",
+                    code="export_busy",
                 ) from None
             if waiting is not None and not told:
                 waiting(f"waiting for {who}")

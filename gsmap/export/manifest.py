@@ -69,16 +69,20 @@ class Manifest:
         path = folder / FILE_NAME
         if not path.exists():
             if folder.exists() and not folder.is_dir():
-                raise ConfigError(f"{folder} is a file: give a folder to export to")
+                raise ConfigError(f"{folder} is a file: give a folder to export to", code="not_a_folder")
             if folder.exists() and any(p for p in folder.iterdir() if not p.name.startswith(".")):
-                raise ConfigError(f"{folder} holds files but no {FILE_NAME}: export to an empty or a new folder")
+                raise ConfigError(
+                    f"{folder} holds files but no {FILE_NAME}: export to an empty or a new folder",
+                    code="folder_not_empty",
+                )
             return cls(map_id)
         try:
             content = json.loads(_text(path))
             version, owner = content["version"], str(content["map_id"])
             if version not in (_NAMELESS, _VERSION):
                 raise ConfigError(
-                    f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
+                    f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder",
+                    code="export_version",
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
             doomed = {_checked_path(p) for p in content.get("doomed", ())}
@@ -88,9 +92,14 @@ class Manifest:
         except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
-            raise InputError(f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder") from error
+            raise InputError(
+                f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder", code="foreign_export"
+            ) from error
         if owner != map_id:
-            raise ConfigError(f"{folder} holds the export of another map ({owner[:12]}): export to another folder")
+            raise ConfigError(
+                f"{folder} holds the export of another map ({owner[:12]}): export to another folder",
+                code="foreign_export",
+            )
         notes: tuple[str, ...] = ()
         if version == _NAMELESS and entries:
             notes = (

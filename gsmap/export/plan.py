@@ -38,7 +38,7 @@ class Params:
 
     def __post_init__(self) -> None:
         if not self.max_shift_m >= 0:
-            raise ConfigError(f"max_shift_m must not be negative, got {self.max_shift_m}")
+            raise ConfigError(f"max_shift_m must not be negative, got {self.max_shift_m}", code="out_of_range")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +91,13 @@ def plan_tiles(
             precision does not hold a millimetre there.
     """
     if not (np.isfinite(tile_size_m) and tile_size_m >= 0):
-        raise ConfigError(f"tile size must be a positive number of metres, or 0 for one file, got {tile_size_m}")
+        raise ConfigError(
+            f"tile size must be a positive number of metres, or 0 for one file, got {tile_size_m}", code="out_of_range"
+        )
     if not poses:
-        raise InputError("nothing to export: no scene has a place in the map yet; run optimize first")
+        raise InputError(
+            "nothing to export: no scene has a place in the map yet; run optimize first", code="nothing_to_export"
+        )
     bbox = None if bbox is None else _checked_box(bbox)
     components = components or dict.fromkeys(poses, 0)
     tiles: list[PlannedTile] = []
@@ -115,7 +119,8 @@ def plan_tiles(
     if not tiles and bbox is not None:
         whole = Boxes.of(list(poses.values()), [scene_bounds[scene] for scene in poses]).around
         raise InputError(
-            f"the box {_text(bbox)} lies outside the map, which spans {_text(whole)}: choose a box that touches it"
+            f"the box {_text(bbox)} lies outside the map, which spans {_text(whole)}: choose a box that touches it",
+            code="box_outside_map",
         )
     return tiles
 
@@ -128,7 +133,8 @@ def _require_near(component: int, box: np.ndarray, metres_per_unit: float) -> No
         at = ", ".join(f"{value:.15g}" for value in offset)
         raise InputError(
             f"component {component} lies near ({at}), where single precision rounds by {rounded_m:.2g} m: take ({at}) "
-            "off the positions of its priors (gsmap prior), or tie it to the world instead (gsmap georeference)"
+            "off the positions of its priors (gsmap prior), or tie it to the world instead (gsmap georeference)",
+            code="precision_loss",
         )
 
 
@@ -165,7 +171,9 @@ def _in_cells(boxes: Boxes, grid: Grid, reach: float) -> _Tiles:
 def _checked_box(bbox: np.ndarray) -> np.ndarray:
     bbox = np.asarray(bbox, dtype=np.float64)
     if bbox.shape != (2, 3) or not np.isfinite(bbox).all() or not (bbox[1] > bbox[0]).all():
-        raise InputError(f"a box needs x0 y0 z0 below x1 y1 z1 on every axis, got {_text(bbox)}: it is empty")
+        raise InputError(
+            f"a box needs x0 y0 z0 below x1 y1 z1 on every axis, got {_text(bbox)}: it is empty", code="invalid_box"
+        )
     return bbox
 
 

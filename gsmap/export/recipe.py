@@ -55,12 +55,18 @@ class TileRecipe:
         if self.format not in _TREES and not formats.can_write(f".{self.format}"):
             suffixes = [name[1:] for name in formats.known("write") if name.startswith(".")]
             known = ", ".join([*suffixes, *_TREES])
-            raise ConfigError(f"cannot write {self.format!r}: choose one of {known}")
+            raise ConfigError(f"cannot write {self.format!r}: choose one of {known}", code="unsupported_output")
         if self.provenance and self.format != "ply":
-            raise ConfigError(f"provenance is a property of .ply files, the format asked for is {self.format}")
+            raise ConfigError(
+                f"provenance is a property of .ply files, the format asked for is {self.format}",
+                code="unsupported_output",
+            )
 
         if self.uncompressed and self.format != _TILES_3D:
-            raise ConfigError(f"uncompressed is of {_TILES_3D} alone, the format asked for is {self.format}")
+            raise ConfigError(
+                f"uncompressed is of {_TILES_3D} alone, the format asked for is {self.format}",
+                code="unsupported_output",
+            )
 
     @property
     def is_tileset(self) -> bool:

@@ -135,7 +135,10 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
         with _explained(path.parent, "write"):
             path.parent.mkdir(parents=True, exist_ok=True)
         if is_stream(path):
-            raise InputError(f"cannot write {path}: a pipe or device holds one file, and {suffix} has others beside it")
+            raise InputError(
+                f"cannot write {path}: a pipe or device holds one file, and {suffix} has others beside it",
+                code="not_writable",
+            )
     with _explained(path, "write"):
         content = gaussians if hasattr(module, "stream") else gaussians.load()
         if not getattr(module, "HOLDS_ORIGIN", False) and origin_of_source(content).any():
@@ -184,9 +187,12 @@ def _suffix(path: Path, verb: str) -> str:
     suffix = suffix_of(path)
     if suffix is None:
         what = f"has the unknown suffix {path.suffix!r}" if path.suffix else "has no suffix"
-        raise InputError(f"{path} {what}: gsmap can {verb} {', '.join(known(verb))}")
+        raise InputError(f"{path} {what}: gsmap can {verb} {', '.join(known(verb))}", code="unsupported_format")
     if not hasattr(_load(suffix), verb):
-        raise InputError(f"{path}: gsmap cannot {verb} {suffix} files; it can {verb} {', '.join(known(verb))}")
+        raise InputError(
+            f"{path}: gsmap cannot {verb} {suffix} files; it can {verb} {', '.join(known(verb))}",
+            code="unsupported_format",
+        )
     return suffix
 
 
@@ -203,11 +209,11 @@ def _layout(path: Path, suffix: str) -> str:
 def _explained(path: Path, verb: str) -> Iterator[None]:
     """Turn what the operating system says into a typed error."""
     if verb == "read" and path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"cannot read {path}: it is a pipe or a device, not a file")
+        raise InputError(f"cannot read {path}: it is a pipe or a device, not a file", code="not_a_plain_file")
     try:
         yield
     except FileNotFoundError as error:
         what = "no such file" if verb == "read" else f"no such folder: {path.parent}"
-        raise NotFoundError(f"cannot {verb} {path}: {what}") from error
+        raise NotFoundError(f"cannot {verb} {path}: {what}", code="file_not_found") from error
     except OSError as error:
-        raise InputError(f"cannot {verb} {path}: {error.strerror or error}") from error
+        raise InputError(f"cannot {verb} {path}: {error.strerror or error}", code="file_unreadable") from error

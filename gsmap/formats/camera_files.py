@@ -11,11 +11,11 @@ from gsmap.errors import InputError, NotFoundError
 
 def load_json(path: Path) -> Any:
     if not path.exists():
-        raise NotFoundError(f"cannot read cameras from {path}: no such file")
+        raise NotFoundError(f"cannot read cameras from {path}: no such file", code="file_not_found")
     try:
         return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON: {error}") from error
+        raise InputError(f"{path} is not JSON: {error}", code="not_json") from error
 
 
 def unique(names: list[str]) -> tuple[str, ...]:

@@ -29,14 +29,19 @@ def read(path: str | os.PathLike[str]) -> Cameras:
             if model is not None:
                 return colmap.read(model)
             if not (path / "transforms.json").is_file():
-                raise InputError(f"{path} holds no cameras: no COLMAP model (cameras.bin/.txt) and no transforms.json")
+                raise InputError(
+                    f"{path} holds no cameras: no COLMAP model (cameras.bin/.txt) and no transforms.json",
+                    code="no_cameras",
+                )
             path = path / "transforms.json"
         content = load_json(path)
         return cameras_json.parse(content, path) if isinstance(content, list) else nerfstudio.parse(content, path)
     except OSError as error:
-        raise InputError(f"cannot read cameras from {path}: {error.strerror or error}") from error
+        raise InputError(
+            f"cannot read cameras from {path}: {error.strerror or error}", code="file_unreadable"
+        ) from error
     except MALFORMED as error:
         if isinstance(error, GsmapError) and str(path) in str(error):
             raise
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{path} does not hold cameras: {what}") from error
+        raise InputError(f"{path} does not hold cameras: {what}", code="invalid_cameras") from error

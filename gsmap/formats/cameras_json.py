@@ -18,7 +18,7 @@ from gsmap.types import Cameras
 def parse(entries: list[dict[str, Any]], path: Path) -> Cameras:
     """Cameras of a parsed file. ``cx cy`` are read where present; else the principal point is the image centre."""
     if not entries:
-        raise InputError(f"{path} holds no cameras: the list is empty")
+        raise InputError(f"{path} holds no cameras: the list is empty", code="no_cameras")
     pose = np.tile(np.eye(4), (len(entries), 1, 1))
     pose[:, :3, :3] = np.array([e["rotation"] for e in entries], np.float64)
     pose[:, :3, 3] = np.array([e["position"] for e in entries], np.float64)

@@ -61,7 +61,10 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     if "shN" in found:
         rest = _array(path, "shN", found["shN"], n, (-1, 3), size)
         if rest.shape[1] not in (0, 3, 8, 15):
-            raise InputError(f"{path}: {rest.shape[1]} SH coefficients; gsmap reads degrees 0 to 3 (0, 3, 8 or 15)")
+            raise InputError(
+                f"{path}: {rest.shape[1]} SH coefficients; gsmap reads degrees 0 to 3 (0, 3, 8 or 15)",
+                code="unsupported_sh_degree",
+            )
         sh = np.concatenate([sh, rest], axis=1)
     means, origin = centred(arrays["means"])
     return Gaussians(means, arrays["quats"], arrays["log_scales"], arrays["logit_opacities"], sh, origin)
@@ -82,15 +85,21 @@ def _loaded(path: str | os.PathLike[str]) -> Any:
     except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, EOFError, *MALFORMED) as error:
         raise InputError(
             f"{path} is no checkpoint that gsmap reads: not a ZIP as torch has written since 1.6 ({error}); "
-            "load it with torch and save it again, or export a .ply"
+            "load it with torch and save it again, or export a .ply",
+            code="wrong_file_type",
         ) from error
     for entry in entries:
         if entry.compress_type != zipfile.ZIP_STORED or entry.file_size != entry.compress_size:
-            raise InputError(f"{path}: {entry.filename!r} is compressed, which torch never does: damaged or hostile")
+            raise InputError(
+                f"{path}: {entry.filename!r} is compressed, which torch never does: damaged or hostile",
+                code="file_damaged",
+            )
         if entry.filename.endswith(".pkl") and entry.file_size > _MAX_PICKLE_BYTES:
-            raise InputError(f"{path}: its {entry.filename!r} is more than {_MAX_PICKLE_BYTES >> 20} MiB")
+            raise InputError(
+                f"{path}: its {entry.filename!r} is more than {_MAX_PICKLE_BYTES >> 20} MiB", code="file_too_large"
+            )
     if not any(entry.filename.endswith("/data.pkl") for entry in entries):
-        raise InputError(f"{path} is a ZIP, but not of torch: it has no data.pkl")
+        raise InputError(f"{path} is a ZIP, but not of torch: it has no data.pkl", code="wrong_file_type")
     import torch
 
     try:
@@ -108,7 +117,8 @@ def _loaded(path: str | os.PathLike[str]) -> Any:
     ) as error:
         text = str(error).split("\n")[0]
         raise InputError(
-            f"{path} cannot be read as weights alone, and gsmap runs no code of a file: {text}; export a .ply"
+            f"{path} cannot be read as weights alone, and gsmap runs no code of a file: {text}; export a .ply",
+            code="unsupported_pickle",
         ) from error
 
 
@@ -129,7 +139,10 @@ def _tensors(path: str | os.PathLike[str], loaded: Any) -> dict[str, Any]:
             ours = names.get(name.rsplit(".", 1)[-1])
             if ours is not None and hasattr(value, "stride"):
                 if ours in found:
-                    raise InputError(f"{path} holds {name!r} twice, more than one splat: export a .ply of one")
+                    raise InputError(
+                        f"{path} holds {name!r} twice, more than one splat: export a .ply of one",
+                        code="unsupported_feature",
+                    )
                 found[ours] = value
             elif isinstance(value, Mapping):
                 todo.append((value, depth + 1))
@@ -143,7 +156,7 @@ def _array(
     import torch
 
     if tensor.layout != torch.strided or not tensor.is_floating_point() or tensor.dtype.itemsize not in (2, 4, 8):
-        raise InputError(f"{path}: {name} is {tensor.layout} of {tensor.dtype}, not numbers")
+        raise InputError(f"{path}: {name} is {tensor.layout} of {tensor.dtype}, not numbers", code="wrong_tensor_type")
     given = tuple(tensor.shape)
     if name == "logit_opacities" and given == (n, 1):
         given, tensor = (n,), tensor[:, 0]
@@ -155,10 +168,14 @@ def _array(
         or any(b not in (-1, a) for a, b in zip(given[1:], shape, strict=True))
     ):
         wanted = ", ".join(["N", *("K" if one < 0 else str(one) for one in shape)])
-        raise InputError(f"{path}: {name} has the shape {given} for {n} Gaussians, expected ({wanted})")
+        raise InputError(
+            f"{path}: {name} has the shape {given} for {n} Gaussians, expected ({wanted})", code="count_mismatch"
+        )
     if not n:
-        raise InputError(f"{path} has no Gaussians")
+        raise InputError(f"{path} has no Gaussians", code="no_gaussians")
     if tensor.numel() * tensor.dtype.itemsize > size:  # a stride of 0 makes a splat of any size out of one number
         check_size(path, tensor.numel() * 4, 0)
-        raise InputError(f"{path}: {name} has {tensor.numel()} numbers, more than the file holds")
+        raise InputError(
+            f"{path}: {name} has {tensor.numel()} numbers, more than the file holds", code="decompression_bomb"
+        )
     return tensor.detach().to(torch.float64 if name == "means" else torch.float32).numpy().copy()

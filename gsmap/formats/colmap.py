@@ -55,17 +55,21 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
             calibrations = dict(_text_cameras((folder / "cameras.txt").read_text(errors="replace")))
             images = sorted(_text_images((folder / "images.txt").read_text(errors="replace")))
         if not images:
-            raise InputError(f"{folder} holds no cameras: its list of images is empty")
+            raise InputError(f"{folder} holds no cameras: its list of images is empty", code="no_cameras")
         names = unique([name for name, _, _ in images])
         quats, translations = np.split(np.array([pose for _, pose, _ in images]), [4], axis=1)
         R_frame_camera = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).inv().as_matrix()
         chosen = [calibrations[camera] for _, _, camera in images]
     except KeyError as error:
-        raise InputError(f"{folder}: an image names camera {error}, which the model does not have") from error
+        raise InputError(
+            f"{folder}: an image names camera {error}, which the model does not have", code="file_damaged"
+        ) from error
     except (ValueError, RuntimeError, struct.error) as error:  # RuntimeError: pycolmap does not know the model
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{folder} is not a readable COLMAP model (truncated?): {error}") from error
+        raise InputError(
+            f"{folder} is not a readable COLMAP model (truncated?): {error}", code="file_truncated"
+        ) from error
     kept, notes = keep_pinholes(chosen, folder)
     pose = np.tile(np.eye(4), (len(images), 1, 1))
     pose[:, :3, :3] = R_frame_camera
@@ -86,9 +90,12 @@ def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
     """
     folder = Path(folder)
     if (folder / "cameras.bin").exists() or (folder / "images.bin").exists():
-        raise InputError(f"{folder} holds a binary COLMAP model, which would be read instead: write to another folder")
+        raise InputError(
+            f"{folder} holds a binary COLMAP model, which would be read instead: write to another folder",
+            code="binary_model_in_the_way",
+        )
     if not folder.parent.is_dir():
-        raise NotFoundError(f"cannot write {folder}: no such folder: {folder.parent}")
+        raise NotFoundError(f"cannot write {folder}: no such folder: {folder.parent}", code="folder_not_found")
     calibrations: dict[tuple[float, ...], int] = {}
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as X Y POINT3D_ID"]
     quats = matrices_to_quats(cameras.T_camera_frame[:, :3, :3])

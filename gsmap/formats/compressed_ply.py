@@ -48,7 +48,9 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     _require(path, chunks, _BOUNDS, "float32")
     n = len(rows)
     if len(chunks) != -(-n // _CHUNK):
-        raise InputError(f"{path}: {n} Gaussians need {-(-n // _CHUNK)} chunks, it has {len(chunks)}")
+        raise InputError(
+            f"{path}: {n} Gaussians need {-(-n // _CHUNK)} chunks, it has {len(chunks)}", code="count_mismatch"
+        )
     low, high, scale_low, scale_high = (
         np.stack([chunks[name] for name in _BOUNDS[at : at + 3]], 1) for at in (0, 3, 6, 9)
     )
@@ -106,10 +108,16 @@ def _read_sh(path: str | os.PathLike[str], header: ply.Header, n: int) -> np.nda
     rows = ply.read_element(path, header, "sh")
     names = [f"f_rest_{i}" for i in range(len(_columns(rows)))]
     if len(names) not in (9, 24, 45):
-        raise InputError(f"{path} has {len(names)} f_rest properties; SH degrees 1 to 3 have 9, 24 or 45")
+        raise InputError(
+            f"{path} has {len(names)} f_rest properties; SH degrees 1 to 3 have 9, 24 or 45",
+            code="unsupported_sh_degree",
+        )
     _require(path, rows, names, "uint8")
     if len(rows) != n or list(_columns(rows)) != names:
-        raise InputError(f"{path}: its SH rows ({len(rows)}) do not fit its {n} Gaussians, or are out of order")
+        raise InputError(
+            f"{path}: its SH rows ({len(rows)}) do not fit its {n} Gaussians, or are out of order",
+            code="count_mismatch",
+        )
     # Bytes stand for the middle of their bin, but the two ends for the ends of the range.
     value = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
     value[[0, 255]] = -4, 4
@@ -124,7 +132,9 @@ def _columns(rows: np.ndarray) -> tuple[str, ...]:
 def _require(path: str | os.PathLike[str], rows: np.ndarray, names: list[str], kind: str) -> None:
     wrong = [n for n in names if n not in _columns(rows) or rows.dtype[n] != np.dtype(kind)]
     if wrong:
-        raise InputError(f"{path} is not a .compressed.ply: {', '.join(wrong)} missing or not {kind}")
+        raise InputError(
+            f"{path} is not a .compressed.ply: {', '.join(wrong)} missing or not {kind}", code="wrong_file_type"
+        )
 
 
 def _between(t: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

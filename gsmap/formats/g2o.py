@@ -49,7 +49,7 @@ def read_graph(path: str | os.PathLike[str], *, confirmed: bool = True) -> G2o:
     """
     path = Path(path)
     if not path.is_file():
-        raise NotFoundError(f"no pose graph at {path}")
+        raise NotFoundError(f"no pose graph at {path}", code="file_not_found")
     poses: dict[str, Sim3] = {}
     edges: list[Edge] = []
     fixed: list[str] = []
@@ -64,7 +64,7 @@ def read_graph(path: str | os.PathLike[str], *, confirmed: bool = True) -> G2o:
             elif words[0] == "VERTEX_SE3:QUAT":
                 name, values = _split(words, 1, 7, where)
                 if name[0] in poses:
-                    raise InputError(f"{where}: vertex {name[0]} is given twice")
+                    raise InputError(f"{where}: vertex {name[0]} is given twice", code="duplicate")
                 poses[name[0]] = _pose(values, where)
             elif words[0] == "EDGE_SE3:QUAT":
                 (target, source), values = _split(words, 2, 28, where)
@@ -75,7 +75,10 @@ def read_graph(path: str | os.PathLike[str], *, confirmed: bool = True) -> G2o:
                 full[:6, :6] = information[np.ix_(_SWAP, _SWAP)]
                 edges.append(Edge(target, source, _pose(values[:7], where), full, confirmed=confirmed))
             else:
-                raise InputError(f"{where}: {words[0]} is not an SE(3) vertex or edge; only 3D pose graphs are read")
+                raise InputError(
+                    f"{where}: {words[0]} is not an SE(3) vertex or edge; only 3D pose graphs are read",
+                    code="invalid_line",
+                )
     for edge in edges:
         for scene in (edge.target, edge.source):
             if scene not in poses:
@@ -116,7 +119,9 @@ def write_graph(
     for edge in edges:
         name = f"edge {edge.target}:{edge.source}"
         if edge.target not in numbers or edge.source not in numbers:
-            raise InputError(f"{name} names a scene without a pose: write all scenes of the component")
+            raise InputError(
+                f"{name} names a scene without a pose: write all scenes of the component", code="unsupported_output"
+            )
         information = without_scale(np.asarray(edge.information, dtype=np.float64))[np.ix_(_SWAP, _SWAP)]
         upper = " ".join(repr(float(v)) for v in information[_UPPER])
         ends = f"{numbers[edge.target]} {numbers[edge.source]}"
@@ -127,25 +132,28 @@ def write_graph(
 
 def _split(words: list[str], names: int, count: int, where: str) -> tuple[list[str], list[float]]:
     if len(words) != 1 + names + count:
-        raise InputError(f"{where}: {words[0]} needs {names + count} values, has {len(words) - 1}")
+        raise InputError(f"{where}: {words[0]} needs {names + count} values, has {len(words) - 1}", code="invalid_line")
     try:
         values = [float(word) for word in words[1 + names :]]
     except ValueError as problem:
-        raise InputError(f"{where}: {problem}") from None
+        raise InputError(f"{where}: {problem}", code="invalid_line") from None
     if not all(math.isfinite(v) for v in values):
-        raise InputError(f"{where} holds NaN or infinity")
+        raise InputError(f"{where} holds NaN or infinity", code="not_finite")
     return words[1 : 1 + names], values
 
 
 def _pose(values: list[float], where: str) -> Sim3:
     x, y, z, w = values[3:7]
     if not 0.5 < x * x + y * y + z * z + w * w < 2:
-        raise InputError(f"{where}: the quaternion {values[3:7]} is not a rotation")
+        raise InputError(f"{where}: the quaternion {values[3:7]} is not a rotation", code="not_a_rotation")
     return Sim3(quats_to_matrices(np.array([w, x, y, z])), np.array(values[:3]))
 
 
 def _values(pose: Sim3, name: str) -> str:
     if not pose.is_rigid:
-        raise InputError(f"{name} has scale {pose.scale:.6g}, which .g2o cannot say: export rigid components only")
+        raise InputError(
+            f"{name} has scale {pose.scale:.6g}, which .g2o cannot say: export rigid components only",
+            code="unsupported_output",
+        )
     w, x, y, z = matrices_to_quats(pose.rotation[None])[0].tolist()
     return " ".join(repr(v) for v in [*pose.translation.tolist(), x, y, z, w])

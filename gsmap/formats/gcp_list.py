@@ -67,13 +67,13 @@ def read(path: str | os.PathLike[str]) -> GcpList:
     """
     path = Path(path)
     if not path.is_file():
-        raise NotFoundError(f"no file of control points at {path}")
+        raise NotFoundError(f"no file of control points at {path}", code="file_not_found")
     if path.stat().st_size > _MOST_BYTES:
-        raise InputError(f"{path} is too large for a list of control points")
+        raise InputError(f"{path} is too large for a list of control points", code="file_too_large")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no text in UTF-8: {error.reason}") from error
+        raise InputError(f"{path} is no text in UTF-8: {error.reason}", code="invalid_text") from error
     return parse(text, str(path))
 
 
@@ -82,12 +82,17 @@ def parse(text: str, where: str = "gcp_list") -> GcpList:
     rows = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     rows = [(number, line) for number, line in rows if line and not line.startswith("#")]
     if not rows:
-        raise InputError(f"{where} is empty: its first line names the coordinate system, such as EPSG:25832")
+        raise InputError(
+            f"{where} is empty: its first line names the coordinate system, such as EPSG:25832", code="file_empty"
+        )
     crs = _crs(re.sub(r"\s+#.*", "", rows[0][1]), f"{where}, line {rows[0][0]}")
     found = [_line(number, line, f"{where}, line {number}") for number, line in rows[1:]]
     found = _with_names(found, [line for _, line in rows[1:]])
     if not found:
-        raise InputError(f"{where} names no control point: each line is geo_x geo_y geo_z im_x im_y image [name]")
+        raise InputError(
+            f"{where} names no control point: each line is geo_x geo_y geo_z im_x im_y image [name]",
+            code="no_control_points",
+        )
     places: dict[str, GcpLine] = {}
     seen: dict[tuple[str, str], GcpLine] = {}
     for one in found:
@@ -95,12 +100,14 @@ def parse(text: str, where: str = "gcp_list") -> GcpList:
         if first.position != one.position:
             raise InputError(
                 f"{where}, line {one.line}: point {one.name} has other coordinates than on line {first.line}: one name "
-                "is one point"
+                "is one point",
+                code="duplicate",
             )
         before = seen.setdefault((one.name, one.image), one)
         if before is not one:
             raise InputError(
-                f"{where}, line {one.line}: point {one.name} in {one.image} again, as on line {before.line}"
+                f"{where}, line {one.line}: point {one.name} in {one.image} again, as on line {before.line}",
+                code="duplicate",
             )
     return GcpList(crs, tuple(found))
 
@@ -118,14 +125,18 @@ def _crs(line: str, where: str) -> str:
     if (utm := _UTM.fullmatch(line)) is not None:
         zone, half = int(utm[1]), utm[2].upper()
         if not 1 <= zone <= 60:
-            raise InputError(f"{where}: there is no UTM zone {zone}")
+            raise InputError(f"{where}: there is no UTM zone {zone}", code="gcp_crs_missing")
         return f"EPSG:{(32600 if half == 'N' else 32700) + zone}"
     if line.startswith("+proj") or re.match(r"(?i)[a-z]+:\d+(\+\d+)?$", line) or line.endswith("]"):
         return line
     if all(_is_number(part) for part in line.split()[:3]):
-        raise InputError(f"{where}: the first line names the coordinate system, such as EPSG:25832; this is a point")
+        raise InputError(
+            f"{where}: the first line names the coordinate system, such as EPSG:25832; this is a point",
+            code="gcp_crs_missing",
+        )
     raise InputError(
-        f"{where}: {line[:60]!r} is no coordinate system: write EPSG:25832, a PROJ string, or WGS84 UTM 32N"
+        f"{where}: {line[:60]!r} is no coordinate system: write EPSG:25832, a PROJ string, or WGS84 UTM 32N",
+        code="gcp_crs_missing",
     )
 
 
@@ -136,22 +147,24 @@ def _line(number: int, line: str, where: str) -> GcpLine:
         raise InputError(
             f"{where} has {len(line.split())} fields and begins with {parts[0][:40]!r}, which is no finite number: a "
             "line is geo_x geo_y geo_z im_x im_y image_name [gcp_name], with pixels and photo, and the point's "
-            "name last"
+            "name last",
+            code="invalid_line",
         )
     if len(parts) < 6:
         raise InputError(
             f"{where} has {len(parts)} of the fields geo_x geo_y geo_z im_x im_y image_name [gcp_name]: "
-            + ("the height is missing" if len(parts) == 5 and not _is_number(parts[4]) else "some are missing")
+            + ("the height is missing" if len(parts) == 5 and not _is_number(parts[4]) else "some are missing"),
+            code="invalid_line",
         )
     if line.count("\t") < 5:
         parts[5:] = _image_and_name(parts[5], where)
     values = []
     for name, part in zip(_NUMBERS, parts, strict=False):
         if not _is_number(part):
-            raise InputError(f"{where}: {name} is {part[:40]!r}, which is no finite number")
+            raise InputError(f"{where}: {name} is {part[:40]!r}, which is no finite number", code="invalid_line")
         values.append(float(part))
     if not parts[5]:
-        raise InputError(f"{where} names no photo")
+        raise InputError(f"{where} names no photo", code="invalid_line")
     name = parts[6] if len(parts) > 6 else ""
     x, y, z, u, v = values
     return GcpLine(number, name, (x, y, z), (u, v), parts[5])
@@ -164,7 +177,8 @@ def _image_and_name(text: str, where: str) -> list[str]:
     # What looks like the number of a copy, "DJI_0001 (2)", is no point's name.
     if len(ends) > 1 or (not ends and len(words) > 2) or (len(words) == 2 and re.fullmatch(r"\(\d+\)", words[1])):
         raise InputError(
-            f"{where}: it is not clear where the photo's name ends in {text[:60]!r}: part the fields with tabs"
+            f"{where}: it is not clear where the photo's name ends in {text[:60]!r}: part the fields with tabs",
+            code="invalid_line",
         )
     return words
 

@@ -85,7 +85,7 @@ def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -
     except MALFORMED as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path} is not valid glTF: {type(error).__name__} {error}") from error
+        raise InputError(f"{path} is not valid glTF: {type(error).__name__} {error}", code="not_json") from error
     if not parts:
         raise NotGaussiansError(f"{path} holds no Gaussian splats ({EXTENSION}): a mesh or a point cloud?")
     return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)
@@ -199,7 +199,9 @@ def _write_container(path: str | os.PathLike[str], gltf: dict[str, Any], chunks:
     total = 12 + 8 + len(text) + 8 + length
     if total >= 2**32:
         count = gltf["accessors"][0]["count"]
-        raise InputError(f"{path}: {count} Gaussians do not fit a GLB of 4 GiB; write 3D Tiles instead")
+        raise InputError(
+            f"{path}: {count} Gaussians do not fit a GLB of 4 GiB; write 3D Tiles instead", code="unsupported_output"
+        )
     with open(path, "wb") as file:
         file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), _JSON) + text)
         file.write(struct.pack("<II", length, _BIN))
@@ -221,21 +223,28 @@ def _read_container(path: str | os.PathLike[str]) -> tuple[dict[str, Any], np.nd
     with open(path, "rb") as file:
         head = file.read(20)
         if len(head) < 20 or head[:4] != b"glTF":
-            raise InputError(f"{path} is not a GLB file: it {'is empty' if not head else 'has no glTF header'}")
+            raise InputError(
+                f"{path} is not a GLB file: it {'is empty' if not head else 'has no glTF header'}",
+                code="wrong_file_type",
+            )
         version, total, json_bytes, kind = struct.unpack_from("<IIII", head, 4)
         if version != 2 or kind != _JSON:
-            raise InputError(f"{path}: GLB version {version} with first chunk {kind:#x}; gsmap reads version 2")
+            raise InputError(
+                f"{path}: GLB version {version} with first chunk {kind:#x}; gsmap reads version 2",
+                code="unsupported_version",
+            )
         if total > size or 20 + json_bytes > total or json_bytes > _MAX_JSON_BYTES:
             raise InputError(
                 f"{path}: its header promises {total:,} bytes with {json_bytes:,} of JSON, the file has {size:,}: "
-                "truncated or damaged"
+                "truncated or damaged",
+                code="file_truncated",
             )
         try:
             gltf = json.loads(file.read(json_bytes))
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: its JSON cannot be read: {error}") from error
+            raise InputError(f"{path}: its JSON cannot be read: {error}", code="not_json") from error
         if not isinstance(gltf, dict):
-            raise InputError(f"{path} is not valid glTF: its JSON is not an object")
+            raise InputError(f"{path} is not valid glTF: its JSON is not an object", code="not_json")
         tail = file.read(8)
     offset = 20 + json_bytes + 8
     if len(tail) < 8 or offset >= size:
@@ -243,7 +252,8 @@ def _read_container(path: str | os.PathLike[str]) -> tuple[dict[str, Any], np.nd
     length, kind = struct.unpack("<II", tail)
     if kind != _BIN or offset + length > size:
         raise InputError(
-            f"{path}: its binary chunk is {length:,} bytes, {size - offset:,} follow: truncated or damaged"
+            f"{path}: its binary chunk is {length:,} bytes, {size - offset:,} follow: truncated or damaged",
+            code="file_truncated",
         )
     return gltf, np.memmap(path, np.uint8, "r", offset, (length,)) if length else np.empty(0, np.uint8)
 
@@ -261,7 +271,7 @@ def _primitives(
         index, parent = todo.pop()
         seen += 1
         if seen > _MAX_NODES or index < 0:
-            raise InputError(f"{path}: more than {_MAX_NODES} nodes, or nodes in a circle")
+            raise InputError(f"{path}: more than {_MAX_NODES} nodes, or nodes in a circle", code="nested_too_deeply")
         node = nodes[index]
         world = parent @ _node_matrix(path, node)
         todo += [(int(child), world) for child in node.get("children", [])]
@@ -293,28 +303,42 @@ def _read_primitive(
     if SPZ_EXTENSION in nested:
         local = spz.unpack(path, _view(path, gltf, binary, nested[SPZ_EXTENSION]["bufferView"]).tobytes())
         if len(local) != gltf["accessors"][attributes["POSITION"]]["count"]:
-            raise InputError(f"{path}: its SPZ holds {len(local)} Gaussians, its accessors do not; it is damaged")
+            raise InputError(
+                f"{path}: its SPZ holds {len(local)} Gaussians, its accessors do not; it is damaged",
+                code="count_mismatch",
+            )
         return _placed(path, local, world)
     if nested:
-        raise InputError(f"{path} is compressed or extended by {', '.join(nested)}: convert it to plain {EXTENSION}")
+        raise InputError(
+            f"{path} is compressed or extended by {', '.join(nested)}: convert it to plain {EXTENSION}",
+            code="unsupported_feature",
+        )
     if splatting.get("kernel") != "ellipse" or splatting.get("colorSpace") != "srgb_rec709_display":
         raise InputError(
             f"{path}: kernel {splatting.get('kernel')!r} and colour space {splatting.get('colorSpace')!r}; gsmap reads "
-            f"'ellipse' and 'srgb_rec709_display' of the ratified {EXTENSION}"
+            f"'ellipse' and 'srgb_rec709_display' of the ratified {EXTENSION}",
+            code="unsupported_version",
         )
     count = int(gltf["accessors"][attributes["POSITION"]]["count"])
 
     def values(name: str, width: int) -> np.ndarray:
         if name not in attributes:
-            raise InputError(f"{path} lacks the attribute {name}: not a file of the ratified {EXTENSION}")
+            raise InputError(
+                f"{path} lacks the attribute {name}: not a file of the ratified {EXTENSION}", code="missing_attribute"
+            )
         return _accessor(path, gltf, binary, attributes[name], count, width)
 
     scales = values(f"{EXTENSION}:SCALE", 3)
     if (scales < 0).any():
-        raise InputError(f"{path} has negative scales: an early draft of {EXTENSION} stored logarithms; export it anew")
+        raise InputError(
+            f"{path} has negative scales: an early draft of {EXTENSION} stored logarithms; export it anew",
+            code="unsupported_version",
+        )
     opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
     if not ((opacities >= 0) & (opacities <= 1)).all():
-        raise InputError(f"{path} has opacities outside [0, 1]: a draft of {EXTENSION}? export it anew")
+        raise InputError(
+            f"{path} has opacities outside [0, 1]: a draft of {EXTENSION}? export it anew", code="unsupported_version"
+        )
     degree = 0
     while degree < 3 and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
         degree += 1
@@ -338,13 +362,19 @@ def _placed(path: str | os.PathLike[str], local: Gaussians, world: np.ndarray) -
     try:
         S_world_local = Sim3.from_matrix(world)
     except InputError as error:
-        raise InputError(f"{path}: a node or tile is placed by more than a turn, shift and scale: {error}") from error
+        raise InputError(
+            f"{path}: a node or tile is placed by more than a turn, shift and scale: {error}",
+            code="unsupported_transform",
+        ) from error
     return placed(local, S_world_local)
 
 
 def _require_inside(path: str | os.PathLike[str], gltf: dict[str, Any], view: dict[str, Any]) -> None:
     if view["buffer"] != 0 or "uri" in gltf["buffers"][0]:
-        raise InputError(f"{path}: its data lies outside the file; gsmap reads self-contained .glb only")
+        raise InputError(
+            f"{path}: its data lies outside the file; gsmap reads self-contained .glb only",
+            code="content_outside_folder",
+        )
 
 
 def _view(path: str | os.PathLike[str], gltf: dict[str, Any], binary: np.ndarray, index: int) -> np.ndarray:
@@ -353,7 +383,10 @@ def _view(path: str | os.PathLike[str], gltf: dict[str, Any], binary: np.ndarray
     _require_inside(path, gltf, view)
     begin, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
     if not (begin >= 0 and length > 0 and begin + length <= len(binary)):
-        raise InputError(f"{path} is damaged: view {index} needs bytes up to {begin + length:,} of {len(binary):,}")
+        raise InputError(
+            f"{path} is damaged: view {index} needs bytes up to {begin + length:,} of {len(binary):,}",
+            code="data_outside_buffer",
+        )
     return binary[begin : begin + length]
 
 
@@ -364,9 +397,13 @@ def _accessor(
     accessor = gltf["accessors"][index]
     kind, stored = _COMPONENTS.get(accessor["componentType"]), _WIDTHS.get(accessor["type"])
     if "sparse" in accessor or "bufferView" not in accessor or kind is None or stored != width:
-        raise InputError(f"{path}: accessor {index} is sparse or of a kind that splats do not have")
+        raise InputError(
+            f"{path}: accessor {index} is sparse or of a kind that splats do not have", code="invalid_accessor"
+        )
     if accessor["count"] != count:
-        raise InputError(f"{path}: accessor {index} has {accessor['count']} values for {count} Gaussians")
+        raise InputError(
+            f"{path}: accessor {index} has {accessor['count']} values for {count} Gaussians", code="count_mismatch"
+        )
     view = gltf["bufferViews"][accessor["bufferView"]]
     _require_inside(path, gltf, view)
     item = np.dtype(kind)
@@ -374,10 +411,11 @@ def _accessor(
     start, begin, length = int(accessor.get("byteOffset", 0)), int(view.get("byteOffset", 0)), int(view["byteLength"])
     needed = start + stride * (count - 1) + item.itemsize * width
     if not count > 0 or min(start, begin) < 0 or not item.itemsize * width <= stride <= 252:
-        raise InputError(f"{path}: accessor {index} has impossible count, offset or stride")
+        raise InputError(f"{path}: accessor {index} has impossible count, offset or stride", code="invalid_accessor")
     if needed > length or begin + length > len(binary):
         raise InputError(
-            f"{path} is damaged: accessor {index} needs {needed:,} bytes of {length:,}, {len(binary):,} in all"
+            f"{path} is damaged: accessor {index} needs {needed:,} bytes of {length:,}, {len(binary):,} in all",
+            code="data_outside_buffer",
         )
     raw = np.ndarray((count, width), item, binary, begin + start, (stride, item.itemsize))
     out = raw.astype(np.float32)

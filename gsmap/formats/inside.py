@@ -22,11 +22,15 @@ def file_inside(path: Path, uri: object, suffix: str = "") -> Path:
     try:
         file = (folder / name).resolve()
     except (ValueError, OSError, RuntimeError) as error:  # a NUL, half a surrogate, a name too long, links in a circle
-        raise InputError(f"{path}: content {uri!r} is no name of a file: {error}") from error
+        raise InputError(f"{path}: content {uri!r} is no name of a file: {error}", code="content_invalid") from error
     if name.is_absolute() or ":" in str(name) or "\\" in str(name) or not file.is_relative_to(folder):
-        raise InputError(f"{path}: content {uri!r} lies outside its folder; gsmap will not follow it")
+        raise InputError(
+            f"{path}: content {uri!r} lies outside its folder; gsmap will not follow it", code="content_outside_folder"
+        )
     if suffix and file.suffix.lower() != suffix:
-        raise InputError(f"{path}: content {uri!r} is not a {suffix}; gsmap reads splats in {suffix} there")
+        raise InputError(
+            f"{path}: content {uri!r} is not a {suffix}; gsmap reads splats in {suffix} there", code="content_invalid"
+        )
     if not file.is_file():
-        raise InputError(f"{path}: content {uri!r} is missing")
+        raise InputError(f"{path}: content {uri!r} is missing", code="content_missing")
     return file

@@ -64,16 +64,21 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """
     size = Path(path).stat().st_size
     if size < _HEADER_BYTES:
-        raise InputError(f"{path} is not a .ksplat: it has {size} bytes, its header alone {_HEADER_BYTES}")
+        raise InputError(
+            f"{path} is not a .ksplat: it has {size} bytes, its header alone {_HEADER_BYTES}", code="wrong_file_type"
+        )
     header = np.fromfile(path, _HEADER, 1)[0]
     level, count = int(header["level"]), int(header["max_sections"])
     if tuple(header["version"]) != (0, 1) or level > 2:
         version = ".".join(map(str, header["version"]))
         raise InputError(
-            f"{path}: .ksplat version {version}, compression level {level}; gsmap reads 0.1, levels 0 to 2"
+            f"{path}: .ksplat version {version}, compression level {level}; gsmap reads 0.1, levels 0 to 2",
+            code="unsupported_version",
         )
     if not 0 < count <= _MAX_SECTIONS or _HEADER_BYTES + count * _SECTION_BYTES > size:
-        raise InputError(f"{path}: {count} sections do not fit into its {size} bytes; is it whole?")
+        raise InputError(
+            f"{path}: {count} sections do not fit into its {size} bytes; is it whole?", code="file_truncated"
+        )
     low, high = (
         float(end) or standard for end, standard in zip(header["sh_range"], (-_SH_RANGE, _SH_RANGE), strict=True)
     )
@@ -82,14 +87,20 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         begin = _HEADER_BYTES + i * _SECTION_BYTES
         section = _Section.of(path, np.fromfile(path, _SECTION, 1, offset=begin)[0], level)
         if at + section.num_bytes > size:
-            raise InputError(f"{path}: section {i} ends at byte {at + section.num_bytes} of {size}; is it whole?")
+            raise InputError(
+                f"{path}: section {i} ends at byte {at + section.num_bytes} of {size}; is it whole?",
+                code="file_truncated",
+            )
         if section.splats:
             parts.append(section.read(path, np.fromfile(path, np.uint8, section.num_bytes, offset=at), (low, high)))
         at += section.num_bytes
     if not parts:
-        raise InputError(f"{path} has no Gaussians")
+        raise InputError(f"{path} has no Gaussians", code="no_gaussians")
     if sum(map(len, parts)) != int(header["splats"]):
-        raise InputError(f"{path}: {int(header['splats'])} Gaussians, its sections have {sum(map(len, parts))}")
+        raise InputError(
+            f"{path}: {int(header['splats'])} Gaussians, its sections have {sum(map(len, parts))}",
+            code="count_mismatch",
+        )
     return Gaussians.concatenate(parts)
 
 
@@ -114,12 +125,19 @@ class _Section:
         told = {name: header[name].item() for name in cls.__dataclass_fields__ if name != "level"}
         section = cls(level=level, **told)
         if section.sh_degree >= len(_SH_VALUES):
-            raise InputError(f"{path}: SH degree {section.sh_degree}; a .ksplat has 0 to {len(_SH_VALUES) - 1}")
+            raise InputError(
+                f"{path}: SH degree {section.sh_degree}; a .ksplat has 0 to {len(_SH_VALUES) - 1}",
+                code="unsupported_sh_degree",
+            )
         if section.splats > section.max_splats:
-            raise InputError(f"{path}: a section of {section.splats} Gaussians with room for {section.max_splats}")
+            raise InputError(
+                f"{path}: a section of {section.splats} Gaussians with room for {section.max_splats}",
+                code="count_mismatch",
+            )
         if level and section.splats and not (section.bucket_bytes == 12 and section.buckets >= section.all_buckets > 0):
             raise InputError(
-                f"{path}: {section.buckets} buckets of {section.bucket_bytes} bytes do not hold its Gaussians"
+                f"{path}: {section.buckets} buckets of {section.bucket_bytes} bytes do not hold its Gaussians",
+                code="invalid_buckets",
             )
         return section
 
@@ -164,7 +182,9 @@ class _Section:
         partial = data[: 4 * self.partial_buckets].view("<u4").astype(np.int64)
         sizes = np.concatenate([np.full(self.full_buckets, self.bucket_size, np.int64), partial])
         if int(sizes.sum()) < self.splats or (sizes > self.splats).any():
-            raise InputError(f"{path}: buckets of {int(sizes.sum())} Gaussians for {self.splats}")
+            raise InputError(
+                f"{path}: buckets of {int(sizes.sum())} Gaussians for {self.splats}", code="invalid_buckets"
+            )
         begin = 4 * self.partial_buckets
         centres = data[begin : begin + 12 * len(sizes)].view("<f4").reshape(-1, 3)
         return np.repeat(centres, sizes, axis=0)[: self.splats]

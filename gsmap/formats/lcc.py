@@ -61,11 +61,16 @@ def stream(path: str | os.PathLike[str]) -> LccSource:
         bounds = {str(one["name"]): _bounds(one) for one in meta["attributes"] if one["name"] in ("scale", "shcoef")}
         with_sh = meta.get("fileType") == "Quality" or (meta.get("fileType") is None and "shcoef" in bounds)
         if not 0 < levels <= _MAX_LEVELS or "scale" not in bounds or (with_sh and "shcoef" not in bounds):
-            raise InputError(f"{path}: {levels} levels, bounds of {sorted(bounds)}: not what gsmap reads of an .lcc")
+            raise InputError(
+                f"{path}: {levels} levels, bounds of {sorted(bounds)}: not what gsmap reads of an .lcc",
+                code="unsupported_version",
+            )
     except MALFORMED as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path} is not the JSON of an .lcc: {type(error).__name__} {error}") from error
+        raise InputError(
+            f"{path} is not the JSON of an .lcc: {type(error).__name__} {error}", code="not_json"
+        ) from error
     data = _beside(path, "data.bin")
     sh = _beside(path, "shcoef.bin") if with_sh else None
     return LccSource(path, data, sh, _runs(path, levels, data, sh), bounds)
@@ -119,7 +124,9 @@ class LccSource:
                 if self.sh is not None:
                     more = np.fromfile(self.sh, "<u4", 16 * wanted, offset=begin * _SH_ROW.itemsize).reshape(-1, 16)
                 if len(rows) != wanted or (more is not None and len(more) != wanted):
-                    raise InputError(f"{self.path}: {self.data.name} was changed while it was read")
+                    raise InputError(
+                        f"{self.path}: {self.data.name} was changed while it was read", code="file_changed"
+                    )
                 yield self._decoded(rows, more)
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
@@ -156,11 +163,13 @@ def _quats(packed: np.ndarray) -> np.ndarray:
 
 def _meta(path: Path) -> dict[str, Any]:
     if path.stat().st_size > _MAX_META_BYTES:
-        raise InputError(f"{path} is larger than the {_MAX_META_BYTES >> 20} MiB of JSON that gsmap reads")
+        raise InputError(
+            f"{path} is larger than the {_MAX_META_BYTES >> 20} MiB of JSON that gsmap reads", code="file_too_large"
+        )
     try:
         return dict(json.loads(path.read_bytes()))
     except MALFORMED as error:
-        raise InputError(f"{path} is not the JSON of an .lcc: {error}") from error
+        raise InputError(f"{path} is not the JSON of an .lcc: {error}", code="not_json") from error
 
 
 def _bounds(one: dict[str, Any]) -> np.ndarray:
@@ -180,7 +189,9 @@ def _runs(path: Path, levels: int, data: Path, sh: Path | None) -> np.ndarray:
     unit = np.dtype([("cell", "<u4"), ("levels", [("rows", "<u4"), ("offset", "<u8"), ("size", "<u4")], levels)])
     size = index.stat().st_size
     if not size or size % unit.itemsize or size > _MAX_INDEX_BYTES:
-        raise InputError(f"{index}: {size} bytes are not units of {unit.itemsize} ({levels} levels)")
+        raise InputError(
+            f"{index}: {size} bytes are not units of {unit.itemsize} ({levels} levels)", code="file_damaged"
+        )
     finest = np.fromfile(index, unit)["levels"][:, 0]
     finest = finest[finest["rows"] > 0]
     first, odd = np.divmod(finest["offset"], np.uint64(_ROW.itemsize))
@@ -188,10 +199,10 @@ def _runs(path: Path, levels: int, data: Path, sh: Path | None) -> np.ndarray:
     if sh is not None:
         there = min(there, sh.stat().st_size // _SH_ROW.itemsize)
     if not len(finest) or odd.any() or (first > there).any():
-        raise InputError(f"{index} names no rows of {data.name}, or rows that are not there")
+        raise InputError(f"{index} names no rows of {data.name}, or rows that are not there", code="rows_outside_file")
     runs = np.stack([first.astype(np.int64), finest["rows"].astype(np.int64)], axis=1)
     in_order = runs[np.argsort(runs[:, 0], kind="stable")]
     ends = in_order.sum(1)
     if ends[-1] > there or (in_order[1:, 0] < ends[:-1]).any():
-        raise InputError(f"{index} names rows that are not in {data.name}, or one twice")
+        raise InputError(f"{index} names rows that are not in {data.name}, or one twice", code="rows_outside_file")
     return runs

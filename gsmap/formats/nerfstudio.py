@@ -42,7 +42,7 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
     """
     frames = content["frames"]
     if not frames:
-        raise InputError(f"{path} holds no cameras: its list of frames is empty")
+        raise InputError(f"{path} holds no cameras: its list of frames is empty", code="no_cameras")
     pose = np.array([f["transform_matrix"] for f in frames], np.float64)
     if pose.shape[1:] == (3, 4):
         pose = np.concatenate([pose, np.tile([[[0.0, 0, 0, 1]]], (len(pose), 1, 1))], axis=1)
@@ -78,7 +78,7 @@ def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
     """
     path = Path(path)
     if not path.parent.is_dir():
-        raise NotFoundError(f"cannot write {path}: no such folder: {path.parent}")
+        raise NotFoundError(f"cannot write {path}: no such folder: {path.parent}", code="folder_not_found")
     pose = cameras.T_frame_camera.copy()
     pose[:, :3, 1:3] *= -1  # OpenCV (y down, z forward) to OpenGL (y up, z back)
     frames = []
@@ -126,7 +126,10 @@ def _intrinsics(both: dict[str, Any], path: Path) -> tuple[tuple[float, float, f
         fy = 0.5 * height / math.tan(0.5 * both["camera_angle_y"])
     fx = fy if fx is None else fx
     if fx is None:
-        raise InputError(f"{path}: frame {both.get('file_path')} has no focal length (fl_x or camera_angle_x)")
+        raise InputError(
+            f"{path}: frame {both.get('file_path')} has no focal length (fl_x or camera_angle_x)",
+            code="incomplete_camera",
+        )
     fy = fx if fy is None else fy
     cx, cy = both.get("cx", width / 2), both.get("cy", height / 2)
     return (float(fx), float(fy), float(cx), float(cy)), (int(width), int(height))
@@ -137,4 +140,4 @@ def _image_size(image: Path, path: Path) -> tuple[int, int]:
         if candidate.is_file():
             with open_picture(candidate) as opened:
                 return opened.size
-    raise InputError(f"{path} gives no image size (w, h) and {image} is not there to tell it")
+    raise InputError(f"{path} gives no image size (w, h) and {image} is not there to tell it", code="incomplete_camera")

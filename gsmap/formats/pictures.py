@@ -54,7 +54,7 @@ def open_picture(
     from PIL import Image, UnidentifiedImageError
 
     if data is None and not Path(path).is_file():
-        raise NotFoundError(f"cannot read {os.fspath(path)}: no such file")
+        raise NotFoundError(f"cannot read {os.fspath(path)}: no such file", code="file_not_found")
     name, readable = os.fspath(path), _readable(formats)
     try:
         with contextlib.ExitStack() as stack:
@@ -63,20 +63,32 @@ def open_picture(
                 picture = stack.enter_context(Image.open(path if data is None else io.BytesIO(data), formats=readable))
             width, height = picture.size
             if width * height > max_pixels:
-                raise InputError(f"{name} has {width} x {height} pixels, more than {max_pixels:,}: reduce the picture")
+                raise InputError(
+                    f"{name} has {width} x {height} pixels, more than {max_pixels:,}: reduce the picture",
+                    code="picture_too_large",
+                )
             yield picture
     except GsmapError:
         raise
     except UnidentifiedImageError as error:
         if "HEIF" in formats and "HEIF" not in readable and _is_heif(path, data):
             raise MissingDependencyError(f"{name} is a HEIC picture: pip install 'gsmap[heic]'") from error
-        raise InputError(f"{name} cannot be read as a {_listed(readable)} picture: convert it to one") from error
+        raise InputError(
+            f"{name} cannot be read as a {_listed(readable)} picture: convert it to one", code="picture_unreadable"
+        ) from error
     except Image.DecompressionBombError as error:
-        raise InputError(f"{name} has more than {max_pixels:,} pixels: reduce the picture") from error
+        raise InputError(
+            f"{name} has more than {max_pixels:,} pixels: reduce the picture", code="picture_too_large"
+        ) from error
     except MemoryError as error:
-        raise InputError(f"{name} needs more memory to be decoded than there is: reduce the picture") from error
+        raise InputError(
+            f"{name} needs more memory to be decoded than there is: reduce the picture", code="picture_too_large"
+        ) from error
     except Exception as error:  # damage makes Pillow's readers raise nearly anything
-        raise InputError(f"{name} cannot be read as a {_listed(readable)} picture ({error}): save it again") from error
+        raise InputError(
+            f"{name} cannot be read as a {_listed(readable)} picture ({error}): save it again",
+            code="picture_unreadable",
+        ) from error
 
 
 def _readable(formats: Sequence[str]) -> list[str]:

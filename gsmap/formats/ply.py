@@ -108,7 +108,10 @@ def stream(path: str | os.PathLike[str]) -> PlySource:
     """
     header = read_header(path)
     if is_compressed(header):
-        raise InputError(f"{path} holds the layout of a .compressed.ply: read it with gsmap.formats.read, which looks")
+        raise InputError(
+            f"{path} holds the layout of a .compressed.ply: read it with gsmap.formats.read, which looks",
+            code="unsupported_format",
+        )
     rows = _rows(path, header, "vertex")
     names = set(header.elements["vertex"].names)
     rest = _rest_names(path, names)
@@ -236,7 +239,8 @@ def _is_activated(path: str | os.PathLike[str], source: PlySource) -> bool:
         if is_opacity:
             raise InputError(
                 f"{path}: its opacities lie in {opacity[0]:.3g} to {opacity[1]:.3g} as opacities do, and its scales "
-                "are logarithms: a .ply of splats has both as trained; write the opacities as logits, log(a / (1 - a))"
+                "are logarithms: a .ply of splats has both as trained; write the opacities as logits, log(a / (1 - a))",
+                code="activated_values",
             )
         return False
     if is_opacity:
@@ -249,7 +253,8 @@ def _is_activated(path: str | os.PathLike[str], source: PlySource) -> bool:
     raise InputError(
         f"{path}: its scales are lengths ({median:.3g} where neighbours are {apart:.3g} apart), and its opacities are "
         f"logits ({opacity[0]:.3g} to {opacity[1]:.3g}): a .ply of splats has both as trained; write the scales as "
-        "logarithms"
+        "logarithms",
+        code="activated_values",
     )
 
 
@@ -353,14 +358,16 @@ def read_header(path: str | os.PathLike[str]) -> Header:
         head = file.read(HEADER_LIMIT_BYTES)
     if not head.startswith((b"ply\n", b"ply\r")):
         what = "is empty" if not head else f"begins with {head[:4]!r}, not with 'ply'"
-        raise InputError(f"{path} is not a PLY file: it {what}")
+        raise InputError(f"{path} is not a PLY file: it {what}", code="wrong_file_type")
     lines: list[str] = []
     offset = 0
     while not lines or lines[-1] != "end_header":
         end = head.find(b"\n", offset)
         if end < 0:
             limit = "within 64 KiB" if len(head) == HEADER_LIMIT_BYTES else "before the file ends"
-            raise InputError(f"{path}: the PLY header has no 'end_header' line {limit}; the file is damaged")
+            raise InputError(
+                f"{path}: the PLY header has no 'end_header' line {limit}; the file is damaged", code="ply_header"
+            )
         lines.append(head[offset:end].decode("utf-8", "replace").strip())
         offset = end + 1
 
@@ -380,14 +387,16 @@ def read_header(path: str | os.PathLike[str]) -> Header:
         elif keyword == "property" and blocks and len(words) == 4 and words[0] == "list":
             blocks[-1][2].append((words[3], None))
         else:
-            raise InputError(f"{path}: line {number} of the PLY header means nothing: {line[:80]!r}")
+            raise InputError(f"{path}: line {number} of the PLY header means nothing: {line[:80]!r}", code="ply_header")
     if not encoding:
-        raise InputError(f"{path}: the PLY header has no 'format' line; the file is damaged")
+        raise InputError(f"{path}: the PLY header has no 'format' line; the file is damaged", code="ply_header")
     elements: dict[str, Element] = {}
     renamed = False
     for name, count, columns in blocks:
         if name in elements or len({c for c, _ in columns}) < len(columns):
-            raise InputError(f"{path}: the PLY header names element {name!r} or one of its properties twice")
+            raise InputError(
+                f"{path}: the PLY header names element {name!r} or one of its properties twice", code="duplicate"
+            )
         if name == "vertex":
             own = {c for c, _ in columns}
             given = [(m[1] if (m := _SPLAT_NAME.fullmatch(c)) and m[1] not in own else c, kind) for c, kind in columns]
@@ -442,7 +451,10 @@ class Rows:
                 wanted = min(CHUNK_ROWS, self.count - start)
                 part = np.fromfile(file, self.dtype, wanted)
                 if _version(os.fstat(file.fileno())) != self.version or len(part) < wanted:
-                    raise InputError(f"{self.path} was written to while it was read: let its writer finish first")
+                    raise InputError(
+                        f"{self.path} was written to while it was read: let its writer finish first",
+                        code="file_changed",
+                    )
                 yield part
 
 
@@ -460,17 +472,20 @@ def _version(found: os.stat_result) -> tuple[int, ...]:
 def _located(path: str | os.PathLike[str], header: Header, name: str) -> tuple[Element, int, int]:
     """An element, where its rows begin in a binary file, and how many rows are before them."""
     if name not in header.elements or not header.elements[name].count:
-        raise InputError(f"{path} has no {name} rows: there is nothing to read")
+        raise InputError(f"{path} has no {name} rows: there is nothing to read", code="no_gaussians")
     offset, skip = header.data_offset, 0
     for element in header.elements.values():
         if element.has_list:
-            raise InputError(f"{path}: element {element.name!r} has a list property: not a 3DGS .ply (a mesh?)")
+            raise InputError(
+                f"{path}: element {element.name!r} has a list property: not a 3DGS .ply (a mesh?)",
+                code="ply_properties",
+            )
         if element.name == name:
             break
         offset += element.count * element.dtype.itemsize
         skip += element.count
     if not element.names:
-        raise InputError(f"{path}: element {name!r} has no properties: not a 3DGS .ply")
+        raise InputError(f"{path}: element {name!r} has no properties: not a 3DGS .ply", code="ply_properties")
     # The smallest an ASCII value can be is one digit and one separator.
     stride = 2 * len(element.names) if header.encoding == "ascii" else element.dtype.itemsize
     size = Path(path).stat().st_size
@@ -479,7 +494,8 @@ def _located(path: str | os.PathLike[str], header: Header, name: str) -> tuple[E
         at_most = "at most " if header.encoding == "ascii" else ""
         raise InputError(
             f"{path} is truncated: its header promises {element.count} {name} rows of at least {stride} bytes, "
-            f"but {max(0, present)} bytes follow, {at_most}{max(0, present) // stride} rows: copy or export it again"
+            f"but {max(0, present)} bytes follow, {at_most}{max(0, present) // stride} rows: copy or export it again",
+            code="file_truncated",
         )
     if header.encoding != "ascii" and not any(e.has_list and e.count for e in header.elements.values()):
         end = header.data_offset + sum(e.count * e.dtype.itemsize for e in header.elements.values())
@@ -497,7 +513,8 @@ def _tail(path: str | os.PathLike[str], start: int) -> bytes:
 def _too_long(path: str | os.PathLike[str], element: Element, more: str) -> InputError:
     return InputError(
         f"{path}: its header promises {element.count} {element.name} rows, but {more}, follow: export it again, or "
-        "correct the counts in its header"
+        "correct the counts in its header",
+        code="file_truncated",
     )
 
 
@@ -514,10 +531,12 @@ def _read_ascii(path: str | os.PathLike[str], header: Header, element: Element, 
         try:
             rows = np.loadtxt(lines, element.dtype, comments=None, skiprows=skip, max_rows=element.count, ndmin=1)
         except ValueError as error:
-            raise InputError(f"{path}: its ASCII rows cannot be read: {error}") from error
+            raise InputError(f"{path}: its ASCII rows cannot be read: {error}", code="invalid_row") from error
         left = sum(1 for line in lines if line.strip())
     if len(rows) < element.count:
-        raise InputError(f"{path} is truncated: {element.count} rows promised, {len(rows)} found")
+        raise InputError(
+            f"{path} is truncated: {element.count} rows promised, {len(rows)} found", code="file_truncated"
+        )
     later = sum(e.count for e in header.elements.values()) - skip - element.count
     if left > later:
         raise _too_long(path, element, f"{element.count + left - later} rows")
@@ -529,7 +548,8 @@ def _rest_names(path: str | os.PathLike[str], names: set[str]) -> list[str]:
     rest = [f"f_rest_{i}" for i in range(count)]
     if count not in (0, 9, 24, 45) or not names.issuperset(rest):
         raise InputError(
-            f"{path} has {count} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45, numbered from 0"
+            f"{path} has {count} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45, numbered from 0",
+            code="unsupported_sh_degree",
         )
     return rest
 

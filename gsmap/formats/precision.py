@@ -43,7 +43,8 @@ def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> Gauss
     if apart <= 2 * step:
         raise InputError(
             f"{where}: its positions near {told(origin)} are in single precision, which rounds them to {step:g} there, "
-            f"but neighbours are {apart:.2g} apart: export it in double precision, or with {told(origin)} taken off"
+            f"but neighbours are {apart:.2g} apart: export it in double precision, or with {told(origin)} taken off",
+            code="precision_loss",
         )
     return source
 
@@ -73,7 +74,8 @@ def about_zero(
         raise InputError(
             f"{path} cannot hold positions near {told(gaussians.origin)}: it rounds them to {step:g} there, and "
             f"neighbours are {apart:.2g} apart: write .ply, .glb, .usdc or tileset.json, or take the offset "
-            f"{told(gaussians.origin)} off (gsmap convert --local)"
+            f"{told(gaussians.origin)} off (gsmap convert --local)",
+            code="precision_loss",
         )
     return gaussians.about(np.zeros(3))
 

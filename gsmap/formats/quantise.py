@@ -25,7 +25,8 @@ def check_size(path: str | os.PathLike[str], expanded: int, compressed: int) -> 
     if expanded > max(_FREE_BYTES, _MAX_RATIO * compressed):
         raise InputError(
             f"{path}: its header promises {expanded / 2**20:,.0f} MiB out of {compressed / 2**20:.1f} MiB compressed; "
-            "no real splat compresses that well, so the file is damaged or hostile"
+            "no real splat compresses that well, so the file is damaged or hostile",
+            code="decompression_bomb",
         )
 
 
@@ -35,7 +36,7 @@ def require_writable(path: str | os.PathLike[str], gaussians: Gaussians) -> None
     Infinite logits and scales of minus infinity are fine: they have an opacity and a size.
     """
     if len(gaussians) == 0:
-        raise InputError(f"{path}: there are no Gaussians to write")
+        raise InputError(f"{path}: there are no Gaussians to write", code="no_gaussians")
     for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
         values = getattr(gaussians, name)
         with np.errstate(all="ignore"):
@@ -44,7 +45,9 @@ def require_writable(path: str | os.PathLike[str], gaussians: Gaussians) -> None
             bad = ~np.isfinite(values) if name in ("means", "quats", "sh") else np.isnan(values)
             if bad.any():
                 row = int(bad.reshape(len(values), -1).any(1).argmax())
-                raise InputError(f"{path}: {name} of Gaussian {row} is not finite: remove it before writing")
+                raise InputError(
+                    f"{path}: {name} of Gaussian {row} is not finite: remove it before writing", code="not_finite"
+                )
 
 
 def opacity_bytes(logits: np.ndarray) -> np.ndarray:

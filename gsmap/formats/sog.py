@@ -100,14 +100,19 @@ def write(
     """
     path = Path(path)
     if not 1 <= palette_size <= _MAX_PALETTE:
-        raise ConfigError(f"palette_size must be 1 to {_MAX_PALETTE}, got {palette_size}")
+        raise ConfigError(f"palette_size must be 1 to {_MAX_PALETTE}, got {palette_size}", code="out_of_range")
     if turns < 1:
-        raise ConfigError(f"turns must be at least 1, got {turns}")
+        raise ConfigError(f"turns must be at least 1, got {turns}", code="out_of_range")
     require_writable(path, gaussians)
     if gaussians.sh_degree > 3:
-        raise InputError(f"{path}: SOG holds SH of degree 3 at most, these have {gaussians.sh_degree}")
+        raise InputError(
+            f"{path}: SOG holds SH of degree 3 at most, these have {gaussians.sh_degree}", code="unsupported_output"
+        )
     if len(gaussians) > _MAX_PIXELS:
-        raise InputError(f"{path}: {len(gaussians):,} Gaussians; a SOG holds {_MAX_PIXELS:,}: write lod-meta.json")
+        raise InputError(
+            f"{path}: {len(gaussians):,} Gaussians; a SOG holds {_MAX_PIXELS:,}: write lod-meta.json",
+            code="unsupported_output",
+        )
     g = gaussians if ordered else gaussians[morton_order(gaussians.means)]
     meta, images = _encode(g, palette_size, turns)
     if antialiased:
@@ -133,7 +138,7 @@ def unbundled(path: str | os.PathLike[str], folder: Path) -> None:
         parts = [part["files"] for part in meta.values() if isinstance(part, dict) and "files" in part]
         for name in [name for names in parts for name in names]:
             if name != Path(name).name:
-                raise InputError(f"{path}: {name!r} is no name of a file")
+                raise InputError(f"{path}: {name!r} is no name of a file", code="content_invalid")
             (folder / name).write_bytes(files(name, size))
         (folder / "meta.json").write_bytes(files("meta.json", _MAX_META_BYTES))
 
@@ -149,11 +154,13 @@ def _opened(path: str | os.PathLike[str], work: Callable[[str | os.PathLike[str]
         with zipfile.ZipFile(path) as archive:
             return work(path, lambda name, limit: _member(path, archive, name, limit), os.path.getsize(path))
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError) as error:
-        raise InputError(f"{path} is not a readable .sog (a ZIP file): {error}") from error
+        raise InputError(f"{path} is not a readable .sog (a ZIP file): {error}", code="wrong_file_type") from error
     except MALFORMED as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: its meta.json does not describe it: {type(error).__name__} {error}") from error
+        raise InputError(
+            f"{path}: its meta.json does not describe it: {type(error).__name__} {error}", code="not_json"
+        ) from error
 
 
 def _folder(path: Path) -> tuple[Files, int]:
@@ -162,7 +169,10 @@ def _folder(path: Path) -> tuple[Files, int]:
     def file(name: str, limit: int) -> bytes:
         place = path if name == "meta.json" else file_inside(path, name)
         if place.stat().st_size > limit:
-            raise InputError(f"{path}: {name} is {place.stat().st_size:,} bytes, more than the {limit:,} gsmap reads")
+            raise InputError(
+                f"{path}: {name} is {place.stat().st_size:,} bytes, more than the {limit:,} gsmap reads",
+                code="file_too_large",
+            )
         return place.read_bytes()
 
     return file, sum(one.stat().st_size for one in path.parent.glob("*.webp") if one.is_file())
@@ -257,13 +267,15 @@ def _decode(path: str | os.PathLike[str], files: Files, size: int) -> Gaussians:
     meta = _meta(path, files)
     n = int(meta["count"])
     if not 0 < n <= _MAX_PIXELS:
-        raise InputError(f"{path}: a count of {n} Gaussians; gsmap reads 1 to {_MAX_PIXELS}")
+        raise InputError(f"{path}: a count of {n} Gaussians; gsmap reads 1 to {_MAX_PIXELS}", code="count_mismatch")
     check_size(path, n * _LEAST_BYTES, size)
 
     def texels(part: str, file: int = 0) -> np.ndarray:
         image = _image(path, files, meta[part]["files"][file], 2 * n).reshape(-1, 4)
         if len(image) < n:
-            raise InputError(f"{path}: the image of {part} holds {len(image)} texels for {n} Gaussians")
+            raise InputError(
+                f"{path}: the image of {part} holds {len(image)} texels for {n} Gaussians", code="count_mismatch"
+            )
         return image[:n]
 
     low, high = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
@@ -288,10 +300,12 @@ def _meta(path: str | os.PathLike[str], files: Files) -> dict[str, Any]:
     try:
         meta = json.loads(files("meta.json", _MAX_META_BYTES))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: its meta.json cannot be read: {error}") from error
+        raise InputError(f"{path}: its meta.json cannot be read: {error}", code="not_json") from error
     version = meta.get("version", 1)
     if version != 2:
-        raise InputError(f"{path}: SOG version {version}; gsmap reads version 2, so export it anew")
+        raise InputError(
+            f"{path}: SOG version {version}; gsmap reads version 2, so export it anew", code="unsupported_version"
+        )
     return meta
 
 
@@ -300,13 +314,15 @@ def _member(path: str | os.PathLike[str], archive: zipfile.ZipFile, name: str, l
     try:
         entry = archive.getinfo(name)
     except KeyError as error:
-        raise InputError(f"{path} lacks {name!r}; is it a whole .sog?") from error
+        raise InputError(f"{path} lacks {name!r}; is it a whole .sog?", code="content_missing") from error
     if entry.file_size > limit:
-        raise InputError(f"{path}: {name} is {entry.file_size:,} bytes, more than the {limit:,} gsmap reads")
+        raise InputError(
+            f"{path}: {name} is {entry.file_size:,} bytes, more than the {limit:,} gsmap reads", code="file_too_large"
+        )
     with archive.open(entry) as file:
         data = file.read(limit + 1)
     if len(data) > limit:
-        raise InputError(f"{path}: {name} is more than the {limit:,} bytes it promises")
+        raise InputError(f"{path}: {name} is more than the {limit:,} bytes it promises", code="file_too_large")
     return data
 
 
@@ -321,14 +337,14 @@ def _image(path: str | os.PathLike[str], files: Files, name: str, most: int) -> 
 def _codebook(path: str | os.PathLike[str], part: dict[str, Any]) -> np.ndarray:
     book = np.array(part["codebook"], np.float32)
     if book.shape != (256,):
-        raise InputError(f"{path}: a codebook of shape {book.shape}, expected 256 values")
+        raise InputError(f"{path}: a codebook of shape {book.shape}, expected 256 values", code="invalid_codebook")
     return book
 
 
 def _bands(path: str | os.PathLike[str], meta: dict[str, Any]) -> int:
     bands = int(meta["shN"]["bands"]) if "shN" in meta else 0
     if not 0 <= bands <= 3:
-        raise InputError(f"{path}: {bands} bands of SH; gsmap reads 0 to 3")
+        raise InputError(f"{path}: {bands} bands of SH; gsmap reads 0 to 3", code="unsupported_sh_degree")
     return bands
 
 
@@ -338,17 +354,23 @@ def _palette_sh(
     """(N, k, 3): 64 palette entries a row of the image, each of k texels."""
     image = _image(path, files, part["files"][0], _MAX_PALETTE * k)
     if image.shape[1] != _PALETTE_COLUMNS * k:
-        raise InputError(f"{path}: an SH palette {image.shape[1]} wide, expected {_PALETTE_COLUMNS * k}")
+        raise InputError(
+            f"{path}: an SH palette {image.shape[1]} wide, expected {_PALETTE_COLUMNS * k}", code="invalid_palette"
+        )
     entries = image.reshape(-1, k, 4)[:, :, :3]
     label = labels[:, 0] | labels[:, 1].astype(np.uint16) << 8
     if label.max() >= min(int(part["count"]), len(entries)):
-        raise InputError(f"{path}: an SH label of {label.max()} beyond the palette's {part['count']} entries")
+        raise InputError(
+            f"{path}: an SH label of {label.max()} beyond the palette's {part['count']} entries", code="invalid_palette"
+        )
     return _codebook(path, part)[entries][label]
 
 
 def _quats(path: str | os.PathLike[str], texels: np.ndarray) -> np.ndarray:
     if (texels[:, 3] < _FIRST_TAG).any():
         row = int((texels[:, 3] < _FIRST_TAG).argmax())
-        raise InputError(f"{path}: the quaternion of Gaussian {row} has the unknown tag {texels[row, 3]}")
+        raise InputError(
+            f"{path}: the quaternion of Gaussian {row} has the unknown tag {texels[row, 3]}", code="not_a_rotation"
+        )
     three = (texels[:, :3] / np.float32(255) * 2 - 1) * np.float32(2**-0.5)
     return from_smallest_three(texels[:, 3] - _FIRST_TAG, three)

@@ -30,7 +30,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     size = Path(path).stat().st_size
     if size == 0 or size % _ROW.itemsize:
         what = "empty" if size == 0 else f"{size} bytes long, not a multiple of {_ROW.itemsize}"
-        raise InputError(f"{path} is not a whole .splat file: it is {what}")
+        raise InputError(f"{path} is not a whole .splat file: it is {what}", code="wrong_file_type")
     rows = np.fromfile(path, _ROW)
     quats = (rows["quat"].astype(np.float32) - 128) / 128
     quats[~quats.any(1), 0] = 1

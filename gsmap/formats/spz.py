@@ -132,9 +132,9 @@ def pack(
         path: of the file that they are for, to say where something is wrong.
     """
     if version not in (3, 4):
-        raise ConfigError(f"cannot write SPZ version {version!r}: choose 3 or 4")
+        raise ConfigError(f"cannot write SPZ version {version!r}: choose 3 or 4", code="unsupported_output")
     if len(sh_bits) != 2 or not all(1 <= bits <= 8 for bits in sh_bits):
-        raise ConfigError(f"sh_bits must be two numbers from 1 to 8, got {sh_bits!r}")
+        raise ConfigError(f"sh_bits must be two numbers from 1 to 8, got {sh_bits!r}", code="out_of_range")
     g = gaussians
     header = _Header(version, len(g), g.sh_degree, _fractional_bits(path, g.means), int(antialiased))
     streams = _encode(header, g, sh_bits)
@@ -171,14 +171,17 @@ def _load(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple[_Hea
     if head == _MAGIC:
         return _load_zstd(path, file, size)
     what = "is empty" if not head else f"begins with {head!r}, not with gzip's mark or NGSP"
-    raise InputError(f"{path} is not an SPZ file: it {what}")
+    raise InputError(f"{path} is not an SPZ file: it {what}", code="wrong_file_type")
 
 
 def _load_gzip(path, file, size) -> tuple[_Header, dict[str, np.ndarray], str]:
     inflater = _Inflater(path, file)
     header = _parse_header(path, inflater.take(16))
     if header.version > 3:
-        raise InputError(f"{path}: SPZ version {header.version} cannot be gzip compressed; the file is damaged")
+        raise InputError(
+            f"{path}: SPZ version {header.version} cannot be gzip compressed; the file is damaged",
+            code="compression_mismatch",
+        )
     check_size(path, header.payload_bytes, size)
     data = np.frombuffer(inflater.take(header.payload_bytes), np.uint8)
     streams, at = {}, 0
@@ -195,46 +198,66 @@ def _load_zstd(path, file, size) -> tuple[_Header, dict[str, np.ndarray], str]:
     head = file.read(32)
     header = _parse_header(path, head)
     if header.version != 4 or len(head) < 32:
-        raise InputError(f"{path}: SPZ version {header.version} must be gzip compressed, or the file is truncated")
+        raise InputError(
+            f"{path}: SPZ version {header.version} must be gzip compressed, or the file is truncated",
+            code="compression_mismatch",
+        )
     num_streams, toc_at = struct.unpack_from("<BI", head, 15)
     strides = {name: stride for name, stride in header.strides.items() if stride}
     if num_streams != len(strides) or not 32 <= toc_at <= min(size, 32 + _MAX_EXTENSION_BYTES):
-        raise InputError(f"{path}: {num_streams} streams at byte {toc_at}, expected {len(strides)}; it is damaged")
+        raise InputError(
+            f"{path}: {num_streams} streams at byte {toc_at}, expected {len(strides)}; it is damaged",
+            code="invalid_streams",
+        )
     extensions = file.read(toc_at - 32) if header.flags & _EXTENSIONS else b""
     file.seek(toc_at)
     toc = file.read(16 * num_streams)
     if len(toc) < 16 * num_streams:
-        raise InputError(f"{path} is truncated within its table of contents")
+        raise InputError(f"{path} is truncated within its table of contents", code="file_truncated")
     sizes = np.frombuffer(toc, "<u8").reshape(-1, 2).tolist()
     if toc_at + len(toc) + sum(s for s, _ in sizes) != size:
-        raise InputError(f"{path}: its streams do not add up to the {size} bytes of the file: truncated or damaged")
+        raise InputError(
+            f"{path}: its streams do not add up to the {size} bytes of the file: truncated or damaged",
+            code="file_truncated",
+        )
     if [u for _, u in sizes] != [header.count * s for s in strides.values()]:
-        raise InputError(f"{path}: its streams do not have the size that {header.count} Gaussians need; it is damaged")
+        raise InputError(
+            f"{path}: its streams do not have the size that {header.count} Gaussians need; it is damaged",
+            code="count_mismatch",
+        )
     check_size(path, header.payload_bytes, size)
     streams = {"sh": np.empty(0, np.uint8)}
     for name, (squeezed, expanded) in zip(strides, sizes, strict=True):
         source, out = file.read(squeezed), np.empty(expanded, np.uint8)
         if _zstd_content_size(source) not in (None, expanded):
-            raise InputError(f"{path}: the {name} are not the size that its table of contents promises; it is damaged")
+            raise InputError(
+                f"{path}: the {name} are not the size that its table of contents promises; it is damaged",
+                code="count_mismatch",
+            )
         try:
             zstd.decompress(source, out)
         except (RuntimeError, ValueError) as error:
-            raise InputError(f"{path}: its {name} cannot be decompressed: {error}") from error
+            raise InputError(
+                f"{path}: its {name} cannot be decompressed: {error}", code="decompression_failed"
+            ) from error
         streams[name] = out
     return header, streams, _axes(path, extensions)
 
 
 def _parse_header(path: str | os.PathLike[str], head: bytes) -> _Header:
     if len(head) < 16 or head[:4] != _MAGIC:
-        raise InputError(f"{path} is not an SPZ file: no NGSP header")
+        raise InputError(f"{path} is not an SPZ file: no NGSP header", code="wrong_file_type")
     header = _Header(*struct.unpack_from("<IIBBB", head, 4))
     if not 1 <= header.version <= 4:
-        raise InputError(f"{path}: SPZ version {header.version} is unknown; gsmap reads 1 to 4")
+        raise InputError(
+            f"{path}: SPZ version {header.version} is unknown; gsmap reads 1 to 4", code="unsupported_version"
+        )
     if header.count == 0:
-        raise InputError(f"{path} holds no Gaussians")
+        raise InputError(f"{path} holds no Gaussians", code="no_gaussians")
     if header.degree >= len(_SH_COEFFICIENTS) or header.fractional_bits > 23:
         raise InputError(
-            f"{path}: SH degree {header.degree} and {header.fractional_bits} fractional bits: it is damaged"
+            f"{path}: SH degree {header.degree} and {header.fractional_bits} fractional bits: it is damaged",
+            code="invalid_fractional_bits",
         )
     return header
 
@@ -247,7 +270,7 @@ def _axes(path: str | os.PathLike[str], extensions: bytes) -> str:
         if kind == _AXES_EXTENSION and length == 4 and at + 12 <= len(extensions):
             value = struct.unpack_from("<I", extensions, at + 8)[0]
             if value > len(_AXES):
-                raise InputError(f"{path}: its axes are of the unknown kind {value}")
+                raise InputError(f"{path}: its axes are of the unknown kind {value}", code="unsupported_axes")
             axes = _AXES[value - 1] if value else SPZ
         at += 8 + length
     return axes
@@ -279,7 +302,9 @@ class _Inflater:
         """Exactly ``size`` bytes; InputError where there are fewer."""
         data = self.rest(size)
         if len(data) < size:
-            raise InputError(f"{self._path} is truncated: {size:,} bytes promised, {len(data):,} found")
+            raise InputError(
+                f"{self._path} is truncated: {size:,} bytes promised, {len(data):,} found", code="file_truncated"
+            )
         return data
 
     def rest(self, limit: int) -> bytes:
@@ -290,7 +315,9 @@ class _Inflater:
             try:
                 parts.append(self._stream.decompress(source, missing))
             except zlib.error as error:
-                raise InputError(f"{self._path} cannot be decompressed: {error}") from error
+                raise InputError(
+                    f"{self._path} cannot be decompressed: {error}", code="decompression_failed"
+                ) from error
             if not source and not parts[-1]:
                 break
             missing -= len(parts[-1])
@@ -309,7 +336,8 @@ def _require_distances(path: str | os.PathLike[str], gaussians: Gaussians) -> No
     if apart < 2 * 2.0**-bits:
         raise InputError(
             f"{path}: positions reach {np.abs(gaussians.means).max():.6g}, where SPZ has steps of {2.0**-bits:g}, but "
-            f"neighbours are {apart:.2g} apart: move the origin closer, or remove what lies far out"
+            f"neighbours are {apart:.2g} apart: move the origin closer, or remove what lies far out",
+            code="precision_loss",
         )
 
 
@@ -317,7 +345,10 @@ def _fractional_bits(path: str | os.PathLike[str], means: np.ndarray) -> int:
     """12 bits (0.24 mm) as everybody writes, more for a small scene, fewer where the range asks for it."""
     extent = float(np.abs(means).max())
     if extent > _MAX_FIXED:
-        raise InputError(f"{path}: positions reach {extent:.3g}, SPZ can hold {_MAX_FIXED}: move the origin closer")
+        raise InputError(
+            f"{path}: positions reach {extent:.3g}, SPZ can hold {_MAX_FIXED}: move the origin closer",
+            code="precision_loss",
+        )
     octaves = int(np.ceil(np.log2(max(extent, 1e-6) * (1 + 1e-6))))
     return max(0, min(23 - octaves, max(_USUAL_BITS, 18 - octaves), 23))
 

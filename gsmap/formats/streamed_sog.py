@@ -91,7 +91,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         raise _not_ours(path, error) from error
     parts = [part for file, runs in sorted(finest.items()) for part in _parts(path, file, runs)]
     if not parts:
-        raise InputError(f"{path} has no Gaussians")
+        raise InputError(f"{path} has no Gaussians", code="no_gaussians")
     return Gaussians.concatenate(parts)
 
 
@@ -120,7 +120,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, max_per_leaf: i
     """
     path = Path(path)
     if max_per_leaf < 1:
-        raise ConfigError(f"max_per_leaf must be at least 1, got {max_per_leaf}")
+        raise ConfigError(f"max_per_leaf must be at least 1, got {max_per_leaf}", code="out_of_range")
     require_writable(path, gaussians)
     write_tree(path, _octree(path, gaussians, *cube_around(gaussians.means), max_per_leaf, "0").node(()))
 
@@ -259,7 +259,9 @@ def _node_json(node: LodNode, files: dict[str, int], counts: dict[int, int]) -> 
 
 def _meta(path: Path) -> dict[str, Any]:
     if path.stat().st_size > _MAX_JSON_BYTES:
-        raise InputError(f"{path} is larger than the {_MAX_JSON_BYTES >> 20} MiB of JSON that gsmap reads")
+        raise InputError(
+            f"{path} is larger than the {_MAX_JSON_BYTES >> 20} MiB of JSON that gsmap reads", code="file_too_large"
+        )
     try:
         meta = json.loads(path.read_bytes())
         version = meta.get("version", 1)  # what splat-transform wrote before 2026 has none
@@ -267,13 +269,16 @@ def _meta(path: Path) -> dict[str, Any]:
             return dict(meta)
     except MALFORMED as error:
         raise _not_ours(path, error) from error
-    raise InputError(f"{path} is not a streamed SOG of version 1, it has version {version} and {sorted(meta)[:9]}")
+    raise InputError(
+        f"{path} is not a streamed SOG of version 1, it has version {version} and {sorted(meta)[:9]}",
+        code="unsupported_version",
+    )
 
 
 def _not_ours(path: Path, error: Exception) -> InputError:
     if isinstance(error, InputError):
         return error
-    return InputError(f"{path} is not a streamed SOG: {type(error).__name__} {error}")
+    return InputError(f"{path} is not a streamed SOG: {type(error).__name__} {error}", code="wrong_file_type")
 
 
 def _leaves(path: Path, meta: Mapping[str, Any]) -> Iterator[dict[int, Run]]:
@@ -285,7 +290,9 @@ def _leaves(path: Path, meta: Mapping[str, Any]) -> Iterator[dict[int, Run]]:
         node, depth = todo.pop()
         seen += 1
         if depth > _MAX_DEPTH or seen > _MAX_NODES:
-            raise InputError(f"{path}: more than {_MAX_NODES} nodes, or nested deeper than {_MAX_DEPTH}")
+            raise InputError(
+                f"{path}: more than {_MAX_NODES} nodes, or nested deeper than {_MAX_DEPTH}", code="nested_too_deeply"
+            )
         if "lods" in node:
             yield {int(level): _run(path, names, told) for level, told in list(node["lods"].items())[:_MAX_LEVELS]}
         todo += [(child, depth + 1) for child in reversed(node.get("children") or [])]
@@ -294,7 +301,10 @@ def _leaves(path: Path, meta: Mapping[str, Any]) -> Iterator[dict[int, Run]]:
 def _run(path: Path, names: list[str], told: Mapping[str, Any]) -> Run:
     file, offset, count = int(told["file"]), int(told.get("offset", 0)), int(told.get("count", 0))
     if not 0 <= file < len(names) or offset < 0 or count < 0:
-        raise InputError(f"{path}: file {file} of {len(names)}, from {offset}, {count} Gaussians: no such run")
+        raise InputError(
+            f"{path}: file {file} of {len(names)}, from {offset}, {count} Gaussians: no such run",
+            code="rows_outside_file",
+        )
     extras = {name: value for name, value in told.items() if name not in ("file", "offset", "count")}
     return Run(str(names[file]), offset, count, extras)
 
@@ -307,7 +317,8 @@ def _parts(path: Path, file: Path, runs: list[Run]) -> Iterator[Gaussians]:
         if run.offset < end or run.offset + run.count > len(gaussians):
             raise InputError(
                 f"{path}: Gaussians {run.offset} to {run.offset + run.count} of {run.uri}, which has {len(gaussians)}, "
-                "are not there or another leaf's"
+                "are not there or another leaf's",
+                code="rows_outside_file",
             )
         end = run.offset + run.count
         yield gaussians[run.offset : end]

@@ -70,16 +70,20 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """
     path = Path(path)
     if path.stat().st_size > _MAX_JSON_BYTES:
-        raise InputError(f"{path} is larger than the {_MAX_JSON_BYTES >> 20} MiB of JSON that gsmap reads")
+        raise InputError(
+            f"{path} is larger than the {_MAX_JSON_BYTES >> 20} MiB of JSON that gsmap reads", code="file_too_large"
+        )
     try:
         tileset = json.loads(path.read_bytes())
         contents = list(_finest(path, tileset["root"]))
     except MALFORMED as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path} is not a 3D Tiles tileset: {type(error).__name__} {error}") from error
+        raise InputError(
+            f"{path} is not a 3D Tiles tileset: {type(error).__name__} {error}", code="wrong_file_type"
+        ) from error
     if not contents:
-        raise InputError(f"{path} has no tiles with content")
+        raise InputError(f"{path} has no tiles with content", code="file_damaged")
     return Gaussians.concatenate(
         [glb.read_world(file_inside(path, uri, ".glb"), matrix @ _Y_UP_TO_Z_UP) for uri, matrix in contents]
     )
@@ -105,7 +109,7 @@ def write(
     """
     path = Path(path)
     if max_per_tile < 1:
-        raise ConfigError(f"max_per_tile must be at least 1, got {max_per_tile}")
+        raise ConfigError(f"max_per_tile must be at least 1, got {max_per_tile}", code="out_of_range")
     require_writable(path, gaussians)
     local = replace(gaussians, origin=np.zeros(3))
     root, _ = _octree(path, local, *cube_around(local.means), max_per_tile, "0", compressed)
@@ -238,9 +242,11 @@ def _finest(path: Path, root: dict[str, Any]) -> Iterator[tuple[str, np.ndarray]
         tile, matrix, refine, depth = todo.pop()
         seen += 1
         if depth > _MAX_DEPTH or seen > _MAX_TILES:
-            raise InputError(f"{path}: more than {_MAX_TILES} tiles, or nested deeper than {_MAX_DEPTH}")
+            raise InputError(
+                f"{path}: more than {_MAX_TILES} tiles, or nested deeper than {_MAX_DEPTH}", code="nested_too_deeply"
+            )
         if "implicitTiling" in tile:
-            raise InputError(f"{path} uses implicit tiling, which gsmap does not read")
+            raise InputError(f"{path} uses implicit tiling, which gsmap does not read", code="unsupported_feature")
         if tile is not root and "transform" in tile:
             matrix = matrix @ np.array(tile["transform"], np.float64).reshape(4, 4).T
         refine = str(tile.get("refine", refine)).upper()
@@ -255,5 +261,7 @@ def _file_of(path: Path, content: dict[str, Any]) -> str:
     """The uri of a tile's content (``url`` before 3D Tiles 1.0) without what is for a server: query and fragment."""
     uri = content.get("uri", content.get("url"))
     if not isinstance(uri, str) or not uri:
-        raise InputError(f"{path} is not a 3D Tiles tileset: the content of a tile names no file (uri)")
+        raise InputError(
+            f"{path} is not a 3D Tiles tileset: the content of a tile names no file (uri)", code="wrong_file_type"
+        )
     return uri.split("#", 1)[0].split("?", 1)[0]

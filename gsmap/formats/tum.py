@@ -25,7 +25,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> list[tuple[float, Sim3]]:
     """
     path = Path(path)
     if not path.is_file():
-        raise NotFoundError(f"no trajectory at {path}")
+        raise NotFoundError(f"no trajectory at {path}", code="file_not_found")
     out = []
     with path.open(encoding="ascii", errors="replace") as lines:
         for number, line in enumerate(lines, 1):
@@ -37,10 +37,15 @@ def read_trajectory(path: str | os.PathLike[str]) -> list[tuple[float, Sim3]]:
             except ValueError:
                 values = []
             if len(values) != 8 or not all(math.isfinite(v) for v in values):
-                raise InputError(f"{path} line {number}: a TUM pose is 8 finite numbers: time, position, quaternion")
+                raise InputError(
+                    f"{path} line {number}: a TUM pose is 8 finite numbers: time, position, quaternion",
+                    code="invalid_line",
+                )
             x, y, z, w = values[4:]
             if not 0.5 < x * x + y * y + z * z + w * w < 2:
-                raise InputError(f"{path} line {number}: the quaternion {values[4:]} is not a rotation")
+                raise InputError(
+                    f"{path} line {number}: the quaternion {values[4:]} is not a rotation", code="not_a_rotation"
+                )
             out.append((values[0], Sim3(quats_to_matrices(np.array([w, x, y, z])), np.array(values[1:4]))))
     return out
 
@@ -60,9 +65,9 @@ def write_trajectory(
     """
     times = range(len(poses)) if timestamps_s is None else timestamps_s
     if len(times) != len(poses):
-        raise InputError(f"{len(poses)} poses but {len(times)} timestamps")
+        raise InputError(f"{len(poses)} poses but {len(times)} timestamps", code="shape_mismatch")
     if names is not None and len(names) != len(poses):
-        raise InputError(f"{len(poses)} poses but {len(names)} names")
+        raise InputError(f"{len(poses)} poses but {len(names)} names", code="shape_mismatch")
     lines = ["# timestamp tx ty tz qx qy qz qw", *(f"# {escaped(remark)}" for remark in remarks)]
     for i, (time_s, pose) in enumerate(zip(times, poses, strict=True)):
         if names is not None:

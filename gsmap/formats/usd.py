@@ -48,15 +48,17 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     _require_usd(path)
     size = path.stat().st_size
     if not 0 < size <= _MAX_FILE_BYTES:
-        raise InputError(f"{path} has {size:,} bytes; gsmap reads USD of 1 to {_MAX_FILE_BYTES:,}")
+        raise InputError(
+            f"{path} has {size:,} bytes; gsmap reads USD of 1 to {_MAX_FILE_BYTES:,}", code="file_too_large"
+        )
     mib = size / _MIB
     limits = Params(max_memory_mb=int(_FREE_MIB + _RATIO * mib), max_seconds=_TIME_S + mib / _MIB_A_SECOND)
     told = asked(path, "usd", limits)
     if "refused" in told:
-        raise InputError(f"{path}: {told['refused']}")
+        raise InputError(f"{path}: {told['refused']}", code="unsupported_feature")
     up = str(told["up"])
     if up not in _UP:
-        raise InputError(f"{path}: its up axis is {up!r}; gsmap reads Y and Z")
+        raise InputError(f"{path}: its up axis is {up!r}; gsmap reads Y and Z", code="unsupported_axes")
     parts = [_splat(path, told, i) for i in range(int(told["count"]))]
     if not parts:
         raise NotGaussiansError(f"{path} holds no ParticleField3DGaussianSplat: a mesh, or splats of an older schema?")
@@ -129,10 +131,10 @@ def _splat(path: Path, told: dict[str, np.ndarray], i: int) -> Gaussians:
 
     means = array("positions")
     if means is None or not len(means):
-        raise InputError(f"{path}: a ParticleField3DGaussianSplat without positions")
+        raise InputError(f"{path}: a ParticleField3DGaussianSplat without positions", code="missing_attribute")
     n, degree = len(means), int(told[f"{i}.degree"])
     if not 0 <= degree <= 3:
-        raise InputError(f"{path}: SH degree {degree}; gsmap reads 0 to 3")
+        raise InputError(f"{path}: SH degree {degree}; gsmap reads 0 to 3", code="unsupported_sh_degree")
     k = (degree + 1) ** 2
 
     def of_each(name: str, width: int, default: float | tuple[float, ...]) -> np.ndarray:
@@ -160,7 +162,10 @@ def _similarity(path: Path, matrix: np.ndarray) -> Sim3:
     det = float(np.linalg.det(linear)) if np.isfinite(matrix).all() else 0.0
     scale = np.cbrt(det)
     if not det > 0 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > 1e-4:
-        raise InputError(f"{path}: a splat's transform mirrors it or scales it unevenly, which gsmap does not read")
+        raise InputError(
+            f"{path}: a splat's transform mirrors it or scales it unevenly, which gsmap does not read",
+            code="unsupported_transform",
+        )
     return Sim3(linear / scale, matrix[:3, 3], float(scale))
 
 

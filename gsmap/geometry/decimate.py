@@ -37,7 +37,7 @@ def decimate(gaussians: Gaussians, max_count: int, pixels: np.ndarray | None = N
         ConfigError: less than one is asked for.
     """
     if max_count < 1:
-        raise ConfigError(f"at least one Gaussian must be left, {max_count} asked for")
+        raise ConfigError(f"at least one Gaussian must be left, {max_count} asked for", code="out_of_range")
     if len(gaussians) <= max_count:
         return gaussians, np.arange(len(gaussians))
     base = np.ascontiguousarray(gaussians.sh[:, 0])

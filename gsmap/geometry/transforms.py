@@ -89,7 +89,7 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Real spherical harmonics (N, (degree + 1)^2) float64 at unit directions (N, 3), in the order and with the signs
     of 3DGS trainers (degree 1 is ``-y, z, -x``)."""
     if not 0 <= degree <= _MAX_SH_DEGREE:
-        raise InputError(f"SH degree must be 0 to {_MAX_SH_DEGREE}, got {degree}")
+        raise InputError(f"SH degree must be 0 to {_MAX_SH_DEGREE}, got {degree}", code="unsupported_sh_degree")
     x, y, z = np.asarray(directions, dtype=np.float64).T
     xx, yy, zz = x * x, y * y, z * z
     basis = [

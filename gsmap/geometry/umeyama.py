@@ -28,7 +28,8 @@ def umeyama(
     source = np.asarray(source, dtype=np.float64)
     if target.shape != source.shape or target.ndim != 2 or target.shape[1] != 3 or len(target) < 3:
         raise InputError(
-            f"umeyama needs two (N, 3) sets of corresponding points, N >= 3; got {target.shape}, {source.shape}"
+            f"umeyama needs two (N, 3) sets of corresponding points, N >= 3; got {target.shape}, {source.shape}",
+            code="degenerate_points",
         )
     w = np.full(len(target), 1.0 / len(target)) if weights is None else np.asarray(weights, float) / np.sum(weights)
     mean_t, mean_s = w @ target, w @ source
@@ -40,8 +41,8 @@ def umeyama(
     if with_scale:
         variance = float(w @ (s**2).sum(1))
         if variance <= 0:
-            raise InputError("umeyama cannot find a scale: all source points coincide")
+            raise InputError("umeyama cannot find a scale: all source points coincide", code="degenerate_points")
         scale = float((singular * sign).sum() / variance)
         if scale <= 0:
-            raise InputError("umeyama found no positive scale: the points do not correspond")
+            raise InputError("umeyama found no positive scale: the points do not correspond", code="degenerate_points")
     return Sim3(rotation, mean_t - scale * rotation @ mean_s, scale)

@@ -26,7 +26,7 @@ def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
         InputError: points so far out that their cell cannot be counted.
     """
     if not voxel_size > 0:
-        raise ConfigError(f"voxel size must be positive, got {voxel_size}")
+        raise ConfigError(f"voxel size must be positive, got {voxel_size}", code="out_of_range")
     points = np.asarray(points, dtype=np.float64)
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
@@ -35,7 +35,10 @@ def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
     cells -= low
     extent = high - low + 1
     if not np.isfinite(extent).all() or np.prod(extent) >= 2**63:
-        raise InputError(f"points span {extent.max():.3g} voxels of {voxel_size}: remove outliers or use larger voxels")
+        raise InputError(
+            f"points span {extent.max():.3g} voxels of {voxel_size}: remove outliers or use larger voxels",
+            code="extent_too_large",
+        )
     return cell_labels(cells)[0]
 
 
@@ -95,7 +98,7 @@ def merge_groups(gaussians: Gaussians, labels: np.ndarray) -> tuple[Gaussians, n
     """
     labels = np.ascontiguousarray(labels, dtype=np.int64)
     if len(labels) != len(gaussians):
-        raise InputError(f"{len(labels)} labels for {len(gaussians)} Gaussians")
+        raise InputError(f"{len(labels)} labels for {len(gaussians)} Gaussians", code="shape_mismatch")
     if len(labels) == 0:
         return gaussians, np.zeros(0, dtype=np.int64)
     sh = gaussians.sh.reshape(len(gaussians), -1)

@@ -81,7 +81,10 @@ def read_captures(
     """
     found = find_captures([paths] if isinstance(paths, (str, os.PathLike)) else paths)
     if len(found) > 1 and (cameras is not None or name is not None):
-        raise ConfigError(f"cameras and name are for one capture, but {len(found)} were found: ingest them one by one")
+        raise ConfigError(
+            f"cameras and name are for one capture, but {len(found)} were found: ingest them one by one",
+            code="many_captures",
+        )
     out = []
     for i, one in enumerate(found):
         if progress:
@@ -183,4 +186,4 @@ def check_scale(policy: str) -> None:
         ConfigError: not ``auto``, ``known`` or ``unknown``.
     """
     if policy not in SCALE_POLICIES:
-        raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {policy!r}")
+        raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {policy!r}", code="invalid_choice")

@@ -76,7 +76,9 @@ def given_date(when: str | datetime | None) -> CaptureDate:
         return CaptureDate()
     known = _zoned(date).isoformat()
     if _zoned(date) > datetime.now(UTC) + timedelta(days=1):
-        raise ConfigError(f"captured-at {known} lies in the future: correct it, or this computer's clock")
+        raise ConfigError(
+            f"captured-at {known} lies in the future: correct it, or this computer's clock", code="date_in_future"
+        )
     return CaptureDate(known, "", "" if date.tzinfo else f"dated {known} as told: no zone was given, taken as UTC")
 
 
@@ -167,10 +169,14 @@ def _from_sidecar(found: Found, latest: datetime) -> CaptureDate | None:
             except (TypeError, ValueError) as error:
                 raise InputError(
                     f"{path}: captured_at must be ISO 8601 text such as 2026-05-31T14:00:00+02:00, got {said!r}: "
-                    "correct it, or give --captured-at"
+                    "correct it, or give --captured-at",
+                    code="invalid_date",
                 ) from error
             if _zoned(date) > latest:
-                raise InputError(f"{path}: captured_at {said} lies in the future: correct it, or give --captured-at")
+                raise InputError(
+                    f"{path}: captured_at {said} lies in the future: correct it, or give --captured-at",
+                    code="date_in_future",
+                )
             return _dated(date, shown(path.name), "" if date.tzinfo else "no zone was given, taken as UTC")
     return None
 
@@ -182,13 +188,13 @@ def _captured_at(path: Path) -> Any:
             return None
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+        raise InputError(f"cannot read {path}: {error.strerror or error}", code="file_unreadable") from error
     if b"captured_at" not in data:
         return None
     try:
         content = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON: {error}: correct it, or give --captured-at") from error
+        raise InputError(f"{path} is not JSON: {error}: correct it, or give --captured-at", code="not_json") from error
     return content.get("captured_at") if isinstance(content, dict) else None
 
 
@@ -337,7 +343,9 @@ def _parsed(when: str | datetime | None) -> datetime | None:
     try:
         return datetime.fromisoformat(when) if isinstance(when, str) else when
     except ValueError as error:
-        raise ConfigError(f"captured-at must be ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}") from error
+        raise ConfigError(
+            f"captured-at must be ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}", code="invalid_date"
+        ) from error
 
 
 def _dated(date: datetime, source: str, note: str) -> CaptureDate:

@@ -99,17 +99,19 @@ def search_captures(paths: Iterable[str | os.PathLike[str]]) -> Search:
     num_splats_in = cache(lambda folder: len(_splats(folder)))
     for path in given:
         if not path.exists():
-            raise NotFoundError(f"no such file or folder: {path}")
+            raise NotFoundError(f"no such file or folder: {path}", code="file_not_found")
         if path.is_dir():
             _search_folder(path, search)
         elif not path.is_file():
-            raise InputError(f"{path} is a pipe or a device, not a file: save what comes from it first")
+            raise InputError(
+                f"{path} is a pipe or a device, not a file: save what comes from it first", code="not_a_plain_file"
+            )
         elif formats.suffix_of(path) is None:
             search.skipped.append(LeftOut(path, _unknown(path)))
         else:
             search.captures.append(_file(path, alone=num_splats_in(path.parent) <= 1))
     if given and not search.captures and not search.unreadable:
-        raise InputError(_why_nothing(given, search.skipped))
+        raise InputError(_why_nothing(given, search.skipped), code="no_captures")
     return search
 
 
@@ -229,7 +231,7 @@ def _last(paths: Iterable[Path]) -> Path | None:
 def _file(path: Path, *, alone: bool) -> Found:
     suffix = formats.suffix_of(path)
     if suffix is None:
-        raise InputError(_unknown(path))
+        raise InputError(_unknown(path), code="unsupported_format")
     stem = path.name[: -len(suffix)]
     names = _names(path, stem)
     name = stem if _tells_nothing(names[-1][1]) else names[-1][1]

@@ -40,7 +40,7 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
     """As `validate`, of the Gaussians alone; they are read once."""
     n = gaussians.num_gaussians
     if not n:
-        raise InputError(f"{where} has no Gaussians")
+        raise InputError(f"{where} has no Gaussians", code="no_gaussians")
     bad = {f"NaN or infinity in {name}": _Rows() for name in FIELDS} | {"a rotation quaternion of zero": _Rows()}
     widest = np.empty(n, np.float32)
     sampled = []
@@ -78,19 +78,25 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
 def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) -> tuple[str, ...]:
     """As `validate`, of the cameras of Gaussians that are sound."""
     if not len(cameras):
-        raise InputError(f"{where} has an empty list of cameras: leave them out, and gsmap makes some")
+        raise InputError(
+            f"{where} has an empty list of cameras: leave them out, and gsmap makes some", code="no_cameras"
+        )
     large = cameras.sizes_px.max(1) > MAX_SIDE_PX
     if large.any():
         i = int(np.argmax(large))
         width, height = cameras.sizes_px[i]
         raise InputError(
             f"{where}: camera {cameras.names[i]!r} has {width} x {height} pixels, more than {MAX_SIDE_PX} on a side: "
-            "correct its size"
+            "correct its size",
+            code="invalid_camera",
         )
     n = gaussians.num_gaussians
     seen = sees(cameras, gathered(gaussians, "means", np.arange(0, n, _step(n))))
     if not seen.any() and not any(sees(cameras, means).any() for means in gaussians.columns("means")):
-        raise InputError(f"{where}: none of its {len(cameras)} cameras sees a Gaussian: they belong to another scene")
+        raise InputError(
+            f"{where}: none of its {len(cameras)} cameras sees a Gaussian: they belong to another scene",
+            code="cameras_see_nothing",
+        )
     blind = int((~seen).sum())
     return (f"{blind} of {len(cameras)} cameras see no Gaussian",) if blind else ()
 
@@ -126,4 +132,6 @@ class _Rows:
     def refuse(self, where: str, what: str) -> None:
         if self.count:
             more = f" ({self.count} such rows)" if self.count > 1 else ""
-            raise InputError(f"{where} holds {what} in row {self.first}{more}: clean or export it again")
+            raise InputError(
+                f"{where} holds {what} in row {self.first}{more}: clean or export it again", code="invalid_gaussians"
+            )

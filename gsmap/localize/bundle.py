@@ -69,13 +69,13 @@ class Params:
 
     def __post_init__(self) -> None:
         if not self.loose or min(self.loose) <= 0:
-            raise ConfigError(f"loose is one factor or more, each above 0, got {self.loose}")
+            raise ConfigError(f"loose is one factor or more, each above 0, got {self.loose}", code="out_of_range")
         for name in ("max_error_px", "max_off", "feature_px", "doubt", "lifted_m", "alike_px"):
             if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}", code="out_of_range")
         for name in ("min_sine", "alike", "weight", "usual", "max_points"):
             if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}", code="out_of_range")
 
 
 @dataclass(frozen=True, eq=False)

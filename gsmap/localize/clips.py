@@ -47,17 +47,17 @@ def read_clip(
 
     path, lens, params = Path(path), lens or Lens(), params or Params()
     if not path.is_file():
-        raise NotFoundError(f"no clip at {path}")
+        raise NotFoundError(f"no clip at {path}", code="file_not_found")
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
-                raise InputError(f"{path} holds no pictures: give a clip")
+                raise InputError(f"{path} holds no pictures: give a clip", code="clip_unreadable")
             _require_size(path, container.streams.video[0])
             chosen = _sharpest(container, params)
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        raise InputError(f"{path} is not a clip that can be read ({error})") from error
+        raise InputError(f"{path} is not a clip that can be read ({error})", code="clip_unreadable") from error
     if not chosen:
-        raise InputError(f"{path} has no frame that can be read")
+        raise InputError(f"{path} has no frame that can be read", code="clip_unreadable")
     return [(at, taken_with(rgb, lens, None, f"{path.name}#{at:.2f}")) for at, rgb in chosen]
 
 
@@ -66,7 +66,8 @@ def _require_size(path: Path, stream) -> None:  # type: ignore[no-untyped-def]
     codec = stream.codec_context
     if codec.width * codec.height > _MAX_FRAME_PX:
         raise InputError(
-            f"{path} has frames of {codec.width} x {codec.height} pixels, more than {_MAX_FRAME_PX:,}: reduce the clip"
+            f"{path} has frames of {codec.width} x {codec.height} pixels, more than {_MAX_FRAME_PX:,}: reduce the clip",
+            code="picture_too_large",
         )
     codec.options = {"max_pixels": str(_MAX_FRAME_PX)}
 

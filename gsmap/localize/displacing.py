@@ -44,7 +44,8 @@ class Params:
             raise ConfigError(
                 "of displacing, share lies in [0, 1], most_px and around_px are 0 or more, longest_side_px is 8 or "
                 f"more; got share={self.share}, most_px={self.most_px}, around_px={self.around_px}, "
-                f"longest_side_px={self.longest_side_px}"
+                f"longest_side_px={self.longest_side_px}",
+                code="out_of_range",
             )
 
 

@@ -93,4 +93,4 @@ class Params:
     def __post_init__(self) -> None:
         family("extractor").get(self.extractor)
         if not self.max_enlarged >= 1:
-            raise ConfigError(f"max_enlarged is 1 or more, got {self.max_enlarged}")
+            raise ConfigError(f"max_enlarged is 1 or more, got {self.max_enlarged}", code="out_of_range")

@@ -35,7 +35,10 @@ class Lens:
     def __post_init__(self) -> None:
         given = (*(self.intrinsics_px or ()), *((self.focal_px,) if self.focal_px is not None else ()))
         if not np.isfinite(given).all() or any(value <= 0 for value in given):
-            raise ConfigError("intrinsics are fx,fy,cx,cy in pixels, and a focal length is in pixels: all above 0")
+            raise ConfigError(
+                "intrinsics are fx,fy,cx,cy in pixels, and a focal length is in pixels: all above 0",
+                code="invalid_intrinsics",
+            )
 
 
 def read_photo(
@@ -54,7 +57,7 @@ def read_photo(
 
     path, lens = Path(path), lens or Lens()
     if not path.is_file():
-        raise NotFoundError(f"no photo at {path}")
+        raise NotFoundError(f"no photo at {path}", code="file_not_found")
 
     with open_picture(path) as picture:
         focal_35mm = picture.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
@@ -76,20 +79,24 @@ def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_
     """
     folder, name = Path(masks), Path(path)
     if not folder.is_dir():
-        raise NotFoundError(f"no folder of masks at {folder}")
+        raise NotFoundError(f"no folder of masks at {folder}", code="folder_not_found")
     offered = [folder / f"{name.name}.png", folder / f"{name.stem}.png"]
     found = next((one for one in offered if one.is_file()), None)
     if found is None:
-        raise NotFoundError(f"{name.name} has no mask in {folder}: call it {offered[0].name}, white where all counts")
+        raise NotFoundError(
+            f"{name.name} has no mask in {folder}: call it {offered[0].name}, white where all counts",
+            code="mask_missing",
+        )
     with open_picture(found) as picture:
         known = np.asarray(picture.convert("L")) > 0
     if known.shape[::-1] != size_px:
         raise InputError(
             f"{found} has {known.shape[1]} x {known.shape[0]} pixels, its photo {size_px[0]} x {size_px[1]}: "
-            "masks are of the upright photo's size"
+            "masks are of the upright photo's size",
+            code="size_mismatch",
         )
     if not known.any():
-        raise InputError(f"{found} is black everywhere: it leaves nothing of its photo")
+        raise InputError(f"{found} is black everywhere: it leaves nothing of its photo", code="black_mask")
     return known
 
 
@@ -104,7 +111,10 @@ def taken_with(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str
     if lens.intrinsics_px is not None:
         cx, cy = lens.intrinsics_px[2:]
         if not (cx < width and cy < height):
-            raise InputError(f"{name} has {width} x {height} pixels: its principal point cannot lie at {cx:g}, {cy:g}")
+            raise InputError(
+                f"{name} has {width} x {height} pixels: its principal point cannot lie at {cx:g}, {cy:g}",
+                code="invalid_intrinsics",
+            )
         return Photo(rgb, np.array(lens.intrinsics_px), 0.0, name)
     if lens.focal_px is not None:
         focal, sigma = lens.focal_px, 0.0

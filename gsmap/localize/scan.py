@@ -50,7 +50,7 @@ class Params:
         for one in fields(self):
             value = getattr(self, one.name)
             if one.name != "reading" and not value > 0:
-                raise ConfigError(f"scan.{one.name} must be positive, got {value}")
+                raise ConfigError(f"scan.{one.name} must be positive, got {value}", code="out_of_range")
 
 
 def as_gaussians(scan: Scan, cell: float, max_points: int = MAX_POINTS) -> Gaussians:

@@ -38,7 +38,8 @@ class Params:
         if not (self.prior > 0 and self.alike >= 0 and self.prior + self.alike < 1):
             raise ConfigError(
                 "prior and alike are shares of the poses that are looked into: prior above 0, alike 0 or more, "
-                f"together less than 1; got prior={self.prior}, alike={self.alike}"
+                f"together less than 1; got prior={self.prior}, alike={self.alike}",
+                code="out_of_range",
             )
 
 

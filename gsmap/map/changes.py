@@ -43,7 +43,9 @@ def named(text: str) -> int:
     """
     number = number_of(text)
     if number is None:
-        raise NotFoundError(f"no change is called {text!r}: they are called c1, c2, ... (gsmap changes MAP)")
+        raise NotFoundError(
+            f"no change is called {text!r}: they are called c1, c2, ... (gsmap changes MAP)", code="change_not_found"
+        )
     return number
 
 
@@ -55,12 +57,15 @@ def within(asked: Wanted, since: str | None, between: Sequence[str] | None, as_o
         ConfigError: a date that is none, two ways of saying since when, or an end before its beginning.
     """
     if since is not None and between is not None:
-        raise ConfigError("say since when, or between which dates: not both")
+        raise ConfigError("say since when, or between which dates: not both", code="conflicting_options")
     first = between[0] if between is not None else since
     start = None if first is None else parsed(first)
     ends = [last_of(text) for text in (between[1] if between is not None else None, as_of) if text is not None]
     if start is not None and any(end < start for end in ends):
-        raise ConfigError(f"no date lies after {first} and before a date that is earlier: give the earlier one first")
+        raise ConfigError(
+            f"no date lies after {first} and before a date that is earlier: give the earlier one first",
+            code="date_out_of_range",
+        )
 
     def holds(when: datetime) -> bool:
         return (start is None or when > start) and all(when <= end for end in ends)
@@ -122,7 +127,9 @@ def change_arrays(store: Store, number: int) -> Change:
     comparison, change = _find(store, number)
     graph = store.revisions.get()
     if graph is None or comparison.newer not in graph.poses:
-        raise NotFoundError(f"c{number} has no place now: its newer capture has none (gsmap update)")
+        raise NotFoundError(
+            f"c{number} has no place now: its newer capture has none (gsmap update)", code="change_unplaced"
+        )
     S = graph.poses[comparison.newer].S_map_scene @ comparison.S_frame_newer.inverse()
     found = store.changes.load(comparison.number).changes[change.place]
     moved = found.S_after_before

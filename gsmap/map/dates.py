@@ -21,7 +21,9 @@ def parsed(text: str) -> datetime:
     try:
         found = datetime.fromisoformat(text)
     except ValueError as error:
-        raise ConfigError(f"{text!r} is not a date: write it as 2024-05-31 or 2024-05-31T12:00:00+02:00") from error
+        raise ConfigError(
+            f"{text!r} is not a date: write it as 2024-05-31 or 2024-05-31T12:00:00+02:00", code="invalid_date"
+        ) from error
     return found if found.tzinfo else found.replace(tzinfo=UTC)
 
 

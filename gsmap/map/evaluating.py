@@ -52,7 +52,9 @@ def poses(
     scenes = store.scenes.list()
     S_scene_world = {s.id: found for s in scenes if (found := _read_truth(Path(truth), s.name)) is not None}
     if not S_scene_world:
-        raise NotFoundError(f"no truth for any scene in {truth}: it needs NAME.json with T_scene_world for each scene")
+        raise NotFoundError(
+            f"no truth for any scene in {truth}: it needs NAME.json with T_scene_world for each scene", code="no_truth"
+        )
 
     def judged(scene: Scene) -> JudgedScene:
         if scene.id not in S_scene_world:
@@ -73,14 +75,14 @@ def _solid(store: Store, S_scene_world: Mapping[str, Sim3], params: Params, scen
 
 def _read_truth(folder: Path, name: str) -> Sim3 | None:
     if not folder.is_dir():
-        raise NotFoundError(f"no folder of truth at {folder}")
+        raise NotFoundError(f"no folder of truth at {folder}", code="folder_not_found")
     path = folder / f"{name}.json"
     if not path.exists():
         return None
     try:
         return Sim3.from_matrix(np.array(json.loads(path.read_text())["T_scene_world"], dtype=float))
     except (OSError, *MALFORMED) as error:
-        raise InputError(f"{path} holds no T_scene_world, a 4x4 similarity: {error}") from error
+        raise InputError(f"{path} holds no T_scene_world, a 4x4 similarity: {error}", code="invalid_truth") from error
 
 
 def images(
@@ -149,7 +151,7 @@ def images(
             )
         )
     if not rows:
-        raise NotFoundError(f"no image in {folder} is named like a camera of a scene")
+        raise NotFoundError(f"no image in {folder} is named like a camera of a scene", code="image_not_found")
     progress(1.0, "")
     return tuple(rows)
 
@@ -191,13 +193,18 @@ class _Export:
 
     def __init__(self, store: Store, folder: Path) -> None:
         if not (folder / manifest.FILE_NAME).is_file():
-            raise NotFoundError(f"no {manifest.FILE_NAME} in {folder}: give a folder that gsmap export wrote")
+            raise NotFoundError(
+                f"no {manifest.FILE_NAME} in {folder}: give a folder that gsmap export wrote", code="not_an_export"
+            )
         found = Manifest.load(folder, store.id)
         self._folder = folder
         self._tiles: dict[str, list[Tile]] = {}
         for tile in found.tiles.values():
             if not found.has_file(folder, tile):
-                raise InputError(f"{folder / tile.path} is missing or cut short: run gsmap export to {folder} again")
+                raise InputError(
+                    f"{folder / tile.path} is missing or cut short: run gsmap export to {folder} again",
+                    code="export_damaged",
+                )
             for scene in tile.poses:
                 self._tiles.setdefault(scene, []).append(tile)
         asked = [export.settings for export in store.exports.list() if export.target == str(folder.resolve())]

@@ -48,13 +48,16 @@ class Request:
     def __post_init__(self) -> None:
         given = [value for value in (self.text, self.picture, self.like, self.at) if value is not None]
         if len(given) != 1:
-            raise ConfigError("say one thing to look for: words, --picture FILE, --like SCENE:NODE or --at X,Y,Z")
+            raise ConfigError(
+                "say one thing to look for: words, --picture FILE, --like SCENE:NODE or --at X,Y,Z",
+                code="nothing_requested",
+            )
         if self.text is not None and not self.text.strip():
-            raise ConfigError("the words to look for are empty")
+            raise ConfigError("the words to look for are empty", code="nothing_requested")
         if self.at is not None and (len(self.at) != 3 or not np.isfinite(self.at).all()):
-            raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {list(self.at)}")
+            raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {list(self.at)}", code="invalid_point")
         if self.top < 1:
-            raise ConfigError(f"at least one hit is shown, got {self.top}")
+            raise ConfigError(f"at least one hit is shown, got {self.top}", code="out_of_range")
 
     @property
     def words(self) -> str:
@@ -212,7 +215,7 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
     """
     poses = store.revisions.get()
     if poses is None:
-        raise NotFoundError("the map has no poses yet: run gsmap update first")
+        raise NotFoundError("the map has no poses yet: run gsmap update first", code="no_poses")
     scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in poses.poses}
     keys = graph_keys(store, list(scenes.values()), settings)
     now = next(iter(keys.values())).recipe if keys else ""
@@ -227,7 +230,8 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
         raise NotFoundError(
             "no placed capture is described by the present recipe yet: run gsmap update first"
             if made
-            else "no placed capture is described: run gsmap update first"
+            else "no placed capture is described: run gsmap update first",
+            code="no_placed_scene",
         )
     recipe = now if present else max(made, key=lambda r: (len(made[r]), r == now, list(made).index(r)))
     notes = []
@@ -259,9 +263,14 @@ def _require_same_meaning(index: _Index, descriptor: str) -> None:
     """Refuse graphs whose embeddings another embedder made than what is asked for."""
     layers = [graph.layers["objects"] for graph in index.graphs.values() if "objects" in graph.layers]
     if not layers:
-        raise NotFoundError("the map's graphs hold no embeddings, since describe.objects is off: show a thing instead")
+        raise NotFoundError(
+            "the map's graphs hold no embeddings, since describe.objects is off: show a thing instead",
+            code="no_embeddings",
+        )
     if any(layer.descriptor_id != descriptor for layer in layers):
-        raise NotFoundError("the map's graphs were made by another embedder: run gsmap update first")
+        raise NotFoundError(
+            "the map's graphs were made by another embedder: run gsmap update first", code="embedding_mismatch"
+        )
 
 
 # --- what is asked for ------------------------------------------------------------------------------------------------
@@ -275,7 +284,8 @@ def _shown(store: Store, request: Request, settings: Settings) -> _Vector | None
             features = embedded_text(request.text, params, specs)
         except ConfigError as error:
             raise ConfigError(
-                f"no object is called {request.text!r} (gsmap edit MAP o12 --name), and {error}"
+                f"no object is called {request.text!r} (gsmap edit MAP o12 --name), and {error}",
+                code="object_not_found",
             ) from error
         return _Vector(features, np.ones(len(features), bool))
     return None if request.picture is None else _Vector(*embedded_picture(request.picture, params, specs))
@@ -289,7 +299,8 @@ def _asked(store: Store, request: Request, index: _Index) -> Sequence[Sighting] 
         if thing is None:
             raise NotFoundError(
                 f"nothing stands within {_NEAR_M:g} m of {','.join(f'{v:g}' for v in request.at)}: gsmap graph "
-                f"{store.home} lists where things are"
+                f"{store.home} lists where things are",
+                code="nothing_near",
             )
         return thing.sightings
     assert request.like is not None
@@ -299,16 +310,22 @@ def _asked(store: Store, request: Request, index: _Index) -> Sequence[Sighting] 
         return named.sightings
     ref, _, number = request.like.rpartition(":")
     if not ref or not number.isdecimal():
-        raise NotFoundError(f"{request.like!r} is neither an object of the map (gsmap graph lists them) nor SCENE:NODE")
+        raise NotFoundError(
+            f"{request.like!r} is neither an object of the map (gsmap graph lists them) nor SCENE:NODE",
+            code="object_not_found",
+        )
     scene = store.scenes.get(ref)
     graph, row = index.graphs.get(scene.id), int(number)
     if graph is None:
-        raise NotFoundError(f"scene {scene.name} has no graph of the recipe that answers: run gsmap update first")
+        raise NotFoundError(
+            f"scene {scene.name} has no graph of the recipe that answers: run gsmap update first", code="no_graph"
+        )
     layer = graph.layers.get("objects")
     if layer is None or row >= len(layer):
         raise NotFoundError(
             f"scene {scene.name} has {0 if layer is None else len(layer)} objects, counted from 0: "
-            f"gsmap show {store.home} {scene.name!r} --picture FILE draws them"
+            f"gsmap show {store.home} {scene.name!r} --picture FILE draws them",
+            code="object_out_of_range",
         )
     pose = index.poses.poses[scene.id]
     thing = _thing_at(pose.S_map_scene.apply(layer.positions[row]), pose.component, index, scene.id)
@@ -384,7 +401,8 @@ def _by_embedding(index: _Index, asked: _Vector, top: int) -> tuple[list[FindHit
         if layer.embeddings.shape[1] != len(asked.features):
             raise ConfigError(
                 f"what is asked for is a vector of {len(asked.features)} numbers, those of the map have "
-                f"{layer.embeddings.shape[1]}: the text tower and the image encoder are not of one pack"
+                f"{layer.embeddings.shape[1]}: the text tower and the image encoder are not of one pack",
+                code="embedding_mismatch",
             )
         scores.append(find.cosines(asked.features, asked.told, layer.embeddings))
         for row in range(len(layer)):

@@ -173,7 +173,8 @@ def _picture(path: str, number: int) -> np.ndarray:
     except InputError as error:
         raise CorruptError(
             f"what the map keeps of photo p{number} is no picture ({error}): take it back (gsmap remove MAP p{number} "
-            "--photo) and add it again"
+            "--photo) and add it again",
+            code="photo_damaged",
         ) from error
 
 

@@ -48,10 +48,12 @@ class Tells:
 
     def __post_init__(self) -> None:
         if self.pictures is not None and not self.changes:
-            raise ConfigError("--pictures are of what differs: ask for it by --changes")
+            raise ConfigError("--pictures are of what differs: ask for it by --changes", code="missing_option")
         if self.captured_at is not None:
             if not self.add:
-                raise ConfigError("--captured-at dates photographs that are kept: add them by --add")
+                raise ConfigError(
+                    "--captured-at dates photographs that are kept: add them by --add", code="missing_option"
+                )
             given_date(self.captured_at)
 
 
@@ -86,7 +88,9 @@ def localize_files(
         raise ReadOnlyError(f"{store.location} is open to be read only: photographs can be placed in it, but not kept")
     check_named(files, video, masks)
     if depth is not None and masks is not None:
-        raise ConfigError("--masks are of photographs: of a depth picture, set what does not count to 0")
+        raise ConfigError(
+            "--masks are of photographs: of a depth picture, set what does not count to 0", code="option_not_applicable"
+        )
     lens = parse_lens(intrinsics, focal)
     if video is not None:
         return _of_pictures(store, settings, frames_of(video, lens, settings), near, True, progress, tells)
@@ -107,9 +111,11 @@ def check_named(
 ) -> None:
     """Refuse photographs beside a clip, and neither; and masks of a clip."""
     if video is not None and masks is not None:
-        raise ConfigError("--masks are of photographs, by their names: a clip's frames have none")
+        raise ConfigError(
+            "--masks are of photographs, by their names: a clip's frames have none", code="option_not_applicable"
+        )
     if bool(files) == (video is not None):
-        raise ConfigError("name the photographs to localise, or one clip by --video")
+        raise ConfigError("name the photographs to localise, or one clip by --video", code="nothing_requested")
 
 
 def photos_of(
@@ -221,13 +227,17 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
         ConfigError: not four numbers, a focal length that is none, or both.
     """
     if intrinsics is not None and focal is not None:
-        raise ConfigError("intrinsics hold the focal length: give one of --intrinsics and --focal")
+        raise ConfigError(
+            "intrinsics hold the focal length: give one of --intrinsics and --focal", code="conflicting_options"
+        )
     if intrinsics is not None:
         parts = intrinsics.split(",") if isinstance(intrinsics, str) else intrinsics
         try:
             fx, fy, cx, cy = (float(part) for part in parts)
         except ValueError:
-            raise ConfigError(f"intrinsics are four numbers fx,fy,cx,cy, got {intrinsics!r}") from None
+            raise ConfigError(
+                f"intrinsics are four numbers fx,fy,cx,cy, got {intrinsics!r}", code="invalid_intrinsics"
+            ) from None
         return Lens((fx, fy, cx, cy))
     if focal is None:
         return Lens()
@@ -236,7 +246,7 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
     try:
         return Lens(focal_px=float(focal))
     except ValueError:
-        raise ConfigError(f"a focal length is auto or pixels, got {focal!r}") from None
+        raise ConfigError(f"a focal length is auto or pixels, got {focal!r}", code="invalid_intrinsics") from None
 
 
 def row_of(names: Mapping[str, str], file: str, found: Placement, seconds: float) -> LocalizeRow:

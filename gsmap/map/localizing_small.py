@@ -43,7 +43,10 @@ def localize_small(
     check_named(files, video, masks)
     scans = [os.fspath(path) for path in files if is_scan(path)]
     if scans:
-        raise ConfigError(f"{scans[0]} is a scan: a small map places photographs alone; ask the map that it is of")
+        raise ConfigError(
+            f"{scans[0]} is a scan: a small map places photographs alone; ask the map that it is of",
+            code="not_in_small_map",
+        )
     lens, settings = parse_lens(intrinsics, focal), settings_of(dict(values or {}), preset)
     named = photos_of(files, lens, masks) if video is None else frames_of(video, lens, settings)
     localizer = SmallLocalizer(folder, settings)

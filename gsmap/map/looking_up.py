@@ -75,7 +75,9 @@ def ask_once(
             if not left:
                 raise
         except CorruptError as error:
-            raise CorruptError(f"{error}: gsmap register {store.home} makes the index anew") from error
+            raise CorruptError(
+                f"{error}: gsmap register {store.home} makes the index anew", code="index_damaged"
+            ) from error
     raise AssertionError("unreachable")
 
 

@@ -255,7 +255,10 @@ class Map(AbstractContextManager["Map"]):
         if supersedes is not None:
             found, _ = readers(captures, **options)
             if len(found) != 1:
-                raise ConfigError(f"one capture takes the place of {supersedes}, {len(found)} were found: name one")
+                raise ConfigError(
+                    f"one capture takes the place of {supersedes}, {len(found)} were found: name one",
+                    code="many_captures",
+                )
             with at_work(self.store, "ingest"):
                 capture = found[0].read()
                 done = supersede(self.store, capture, supersedes, self.settings, self._progress, named=name is not None)
@@ -346,7 +349,10 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.stages.register import Known, register
 
         if captured_at is not None and not captures:
-            raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
+            raise ConfigError(
+                "captured-at is of captures: name their files, or correct a scene with gsmap edit",
+                code="option_not_applicable",
+            )
         before = reports.mark(self.store)
         with at_work(self.store, "update"):
             ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
@@ -773,10 +779,12 @@ class Map(AbstractContextManager["Map"]):
         if frame == "scene":
             return gaussians, cameras
         if frame != "map":
-            raise ConfigError(f"a scene is read in frame 'scene' or 'map', got {frame!r}")
+            raise ConfigError(f"a scene is read in frame 'scene' or 'map', got {frame!r}", code="invalid_choice")
         graph = self.pose_graph()
         if graph is None or scene.id not in graph.poses:
-            raise NotFoundError(f"scene {scene.name} has no place in the map yet: run gsmap update first")
+            raise NotFoundError(
+                f"scene {scene.name} has no place in the map yet: run gsmap update first", code="scene_unplaced"
+            )
         S_map_scene = graph.poses[scene.id].S_map_scene
         return transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene)
 
@@ -902,7 +910,9 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map import evaluating
 
         if images is None and (tiles is not None or lpips is not None):
-            raise ConfigError("tiles and LPIPS are of photographs: give the folder of images, too")
+            raise ConfigError(
+                "tiles and LPIPS are of photographs: give the folder of images, too", code="missing_option"
+            )
         params = self.settings.evaluate
         if max_rre_deg is not None:
             params = replace(params, max_rre_deg=max_rre_deg)
@@ -1006,7 +1016,10 @@ class Map(AbstractContextManager["Map"]):
 
         a, b = self._pair(pair)
         if (picture := picture_of_pair(self.store, a.id, b.id)) is None:
-            raise NotFoundError(f"{a.name}:{b.name} has no pose to draw both captures in: gsmap why MAP A:B says why")
+            raise NotFoundError(
+                f"{a.name}:{b.name} has no pose to draw both captures in: gsmap why MAP A:B says why",
+                code="no_pose_of_pair",
+            )
         save_picture(picture, path)
 
     def draw_change(self, name: str, path: str | os.PathLike[str]) -> None:
@@ -1019,7 +1032,9 @@ class Map(AbstractContextManager["Map"]):
 
         row = self.show_change(name)
         if (picture := picture_of_change(self.store, self._settings_to_look_by(), row)) is None:
-            raise NotFoundError(f"{name} has no place now: its newer capture has none (gsmap update)")
+            raise NotFoundError(
+                f"{name} has no place now: its newer capture has none (gsmap update)", code="change_unplaced"
+            )
         save_picture(picture, path)
 
     def draw_graph(self, ref: str, path: str | os.PathLike[str]) -> None:
@@ -1030,7 +1045,9 @@ class Map(AbstractContextManager["Map"]):
         scene = self.store.scenes.get(ref)
         graph, _ = self._graph_of(scene)
         if graph is None:
-            raise NotFoundError(f"scene {scene.name} has no graph: run gsmap describe MAP {scene.name!r} first")
+            raise NotFoundError(
+                f"scene {scene.name} has no graph: run gsmap describe MAP {scene.name!r} first", code="no_graph"
+            )
         save_picture(draw_graph(*self.read(scene.id), graph), path)
 
     def write_poses(self, out: str | os.PathLike[str], format: str, crs: str | None = None) -> list[Path]:
@@ -1179,7 +1196,10 @@ class Map(AbstractContextManager["Map"]):
         """
         row = as_values.branch_row(self.store.branches.get(name))
         if kind not in (None, row.kind):
-            raise NotFoundError(f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete")
+            raise NotFoundError(
+                f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete",
+                code="wrong_reference_kind",
+            )
         self.store.branches.delete(name)
         return row
 

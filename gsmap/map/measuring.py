@@ -51,10 +51,13 @@ def measure(
     """
     graph = store.revisions.get()
     if graph is None or not graph.poses:
-        raise NotFoundError("the map has no poses to measure with: run gsmap update first")
+        raise NotFoundError("the map has no poses to measure with: run gsmap update first", code="no_poses")
     components = _components(graph)
     if component is not None and component not in components:
-        raise NotFoundError(f"the map has no component {component}: it has {', '.join(map(str, components))}")
+        raise NotFoundError(
+            f"the map has no component {component}: it has {', '.join(map(str, components))}",
+            code="component_not_found",
+        )
     solved = _Solved(store, settings, graph)
     said = [place(store, text) for text in (a, b)]
     placed = [_where(store, one, graph, component) for one in said]
@@ -78,7 +81,8 @@ def measure(
     else:
         raise NotFoundError(
             "the two points lie in different components, and not both of them are tied to the world: gsmap "
-            "georeference does so"
+            "georeference does so",
+            code="conflicting_options",
         )
     rows = [_row(solved, one, frame, crs) for one in placed]
     named = crs or (frame.crs if frame else None)
@@ -108,7 +112,9 @@ def _where(store: Store, one: Place, graph: PoseGraph, component: int | None) ->
     if one.crs is not None:
         tied = [tie for tie in graph.world if tie.S_world_map is not None and tie.frame is not None]
         if not tied:
-            raise NotFoundError("the map is not tied to the world: gsmap georeference does so")
+            raise NotFoundError(
+                "the map is not tied to the world: gsmap georeference does so", code="not_georeferenced"
+            )
         from gsmap.world.frame import to_frame
 
         frame = tied[0].frame
@@ -121,13 +127,17 @@ def _where(store: Store, one: Place, graph: PoseGraph, component: int | None) ->
     if one.scene is not None:
         pose = graph.poses.get(one.scene)
         if pose is None or pose.S_map_scene is None:
-            raise NotFoundError(f"scene {store.scenes.get(one.scene).name} has no place in the map: run gsmap update")
+            raise NotFoundError(
+                f"scene {store.scenes.get(one.scene).name} has no place in the map: run gsmap update",
+                code="scene_unplaced",
+            )
         at, of = pose.S_map_scene.apply(one.point), pose.component
     else:
         components = _components(graph)
         if component is None and len(components) > 1:
             raise ConfigError(
-                f"{one.said} is in the map's frame, of which there are {len(components)}: name one with --component"
+                f"{one.said} is in the map's frame, of which there are {len(components)}: name one with --component",
+                code="component_required",
             )
         of, at = components[0] if component is None else component, one.point
     tie = graph.tie(of)

@@ -134,7 +134,7 @@ class Known:
             why = (
                 f"{', '.join(one.id for one in found)} are called so" if found else "no object of the map is called so"
             )
-            raise NotFoundError(f"{text}: {why}; gsmap graph MAP lists them")
+            raise NotFoundError(f"{text}: {why}; gsmap graph MAP lists them", code="object_not_found")
         return found[0]
 
 
@@ -249,13 +249,13 @@ def edit_object(
     if number is None:
         number = number_of(known.named(ref).id)
     if number is None:
-        raise NotFoundError(f"{ref} has no number yet: the map is open for reading only")
+        raise NotFoundError(f"{ref} has no number yet: the map is open for reading only", code="object_without_number")
     other = None if same_as is None else 0
     if same_as is not None and not _none(same_as):
         target, mine = known.named(same_as), known.named(f"o{number}")
         other = number_of(target.id)
         if why := apart(mine, target, known.scenes):
-            raise InputError(f"o{number} and {target.id} cannot be one: {why}")
+            raise InputError(f"o{number} and {target.id} cannot be one: {why}", code="objects_differ")
     store.objects.edit(
         number,
         name=name,
@@ -296,7 +296,9 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
         NotFoundError: no object is called so.
     """
     if (place is None) == (box is None):
-        raise ConfigError("say which place: an object's id, a point X,Y,Z, or --box with six numbers")
+        raise ConfigError(
+            "say which place: an object's id, a point X,Y,Z, or --box with six numbers", code="nothing_requested"
+        )
     if place is not None and not ("," in place and _POINT.fullmatch(place)):
         chosen = [known.named(place)]
     else:
@@ -343,12 +345,14 @@ def _area(place: str | None, box: Sequence[float] | None) -> np.ndarray:
             [float(part) for part in place.split(",")] if place is not None else [float(part) for part in box or ()]
         )
     except ValueError as error:
-        raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {place!r}") from error
+        raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {place!r}", code="invalid_point") from error
     if len(numbers) != (3 if place is not None else 6) or not np.isfinite(numbers).all():
-        raise ConfigError("a point is three numbers X,Y,Z, a box six: its lowest and its highest corner")
+        raise ConfigError(
+            "a point is three numbers X,Y,Z, a box six: its lowest and its highest corner", code="invalid_point"
+        )
     corners = np.array(numbers).reshape(-1, 3)
     if (corners[0] > corners[-1]).any():
-        raise ConfigError("a box is its lowest corner, then its highest")
+        raise ConfigError("a box is its lowest corner, then its highest", code="invalid_box")
     return np.array([corners[0], corners[-1]])
 
 
@@ -395,7 +399,7 @@ def write_graph(known: Known, out: str | os.PathLike[str], format: str) -> Path:
         ConfigError: another format than ``json`` (what ``--json`` prints) and ``graphml``.
     """
     if format not in FORMATS:
-        raise ConfigError(f"the graph is written as {' or '.join(FORMATS)}, got {format!r}")
+        raise ConfigError(f"the graph is written as {' or '.join(FORMATS)}, got {format!r}", code="invalid_choice")
     path = Path(out)
     if format == "json":
         write_text_output(path, json.dumps({"schema": SCHEMA, **objects_report(known).to_json()}, indent=1))

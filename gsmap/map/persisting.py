@@ -120,7 +120,10 @@ def rows(store: Store, scene: str, passing: Passing) -> np.ndarray:
             out[found[place].before if side == "before" else found[place].after] = True
     graph = store.graphs.load(scene, passing.graph) if passing.graph else None
     if passing.graph and graph is None:
-        raise NotFoundError(f"the things of scene {scene[:12]} were dropped meanwhile: run the same export again")
+        raise NotFoundError(
+            f"the things of scene {scene[:12]} were dropped meanwhile: run the same export again",
+            code="changed_meanwhile",
+        )
     if graph is not None and graph.things is not None and len(graph.things):
         from gsmap.objects.changed import CHANGED  # naming what passes does without
 

@@ -73,7 +73,8 @@ def match_photos(photos: Collection[str], names: Mapping[str, Sequence[str]], wh
             one, other = (f"{scene}/{names[scene][row]}" for scene, row in several[:2])
             raise InputError(
                 f"{where[photo]}: {photo} may be the camera {one} or {other}: give the photo with more of its path, so "
-                "that it ends in one of these (a folder that is called as the scene is enough where scenes differ)"
+                "that it ends in one of these (a folder that is called as the scene is enough where scenes differ)",
+                code="photo_ambiguous",
             )
         chosen[photo] = several[0]
     left_out |= _one_photo_each(chosen, ranked, names, where)
@@ -139,7 +140,8 @@ def _one_photo_each(
                 scene, row = camera
                 raise InputError(
                     f"{where[other]}: {first} and {other} may both be the camera {scene}/{names[scene][row]}: leave "
-                    "out the photos of one of their folders, or call the right folder as the scene"
+                    "out the photos of one of their folders, or call the right folder as the scene",
+                    code="photo_ambiguous",
                 )
             left_out[other] = first
             del chosen[other]

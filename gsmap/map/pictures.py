@@ -56,7 +56,9 @@ class Pictures:
         path = folder / FILE_NAME
         if not os.path.lexists(path):
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-                raise ConfigError(f"{folder} holds other things: give an empty or a new folder for pictures")
+                raise ConfigError(
+                    f"{folder} holds other things: give an empty or a new folder for pictures", code="folder_not_empty"
+                )
             return cls(map_id)
         try:
             with open(open_file(path), "rb") as file:
@@ -64,9 +66,13 @@ class Pictures:
             owner, version = str(content["map_id"]), content["version"]
             scenes = {str(name): [str(scene) for scene in ids] for name, ids in content["pictures"].items()}
         except (OSError, *MALFORMED) as error:
-            raise InputError(f"{path} was not written by gsmap ({error!r}): give another folder") from error
+            raise InputError(
+                f"{path} was not written by gsmap ({error!r}): give another folder", code="foreign_export"
+            ) from error
         if owner != map_id or version != _VERSION:
-            raise ConfigError(f"{folder} holds pictures of another map ({owner[:12]}): give another folder")
+            raise ConfigError(
+                f"{folder} holds pictures of another map ({owner[:12]}): give another folder", code="foreign_export"
+            )
         return cls(map_id, {name: ids for name, ids in scenes.items() if _PICTURE.fullmatch(name)})
 
     def save(self, folder: Path) -> None:
@@ -190,7 +196,9 @@ def save_picture(picture: np.ndarray, path: str | os.PathLike[str]) -> None:
     try:
         write_output(Path(path), Image.fromarray(picture).save)
     except ValueError as error:  # a suffix that Pillow does not know
-        raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
+        raise ConfigError(
+            f"cannot draw to {path} ({error}): name a file that ends with .png", code="wrong_suffix"
+        ) from error
 
 
 def draw_places(

@@ -67,7 +67,7 @@ def localiser(store: Store, localize: Callable[..., Any], folder: str | os.PathL
     """
     root = Path(folder)
     if not root.is_dir():
-        raise NotFoundError(f"no folder of photos at {root}")
+        raise NotFoundError(f"no folder of photos at {root}", code="folder_not_found")
 
     def localise(names: Sequence[str]) -> dict[str, PlacedPhoto]:
         files = {name: root / name for name in names if _inside(root, name)}

@@ -50,7 +50,10 @@ def place(store: Store, text: str) -> Place:
     scene_name, colon, rest = text.rpartition(":")
     if (world := _CRS.fullmatch(text)) is not None and (numbers := _numbers(world[2], 3)) is not None:
         if world[1].lower() == "world" and any(scene.name == world[1] for scene in store.scenes.list()):
-            raise ConfigError(f"a scene is called {world[1]}: name it by its id, or the world by its CRS, EPSG:N:X,Y,Z")
+            raise ConfigError(
+                f"a scene is called {world[1]}: name it by its id, or the world by its CRS, EPSG:N:X,Y,Z",
+                code="scene_ambiguous",
+            )
         return Place(text, numbers, np.zeros((3, 3)), crs="world" if world[1].lower() == "world" else world[1])
     if colon and (numbers := _numbers(rest, 3)) is not None:
         return Place(text, numbers, np.zeros((3, 3)), scene=store.scenes.get(scene_name).id)
@@ -60,7 +63,7 @@ def place(store: Store, text: str) -> Place:
         scene = store.scenes.get(scene_name).id
         found = picked_point(store, scene, camera, numbers, DEPTH_SIGMA_FRACTION, PIXEL_SIGMA_PX)
         return Place(text, *found, scene=scene)
-    raise ConfigError(f"{text!r} is no point: give {HOW}")
+    raise ConfigError(f"{text!r} is no point: give {HOW}", code="invalid_point")
 
 
 def place_in_scene(store: Store, text: str) -> Place:
@@ -69,7 +72,8 @@ def place_in_scene(store: Store, text: str) -> Place:
     if found.scene is None:
         raise ConfigError(
             f"{text!r} is a point of the {'world' if found.crs else 'map'}, whose frame the solve moves: pick it in a "
-            "scene, SCENE:X,Y,Z or SCENE:CAMERA@COLUMN,ROW"
+            "scene, SCENE:X,Y,Z or SCENE:CAMERA@COLUMN,ROW",
+            code="moving_frame",
         )
     return found
 

@@ -63,15 +63,16 @@ def write_poses(
     from gsmap.map.settings import Settings
 
     if format not in FORMATS:
-        raise ConfigError(f"poses are written as {', '.join(FORMATS)}, got {format!r}")
+        raise ConfigError(f"poses are written as {', '.join(FORMATS)}, got {format!r}", code="invalid_choice")
     graph = store.revisions.get()
     scenes = {scene.id: scene for scene in store.scenes.list()}
     placed = [pose for scene, pose in (graph.poses if graph else {}).items() if scene in scenes]
     if graph is None or not placed:
-        raise NotFoundError("no scene has a place in the map yet: run gsmap update first")
+        raise NotFoundError("no scene has a place in the map yet: run gsmap update first", code="no_poses")
     if crs is not None and format != "json":
         raise ConfigError(
-            f"{format} holds poses in the map's frame; world coordinates go into json: leave out --format"
+            f"{format} holds poses in the map's frame; world coordinates go into json: leave out --format",
+            code="unsupported_output",
         )
     if format == "json":
         rows = [row.to_json() for row in reports.pose_rows(store, crs)]
@@ -80,7 +81,10 @@ def write_poses(
         return [out]
     components = sorted({pose.component for pose in placed})
     if len(components) > 1 and is_stream(out):
-        raise InputError(f"{out} takes one file, and each of {len(components)} components gets its own: name a file")
+        raise InputError(
+            f"{out} takes one file, and each of {len(components)} components gets its own: name a file",
+            code="missing_option",
+        )
     metres = map_metres(store, settings or Settings(), graph)
     placed.sort(key=lambda pose: scenes[pose.scene].name)
     written = []
@@ -177,7 +181,9 @@ def _edges(store: Store, members: Sequence[ScenePose], used: set[tuple[str, str]
         r = stored.registration
         if {r.target, r.source} <= inside and (r.target, r.source) in used:
             if r.S_target_source is None or r.information is None:
-                raise InputError(f"edge {r.target}:{r.source} is in use but has no pose: run gsmap optimize")
+                raise InputError(
+                    f"edge {r.target}:{r.source} is in use but has no pose: run gsmap optimize", code="no_pose_of_pair"
+                )
             edges.append(Edge(r.target, r.source, r.S_target_source, r.information))
     return edges
 

@@ -110,13 +110,20 @@ def write_report(
 def check_target(path: Path) -> None:
     """Whether a report may be written to a file; see `write_report` for the errors."""
     if path.suffix.lower() not in _SUFFIXES:
-        raise ConfigError(f"a report is a page: name a file that ends with .html, not {path.name or path}")
+        raise ConfigError(
+            f"a report is a page: name a file that ends with .html, not {path.name or path}", code="wrong_suffix"
+        )
     if path.is_dir():
-        raise ConfigError(f"{path} is a folder: name a file in it, such as {path / 'report.html'}")
+        raise ConfigError(
+            f"{path} is a folder: name a file in it, such as {path / 'report.html'}", code="target_is_a_folder"
+        )
     if not path.parent.is_dir():
-        raise NotFoundError(f"cannot write {path}: {path.parent} does not exist")
+        raise NotFoundError(f"cannot write {path}: {path.parent} does not exist", code="folder_not_found")
     if path.exists() and not is_stream(path) and owner_of(path) is None:
-        raise ConfigError(f"{path} is there and was not written by gsmap report: choose another name, or delete it")
+        raise ConfigError(
+            f"{path} is there and was not written by gsmap report: choose another name, or delete it",
+            code="foreign_export",
+        )
 
 
 def _known_objects(store: Store, settings: Settings) -> ObjectsReport | None:

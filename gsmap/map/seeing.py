@@ -22,7 +22,8 @@ def camera_of(cameras: Cameras, name: str, scene_name: str) -> Cameras:
         what = f"{len(found)} cameras" if found else "no camera"
         some = ", ".join([cameras.names[row] for row in found[:3]] or cameras.names[:3])
         raise NotFoundError(
-            f"scene {scene_name} has {what} called {name!r}: {'such as' if found else 'its first ones are'} {some}"
+            f"scene {scene_name} has {what} called {name!r}: {'such as' if found else 'its first ones are'} {some}",
+            code="camera_not_found",
         )
     return cameras[found]
 
@@ -39,7 +40,10 @@ def surface_at(
     """
     width, height = camera.sizes_px[0].tolist()
     if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
-        raise InputError(f"pixel {pixel[0]:g},{pixel[1]:g} lies outside of camera {camera.names[0]} ({width}x{height})")
+        raise InputError(
+            f"pixel {pixel[0]:g},{pixel[1]:g} lies outside of camera {camera.names[0]} ({width}x{height})",
+            code="pixel_outside",
+        )
     pose = camera.T_frame_camera[0]
     ray = pose[:3, :3] @ ray_of(camera.intrinsics_px[0], pixel)
     found = surface_along(gaussians, pose[:3, 3], ray)
@@ -70,7 +74,8 @@ def picked_point(
     if seen is None:
         raise NotFoundError(
             f"pixel {pixel[0]:g},{pixel[1]:g} of camera {camera.names[0]} of scene {found.name} shows no surface: pick "
-            "one that does"
+            "one that does",
+            code="pixel_without_surface",
         )
     depth, sigma = seen
     fx, fy = camera.intrinsics_px[0, :2]

@@ -148,7 +148,7 @@ def settings_of(values: Mapping[str, Any], preset: str | None = None) -> Setting
         ConfigError: no such preset or setting, or a value that does not fit.
     """
     if preset is not None and preset not in PRESETS:
-        raise ConfigError(f"there is no preset {preset!r}: choose one of {', '.join(PRESETS)}")
+        raise ConfigError(f"there is no preset {preset!r}: choose one of {', '.join(PRESETS)}", code="unknown_preset")
     tree: Settings = changed(Settings(), {**PRESETS[preset or "default"], **values})
     return tree
 
@@ -195,7 +195,7 @@ def _combined(folder: Path, preset: str, values: Mapping[str, Any], more: Mappin
         try:
             settings_of(values, preset)
         except ConfigError as error:
-            raise ConfigError(f"{folder / FILE_NAME}: {error}") from error
+            raise ConfigError(f"{folder / FILE_NAME}: {error}", code="invalid_settings_file") from error
         raise
 
 
@@ -218,11 +218,15 @@ def write_settings(
         settings_of({}, preset)
     unknown = [name for name in drop if name not in old]
     if unknown:
-        raise ConfigError(f"{unknown[0]} is not changed in {folder / FILE_NAME}: there is nothing to take back")
+        raise ConfigError(
+            f"{unknown[0]} is not changed in {folder / FILE_NAME}: there is nothing to take back",
+            code="setting_not_changed",
+        )
     _combined(folder, preset or old_preset, kept, values)
     if of_run := [name for name in values if _is_of_the_run(name)]:
         raise ConfigError(
             f"{of_run[0]} is not kept with a map: say it with each run (--executor, --scheduler), or by GSMAP_EXECUTOR "
-            "and GSMAP_SCHEDULER"
+            "and GSMAP_SCHEDULER",
+            code="setting_of_run",
         )
     save(folder / FILE_NAME, {**({PRESET: preset} if preset else {}), **values}, drop)

@@ -92,7 +92,8 @@ class SharedJobs:
         if self._todo and is_beginning():  # its parent, who does these jobs, waits for it to have begun
             raise ConfigError(
                 "a worker process reads the script that started it, and comes to what starts workers: put what the "
-                'script does below `if __name__ == "__main__":`'
+                'script does below `if __name__ == "__main__":`',
+                code="main_guard_missing",
             )
         together_s = TOGETHER_S if together_s is None else together_s
         while self._todo:

@@ -103,10 +103,11 @@ def export_small(
         NotFoundError: the map has no poses yet.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise StoreError(f"{out} exists already: choose another name")
+        raise StoreError(f"{out} exists already: choose another name", code="already_exists")
     if settings.localize.extractor != "sift":
         raise ConfigError(
-            "a small map holds no model: export it with the built-in features (--set localize.extractor=sift)"
+            "a small map holds no model: export it with the built-in features (--set localize.extractor=sift)",
+            code="small_map_extractor",
         )
     localizer = Localizer(store, settings, progress)
     params = settings.localize.small
@@ -275,7 +276,8 @@ def _require_enough(
             raise ConfigError(
                 f"{budget / 1e6:.2f} MB are too few for {len(rows)} scenes: {row.scene_name} would keep "
                 f"{per_view:.0f} features a view and {part:.0%} of the Gaussians that show, by which hardly a "
-                f"photograph would be found; give about {need / 1e6:.1f} MB"
+                f"photograph would be found; give about {need / 1e6:.1f} MB",
+                code="small_map_budget",
             )
 
 
@@ -337,7 +339,10 @@ class SmallLocalizer(Localizer):
         self.params = self.settings.localize
         self.folder = Path(folder)
         if self.params.extractor != "sift":
-            raise ConfigError("a small map holds features of the built-in extractor: localize.extractor must be sift")
+            raise ConfigError(
+                "a small map holds features of the built-in extractor: localize.extractor must be sift",
+                code="small_map_extractor",
+            )
         told = _read_header(self.folder / FILE_NAME)
         try:
             self.metres = {int(k): _positive(v) for k, v in told["metres_per_unit"].items()}
@@ -376,7 +381,7 @@ class SmallLocalizer(Localizer):
     def _id_of(self, name: str) -> str:
         found = [one.id for one in self.small.values() if name in (one.name, one.id)]
         if not found:
-            raise NotFoundError(f"no scene is called {name!r} in {self.folder}")
+            raise NotFoundError(f"no scene is called {name!r} in {self.folder}", code="scene_not_found")
         return found[0]
 
     def _small_gaussians(self, scene: str) -> Gaussians:
@@ -406,7 +411,7 @@ class SmallLocalizer(Localizer):
                 raise ValueError("its bytes differ from what was written")
             return _unpacked(path, content, names), len(content)
         except FileNotFoundError as error:
-            raise CorruptError(f"{path} is missing: export the small map again") from error
+            raise CorruptError(f"{path} is missing: export the small map again", code="small_map_damaged") from error
         except (OSError, EOFError, MemoryError, *_BAD_ZIP, *MALFORMED) as error:
             raise _corrupt(path, error) from error
 
@@ -457,7 +462,10 @@ def _read_header(path: Path) -> dict[str, Any]:
     except (OSError, MemoryError, *MALFORMED) as error:
         raise _corrupt(path, error) from error
     if told["version"] != _VERSION:
-        raise ConfigError(f"{path.parent} was written by another version of gsmap ({told['version']}): export it again")
+        raise ConfigError(
+            f"{path.parent} was written by another version of gsmap ({told['version']}): export it again",
+            code="small_map_version",
+        )
     return dict(told)
 
 
@@ -490,4 +498,6 @@ def _positive(value: Any) -> float:
 
 
 def _corrupt(path: Path, error: Exception) -> CorruptError:
-    return CorruptError(f"{path} is no small map that gsmap wrote, or damaged ({error}): export it again")
+    return CorruptError(
+        f"{path} is no small map that gsmap wrote, or damaged ({error}): export it again", code="small_map_damaged"
+    )

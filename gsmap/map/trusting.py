@@ -58,7 +58,10 @@ def _folder(path: str | os.PathLike[str]) -> Path:
 
 def _remembered(folder: Path) -> trusting.Remembered:
     if not folder.is_dir():
-        raise NotFoundError(f"no map at {called(folder)}")
+        raise NotFoundError(f"no map at {called(folder)}", code="map_not_found")
     if not (folder / trusting.URL_FILE).exists():
-        raise ConfigError(f"{folder} keeps its catalog in its own folder, if it is a map: there is nothing to trust")
+        raise ConfigError(
+            f"{folder} keeps its catalog in its own folder, if it is a map: there is nothing to trust",
+            code="nothing_to_trust",
+        )
     return trusting.remembered(folder)

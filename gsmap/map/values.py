@@ -68,7 +68,7 @@ def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> S
     """Make a map of some scenes (by id); it appears whole or not at all. See `gsmap.store.merging.split`."""
     folder = Path(out).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise StoreError(f"{out} exists already: choose another name")
+        raise StoreError(f"{out} exists already: choose another name", code="already_exists")
     with staging.beside(folder) as staged:
         with Store.create(staged) as part:
             merged = merging.split(store, part, chosen)
@@ -97,7 +97,9 @@ def chosen(store: Store, island: int | None, box: Sequence[float] | None, scenes
         NotFoundError: there are none.
     """
     if (scenes is None) == (island is None and box is None) or (scenes is not None and not scenes):
-        raise ConfigError("say which scenes: those of a component, those in a box, or their names")
+        raise ConfigError(
+            "say which scenes: those of a component, those in a box, or their names", code="nothing_requested"
+        )
     if scenes is not None:
         return list(dict.fromkeys(store.scenes.get(ref).id for ref in scenes))
     graph, living = store.revisions.get(), {scene.id: scene for scene in store.scenes.list()}
@@ -110,7 +112,9 @@ def chosen(store: Store, island: int | None, box: Sequence[float] | None, scenes
         inside = [pose for pose in inside if pose.scene in touching]
     if not inside:
         known = sorted({pose.component for pose in placed})
-        raise NotFoundError(f"no placed scene of {store.location} lies there: its components are {known}")
+        raise NotFoundError(
+            f"no placed scene of {store.location} lies there: its components are {known}", code="no_placed_scene"
+        )
     return [pose.scene for pose in inside]
 
 

@@ -80,7 +80,7 @@ class MapDoors:
 
     def source(self, scene: str) -> GaussianSource:
         if self._store.scenes.removed_at(scene) is not None:
-            raise NotFoundError(f"scene {scene} was removed")
+            raise NotFoundError(f"scene {scene} was removed", code="scene_removed")
         return self._store.scenes.source(scene)
 
     def extras(self, scene: str) -> dict[str, Any]:
@@ -108,7 +108,7 @@ class MapDoors:
     def revision(self, number: int) -> dict[str, Any]:
         graph = self._store.revisions.get(number)
         if graph is None:
-            raise NotFoundError(f"there is no revision {number}")
+            raise NotFoundError(f"there is no revision {number}", code="revision_not_found")
         at = self._places()
         return {
             "id": number,
@@ -145,7 +145,10 @@ class MapDoors:
     def pair_pictures(self, target: str, source: str) -> PairPictures:
         stored, names = self._store.registrations.get(target, source), self.pair_cameras(target, source)
         if stored is None or not names:
-            raise NotFoundError("this pair has no pose to draw both captures in, or is too large to be drawn here")
+            raise NotFoundError(
+                "this pair has no pose to draw both captures in, or is too large to be drawn here",
+                code="no_pose_of_pair",
+            )
         seen = pair_as_seen(self._store, stored.registration, self._settings.view.pair_views)
         side = self._settings.view.picture_px
         looks = [looks_at(seen.target, seen.source, one.resized(side), seen.unit_m) for one in seen.cameras]
@@ -156,7 +159,9 @@ class MapDoors:
         row = change_row(self._store, self._settings, named(change))
         picture = picture_of_change(self._store, self._settings, row, self._settings.view.picture_px)
         if picture is None:
-            raise NotFoundError(f"{change} has no place now: its newer capture has none (gsmap update)")
+            raise NotFoundError(
+                f"{change} has no place now: its newer capture has none (gsmap update)", code="change_unplaced"
+            )
         return picture
 
     # --- objects -----------------------------------------------------------------------------------------------------
@@ -208,7 +213,7 @@ class MapDoors:
 
     def merged(self, component: int) -> Path:
         if component not in self._merged:
-            raise NotFoundError(f"no merged tiles of component {component} were given")
+            raise NotFoundError(f"no merged tiles of component {component} were given", code="no_tiles")
         return self._merged[component]
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -228,7 +233,7 @@ class MapDoors:
     def _entry(self, scene: str) -> ViewScene:
         found = next((entry for entry in self.content().scenes if entry.scene.id == scene), None)
         if found is None:
-            raise NotFoundError(f"there is no scene {scene}")
+            raise NotFoundError(f"there is no scene {scene}", code="scene_not_found")
         return found
 
 
@@ -395,12 +400,14 @@ def merged_tilesets(store: Store, out: Path) -> dict[int, Path]:
     from gsmap.export.tileset import FILE_NAME
 
     if not out.is_dir():
-        raise NotFoundError(f"no folder of exported tiles at {out}")
+        raise NotFoundError(f"no folder of exported tiles at {out}", code="folder_not_found")
     manifest = Manifest.load(out, store.id)
     folders = {tile.component: out / tile.path.split("/")[0] for tile in manifest.tiles.values() if tile.path}
     found = {component: folder for component, folder in folders.items() if (folder / FILE_NAME).is_file()}
     if not found:
-        raise ConfigError(f"{out} holds no 3D Tiles: gsmap export MAP {out} --format 3dtiles makes them")
+        raise ConfigError(
+            f"{out} holds no 3D Tiles: gsmap export MAP {out} --format 3dtiles makes them", code="no_tiles"
+        )
     return found
 
 

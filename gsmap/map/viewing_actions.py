@@ -48,7 +48,7 @@ def actions_of(opened: Opened) -> dict[str, Action]:
 def _review(review: Callable[[str, str], object], said: Mapping[str, Any]) -> None:
     note = _text(said, "note", may_be_empty=True)
     if len(note) > _MAX_NOTE:
-        raise InputError(f"a note has at most {_MAX_NOTE} characters")
+        raise InputError(f"a note has at most {_MAX_NOTE} characters", code="invalid_request")
     review(_text(said, "what"), note)
 
 
@@ -59,9 +59,11 @@ def _prior(opened: Opened, said: Mapping[str, Any]) -> None:
     try:
         matrix = np.array(said.get("S_map_scene"), np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"S_map_scene is a matrix of four rows of four numbers: {error}") from error
+        raise InputError(
+            f"S_map_scene is a matrix of four rows of four numbers: {error}", code="invalid_pose"
+        ) from error
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError("S_map_scene is a matrix of four rows of four finite numbers")
+        raise InputError("S_map_scene is a matrix of four rows of four finite numbers", code="invalid_pose")
     S = Sim3.from_matrix(matrix)
     graph = opened.pose_graph()
     pose = None if graph is None else graph.poses.get(scene.id)
@@ -75,19 +77,19 @@ def _prior(opened: Opened, said: Mapping[str, Any]) -> None:
 def _earlier_prior(opened: Opened, said: Mapping[str, Any]) -> None:
     scene, number = _text(said, "scene"), said.get("number")
     if not isinstance(number, int) or isinstance(number, bool):
-        raise InputError("number must be a whole number")
+        raise InputError("number must be a whole number", code="invalid_request")
     opened.set_prior(opened.store.priors.earlier(scene, number))
 
 
 def _text(said: Mapping[str, Any], name: str, *, may_be_empty: bool = False) -> str:
     value = said.get(name, "" if may_be_empty else None)
     if not isinstance(value, str) or not (value or may_be_empty):
-        raise InputError(f"{name} must be a text")
+        raise InputError(f"{name} must be a text", code="invalid_request")
     return value
 
 
 def _positive(said: Mapping[str, Any], name: str) -> float:
     value = said.get(name)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not (0 < value < math.inf):
-        raise InputError(f"{name} must be a positive number")
+        raise InputError(f"{name} must be a positive number", code="invalid_request")
     return float(value)

@@ -80,13 +80,17 @@ def write_site(
 def write_page(store: Store, settings: Settings, path: Path, megabytes: float, progress: StageProgress) -> ViewReport:
     """See `gsmap.Map.write_page`."""
     if not (math.isfinite(megabytes) and megabytes > 0):
-        raise ConfigError(f"the page's levels of detail need a positive number of megabytes, got {megabytes}")
+        raise ConfigError(
+            f"the page's levels of detail need a positive number of megabytes, got {megabytes}", code="out_of_range"
+        )
     if path.suffix.lower() not in _SUFFIXES:
-        raise ConfigError(f"a page in one file ends with .html, not {path.name or path}")
+        raise ConfigError(f"a page in one file ends with .html, not {path.name or path}", code="wrong_suffix")
     if not path.parent.is_dir():
-        raise NotFoundError(f"cannot write {path}: {path.parent} does not exist")
+        raise NotFoundError(f"cannot write {path}: {path.parent} does not exist", code="folder_not_found")
     if path.exists() and not is_stream(path) and owner_of(path) != store.id:
-        raise ConfigError(f"{path} is there and is no page of this map: choose another name, or delete it")
+        raise ConfigError(
+            f"{path} is there and is no page of this map: choose another name, or delete it", code="foreign_export"
+        )
     page, doors = built_page(), MapDoors(store, settings)
     made: list[site.SiteContents] = []
     told = partial(progress, "page")
@@ -145,7 +149,8 @@ def site_files(folder: Path) -> list[str]:
     if said[1] is None:
         raise ConfigError(
             f"{folder} holds a page of an older gsmap, which kept no list of its files: move your own files out of it, "
-            "delete it, and export again"
+            "delete it, and export again",
+            code="foreign_export",
         )
     return said[1]
 
@@ -178,9 +183,12 @@ def _mark(map_id: str, files: Sequence[str]) -> bytes:
 def _check_folder(store: Store, folder: Path) -> None:
     """Whether a page may be written to a folder: nothing is replaced that is not this map's page."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise ConfigError(f"{folder} is no folder: give an empty or a new one")
+        raise ConfigError(f"{folder} is no folder: give an empty or a new one", code="not_a_folder")
     if folder.is_dir() and any(folder.iterdir()) and site_owner(folder) != store.id:
-        raise ConfigError(f"{folder} holds other things than a page of this map: give an empty or a new folder")
+        raise ConfigError(
+            f"{folder} holds other things than a page of this map: give an empty or a new folder",
+            code="folder_not_empty",
+        )
     site_files(folder)
 
 
@@ -228,10 +236,14 @@ def _check_free(folder: Path, path: str, is_ours: bool) -> None:
     for depth in range(1, len(above) + 1):
         at = folder.joinpath(*above[:depth])
         if os.path.lexists(at) and not is_folder(at):
-            raise ConfigError(f"{at} is not of the page, and a folder of it has to go there: move it away")
+            raise ConfigError(
+                f"{at} is not of the page, and a folder of it has to go there: move it away", code="folder_not_empty"
+            )
     place = folder / path
     if os.path.lexists(place) and not (is_ours and is_file(place)):
-        raise ConfigError(f"{place} is not of the page, and a file of it has to go there: move it away")
+        raise ConfigError(
+            f"{place} is not of the page, and a file of it has to go there: move it away", code="folder_not_empty"
+        )
 
 
 def _remove(folder: Path, files: Sequence[str]) -> None:

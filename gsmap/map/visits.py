@@ -34,9 +34,13 @@ class Params:
 
     def __post_init__(self) -> None:
         if not 0 < self.min_new_fraction <= 1:
-            raise ConfigError(f"visits.min_new_fraction must be a share in (0, 1], got {self.min_new_fraction}")
+            raise ConfigError(
+                f"visits.min_new_fraction must be a share in (0, 1], got {self.min_new_fraction}", code="out_of_range"
+            )
         if not self.max_earlier_visits >= 0:
-            raise ConfigError(f"visits.max_earlier_visits must not be negative, got {self.max_earlier_visits}")
+            raise ConfigError(
+                f"visits.max_earlier_visits must not be negative, got {self.max_earlier_visits}", code="out_of_range"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,7 +95,8 @@ def checked_params(method: str, params: Any) -> Any:
     if not isinstance(params, wanted):
         raise ConfigError(
             f"merge method {method!r} takes {wanted.__module__}.Params, got {type(params).__module__}."
-            f"{type(params).__qualname__}"
+            f"{type(params).__qualname__}",
+            code="invalid_method",
         )
     return params
 
@@ -126,9 +127,12 @@ def with_steps(method: str, params: Any, steps: int) -> Any:
     params, name = checked_params(method, params), merger(method).STEPS
     if name is None:
         takes = [other for other in methods() if merger(other).STEPS is not None]
-        raise ConfigError(f"merge method {method!r} takes no steps: leave --steps out, or use {' or '.join(takes)}")
+        raise ConfigError(
+            f"merge method {method!r} takes no steps: leave --steps out, or use {' or '.join(takes)}",
+            code="option_not_applicable",
+        )
     if steps < 0:
-        raise ConfigError(f"steps must not be negative, got {steps}")
+        raise ConfigError(f"steps must not be negative, got {steps}", code="out_of_range")
     return replace(params, **{name: steps})
 
 
@@ -143,11 +147,14 @@ def with_prefer(method: str, params: Any, prefer: str) -> Any:
     """
     params = checked_params(method, params)
     if prefer not in PREFERENCES:
-        raise ConfigError(f"prefer is one of {', '.join(PREFERENCES)}, got {prefer!r}")
+        raise ConfigError(f"prefer is one of {', '.join(PREFERENCES)}, got {prefer!r}", code="invalid_choice")
     if hasattr(params, "prefer"):
         return replace(params, prefer=prefer)
     takes = [other for other in methods() if hasattr(merger(other).Params(), "prefer")]
-    raise ConfigError(f"merge method {method!r} prefers nobody: leave --prefer out, or use {' or '.join(takes)}")
+    raise ConfigError(
+        f"merge method {method!r} prefers nobody: leave --prefer out, or use {' or '.join(takes)}",
+        code="option_not_applicable",
+    )
 
 
 def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
@@ -195,13 +202,15 @@ def merge(
     """
     params = checked_params(method, params)
     if budget_s is not None and not budget_s > 0:
-        raise ConfigError(f"a merge budget must be a positive number of seconds, got {budget_s}")
+        raise ConfigError(f"a merge budget must be a positive number of seconds, got {budget_s}", code="invalid_budget")
     if not scenes:
-        raise InputError("nothing to merge: no scenes given")
+        raise InputError("nothing to merge: no scenes given", code="nothing_to_merge")
     if bounds is not None:
         bounds = np.asarray(bounds, dtype=np.float64)
         if bounds.shape != (2, 3) or not (bounds[1] > bounds[0]).all():
-            raise InputError(f"bounds must be a (2, 3) box with low < high on every axis, got {bounds.tolist()}")
+            raise InputError(
+                f"bounds must be a (2, 3) box with low < high on every axis, got {bounds.tolist()}", code="invalid_box"
+            )
 
     # The result must not depend on the order of the scenes.
     order = sorted(range(len(scenes)), key=lambda i: scenes[i].scene_id)

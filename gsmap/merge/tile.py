@@ -66,7 +66,7 @@ def merge_tile(
     ``origin`` of the result counts in ``scenes``.
     """
     if not scenes:
-        raise InputError("nothing to merge: no scene touches the tile")
+        raise InputError("nothing to merge: no scene touches the tile", code="nothing_to_merge")
     how, params = merger(method), checked_params(method, params)
     dated = len({scene.captured_at for scene in scenes} - {None}) > 1
     reading = _Reading(

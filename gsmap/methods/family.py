@@ -104,23 +104,27 @@ class Family:
             except (Exception, SystemExit) as error:  # another package's code may fail in any way
                 raise ConfigError(
                     f"{self.name} {name!r} of the package {_package(added[name])} cannot be loaded "
-                    f"({type(error).__name__}: {error}): mend or uninstall that package"
+                    f"({type(error).__name__}: {error}): mend or uninstall that package",
+                    code="method_not_loadable",
                 ) from error
         else:
             known = self.names()
             near = difflib.get_close_matches(name, known, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise ConfigError(f"there is no {self.name} {name!r}{hint}: choose one of {', '.join(known)}")
+            raise ConfigError(
+                f"there is no {self.name} {name!r}{hint}: choose one of {', '.join(known)}", code="unknown_method"
+            )
         wanted = (*(("Params",) if self.has_params else ()), "VERSION", *self.contract)
         missing = [part for part in wanted if not hasattr(method, part)]
         if self.any_of and not any(hasattr(method, part) for part in self.any_of):
             missing.append(" or ".join(self.any_of))
         if missing:
             raise ConfigError(
-                f"{self.name} {name!r} lacks {', '.join(missing)}: see the contract in gsmap.methods.{self.name}"
+                f"{self.name} {name!r} lacks {', '.join(missing)}: see the contract in gsmap.methods.{self.name}",
+                code="invalid_method",
             )
         if self.has_params and not _is_frozen(method.Params):
-            raise ConfigError(f"{self.name} {name!r}: its Params must be a frozen dataclass")
+            raise ConfigError(f"{self.name} {name!r}: its Params must be a frozen dataclass", code="invalid_method")
         if self.has_params and name not in built_in:
             try:
                 get_type_hints(method.Params)
@@ -128,7 +132,8 @@ class Family:
             except Exception as error:
                 raise ConfigError(
                     f"{self.name} {name!r}: its Params cannot be made without arguments or read "
-                    f"({type(error).__name__}: {error})"
+                    f"({type(error).__name__}: {error})",
+                    code="invalid_method",
                 ) from error
         return method
 
@@ -176,7 +181,8 @@ class MethodParams(Mapping[str, Any]):
         if not isinstance(params, wanted):
             raise ConfigError(
                 f"{self.family} {name!r} takes {wanted.__module__}.Params, got {type(params).__module__}."
-                f"{type(params).__name__}"
+                f"{type(params).__name__}",
+                code="invalid_method",
             )
         kept = dict(self.changed) | {name: params}
         return MethodParams(self.family, tuple(sorted((n, p) for n, p in kept.items() if p != self._default(n))))

@@ -28,9 +28,12 @@ def refuse_external_data(path: Path) -> None:
     try:
         outside = _has_external(memoryview(path.read_bytes()), "model", 0)
     except (ValueError, IndexError):
-        raise InputError(f"{path} is not an ONNX model: it does not parse") from None
+        raise InputError(f"{path} is not an ONNX model: it does not parse", code="not_a_model") from None
     if outside:
-        raise InputError(f"{path} keeps weights in other files; save it as one file (onnx.save without external data)")
+        raise InputError(
+            f"{path} keeps weights in other files; save it as one file (onnx.save without external data)",
+            code="model_has_external_data",
+        )
 
 
 def _has_external(data: memoryview, message: str, depth: int) -> bool:

@@ -66,7 +66,7 @@ class ModelProcess:
         said, _ = self._exchange("loading it", None, {})
         if "error" in said:
             self.close()
-            raise InputError(f"{path} is not an ONNX model that can be run: {said['error']}")
+            raise InputError(f"{path} is not an ONNX model that can be run: {said['error']}", code="not_a_model")
         self.inputs, self.outputs = (_tensors(said[end]) for end in ("inputs", "outputs"))
 
     @property
@@ -112,7 +112,8 @@ class ModelProcess:
             self.close()
             raise InputError(
                 f"model {self.path}: {what} took more than {self.limits.time_s:g} s and was ended: give it more with "
-                "--set describe.object.model_time_s=SECONDS, or take another model"
+                "--set describe.object.model_time_s=SECONDS, or take another model",
+                code="model_timeout",
             ) from error
         except (EOFError, OSError, ValueError, LookupError, TypeError) as error:
             self.close()
@@ -129,7 +130,8 @@ class ModelProcess:
     def _too_large(self, what: str, ended: str) -> InputError:
         return InputError(
             f"model {self.path}: {what} ended its process ({ended}), most likely for lack of memory: give it more than "
-            f"{self.limits.memory_mb} MB with --set describe.object.model_memory_mb=MB, or take another model"
+            f"{self.limits.memory_mb} MB with --set describe.object.model_memory_mb=MB, or take another model",
+            code="model_out_of_memory",
         )
 
 

@@ -25,9 +25,13 @@ def open_session(spec: ModelSpec) -> ModelProcess:
     """
     path = Path(spec.path)
     if not path.is_file():
-        raise NotFoundError(f"model {spec.kind} is missing: {path}; add it again with `gsmap models add`")
+        raise NotFoundError(
+            f"model {spec.kind} is missing: {path}; add it again with `gsmap models add`", code="model_missing"
+        )
     if hashlib.sha256(path.read_bytes()).hexdigest() != spec.sha256:
-        raise InputError(f"model {spec.kind} has changed since it was added: {path}; add it again")
+        raise InputError(
+            f"model {spec.kind} has changed since it was added: {path}; add it again", code="model_changed"
+        )
     return _process(spec.path, spec.sha256, spec.limits)
 
 
@@ -42,7 +46,8 @@ def run(spec: ModelSpec, session: ModelProcess, outputs: list[str] | None, feed:
     except RuntimeError as error:
         given = ", ".join(f"{name} {list(value.shape)}" for name, value in feed.items())
         raise InputError(
-            f"model {spec.kind} ({spec.path}) does not run on {given}: {error}; add another with `gsmap models add`"
+            f"model {spec.kind} ({spec.path}) does not run on {given}: {error}; add another with `gsmap models add`",
+            code="model_failed",
         ) from error
 
 
@@ -59,7 +64,9 @@ def declared(path: Path, sha256: str, limits: ModelLimits) -> tuple[tuple[Tensor
 def misfit(spec: ModelSpec, problem: str) -> InputError:
     """The error for a model whose inputs and outputs are not those of its kind."""
     have = ", ".join(f"{t.name} {list(t.shape)}" for t in spec.inputs)
-    return InputError(f"{spec.path} is not a {spec.kind} model: {problem}; its inputs are {have or 'none'}")
+    return InputError(
+        f"{spec.path} is not a {spec.kind} model: {problem}; its inputs are {have or 'none'}", code="model_misfit"
+    )
 
 
 def _process(path: str, sha256: str, limits: ModelLimits) -> ModelProcess:

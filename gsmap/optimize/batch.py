@@ -177,5 +177,6 @@ def _check_confirmed(m: Measurements, state: State, gate: float) -> None:
     if worst.max() > CONTRADICTION_GATES * gate:
         target, source = alone.keys[int(np.argmax(worst))]
         raise InputError(
-            f"confirmed edge {target}:{source} contradicts the other confirmed edges: reject it, or one of them"
+            f"confirmed edge {target}:{source} contradicts the other confirmed edges: reject it, or one of them",
+            code="confirmed_edges_contradict",
         )

@@ -90,19 +90,26 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
     row = {scene: k for k, scene in enumerate(ids)}
     if len(row) != len(ids):
         twice = next(s for k, s in enumerate(ids) if row[s] != k)
-        raise InputError(f"scene {twice!r} is listed twice: pass every scene once")
+        raise InputError(f"scene {twice!r} is listed twice: pass every scene once", code="duplicate")
     seen: set[tuple[str, str]] = set()
     for edge in edges:
         for scene in (edge.target, edge.source):
             if scene not in row:
-                raise InputError(f"edge {_name(edge)} names scene {scene!r}, which is not in the map")
+                raise InputError(
+                    f"edge {_name(edge)} names scene {scene!r}, which is not in the map", code="unknown_scene"
+                )
         if edge.target == edge.source:
-            raise InputError(f"edge {_name(edge)} ties a scene to itself: remove it")
+            raise InputError(f"edge {_name(edge)} ties a scene to itself: remove it", code="self_edge")
         if (edge.target, edge.source) in seen:
-            raise InputError(f"edge {_name(edge)} is given twice: pass one measurement for a target and source")
+            raise InputError(
+                f"edge {_name(edge)} is given twice: pass one measurement for a target and source", code="duplicate"
+            )
         seen.add((edge.target, edge.source))
         if np.shape(edge.information) != (7, 7):
-            raise InputError(f"edge {_name(edge)} needs a (7, 7) information matrix, got {np.shape(edge.information)}")
+            raise InputError(
+                f"edge {_name(edge)} needs a (7, 7) information matrix, got {np.shape(edge.information)}",
+                code="invalid_information",
+            )
     targets = np.array([row[e.target] for e in edges], dtype=np.int64)
     sources = np.array([row[e.source] for e in edges], dtype=np.int64)
     information = np.array([e.information for e in edges], dtype=np.float64).reshape(-1, 7, 7)
@@ -140,16 +147,20 @@ def check_priors(scene_ids: Sequence[str], priors: Sequence[Prior]) -> None:
         check_sim3(prior.S_map_scene, f"S_map_scene of the prior of scene {prior.scene!r}")
         sigmas = np.asarray(prior.sigmas, dtype=np.float64)
         if prior.scene not in known:
-            raise InputError(f"prior names scene {prior.scene!r}, which is not in the map")
+            raise InputError(f"prior names scene {prior.scene!r}, which is not in the map", code="unknown_scene")
         if sigmas.shape != (7,) or np.isnan(sigmas).any() or (sigmas <= 0).any():
             raise InputError(
-                f"prior of scene {prior.scene!r} needs 7 positive sigmas, inf where unknown; got {sigmas.tolist()}"
+                f"prior of scene {prior.scene!r} needs 7 positive sigmas, inf where unknown; got {sigmas.tolist()}",
+                code="invalid_sigma",
             )
         if prior.up is not None:
             up = np.asarray(prior.up, dtype=np.float64)
             usable = up.shape == (3,) and np.isfinite(up).all() and np.linalg.norm(up) > 1e-9
             if not usable or not (np.isfinite(prior.up_sigma_rad) and prior.up_sigma_rad > 0):
-                raise InputError(f"prior of scene {prior.scene!r} needs a finite up direction and a positive sigma")
+                raise InputError(
+                    f"prior of scene {prior.scene!r} needs a finite up direction and a positive sigma",
+                    code="invalid_prior",
+                )
 
 
 def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
@@ -158,11 +169,17 @@ def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
         return
     finite = np.isfinite(information).all((1, 2))
     if not finite.all():
-        raise InputError(f"edge {_name(edges[int(np.argmin(finite))])} has NaN or infinity in its information matrix")
+        raise InputError(
+            f"edge {_name(edges[int(np.argmin(finite))])} has NaN or infinity in its information matrix",
+            code="not_finite",
+        )
     size = np.abs(information).max((1, 2))
     skewed = np.abs(information - information.transpose(0, 2, 1)).max((1, 2)) > 1e-6 * size
     if skewed.any():
-        raise InputError(f"edge {_name(edges[int(np.argmax(skewed))])} has an information matrix that is not symmetric")
+        raise InputError(
+            f"edge {_name(edges[int(np.argmax(skewed))])} has an information matrix that is not symmetric",
+            code="invalid_information",
+        )
     # Scale to a unit diagonal first: a stiff scale row beside soft ones is well posed, however large the ratio.
     diagonal = np.einsum("eii->ei", information)
     bad = (diagonal <= 0).any(1)
@@ -173,7 +190,8 @@ def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
         raise InputError(
             f"edge {_name(edges[int(np.argmax(bad))])} has an information matrix that is not positive definite: "
             "every direction needs some certainty; reject the edge, or remove and ingest its captures again where an "
-            "older gsmap took them in at map coordinates"
+            "older gsmap took them in at map coordinates",
+            code="invalid_information",
         )
 
 

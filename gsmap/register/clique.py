@@ -42,6 +42,8 @@ def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000, *, more_than:
 
     rows = np.ascontiguousarray(rows)
     if rows.dtype != np.uint64 or rows.ndim != 2 or rows.shape[1] != -(-len(rows) // 64):
-        raise InputError(f"a graph needs (M, ceil(M / 64)) uint64 bit rows, got {rows.shape} {rows.dtype}")
+        raise InputError(
+            f"a graph needs (M, ceil(M / 64)) uint64 bit rows, got {rows.shape} {rows.dtype}", code="shape_mismatch"
+        )
     members, exact, steps = _native.maximum_clique(rows, int(more_than), int(step_limit))
     return Clique(members.astype(np.int64), bool(exact), int(steps))

@@ -37,7 +37,10 @@ class Params:
 
     def __post_init__(self) -> None:
         if self.test not in get_args(Test):
-            raise ConfigError(f"the consistency test must be one of {', '.join(get_args(Test))}, got {self.test!r}")
+            raise ConfigError(
+                f"the consistency test must be one of {', '.join(get_args(Test))}, got {self.test!r}",
+                code="invalid_choice",
+            )
 
 
 def consistency_graph(matches: Correspondences, params: Params | None = None, *, scale: float = 1.0) -> np.ndarray:

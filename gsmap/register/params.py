@@ -111,10 +111,15 @@ class Params:
 
     def __post_init__(self) -> None:
         if self.fallback not in get_args(Fallback):
-            raise ConfigError(f"fallback must be one of {', '.join(get_args(Fallback))}, got {self.fallback!r}")
+            raise ConfigError(
+                f"fallback must be one of {', '.join(get_args(Fallback))}, got {self.fallback!r}", code="invalid_choice"
+            )
         for name in (self.proposer, self.fallback_proposer):
             family("proposer").get(name)
         for name in (self.coarse_refiner, self.refiner, self.scale_refiner, self.polisher):
             family("refiner").get(name)
         if not family("refiner").get(self.scale_refiner).SCALES:
-            raise ConfigError(f"scale_refiner must be one that can refine the scale, {self.scale_refiner!r} cannot")
+            raise ConfigError(
+                f"scale_refiner must be one that can refine the scale, {self.scale_refiner!r} cannot",
+                code="setting_mismatch",
+            )

@@ -39,7 +39,10 @@ class SceneView:
 
     def __post_init__(self) -> None:
         if self.scale_policy not in SCALE_POLICIES:
-            raise ConfigError(f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {self.scale_policy!r}")
+            raise ConfigError(
+                f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {self.scale_policy!r}",
+                code="invalid_choice",
+            )
 
     @cached_property
     def centre(self) -> np.ndarray:

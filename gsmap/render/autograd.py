@@ -27,7 +27,10 @@ def render_tensors(
 ) -> Rendered:
     """`gsmap.render.render` for tensors on the CPU."""
     if gaussians.means.device.type == "cuda":
-        raise ConfigError("the native backend renders CPU tensors: move them to the CPU or use backend='auto'")
+        raise ConfigError(
+            "the native backend renders CPU tensors: move them to the CPU or use backend='auto'",
+            code="unsupported_backend",
+        )
     width, height = image_size(cameras)
     options = (cameras.intrinsics_px, width, height, background, depth, dominant_id, max_weight, index)
     return Rendered(*_Render.apply(*gaussians.tensors(), T_camera_frame, options))

@@ -24,7 +24,7 @@ def backend(name: str = "auto") -> Literal["native", "gsplat"]:
         ConfigError: an unknown name.
     """
     if name not in ("auto", "native", "gsplat"):
-        raise ConfigError(f"backend must be auto, native or gsplat, got {name!r}")
+        raise ConfigError(f"backend must be auto, native or gsplat, got {name!r}", code="invalid_choice")
     if name == "gsplat" or (name == "auto" and gsplat_available()):
         return "gsplat"
     return "native"

@@ -147,17 +147,21 @@ def checked_mask(mask: np.ndarray | None, n: int) -> np.ndarray | None:
         return None
     mask = np.ascontiguousarray(mask, dtype=bool)
     if mask.shape != (n,):
-        raise InputError(f"frozen must be a mask of shape ({n},), got {mask.shape}")
+        raise InputError(f"frozen must be a mask of shape ({n},), got {mask.shape}", code="shape_mismatch")
     return mask
 
 
 def check_pixels(values: Any, shape: tuple[int, ...], name: str) -> None:
     """Raise InputError where images or masks differ from the cameras' shape."""
     if tuple(values.shape) != shape:
-        raise InputError(f"{name} must have the cameras' shape {shape}, got {tuple(values.shape)}")
+        raise InputError(
+            f"{name} must have the cameras' shape {shape}, got {tuple(values.shape)}", code="shape_mismatch"
+        )
 
 
 def check_appended(gaussians: Gaussians, num_sh: int) -> None:
     """Raise InputError where Gaussians to be appended have another SH degree."""
     if gaussians.sh.shape[1] != num_sh:
-        raise InputError(f"appended Gaussians have {gaussians.sh.shape[1]} SH coefficients, not {num_sh}")
+        raise InputError(
+            f"appended Gaussians have {gaussians.sh.shape[1]} SH coefficients, not {num_sh}", code="shape_mismatch"
+        )

@@ -52,7 +52,8 @@ class ChunkIndex:
         m = len(self.starts) - 1
         if self.low.shape != (m, 3) or self.high.shape != (m, 3) or self.radius.shape != (m,):
             raise InputError(
-                f"ChunkIndex of {m} chunks has boxes {self.low.shape}, {self.high.shape}, {self.radius.shape}"
+                f"ChunkIndex of {m} chunks has boxes {self.low.shape}, {self.high.shape}, {self.radius.shape}",
+                code="shape_mismatch",
             )
 
     @property

@@ -37,7 +37,7 @@ def set_num_threads(count: int | None = None) -> None:
             affinity = getattr(os, "sched_getaffinity", None)
             count = len(affinity(0)) if affinity else os.cpu_count() or 1
     if count < 1:
-        raise InputError(f"the number of threads must be at least 1, got {count}")
+        raise InputError(f"the number of threads must be at least 1, got {count}", code="out_of_range")
     _set_num_threads(count)
 
 
@@ -95,7 +95,8 @@ def forward(
     if index is not None:
         if index.num_gaussians != len(arrays[0]):
             raise InputError(
-                f"the index is of {index.num_gaussians} Gaussians, rendered are {len(arrays[0])}: rebuild it"
+                f"the index is of {index.num_gaussians} Gaussians, rendered are {len(arrays[0])}: rebuild it",
+                code="shape_mismatch",
             )
         ranges = index.visible_ranges(pose, intrinsics_px, width, height)
     view.forward(

@@ -35,13 +35,17 @@ def image_size(cameras: Cameras) -> tuple[int, int]:
         InputError: not `Cameras`, several sizes, or larger than the rasteriser's 65,535 tiles of 32 pixels a side.
     """
     if not isinstance(cameras, Cameras):
-        raise InputError(f"render needs gsmap.types.Cameras, got {type(cameras).__name__}")
+        raise InputError(f"render needs gsmap.types.Cameras, got {type(cameras).__name__}", code="wrong_type")
     if len(cameras) == 0:
         return 1, 1
     width, height = (int(v) for v in cameras.sizes_px[0])
     if (cameras.sizes_px != (width, height)).any():
         sizes = sorted({f"{w}x{h}" for w, h in cameras.sizes_px.tolist()})
-        raise InputError(f"cameras of one render call must share one image size, got {', '.join(sizes[:5])}")
+        raise InputError(
+            f"cameras of one render call must share one image size, got {', '.join(sizes[:5])}", code="shape_mismatch"
+        )
     if width * height > 2**28:
-        raise InputError(f"an image of {width}x{height} pixels is too large to render: resize the cameras")
+        raise InputError(
+            f"an image of {width}x{height} pixels is too large to render: resize the cameras", code="picture_too_large"
+        )
     return width, height

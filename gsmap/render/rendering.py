@@ -63,10 +63,13 @@ def render(
     width, height = image_size(cameras)
     colour = np.asarray(background, dtype=np.float32)
     if colour.shape != (3,) or not np.isfinite(colour).all():
-        raise InputError(f"background must be three finite numbers, got {background!r}")
+        raise InputError(f"background must be three finite numbers, got {background!r}", code="invalid_vector")
     if isinstance(gaussians, Gaussians):
         if T_camera_frame is not None:
-            raise InputError("T_camera_frame goes with GaussianTensors; for numpy, put the pose into the cameras")
+            raise InputError(
+                "T_camera_frame goes with GaussianTensors; for numpy, put the pose into the cameras",
+                code="invalid_pose",
+            )
         images = native.allocate(len(cameras), height, width, len(gaussians), depth, dominant_id, max_weight)
         if chosen == "gsplat":
             from gsmap.render import gsplat
@@ -91,7 +94,9 @@ def render(
     from gsmap.render.tensors import GaussianTensors
 
     if not isinstance(gaussians, GaussianTensors):
-        raise InputError(f"render needs Gaussians or GaussianTensors, got {type(gaussians).__name__}")
+        raise InputError(
+            f"render needs Gaussians or GaussianTensors, got {type(gaussians).__name__}", code="wrong_type"
+        )
     pose = _view_matrices(cameras, T_camera_frame)
     # Tensors that lie on the GPU are rendered there, even where gsplat turns out to be missing: its error says so.
     if chosen == "gsplat" or (backend == "auto" and gaussians.means.device.type == "cuda"):
@@ -107,8 +112,9 @@ def _view_matrices(cameras: Cameras, T_camera_frame: torch.Tensor | None) -> tor
         return torch.from_numpy(cameras.T_camera_frame)
     if tuple(T_camera_frame.shape) != (len(cameras), 4, 4) or not T_camera_frame.is_floating_point():
         raise InputError(
-            f"T_camera_frame must be a float tensor ({len(cameras)}, 4, 4), got {tuple(T_camera_frame.shape)}"
+            f"T_camera_frame must be a float tensor ({len(cameras)}, 4, 4), got {tuple(T_camera_frame.shape)}",
+            code="invalid_pose",
         )
     if not bool(torch.isfinite(T_camera_frame).all()):
-        raise InputError("T_camera_frame holds NaN or infinity")
+        raise InputError("T_camera_frame holds NaN or infinity", code="not_finite")
     return T_camera_frame

@@ -26,19 +26,26 @@ class GaussianTensors:
             value = getattr(self, f.name)
             if not isinstance(value, torch.Tensor) or value.dtype != torch.float32:
                 kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
-                raise InputError(f"GaussianTensors.{f.name} must be a float32 tensor, got {kind}")
+                raise InputError(f"GaussianTensors.{f.name} must be a float32 tensor, got {kind}", code="wrong_type")
             if value.device != self.means.device:
-                raise InputError(f"GaussianTensors.{f.name} is on {value.device}, means are on {self.means.device}")
+                raise InputError(
+                    f"GaussianTensors.{f.name} is on {value.device}, means are on {self.means.device}",
+                    code="shape_mismatch",
+                )
         n = self.means.shape[0] if self.means.ndim else 0
         expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise InputError(
-                    f"GaussianTensors.{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}"
+                    f"GaussianTensors.{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}",
+                    code="shape_mismatch",
                 )
         sh = tuple(self.sh.shape)
         if len(sh) != 3 or sh[0] != n or sh[1] not in (1, 4, 9, 16) or sh[2] != 3:
-            raise InputError(f"GaussianTensors.sh must have shape ({n}, K, 3) with K = 1, 4, 9 or 16, got {sh}")
+            raise InputError(
+                f"GaussianTensors.sh must have shape ({n}, K, 3) with K = 1, 4, 9 or 16, got {sh}",
+                code="shape_mismatch",
+            )
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -52,7 +52,9 @@ class Params:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if value < 0:
-                raise ConfigError(f"report.{name} must not be negative, got {value}")
+                raise ConfigError(f"report.{name} must not be negative, got {value}", code="out_of_range")
         for name in ("plan_px", "picture_px"):
             if getattr(self, name) < 16:
-                raise ConfigError(f"report.{name} must be at least 16 pixels, got {getattr(self, name)}")
+                raise ConfigError(
+                    f"report.{name} must be at least 16 pixels, got {getattr(self, name)}", code="out_of_range"
+                )

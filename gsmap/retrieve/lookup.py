@@ -135,7 +135,7 @@ def _search(found: _Matches, block: _Block, place_of: np.ndarray) -> None:
             found.asker.asking.codes, node, begin, end, block.rows, others, found.nearest
         )
     except ValueError as error:
-        raise CorruptError(f"an index has rows of scenes that it has not ({error})") from error
+        raise CorruptError(f"an index has rows of scenes that it has not ({error})", code="index_damaged") from error
     found.parts.append((who, squared, place, positions_of(block.rows[row])))
     if found.seen is not None:
         for first, last in zip(begin.tolist(), end.tolist(), strict=True):

@@ -51,7 +51,9 @@ class Params:
     def __post_init__(self) -> None:
         for field in fields(self):
             if not getattr(self, field.name) >= 0:
-                raise ConfigError(f"retrieve.{field.name} must not be negative, got {getattr(self, field.name)}")
+                raise ConfigError(
+                    f"retrieve.{field.name} must not be negative, got {getattr(self, field.name)}", code="out_of_range"
+                )
         for name in ("enough", "nodes_per_scene", "votes_per_node", "matches", "checked_scenes"):
             if getattr(self, name) < 1:
-                raise ConfigError(f"retrieve.{name} must be at least 1, got {getattr(self, name)}")
+                raise ConfigError(f"retrieve.{name} must be at least 1, got {getattr(self, name)}", code="out_of_range")

@@ -83,7 +83,10 @@ def parse(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     name, value = name.strip(), value.strip()
     if not equals or not name:
-        raise ConfigError(f"a setting is given as name=value, such as register.verdict.max_log_nfa=-6, got {text!r}")
+        raise ConfigError(
+            f"a setting is given as name=value, such as register.verdict.max_log_nfa=-6, got {text!r}",
+            code="invalid_assignment",
+        )
     for text in (value, _BARE_DOT.sub(r"0.", value)):
         with contextlib.suppress(ValueError, RecursionError):
             return name, tomllib.loads(f"value = {text}")["value"]
@@ -151,7 +154,9 @@ def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:
         new = _set(below, path[1:], value, name, root)
     elif _is_node(below):
         inside = ", ".join(leaf.name for leaf in list(leaves(below, f"{name}."))[:4])
-        raise ConfigError(f"{name} holds several settings: set one of them, such as {inside}")
+        raise ConfigError(
+            f"{name} holds several settings: set one of them, such as {inside}", code="setting_not_a_leaf"
+        )
     else:
         new = _of_type(value, annotation, name)
     if isinstance(tree, MethodParams):
@@ -165,7 +170,7 @@ def _unknown(name: str, root: Any) -> ConfigError:
     known = [leaf.name for leaf in leaves(root)]
     near = difflib.get_close_matches(name, known, 1, 0.5) or [k for k in known if k.endswith("." + name.split(".")[-1])]
     hint = f": did you mean {near[0]}?" if near else ": gsmap settings MAP lists them all"
-    return ConfigError(f"there is no setting {name!r}{hint}")
+    return ConfigError(f"there is no setting {name!r}{hint}", code="unknown_setting")
 
 
 def _of_type(value: Any, annotation: Any, name: str) -> Any:
@@ -186,7 +191,7 @@ def _of_type(value: Any, annotation: Any, name: str) -> Any:
     if origin is Literal:
         if value in inner:
             return value
-        raise ConfigError(f"{name} must be one of {', '.join(map(str, inner))}, got {value!r}")
+        raise ConfigError(f"{name} must be one of {', '.join(map(str, inner))}, got {value!r}", code="invalid_choice")
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
             raise _wrong(value, annotation, name)
@@ -209,4 +214,4 @@ def _of_type(value: Any, annotation: Any, name: str) -> Any:
 
 def _wrong(value: Any, annotation: Any, name: str) -> ConfigError:
     wanted = getattr(annotation, "__name__", str(annotation)) if not get_args(annotation) else str(annotation)
-    return ConfigError(f"{name} takes {wanted}, got {value!r}")
+    return ConfigError(f"{name} takes {wanted}, got {value!r}", code="invalid_setting_value")

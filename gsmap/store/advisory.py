@@ -30,7 +30,7 @@ def take(connection: Connection, lock: int, patience_s: float, busy: str, *, sha
     later = f"{busy} for {patience_s:g} s; try again later"
     if patience_s <= 0:
         if not connection.execute(text(f"SELECT pg_try_advisory_xact_lock{kind}(:a, :b)"), number).scalar_one():
-            raise BusyError(later)
+            raise BusyError(later, code="lock_busy")
         return
     wait = text("SELECT set_config('lock_timeout', :ms, true)")
     connection.execute(wait, {"ms": str(int(1e3 * patience_s))})
@@ -38,6 +38,6 @@ def take(connection: Connection, lock: int, patience_s: float, busy: str, *, sha
         connection.execute(text(f"SELECT pg_advisory_xact_lock{kind}(:a, :b)"), number)
     except OperationalError as error:
         if getattr(error.orig, "sqlstate", None) == _NOT_AVAILABLE:
-            raise BusyError(later) from error
+            raise BusyError(later, code="lock_busy") from error
         raise
     connection.execute(wait, {"ms": "0"})

@@ -226,9 +226,12 @@ class Arrays:
         for file in files:
             path, found = place / file.path, present.get(file.path)
             if found is not None and not stat.S_ISREG(found.st_mode):
-                raise CorruptError(f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it")
+                raise CorruptError(
+                    f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it",
+                    code="not_a_plain_file",
+                )
             if found is None or found.st_size != file.size_bytes:
-                raise CorruptError(f"{path} is missing or cut off: {layout.mend(kind)}")
+                raise CorruptError(f"{path} is missing or cut off: {layout.mend(kind)}", code="arrays_missing")
         try:
             with _opened(place, kind, files) as body:
                 names = body.array_names() if only is None else only
@@ -237,7 +240,9 @@ class Arrays:
             if error.errno in _NOT_ITS_BYTES:
                 with explained(place):
                     raise
-            raise CorruptError(f"{place} cannot be read ({error}): {layout.mend(kind)}") from error
+            raise CorruptError(
+                f"{place} cannot be read ({error}): {layout.mend(kind)}", code="arrays_corrupt"
+            ) from error
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
         """What differs from the manifest, after reading every byte."""
@@ -295,7 +300,10 @@ class Arrays:
     def _place(self, kind: str, name: str) -> Path:
         """Where a group lies; its name has been a row's, and that row a stranger's."""
         if kind not in KINDS or not is_digest(name):
-            raise CorruptError(f"{kind}/{name} is not the name of a group of arrays: nothing is done with it")
+            raise CorruptError(
+                f"{kind}/{name} is not the name of a group of arrays: nothing is done with it",
+                code="invalid_stored_name",
+            )
         self._check_root()
         refuse_links(self.root, kind, name)
         return self.root / kind / name
@@ -383,11 +391,16 @@ def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
     for file in files:
         path, mine, found = place / file.path, target / file.path, present.get(file.path)
         if found is None or not stat.S_ISREG(found.st_mode) or found.st_size != file.size_bytes:
-            raise CorruptError(f"{path} is missing or cut off: run gsmap check on that map, and repair it first")
+            raise CorruptError(
+                f"{path} is missing or cut off: run gsmap check on that map, and repair it first", code="arrays_missing"
+            )
         mine.parent.mkdir(parents=True, exist_ok=True)
         link_or_copy(path, mine)
         if _sha256(mine) != file.sha256:
-            raise CorruptError(f"{path} differs from what was written: run gsmap check on that map, repair it first")
+            raise CorruptError(
+                f"{path} differs from what was written: run gsmap check on that map, repair it first",
+                code="bytes_differ",
+            )
     for path in [*(p for p in target.rglob("*") if p.is_dir()), target]:
         sync_folder(path)
     return target

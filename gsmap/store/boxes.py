@@ -21,7 +21,9 @@ def chunk_boxes(gaussians: Gaussians, rows: int, *, sigmas: float = 3.0) -> np.n
 def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
     """Keep the boxes (C, 2, 3) of a scene's chunks, in place of those that there are."""
     if number >= 1 << 24:
-        raise StoreError("a map holds at most 16 million scenes")  # the R*Tree's floats count no further
+        raise StoreError(
+            "a map holds at most 16 million scenes", code="too_many_scenes"
+        )  # the R*Tree's floats count no further
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
     rows = [
         {"s": number, "chunk": i}
@@ -47,7 +49,9 @@ def get_boxes(connection: Connection, number: int) -> np.ndarray:
 def touching(connection: Connection, number: int, bounds: np.ndarray) -> list[int]:
     """The chunks of a scene whose boxes meet one (2, 3) in its frame."""
     if bounds.shape != (2, 3):
-        raise InputError(f"bounds must be (2, 3): lowest and highest corner, got shape {bounds.shape}")
+        raise InputError(
+            f"bounds must be (2, 3): lowest and highest corner, got shape {bounds.shape}", code="invalid_box"
+        )
     query = text(
         f"SELECT chunk FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s AND x1 >= :x0 AND x0 <= :x1 "
         "AND y1 >= :y0 AND y0 <= :y1 AND z1 >= :z0 AND z0 <= :z1 ORDER BY chunk"

@@ -109,7 +109,7 @@ def find(path: str | os.PathLike[str]) -> Place:
             return place
     known = ", ".join(place.branch for place in places(home))
     there = f"it has {known}" if known else f"make it with gsmap branch {home} {name}"
-    raise NotFoundError(f"{home} has no branch or tag {name!r}: {there}")
+    raise NotFoundError(f"{home} has no branch or tag {name!r}: {there}", code="branch_not_found")
 
 
 def places(home: Path) -> list[Place]:
@@ -155,7 +155,9 @@ def checked_name(name: str) -> str:
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            f"a branch or tag is called by up to 64 letters, digits, '.', '_' and '-', not beginning with '.': {name!r}"
+            "a branch or tag is called by up to 64 letters, digits, '.', '_' and '-', not beginning with '.': "
+            f"{name!r}",
+            code="invalid_name",
         )
     return name
 
@@ -200,14 +202,17 @@ class Branches:
             kind = "tag" if tag else "branch"
             raise ConfigError(
                 f"{self._place.location} lies in a bucket, where a map has no branches or tags: gsmap clone makes "
-                f"a map of its own in a folder, which can have a {kind}"
+                f"a map of its own in a folder, which can have a {kind}",
+                code="no_branches_in_bucket",
             )
         folder = home / FOLDER / checked_name(name)
         if folder.exists() or Path(f"{home}@{name}").exists():
             taken = "a branch or tag" if folder.exists() else f"the path {home}@{name}"
-            raise ConfigError(f"{taken} of the name {name!r} exists already: choose another name")
+            raise ConfigError(f"{taken} of the name {name!r} exists already: choose another name", code="branch_exists")
         if not os.access(home, os.W_OK):
-            raise StoreError(f"{home} cannot be written, so it can get no branch: copy it to where it can be")
+            raise StoreError(
+                f"{home} cannot be written, so it can get no branch: copy it to where it can be", code="not_writable"
+            )
         staged = folder.with_name(f".{name}.{uuid.uuid4().hex[:8]}")
         # Nobody reclaims arrays between the copy and the moment at which it counts.
         with explained(home), self._arrays.lock():
@@ -274,7 +279,9 @@ class Branches:
             if place.branch == name:
                 return place
         known = ", ".join(place.branch for place in places(self._place.home)) or "none"
-        raise NotFoundError(f"{self._place.home} has no branch or tag {name!r}: it has {known}")
+        raise NotFoundError(
+            f"{self._place.home} has no branch or tag {name!r}: it has {known}", code="branch_not_found"
+        )
 
 
 class Others:
@@ -299,7 +306,8 @@ class Others:
         if strange := strangers(self._home):
             raise StoreError(
                 f"{self._home / strange[0]} is no branch, and may be one that lost {MARKER} or its name: nothing is "
-                "reclaimed while it lies there; put back what it lacks, or move it out of the map"
+                "reclaimed while it lies there; put back what it lacks, or move it out of the map",
+                code="stray_branch",
             )
         for place in other_places(self._home, self._folder):
             with explained(place.folder):

@@ -32,7 +32,7 @@ def max_bytes() -> int:
     """How much is kept at most: ``GSMAP_CACHE_MB``."""
     named = os.environ.get(SIZE_VARIABLE) or str(_DEFAULT_MB)
     if not named.isdecimal():
-        raise ConfigError(f"{SIZE_VARIABLE} must be a number of megabytes, got {named!r}")
+        raise ConfigError(f"{SIZE_VARIABLE} must be a number of megabytes, got {named!r}", code="invalid_environment")
     return int(named) * 1_000_000
 
 
@@ -63,7 +63,7 @@ def keep(sha256: str, chunks: Iterable[bytes], what: str) -> Path:
                 digest.update(chunk)
                 file.write(chunk)
         if digest.hexdigest() != sha256:
-            raise CorruptError(f"{what} differs from what was written")
+            raise CorruptError(f"{what} differs from what was written", code="bytes_differ")
         _make_room(root, staged.stat().st_size)
         os.replace(staged, root / sha256)
     finally:

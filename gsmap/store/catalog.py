@@ -130,7 +130,7 @@ class Catalog:
             yield self._writing
             return
         if not self.writable:
-            raise StoreError(self._refusal)
+            raise StoreError(self._refusal, code="catalog_refused")
         with self.lock() if self.is_sqlite else contextlib.nullcontext():
             with explained(self.folder, NOT_KEPT), self.engine.connect() as connection:
                 try:
@@ -162,7 +162,7 @@ class Catalog:
             BusyError: another process kept it for ``patience_s``.
         """
         if not self.writable:
-            raise StoreError(self._refusal)
+            raise StoreError(self._refusal, code="catalog_refused")
         if self._depth:
             yield
             return
@@ -223,12 +223,14 @@ class Catalog:
         if self.is_sqlite:
             file = self.folder / sqlite.FILE
             if self.writable and not sqlite.has_log(file):
-                raise CorruptError(digests.damaged(file, ["another program changed its journal mode"]))
+                raise CorruptError(
+                    digests.damaged(file, ["another program changed its journal mode"]), code="catalog_damaged"
+                )
             found = self.page_problems(at_most_bytes=None if whole else digests.WHOLE_BYTES)
             if found:
                 backup = digests.is_backup(file, sqlite.handle(self.engine))
                 if backup is None or read_log(log_of(file)).frames:
-                    raise CorruptError(digests.damaged(file, found))
+                    raise CorruptError(digests.damaged(file, found), code="catalog_damaged")
                 if self.writable:  # somebody put it back
                     with self.lock():
                         digests.save(file, backup)
@@ -282,7 +284,10 @@ class Catalog:
             CorruptError: SQLite cannot make sense of them.
         """
         if not self.is_sqlite:
-            raise ConfigError(f"{self.folder}: its catalog is no file of the map, so that there is nothing to accept")
+            raise ConfigError(
+                f"{self.folder}: its catalog is no file of the map, so that there is nothing to accept",
+                code="nothing_to_accept",
+            )
         with self.lock(), explained(self.folder):
             found = self.page_problems()
             with self.read() as connection:
@@ -290,7 +295,8 @@ class Catalog:
             if wrong:
                 raise CorruptError(
                     f"{self.folder}: the catalog cannot be accepted, SQLite finds {summary(wrong)}: restore "
-                    f"{sqlite.FILE} from a backup"
+                    f"{sqlite.FILE} from a backup",
+                    code="catalog_damaged",
                 )
             sqlite.accept(self.engine, self.folder / sqlite.FILE)
         return found
@@ -321,7 +327,7 @@ class Catalog:
             with explained(self.folder):
                 sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
         except CorruptError as error:
-            raise CorruptError(f"{error}; what was written since is kept in its log") from error
+            raise CorruptError(f"{error}; what was written since is kept in its log", code="catalog_damaged") from error
         except StoreError as error:
             _log.warning("what was written is kept, but not yet folded into %s: %s", sqlite.FILE, error)
 
@@ -362,11 +368,14 @@ def url_engine(url: str) -> Engine:
     try:
         if make_url(url).get_backend_name() != "postgresql":
             raise ConfigError(
-                f"{url_without_password(url)!r} is not a PostgreSQL database URL (postgresql+psycopg://...)"
+                f"{url_without_password(url)!r} is not a PostgreSQL database URL (postgresql+psycopg://...)",
+                code="invalid_catalog_url",
             )
         return create_engine(url, pool_pre_ping=True)
     except (ArgumentError, NoSuchModuleError) as error:
-        raise ConfigError(f"{url!r} is not a database URL that SQLAlchemy knows: {error}") from error
+        raise ConfigError(
+            f"{url!r} is not a database URL that SQLAlchemy knows: {error}", code="invalid_catalog_url"
+        ) from error
     except ModuleNotFoundError as error:
         raise MissingDependencyError(f"the catalog needs the package {error.name}: pip install {error.name}") from error
 

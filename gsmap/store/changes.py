@@ -81,7 +81,8 @@ class Changes:
         """
         if key.inputs[:2] != (older, newer) or older == newer:
             raise InputError(
-                f"the key of a comparison must have its two scenes {older} and {newer} as its first inputs"
+                f"the key of a comparison must have its two scenes {older} and {newer} as its first inputs",
+                code="key_input_mismatch",
             )
         whole = self._whole(report.changes, older, newer, counted)
         arrays = _to_arrays(whole)
@@ -153,7 +154,7 @@ class Changes:
         with self._catalog.read() as connection:
             row = connection.execute(select(comparisons).where(comparisons.c.number == number)).first()
             if row is None:
-                raise NotFoundError(f"no comparison {number} in this map")
+                raise NotFoundError(f"no comparison {number} in this map", code="change_not_found")
             return read_comparison(connection, row)
 
     def load(self, comparison: int) -> ChangeReport:
@@ -175,7 +176,8 @@ class Changes:
             }
         if not found.whole:
             raise NotFoundError(
-                f"the arrays of comparison {comparison} were pruned: gsmap changes MAP makes those of today's again"
+                f"the arrays of comparison {comparison} were pruned: gsmap changes MAP makes those of today's again",
+                code="arrays_pruned",
             )
         parts: list[dict[str, np.ndarray]] = []
         if found.changes:
@@ -228,14 +230,19 @@ class Changes:
                 .where(changes.c.number == number, changes.c.same_as.is_(None))
             ).first()
             if row is None:
-                raise NotFoundError(f"this map has no change c{number}: gsmap changes MAP lists them")
+                raise NotFoundError(
+                    f"this map has no change c{number}: gsmap changes MAP lists them", code="change_not_found"
+                )
             found = newest(connection, row.pair)
             assert found is not None
             for change in read_comparison(connection, found).changes:
                 if change.number == number:
                     return change
             names = " and ".join(scene_name(connection, scene) for scene in (found.older, found.newer))
-        raise NotFoundError(f"change c{number} is no longer found: {names} were compared again on {found.created_at}")
+        raise NotFoundError(
+            f"change c{number} is no longer found: {names} were compared again on {found.created_at}",
+            code="change_not_found",
+        )
 
     def review(self, number: int, review: str, note: str = "") -> StoredChange:
         """Write down a person's word on a change: ``confirm`` it, ``reject`` it, or ``withdraw`` the last word.
@@ -246,10 +253,12 @@ class Changes:
             ConfigError: another word.
         """
         if review not in REVIEWS:
-            raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}")
+            raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
         with self._catalog.write() as connection:
             if review == "withdraw" and self.get(number).status == OPEN:
-                raise InputError(f"nobody has reviewed c{number}: there is nothing to withdraw")
+                raise InputError(
+                    f"nobody has reviewed c{number}: there is nothing to withdraw", code="nothing_to_withdraw"
+                )
             self.get(number)
             when = later(connection, change_reviews.c.created_at, change_reviews.c.change == number)
             row = {"change": number, "review": review, "note": note, "created_at": when}
@@ -299,7 +308,7 @@ def _parts(
     most = {"before": older, "after": newer}
     fits = all(((arrays[name] >= 0) & (arrays[name] < count)).all() for name, count in most.items())
     if not fits or not np.isfinite(arrays["voxels"]).all():
-        raise CorruptError(f"{where} is not what a comparison can have found: run gsmap check")
+        raise CorruptError(f"{where} is not what a comparison can have found: run gsmap check", code="catalog_invalid")
     cut = {name: np.split(arrays[name], np.cumsum(counts)[:-1]) for name, counts in _counts(found).items()}
     return [{name: cut[name][i] for name in _PARTS} for i in range(len(found))]
 

@@ -59,7 +59,7 @@ class _Checked(TypeDecorator[Any]):
 
     def process_bind_param(self, value: Any, dialect: Any) -> Any:
         if value is not None and not (isinstance(value, str) and self.fits(value)):
-            raise InputError(f"{self.where} must be {self.what}, got {_short(value)}")
+            raise InputError(f"{self.where} must be {self.what}, got {_short(value)}", code="invalid_column_value")
         return value
 
     def result_processor(self, dialect: Any, coltype: Any) -> Callable[[Any], Any] | None:
@@ -237,7 +237,8 @@ def not_ours(where: str) -> Iterator[None]:
     except GsmapError as error:
         raise CorruptError(
             f"the catalog holds bytes in {where} that are none of its numbers ({error}): gsmap did not write that; "
-            "restore the catalog from a backup, and do not trust a map that was sent to you so"
+            "restore the catalog from a backup, and do not trust a map that was sent to you so",
+            code="catalog_invalid",
         ) from error
 
 
@@ -354,7 +355,8 @@ def corrupt(where: str, value: Any, what: str) -> CorruptError:
     """What to tell of a value that gsmap cannot have written."""
     return CorruptError(
         f"the catalog holds {_short(value)} in {where}, which is not {what}: gsmap did not write that; "
-        "restore the catalog from a backup, and do not trust a map that was sent to you so"
+        "restore the catalog from a backup, and do not trust a map that was sent to you so",
+        code="catalog_invalid",
     )
 
 

@@ -76,7 +76,7 @@ def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
     boxes = arrays["compact.boxes"]
     ranges = {name: arrays[f"compact.{name}_range"] for name in _VALUES}
     if not all(np.isfinite(a).all() for a in (boxes, *ranges.values())):
-        raise CorruptError(_NOT_FINITE)
+        raise CorruptError(_NOT_FINITE, code="not_finite")
     chunk = rows // CHUNK_ROWS
     with np.errstate(over="ignore", invalid="ignore"):
         size = boxes[:, 1] - boxes[:, 0]
@@ -84,7 +84,7 @@ def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
         value = {name: low + arrays[f"compact.{name}"] * step for name, (low, step) in ranges.items()}
         found = [array.astype(np.float32) for array in (means, *value.values())]
     if not all(np.isfinite(array).all() for array in found):
-        raise CorruptError(_NOT_FINITE)
+        raise CorruptError(_NOT_FINITE, code="not_finite")
     packed = arrays["compact.quats"]
     three = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
     quats = from_smallest_three(packed >> 30, (three / _LEVELS_10 - 0.5) * _SQRT2)

@@ -45,7 +45,10 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
     else:
         engine = _catalog.url_engine(url)
         if migrate.version(engine, folder) is not None:
-            raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
+            raise StoreError(
+                f"the database {engine.url!r} holds a map already: give each map a database of its own",
+                code="database_not_empty",
+            )
         trust.write(folder, _catalog.url_without_password(url), map_id)
         made = Catalog(folder, engine, writable=True)
     migrate.upgrade(made)
@@ -94,7 +97,8 @@ def copy_catalog(source: Catalog, target: Catalog, *, leave_out: Collection[str]
     versions = [migrate.version(one.engine, one.folder) for one in (source, target)]
     if versions[0] != versions[1]:
         raise StoreError(
-            f"{source.folder} has schema {versions[0]}, the catalog to copy it to {versions[1]}: run gsmap migrate"
+            f"{source.folder} has schema {versions[0]}, the catalog to copy it to {versions[1]}: run gsmap migrate",
+            code="schema_mismatch",
         )
     with one_state(source) as reading, target.write() as writing:
         return copy_rows(reading, writing, leave_out=leave_out)
@@ -105,7 +109,10 @@ def copy_rows(source: Connection, target: Connection, *, leave_out: Collection[s
     counts = {}
     for table in tables():
         if target.execute(select(text("1")).select_from(table).limit(1)).first() is not None:
-            raise StoreError(f"the catalog to copy to holds {table.name} already: give it an empty database")
+            raise StoreError(
+                f"the catalog to copy to holds {table.name} already: give it an empty database",
+                code="database_not_empty",
+            )
         counts[table.name] = 0 if table.name in leave_out else _copy_table(source, target, table)
     _set_counters(target)
     return counts

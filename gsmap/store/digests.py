@@ -85,7 +85,8 @@ def load(file: Path) -> Digests | None:
             return Digests(page_size, body[start:end], next_count, dict(_ENTRY.iter_unpack(body[end:])))
     raise CorruptError(
         f"{path} is damaged, so that the catalog cannot be verified: restore it from a backup, or take the catalog as "
-        f"it is with gsmap check {file.parent} --accept-catalog"
+        f"it is with gsmap check {file.parent} --accept-catalog",
+        code="catalog_damaged",
     )
 
 
@@ -183,7 +184,7 @@ def fold(
     if not accept:
         found = _found(file, handle, noted, log, before)
         if found:
-            raise CorruptError(damaged(file, found))
+            raise CorruptError(damaged(file, found), code="catalog_damaged")
     changed = _of_log(file, log, before.page_size)
     save(file, Digests(before.page_size, before.pages, log.num_pages or before.count, changed))
     num_frames = begin()

@@ -32,22 +32,28 @@ UNCERTAIN = "whether this last step was kept shows once that is mended; what was
 
 LITTLE_BYTES = 64 << 10  # with less than this left a disk is full: SQLite's index of its log alone takes half of it
 
-_Said = tuple[type[StoreError], str, str]  # the error, what is wrong, and what to do
+_Said = tuple[type[StoreError], str, str, str]  # the error, its code, what is wrong, and what to do
 PRUNE_MAY = " (gsmap prune may)"
-_FULL: _Said = (DiskFullError, "the disk is full", f"free some space{PRUNE_MAY} and try again")
-_READ_ONLY: _Said = (ReadOnlyError, "the disk is read-only", "")
-_DENIED: _Said = (ReadOnlyError, "permission is missing", "check who may read and write there")
+_FULL: _Said = (DiskFullError, "disk_full", "the disk is full", f"free some space{PRUNE_MAY} and try again")
+_READ_ONLY: _Said = (ReadOnlyError, "read_only", "the disk is read-only", "")
+_DENIED: _Said = (ReadOnlyError, "no_permission", "permission is missing", "check who may read and write there")
 _FAILED: _Said = (
     DiskError,
+    "disk_failed",
     "the disk failed",
     "run gsmap check once it works (a quota that is used up looks the same)",
 )
-_TOO_MANY: _Said = (StoreError, "too many files are open", "raise the limit (ulimit -n)")
-_REFUSED: _Said = (StoreError, "the system refused", "")
-_BUSY: _Said = (BusyError, "another process holds the catalog", "try again later")
-_SAID_NO: _Said = (StoreError, "the catalog refused", "")
-_GONE: _Said = (StoreError, "the catalog's server went away", "try again once it is back")
-_PASSWORD: _Said = (StoreError, "the catalog's server wants another password", "give it in PGPASSWORD or ~/.pgpass")
+_TOO_MANY: _Said = (StoreError, "too_many_open_files", "too many files are open", "raise the limit (ulimit -n)")
+_REFUSED: _Said = (StoreError, "system_refused", "the system refused", "")
+_BUSY: _Said = (BusyError, "catalog_busy", "another process holds the catalog", "try again later")
+_SAID_NO: _Said = (StoreError, "catalog_refused", "the catalog refused", "")
+_GONE: _Said = (StoreError, "server_lost", "the catalog's server went away", "try again once it is back")
+_PASSWORD: _Said = (
+    StoreError,
+    "password_refused",
+    "the catalog's server wants another password",
+    "give it in PGPASSWORD or ~/.pgpass",
+)
 
 
 _CALLED: dict[Path, str] = {}
@@ -83,7 +89,7 @@ def explained(folder: Path, state: str = "", *, committing: bool = False) -> Ite
         said = _database_said(error, folder)
         if said is None:
             raise
-        uncertain = committing and said[:2] in (_FAILED[:2], _GONE[:2])
+        uncertain = committing and said[:3] in (_FAILED[:3], _GONE[:3])
         raise _error(folder, said, _text(error), UNCERTAIN if uncertain else state) from error
     except OSError as error:
         where = Path(os.fsdecode(error.filename)) if isinstance(error.filename, (str, bytes)) else folder
@@ -119,8 +125,8 @@ def sqlite_code(error: BaseException) -> int | None:
 
 
 def _error(where: Path, said: _Said, text: str, state: str) -> StoreError:
-    kind, what, advice = said
-    return kind("; ".join(part for part in (f"{called(where)}: {what} ({text})", state, advice) if part))
+    kind, code, what, advice = said
+    return kind("; ".join(part for part in (f"{called(where)}: {what} ({text})", state, advice) if part), code=code)
 
 
 def _text(error: BaseException) -> str:
@@ -132,12 +138,12 @@ def _database_said(error: SQLAlchemyError | sqlite3.Error, folder: Path) -> _Sai
     if isinstance(error, StatementError) and isinstance(error.orig, GsmapError):
         raise error.orig from error  # one of ours, on its way through SQLAlchemy
     if isinstance(error, (NoResultFound, MultipleResultsFound)):
-        return CorruptError, "the catalog lacks a row, or has it twice", "restore it from a backup"
+        return CorruptError, "catalog_invalid", "the catalog lacks a row, or has it twice", "restore it from a backup"
     code = sqlite_code(error)
     if code is not None:
         return _sqlite_said(code, folder)
     if isinstance(error, PoolTimeoutError):
-        return BusyError, "too many threads use the catalog", "try again later"
+        return BusyError, "catalog_busy", "too many threads use the catalog", "try again later"
     state = getattr(getattr(error, "orig", None), "sqlstate", None)
     if isinstance(state, str):
         return _server_said(state)
@@ -156,12 +162,22 @@ def _sqlite_said(code: int, folder: Path) -> _Said:
     if primary in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
         found = sqlite.damage(folder / sqlite.FILE)  # nothing is called damaged on one code's word
         if found:
-            return CorruptError, f"the catalog is damaged: {summary(found)}", "restore map.sqlite from a backup"
-        return StoreError, "the catalog could not be read", "its bytes are as they were written: try again"
+            return (
+                CorruptError,
+                "catalog_damaged",
+                f"the catalog is damaged: {summary(found)}",
+                "restore map.sqlite from a backup",
+            )
+        return (
+            StoreError,
+            "catalog_unreadable",
+            "the catalog could not be read",
+            "its bytes are as they were written: try again",
+        )
     if primary == sqlite3.SQLITE_NOMEM or code == sqlite3.SQLITE_IOERR_NOMEM:
-        return StoreError, "there is not enough memory", ""
+        return StoreError, "out_of_memory", "there is not enough memory", ""
     if code == sqlite3.SQLITE_READONLY_DBMOVED:
-        return StoreError, "the catalog was moved or replaced while it was open", "open the map again"
+        return StoreError, "catalog_moved", "the catalog was moved or replaced while it was open", "open the map again"
     if primary in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM):
         return _disk_said(primary, folder)
     return _SAID_NO
@@ -183,22 +199,32 @@ def _disk_said(primary: int, folder: Path) -> _Said:
     if primary == sqlite3.SQLITE_IOERR:
         return _FAILED
     if primary == sqlite3.SQLITE_CANTOPEN and os.access(folder, os.W_OK):
-        return StoreError, "the catalog cannot be opened", "check who may read and write it"
+        return StoreError, "catalog_unreadable", "the catalog cannot be opened", "check who may read and write it"
     return _DENIED
 
 
 def _server_said(state: str) -> _Said:
     """What an SQLSTATE of PostgreSQL means here; appendix A of its manual."""
     if state == "53100":
-        return DiskFullError, "the disk of the catalog's server is full", "free some space there and try again"
+        return (
+            DiskFullError,
+            "disk_full",
+            "the disk of the catalog's server is full",
+            "free some space there and try again",
+        )
     if state == "58030":
-        return DiskError, "the disk of the catalog's server failed", "look at the server's log"
+        return DiskError, "disk_failed", "the disk of the catalog's server failed", "look at the server's log"
     if state == "25006":
-        return ReadOnlyError, "the catalog's server lets nobody write", ""
+        return ReadOnlyError, "read_only", "the catalog's server lets nobody write", ""
     if state in ("XX001", "XX002"):
-        return CorruptError, "the catalog's server finds its own data damaged", "restore that database from a backup"
+        return (
+            CorruptError,
+            "catalog_damaged",
+            "the catalog's server finds its own data damaged",
+            "restore that database from a backup",
+        )
     if state in ("40001", "40P01", "53300", "55P03", "57P03"):
-        return BusyError, "the catalog's server is busy", "try again later"
+        return BusyError, "catalog_busy", "the catalog's server is busy", "try again later"
     if state.startswith("28"):
         return _PASSWORD
     return _GONE if state.startswith(("08", "57P")) else _SAID_NO

@@ -76,7 +76,7 @@ class Exports:
         }
         with self._catalog.write() as connection:
             if connection.execute(select(exports.c.number).where(exports.c.number == export)).first() is None:
-                raise NotFoundError(f"no export {export}: begin one first")
+                raise NotFoundError(f"no export {export}: begin one first", code="export_not_found")
             connection.execute(insert(tiles), row | {"recipe": recipes.keep(connection, tile.recipe)})
 
     def forget(self, target: str | os.PathLike[str], paths: Iterable[str]) -> None:

@@ -77,7 +77,9 @@ def told_metres(connection: Connection) -> dict[str, str]:
     try:
         return {scene: checked_metres(value) for scene, value in said.items() if value}
     except InputError as error:
-        raise CorruptError(f"the catalog holds a fact that gsmap did not write: {error}") from error
+        raise CorruptError(
+            f"the catalog holds a fact that gsmap did not write: {error}", code="catalog_invalid"
+        ) from error
 
 
 def checked_metres(value: float | str) -> str:
@@ -91,7 +93,9 @@ def checked_metres(value: float | str) -> str:
     except ValueError:
         metres = float("nan")
     if not (math.isfinite(metres) and metres > 0):
-        raise InputError(f"metres per unit of a scene are a positive number such as 0.3, got {value!r}")
+        raise InputError(
+            f"metres per unit of a scene are a positive number such as 0.3, got {value!r}", code="invalid_metre"
+        )
     return repr(metres)
 
 
@@ -124,10 +128,10 @@ def checked_text(what: str, text: str, *, lines: bool = False) -> str:
         InputError: otherwise.
     """
     if not text.strip():
-        raise InputError(f"{what} must not be empty")
+        raise InputError(f"{what} must not be empty", code="invalid_name")
     bad = control_characters(text, lines=lines)
     if bad:
-        raise InputError(f"{what} {text!r} has a control character ({bad[0]!r}): leave it out")
+        raise InputError(f"{what} {text!r} has a control character ({bad[0]!r}): leave it out", code="invalid_name")
     return text
 
 
@@ -140,5 +144,7 @@ def checked_date(when: str) -> str:
     try:
         parsed = datetime.fromisoformat(when)
     except ValueError as error:
-        raise InputError(f"a capture date is ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}") from error
+        raise InputError(
+            f"a capture date is ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}", code="invalid_date"
+        ) from error
     return (parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)).isoformat()

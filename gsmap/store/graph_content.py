@@ -85,7 +85,9 @@ def from_arrays(scene_id: str, about: Mapping[str, Any], stored: Mapping[str, np
             own: dict[str, Any] = {name: whole[f"things.{name}"] for name in _THINGS}
             things = Segments(**own, unit_m=told["unit_m"])
     except (KeyError, ValueError, TypeError) as error:
-        raise CorruptError(f"the graph of scene {scene_id[:12]} does not fit its row ({error!r})") from error
+        raise CorruptError(
+            f"the graph of scene {scene_id[:12]} does not fit its row ({error!r})", code="catalog_invalid"
+        ) from error
     return SceneGraph(scene_id, layers, up, unit_m, tuple(about["notes"]), things, working_m)
 
 

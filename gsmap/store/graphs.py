@@ -82,7 +82,9 @@ class Graphs:
             InputError: the key does not name the scene, so another scene's graph would have the same.
         """
         if graph.scene_id not in key.inputs:
-            raise InputError(f"the key of a graph must name its scene {graph.scene_id} among its inputs")
+            raise InputError(
+                f"the key of a graph must name its scene {graph.scene_id} among its inputs", code="key_input_mismatch"
+            )
         arrays, about = to_arrays(self._whole(graph))
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}

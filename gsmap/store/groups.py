@@ -72,7 +72,9 @@ def unless_pruned(catalog: Catalog, group_id: str, gone: str) -> Iterator[None]:
         with catalog.read() as connection:
             if has_group(connection, group_id):
                 raise
-        raise NotFoundError(f"{gone}, and its arrays were pruned while they were read: try again") from None
+        raise NotFoundError(
+            f"{gone}, and its arrays were pruned while they were read: try again", code="changed_meanwhile"
+        ) from None
 
 
 def num_bytes(connection: Connection, group_id: str) -> int:

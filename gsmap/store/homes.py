@@ -40,10 +40,15 @@ def local(path: str | os.PathLike[str]) -> Path:
     if not found or "/" in scheme:
         return Path(text)
     if scheme != "file":
-        raise ConfigError(f"a map lies in a folder, at file:///FOLDER or at s3://BUCKET/PREFIX, not at {scheme}://")
+        raise ConfigError(
+            f"a map lies in a folder, at file:///FOLDER or at s3://BUCKET/PREFIX, not at {scheme}://",
+            code="invalid_location",
+        )
     host, _, below = rest.partition("/")
     if host not in ("", "localhost"):
-        raise ConfigError(f"{text} is on another machine: write file:///FOLDER, with three slashes")
+        raise ConfigError(
+            f"{text} is on another machine: write file:///FOLDER, with three slashes", code="invalid_location"
+        )
     return Path("/" + urllib.parse.unquote(below))
 
 
@@ -83,7 +88,9 @@ class Home:
                 content = self._small(name)
             except NotFoundError:
                 if name == trust.URL_FILE:
-                    raise NotFoundError(f"no map at {self.url}: make one with gsmap init {self.url}") from None
+                    raise NotFoundError(
+                        f"no map at {self.url}: make one with gsmap init {self.url}", code="map_not_found"
+                    ) from None
                 (self.desk / name).unlink(missing_ok=True)
                 continue
             if not (self.desk / name).is_file() or (self.desk / name).read_bytes() != content:
@@ -116,7 +123,9 @@ class Home:
         """
         folder, _, file = name.partition("/")
         if "/" in name.replace("/", "", 1) or {folder, file} & {"", ".", ".."}:
-            raise CorruptError(f"{self.url} has no file called {name!r}: nothing is done with it")
+            raise CorruptError(
+                f"{self.url} has no file called {name!r}: nothing is done with it", code="invalid_stored_name"
+            )
         target = self.desk / name
         if not target.is_file():
             target.parent.mkdir(exist_ok=True)
@@ -127,7 +136,9 @@ class Home:
         for chunk in self.place.get(name):
             out += chunk
             if len(out) > _MAX_BYTES:
-                raise CorruptError(f"{self.url}/{name} is far too long: gsmap did not write that")
+                raise CorruptError(
+                    f"{self.url}/{name} is far too long: gsmap did not write that", code="file_too_large"
+                )
         return out
 
 

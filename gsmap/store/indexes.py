@@ -178,7 +178,9 @@ class Indexes:
     def _segment(self, row: Row[Any], files: tuple[StoredFile, ...]) -> StoredSegment:
         members = [Member(scene, graph, bool(up), bool(metric), c) for scene, graph, up, metric, c in row.members]
         if row.num_nodes < 0:
-            raise CorruptError(f"the catalog holds {row.num_nodes} in index_segments.num_nodes: restore it")
+            raise CorruptError(
+                f"the catalog holds {row.num_nodes} in index_segments.num_nodes: restore it", code="catalog_invalid"
+            )
         return StoredSegment(row.group_id, members, row.num_nodes, files, self._arrays, self._catalog)
 
     @staticmethod

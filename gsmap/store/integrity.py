@@ -169,7 +169,9 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
         DiskFullError: even what could be reclaimed first did not make the room that rows need.
     """
     if keep_revisions is not None and keep_revisions < 0:
-        raise ConfigError(f"the number of revisions to keep must not be negative, got {keep_revisions}")
+        raise ConfigError(
+            f"the number of revisions to keep must not be negative, got {keep_revisions}", code="out_of_range"
+        )
     try:
         return _prune(catalog, arrays, keep_revisions, dry_run)
     except DiskFullError as error:  # no advice to do what is being done

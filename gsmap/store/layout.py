@@ -109,7 +109,9 @@ class Body:
             yield
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, struct.error) as error:
             said = str(error) if type(error) is ValueError else f"its zarr metadata makes no sense ({error!r})"
-            raise CorruptError(f"{at}: {said}; gsmap did not write that: {mend(self.kind)}") from error
+            raise CorruptError(
+                f"{at}: {said}; gsmap did not write that: {mend(self.kind)}", code="arrays_corrupt"
+            ) from error
 
     def laid_out(
         self, names: Collection[str], shapes: Mapping[str, Shape] | None = None, *, heads: bool = False

@@ -130,7 +130,10 @@ class Leases:
         if not self.try_hold(what, task):
             holder = next((lease for lease in self.list() if lease.what == what), None)
             who = "another process" if holder is None else holder.who
-            raise BusyError(f"{called(self._catalog.folder)}: {who} is at work on {what}; try again when it has ended")
+            raise BusyError(
+                f"{called(self._catalog.folder)}: {who} is at work on {what}; try again when it has ended",
+                code="lease_held",
+            )
         try:
             yield
         finally:

@@ -53,7 +53,7 @@ def matrices_of_bytes(values: Sequence[bytes]) -> np.ndarray:
     found = _floats(values, 49).reshape(-1, 7, 7).astype(np.float64)
     size = np.abs(found).max((1, 2), initial=0)
     if (np.abs(found - found.transpose(0, 2, 1)).max((1, 2), initial=0) > _SKEWED * size).any():
-        raise InputError("a matrix that is not symmetric")
+        raise InputError("a matrix that is not symmetric", code="invalid_record")
     return found
 
 
@@ -80,10 +80,10 @@ def covariances_of_bytes(values: Sequence[bytes]) -> np.ndarray:
 def _floats(values: Sequence[bytes], count: int) -> np.ndarray:
     """(K, count) finite numbers."""
     if any(len(value) != count * _FLOAT.itemsize for value in values):
-        raise InputError(f"not {count} numbers")
+        raise InputError(f"not {count} numbers", code="invalid_record")
     found = np.frombuffer(b"".join(values), _FLOAT).reshape(-1, count)
     if not np.isfinite(found).all():
-        raise InputError("NaN or infinity")
+        raise InputError("NaN or infinity", code="not_finite")
     return found
 
 

@@ -128,7 +128,8 @@ def bring_scene(into: Store, source: Store, scene: str) -> Merged:
     with between(into, source, only={scene}, mend=True) as transfer:
         if scene not in transfer.wanted:
             raise NotFoundError(
-                f"scene {scene} was forgotten in {into.location} on demand: ingest its capture if it is to come back"
+                f"scene {scene} was forgotten in {into.location} on demand: ingest its capture if it is to come back",
+                code="scene_removed",
             )
         transfer.scenes()
         if into.home.samefile(source.home):
@@ -154,7 +155,8 @@ def _check_shared(transfer: Transfer, scene: str) -> None:
     if problems:
         raise CorruptError(
             f"the arrays of scene {scene} are damaged, and {transfer.source.location} has the very same: bring them "
-            f"from another map or a restored backup ({problems[0]})"
+            f"from another map or a restored backup ({problems[0]})",
+            code="arrays_corrupt",
         )
 
 

@@ -40,15 +40,19 @@ def require_current(catalog: Catalog) -> None:
     with catalog.read() as connection:
         found = _version(connection)
     if found is None:
-        raise CorruptError(f"{folder}: its catalog holds no gsmap tables; restore it from a backup")
+        raise CorruptError(
+            f"{folder}: its catalog holds no gsmap tables; restore it from a backup", code="catalog_invalid"
+        )
     if found > schema.HEAD:
         raise SchemaVersionError(
             f"{folder} was written by a newer gsmap (schema {found}, this gsmap {__version__} knows up to "
-            f"{schema.HEAD}): upgrade gsmap"
+            f"{schema.HEAD}): upgrade gsmap",
+            code="map_too_new",
         )
     if found < schema.HEAD:
         raise SchemaVersionError(
-            f"{folder} was written by an older gsmap (schema {found}, now {schema.HEAD}): run gsmap migrate {folder}"
+            f"{folder} was written by an older gsmap (schema {found}, now {schema.HEAD}): run gsmap migrate {folder}",
+            code="map_too_old",
         )
     if catalog.is_sqlite:  # a server's tables are the user's own
         with catalog.read() as connection:
@@ -78,7 +82,8 @@ def _require_tables(connection: Connection, folder: Path) -> None:
 def _not_ours(folder: Path, what: str) -> CorruptError:
     return CorruptError(
         f"{folder}: its catalog {what}: gsmap did not make it so; restore it from a backup, and do not trust a map "
-        "that was sent to you so"
+        "that was sent to you so",
+        code="catalog_invalid",
     )
 
 
@@ -107,7 +112,10 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
                 with connection.execution_options(gsmap_write=True).begin() as transaction:
                     _run(connection, revision)
                     if catalog.is_sqlite and connection.exec_driver_sql("PRAGMA foreign_key_check").first():
-                        raise StoreError(f"{catalog.folder}: the migration would break references: it was not kept")
+                        raise StoreError(
+                            f"{catalog.folder}: the migration would break references: it was not kept",
+                            code="migration_breaks_references",
+                        )
                     with explained(catalog.folder, NOT_KEPT, committing=True):
                         commit(connection, transaction)
             finally:
@@ -131,7 +139,7 @@ def folder() -> Path:
     for place in (package / "migrations", package.parent / "migrations"):
         if (place / "env.py").is_file():
             return place
-    raise StoreError(f"{package} was installed without its migrations: install gsmap again")
+    raise StoreError(f"{package} was installed without its migrations: install gsmap again", code="no_migrations")
 
 
 def _driver(connection: Connection) -> Any:

@@ -81,7 +81,7 @@ class Models:
         """
         source = Path(path).absolute()
         if not source.is_file():
-            raise NotFoundError(f"no model file at {path}")
+            raise NotFoundError(f"no model file at {path}", code="file_not_found")
         checked_text("the name of a model", name)
         with open(source, "rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
@@ -107,7 +107,9 @@ class Models:
         for model in self.list():
             if model.name == name:
                 return model
-        raise NotFoundError(f"no model is called {name!r}: gsmap models list MAP shows what there is")
+        raise NotFoundError(
+            f"no model is called {name!r}: gsmap models list MAP shows what there is", code="model_not_found"
+        )
 
     def list(self) -> list[Model]:
         """All models, oldest first."""
@@ -148,7 +150,8 @@ def model_path(folder: Path, row: Row[Any]) -> Path:
     if above != FOLDER or "/" in name or not is_relative(path):
         raise CorruptError(
             f"the catalog holds {path!r} in models.path, which is not a file of the map's own: gsmap did not write "
-            "that; restore the catalog from a backup, and do not trust a map that was sent to you so"
+            "that; restore the catalog from a backup, and do not trust a map that was sent to you so",
+            code="catalog_invalid",
         )
     refuse_links(folder, FOLDER, name)
     return folder / path

@@ -64,7 +64,9 @@ def shape_of(how: Mapping[str, Any]) -> Shape:
     """
     shape, step, known = how.get("shape"), how.get("step"), {how.get("is"), how.get("as")} <= set(_TYPES)
     if not (_is_shape(shape) and known and type(step) is float and math.isfinite(step) and step > 0):
-        raise CorruptError(f"the catalog has an array that is kept as {how!r:.100}: gsmap did not write that")
+        raise CorruptError(
+            f"the catalog has an array that is kept as {how!r:.100}: gsmap did not write that", code="catalog_invalid"
+        )
     width = _TYPES[how["as"]].itemsize
     return tuple(shape) if width == 1 else (width * math.prod(shape[1:]), shape[0])
 

@@ -144,7 +144,7 @@ class ObjectArrays(Arrays):
             names = body.array_names() if only is None else only
             return body.read(body.laid_out(names, shapes), rows)
         except NotFoundError as error:
-            raise CorruptError(f"{error}, or not all of it: {layout.mend(kind)}") from error
+            raise CorruptError(f"{error}, or not all of it: {layout.mend(kind)}", code="arrays_corrupt") from error
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
         out = []
@@ -181,7 +181,9 @@ class ObjectArrays(Arrays):
                 for chunk in self.chunks(kind, name, file):
                     copy.write(chunk)
             if stored_file(target, file.path) != file:
-                raise CorruptError(f"{self._home.url}/{self._key(kind, name, file)} differs from what was written")
+                raise CorruptError(
+                    f"{self._home.url}/{self._key(kind, name, file)} differs from what was written", code="bytes_differ"
+                )
         return target
 
     def chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
@@ -227,12 +229,18 @@ class ObjectArrays(Arrays):
 
     def _key(self, kind: str, name: str, file: StoredFile) -> str:
         if "/" in file.path:
-            raise CorruptError(f"{kind}/{name} has a file {file.path!r}, which no archive is called: nothing is done")
+            raise CorruptError(
+                f"{kind}/{name} has a file {file.path!r}, which no archive is called: nothing is done",
+                code="invalid_stored_name",
+            )
         return f"{self._prefix(kind, name)}{file.sha256[:32]}-{file.path}"
 
     def _prefix(self, kind: str, name: str) -> str:
         if kind not in KINDS or not is_digest(name):
-            raise CorruptError(f"{kind}/{name} is not the name of a group of arrays: nothing is done with it")
+            raise CorruptError(
+                f"{kind}/{name} is not the name of a group of arrays: nothing is done with it",
+                code="invalid_stored_name",
+            )
         return f"{_ROOT}/{kind}/{name}/"
 
 

@@ -268,7 +268,9 @@ class Objects:
         with self._catalog.write() as connection:
             for one in (number, same_as or number):
                 if connection.execute(select(objects.c.number).where(objects.c.number == one)).first() is None:
-                    raise NotFoundError(f"this map has no object o{one}: gsmap graph MAP lists them")
+                    raise NotFoundError(
+                        f"this map has no object o{one}: gsmap graph MAP lists them", code="object_not_found"
+                    )
             words = standing(connection)
             mine = words.get(number, ObjectWords())
             said = [(kind, value) for kind, value in said if kind == "note" or getattr(mine, kind) != value]
@@ -384,7 +386,7 @@ def standing(connection: Connection) -> dict[int, ObjectWords]:
 def _checked_name(name: str) -> str:
     name = facts.checked_text("the name of an object", name).strip()
     if _NO_NAME.fullmatch(name):
-        raise InputError(f"an object cannot be called {name!r}: ids and points look so")
+        raise InputError(f"an object cannot be called {name!r}: ids and points look so", code="invalid_name")
     return name
 
 
@@ -393,7 +395,8 @@ def _check_free(words: Mapping[int, ObjectWords], number: int, name: str) -> Non
         if other != number and said.name.casefold() == name.casefold():
             raise InputError(
                 f"o{other} is called {said.name!r} already: choose another name, rename that one, or say that the two "
-                f"are one (--same-as o{other})"
+                f"are one (--same-as o{other})",
+                code="name_taken",
             )
 
 
@@ -402,7 +405,9 @@ def _check_no_circle(words: Mapping[int, ObjectWords], number: int, same_as: str
     at: str | None = same_as
     while at:
         if at in seen:
-            raise InputError(f"o{number} and {same_as} are said to be one already, or are the same object")
+            raise InputError(
+                f"o{number} and {same_as} are said to be one already, or are the same object", code="already_same"
+            )
         seen.add(at)
         at = words.get(number_of(at) or 0, ObjectWords()).same_as
 
@@ -482,7 +487,7 @@ def _read(row: Row[Any]) -> ObjectSet:
         value = row.value
         scenes = [str(scene) for scene in value["scenes"]]
         if set(scenes) != set(row.poses):
-            raise InputError("its captures are not those of its poses")
+            raise InputError("its captures are not those of its poses", code="invalid_record")
         things = dict(zip(scenes, map(str, value["things"]), strict=True))
         return ObjectSet(
             row.key,
@@ -497,7 +502,8 @@ def _read(row: Row[Any]) -> ObjectSet:
     except (GsmapError, TypeError, ValueError, KeyError, IndexError, AttributeError, zlib.error) as error:
         raise CorruptError(
             f"the catalog holds objects, in object_sets row {row.number}, that make no sense ({error}): gsmap did not "
-            "write that; restore the catalog from a backup"
+            "write that; restore the catalog from a backup",
+            code="catalog_invalid",
         ) from error
 
 
@@ -505,12 +511,12 @@ def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, 
     said: dict[int, Sighting] = {}
     for at, state, thing, box, looked, asked in one["sightings"]:
         if state not in SIGHTING_STATES or not 0 <= at < len(scenes) or not -1 <= asked < len(scenes):
-            raise InputError(f"a sighting of {state!r}")
+            raise InputError(f"a sighting of {state!r}", code="invalid_record")
         corners = None if box is None else _numbers(box, (2, 3))
         by = "" if asked < 0 else scenes[asked]
         said[at] = Sighting(scenes[at], state, int(thing), corners, float(looked), by)
     if number_of(str(one["id"])) is None:
-        raise InputError(f"an object called {one['id']!r}")
+        raise InputError(f"an object called {one['id']!r}", code="invalid_record")
     # Captures whose things nobody knows tell nothing of any.
     every = tuple(
         said.get(i, Sighting(scene, "unseen", -1, None, 0.0)) for i, scene in enumerate(scenes) if things[scene]
@@ -523,18 +529,18 @@ def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, 
 def _room(one: Mapping[str, Any], count: int) -> Room:
     width, depth = (int(n) for n in one["shape"])
     if not (0 < width * depth <= _MAX_CELLS and width > 0):
-        raise InputError(f"a room of {width} x {depth} cells")
+        raise InputError(f"a room of {width} x {depth} cells", code="invalid_record")
     packed = zlib.decompressobj().decompress(base64.b64decode(one["cells"], validate=True), -(-width * depth // 8))
     cells = np.unpackbits(np.frombuffer(packed, np.uint8), count=width * depth).astype(bool).reshape(width, depth)
     floor, ceiling = _numbers(one["heights_m"], (2,)).tolist()
     doors = tuple(int(other) for other in one["doors"])
     if not cells.any() or not float(one["cell_m"]) > 0 or not all(0 <= other < count for other in doors):
-        raise InputError("a room without floor, or with a door to nowhere")
+        raise InputError("a room without floor, or with a door to nowhere", code="invalid_record")
     return Room(_numbers(one["low"], (2,)), cells, float(one["cell_m"]), floor, ceiling, doors)
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     array = np.array(value, np.float64)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{shape} finite numbers are wanted")
+        raise InputError(f"{shape} finite numbers are wanted", code="invalid_record")
     return array

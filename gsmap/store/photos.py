@@ -58,7 +58,7 @@ class Photos:
             NotFoundError: no such scene.
         """
         if not jpeg.startswith(b"\xff\xd8\xff") or len(jpeg) > MAX_BYTES:
-            raise InputError(f"a photo is kept as a JPEG of at most {MAX_BYTES} bytes")
+            raise InputError(f"a photo is kept as a JPEG of at most {MAX_BYTES} bytes", code="photo_not_jpeg")
         when = None if sighting.captured_at is None else facts.checked_date(sighting.captured_at)
         pixels = np.frombuffer(jpeg, np.uint8)
         group_id = digest(pixels, text=KIND)
@@ -105,13 +105,17 @@ class Photos:
             mine = photo_sightings.c.number == number
             row = connection.execute(select(photo_sightings).where(mine)).first()
             if row is None:
-                raise NotFoundError(f"the map keeps no photo {number}: gsmap list MAP photos shows them")
+                raise NotFoundError(
+                    f"the map keeps no photo {number}: gsmap list MAP photos shows them", code="photo_not_found"
+                )
             files = manifest(connection, row.group_id)
         with unless_pruned(self._catalog, row.group_id, f"photo {row.name} was taken back"):
             held = self._arrays.read(KIND, row.group_id, files, shapes={"jpeg": (None,)})["jpeg"]
         content = held.tobytes() if held.dtype == np.uint8 and len(held) <= MAX_BYTES else b""
         if not content.startswith(b"\xff\xd8\xff"):
-            raise CorruptError(f"what the map keeps of photo {row.name} is no JPEG: restore it from a backup")
+            raise CorruptError(
+                f"what the map keeps of photo {row.name} is no JPEG: restore it from a backup", code="photo_damaged"
+            )
         return content
 
     def find(self, which: str) -> StoredPhoto:
@@ -126,7 +130,10 @@ class Photos:
             found = [one for one in kept if one.sighting.digest.startswith(which)]
         if len(found) != 1:
             why = "keeps several photos of that name" if found else "keeps no photo"
-            raise NotFoundError(f"{which}: the map {why}; gsmap list MAP photos shows them with numbers such as p3")
+            raise NotFoundError(
+                f"{which}: the map {why}; gsmap list MAP photos shows them with numbers such as p3",
+                code="photo_not_found",
+            )
         return found[0]
 
     def remove(self, number: int) -> None:
@@ -193,6 +200,7 @@ def _stored(row: Row[Any]) -> StoredPhoto:
     except (GsmapError, TypeError, ValueError, KeyError, AttributeError) as error:
         raise CorruptError(
             f"the catalog holds a photo, in photo_sightings row {row.number}, that makes no sense ({error}): gsmap did "
-            "not write that; restore the catalog from a backup"
+            "not write that; restore the catalog from a backup",
+            code="catalog_invalid",
         ) from error
     return StoredPhoto(row.number, sighting, row.created_at, row.group_id or "")

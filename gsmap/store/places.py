@@ -94,15 +94,23 @@ def place_of(target: str | os.PathLike[str]) -> Place:
         return FolderPlace(Path(text))
     parts = urllib.parse.urlsplit(text)
     if scheme not in ("file", "s3"):
-        raise ConfigError(f"a backup goes to a folder, file:///FOLDER or s3://BUCKET/PREFIX, not to {scheme}://")
+        raise ConfigError(
+            f"a backup goes to a folder, file:///FOLDER or s3://BUCKET/PREFIX, not to {scheme}://",
+            code="invalid_location",
+        )
     if "@" in parts.netloc or parts.query or parts.fragment:
-        raise ConfigError("the address of a backup has no password and no options: give them as AWS_... variables")
+        raise ConfigError(
+            "the address of a backup has no password and no options: give them as AWS_... variables",
+            code="invalid_location",
+        )
     if scheme == "file":
         if parts.netloc not in ("", "localhost"):
-            raise ConfigError(f"{text} is on another machine: write file:///FOLDER, with three slashes")
+            raise ConfigError(
+                f"{text} is on another machine: write file:///FOLDER, with three slashes", code="invalid_location"
+            )
         return FolderPlace(Path(urllib.parse.unquote(parts.path)))
     if not parts.netloc:
-        raise ConfigError(f"{text} names no bucket: write s3://BUCKET/PREFIX")
+        raise ConfigError(f"{text} names no bucket: write s3://BUCKET/PREFIX", code="invalid_location")
     return ObjectPlace(parts.netloc, parts.path.strip("/"))
 
 
@@ -184,10 +192,10 @@ class FolderPlace:
             try:
                 handle = os.open(self._path(name), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
             except FileNotFoundError:
-                raise NotFoundError(f"{self.url} has no {name}") from None
+                raise NotFoundError(f"{self.url} has no {name}", code="backup_file_missing") from None
             with open(handle, "rb") as file:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
-                    raise StoreError(f"{self.url}: {name} is not a file")
+                    raise StoreError(f"{self.url}: {name} is not a file", code="place_failed")
                 while chunk := file.read(CHUNK_BYTES):
                     yield chunk
 
@@ -210,7 +218,7 @@ class FolderPlace:
         for part in name.split("/")[:-1]:
             folder = folder / part
             if folder.is_symlink():
-                raise StoreError(f"{folder} is a link: a backup has none; it may lead anywhere")
+                raise StoreError(f"{folder} is a link: a backup has none; it may lead anywhere", code="link_refused")
         return self.root / name
 
     @contextlib.contextmanager
@@ -229,8 +237,12 @@ class FolderPlace:
             if kind is DiskError:
                 raise DiskError(f"{self.url}: the disk failed ({error.filename or error.strerror})") from error
             if error.errno == errno.ELOOP:
-                raise StoreError(f"{error.filename} is a link: a backup has none; it may lead anywhere") from error
-            raise StoreError(f"{self.url}: {error.strerror or error} ({error.filename or 'no name'})") from error
+                raise StoreError(
+                    f"{error.filename} is a link: a backup has none; it may lead anywhere", code="link_refused"
+                ) from error
+            raise StoreError(
+                f"{self.url}: {error.strerror or error} ({error.filename or 'no name'})", code="place_failed"
+            ) from error
 
 
 class ObjectPlace:
@@ -310,7 +322,7 @@ class ObjectPlace:
             try:
                 found = self._api.get_ranges(self._store, name, starts=starts, ends=ends, coalesce=0)
             except FileNotFoundError:
-                raise NotFoundError(f"{self.url} has no {name}") from None
+                raise NotFoundError(f"{self.url} has no {name}", code="backup_file_missing") from None
         return [bytes(one) for one in found]
 
     def get(self, name: str) -> Iterator[bytes]:
@@ -318,7 +330,7 @@ class ObjectPlace:
             try:
                 found = self._api.get(self._store, name)
             except FileNotFoundError:
-                raise NotFoundError(f"{self.url} has no {name}") from None
+                raise NotFoundError(f"{self.url} has no {name}", code="backup_file_missing") from None
             for chunk in found.stream(min_chunk_size=CHUNK_BYTES):
                 yield bytes(chunk)
 
@@ -337,12 +349,14 @@ class ObjectPlace:
             yield
         except (PermissionDeniedError, UnauthenticatedError) as error:
             raise _Refused(
-                f"{self.url}: not allowed to {what} ({_first_line(error)}): see AWS_ACCESS_KEY_ID"
+                f"{self.url}: not allowed to {what} ({_first_line(error)}): see AWS_ACCESS_KEY_ID",
+                code="place_refused",
             ) from error
         except (BaseError, OSError) as error:
             raise _Refused(
-                f"{self.url}: cannot {what} ({_first_line(error)}): see AWS_ENDPOINT_URL, and try again"
-            ) from (error)
+                f"{self.url}: cannot {what} ({_first_line(error)}): see AWS_ENDPOINT_URL, and try again",
+                code="place_failed",
+            ) from error
 
 
 class _Refused(StoreError):

@@ -25,7 +25,10 @@ class Priors:
         """Give a scene a prior, in place of the one it had."""
         sigmas = np.asarray(prior.sigmas, np.float64)
         if sigmas.shape != (7,) or not (sigmas > 0).all():
-            raise InputError(f"a prior needs 7 positive sigmas (inf where nothing is known), got {sigmas.tolist()}")
+            raise InputError(
+                f"a prior needs 7 positive sigmas (inf where nothing is known), got {sigmas.tolist()}",
+                code="invalid_sigma",
+            )
         with self._catalog.write() as connection:
             scene = resolve(connection, prior.scene)
             self._retire(connection, scene)
@@ -68,7 +71,7 @@ class Priors:
             query = select(priors).where(priors.c.scene == scene, priors.c.number == number)
             row = connection.execute(query).one_or_none()
         if row is None:
-            raise NotFoundError(f"scene {ref!r} has no prior of number {number}")
+            raise NotFoundError(f"scene {ref!r} has no prior of number {number}", code="prior_not_found")
         return _prior(row)
 
     def remove(self, ref: str) -> None:
@@ -79,7 +82,7 @@ class Priors:
         """
         with self._catalog.write() as connection:
             if not self._retire(connection, resolve(connection, ref)):
-                raise NotFoundError(f"scene {ref!r} has no prior")
+                raise NotFoundError(f"scene {ref!r} has no prior", code="prior_not_found")
 
     def _retire(self, connection: Connection, scene: str) -> int:
         standing = (priors.c.scene == scene) & priors.c.removed_at.is_(None)

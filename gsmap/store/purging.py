@@ -221,7 +221,8 @@ def overwrite(catalog: Catalog) -> None:
         if not sqlite.vacuum(catalog.engine, catalog.folder / sqlite.FILE, erase=True):
             raise BusyError(
                 f"{catalog.folder}: another process reads the state from before the purge; its rows are gone, but not "
-                "yet from the file: run the same command again when that process is done"
+                "yet from the file: run the same command again when that process is done",
+                code="purge_pending",
             )
 
 

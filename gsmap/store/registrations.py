@@ -174,7 +174,10 @@ class Registrations:
             for registration, key in made:
                 a, b = sorted((registration.target, registration.source))
                 if a == b or not {a, b} <= known:
-                    raise InputError(f"a registration is of two scenes of the map, by their ids, got {a} and {b}")
+                    raise InputError(
+                        f"a registration is of two scenes of the map, by their ids, got {a} and {b}",
+                        code="invalid_registration",
+                    )
                 rows.append(_row_of(registration, f"{a}:{b}", key, kept[key.recipe]))
             connection.execute(insert(registrations), rows)
 
@@ -189,9 +192,12 @@ class Registrations:
         with self._catalog.write() as connection:
             row = connection.execute(select(registrations).where(registrations.c.number == number)).first()
             if row is None:
-                raise NotFoundError(f"no registration {number} in this map")
+                raise NotFoundError(f"no registration {number} in this map", code="registration_not_found")
             if row.proposer == MANUAL:
-                raise InputError(f"registration {number} was measured by a person: save it again instead")
+                raise InputError(
+                    f"registration {number} was measured by a person: save it again instead",
+                    code="registration_measured",
+                )
             pair = _rows_of(connection, row.pair)
             newest = [r for r in pair if r.proposer != MANUAL][-1]
             original = row.number if row.adopts is None else row.adopts
@@ -365,20 +371,25 @@ class Registrations:
             ConfigError: another word.
         """
         if review not in REVIEWS:
-            raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}")
+            raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
         with self._catalog.write() as connection:
             found = self.get(a, b)
             first, second = scene_name(connection, a), scene_name(connection, b)
             if found is None:
                 raise NotFoundError(
-                    f"{first} and {second} were never registered: gsmap register MAP --pairs {first}:{second}"
+                    f"{first} and {second} were never registered: gsmap register MAP --pairs {first}:{second}",
+                    code="registration_not_found",
                 )
             if review == "confirm" and found.registration.S_target_source is None:
                 raise InputError(
-                    f"{first} and {second} have no pose to confirm: {found.registration.reason or 'none was found'}"
+                    f"{first} and {second} have no pose to confirm: {found.registration.reason or 'none was found'}",
+                    code="no_pose_of_pair",
                 )
             if review == "withdraw" and found.review is None and not found.manual:
-                raise InputError(f"nobody has reviewed {first} and {second}: there is nothing to withdraw")
+                raise InputError(
+                    f"nobody has reviewed {first} and {second}: there is nothing to withdraw",
+                    code="nothing_to_withdraw",
+                )
             row = {"review": review, "registration": found.number, "note": note, "created_at": now()}
             connection.execute(insert(reviews), row | {"pair": _pair(connection, a, b)})
             return self.get(a, b)
@@ -429,9 +440,14 @@ def _decide(rows: Sequence[Row[Any]], said: Iterable[Review]) -> tuple[Row[Any] 
 def _check_told(r: Registration, key: RecipeKey | None) -> None:
     """What a registration's row asks beside its figures; see `Registrations.save`."""
     if (r.proposer == MANUAL) != (key is None):
-        raise InputError(f"a registration needs its recipe key, unless its proposer is {MANUAL!r}")
+        raise InputError(
+            f"a registration needs its recipe key, unless its proposer is {MANUAL!r}", code="invalid_registration"
+        )
     if r.proposer == MANUAL and r.status != "accepted":
-        raise InputError("a measured registration has status 'accepted', a pose and an information matrix")
+        raise InputError(
+            "a measured registration has status 'accepted', a pose and an information matrix",
+            code="invalid_registration",
+        )
 
 
 def _row_of(r: Registration, pair: str, key: RecipeKey | None, recipe: str | None) -> dict[str, Any]:
@@ -460,7 +476,7 @@ def _row_of(r: Registration, pair: str, key: RecipeKey | None, recipe: str | Non
 def _pair(connection: Connection, a: str, b: str) -> str:
     first, second = sorted((resolve(connection, a), resolve(connection, b)))
     if first == second:
-        raise InputError(f"{a} and {b} are the same scene: a pair needs two")
+        raise InputError(f"{a} and {b} are the same scene: a pair needs two", code="same_scene")
     return f"{first}:{second}"
 
 

@@ -141,10 +141,13 @@ class Revisions:
                 return None
             row = connection.execute(select(revisions).where(revisions.c.number == wanted)).first()
             if row is None:
-                raise NotFoundError(f"no revision {number}: gsmap list MAP revisions shows what there is")
+                raise NotFoundError(
+                    f"no revision {number}: gsmap list MAP revisions shows what there is", code="revision_not_found"
+                )
             if is_dropped(connection, row):
                 raise NotFoundError(
-                    f"revision {number} was dropped by gsmap prune: of it only its line in the list is left"
+                    f"revision {number} was dropped by gsmap prune: of it only its line in the list is left",
+                    code="revision_dropped",
                 )
             return _pose_graph(connection, row)
 
@@ -162,7 +165,9 @@ class Revisions:
         with self._catalog.read() as connection:
             row = connection.execute(select(revisions).where(revisions.c.number == number)).first()
         if row is None:
-            raise NotFoundError(f"no revision {number}: gsmap list MAP revisions shows what there is")
+            raise NotFoundError(
+                f"no revision {number}: gsmap list MAP revisions shows what there is", code="revision_not_found"
+            )
         return _revision(row)
 
     def newest(self) -> Revision | None:

@@ -69,7 +69,9 @@ class RowMap:
         if counted == self.num_whole:
             return rows
         if counted != self.num_kept:
-            raise InputError("the capture was thinned or ingested again meanwhile: run the same again")
+            raise InputError(
+                "the capture was thinned or ingested again meanwhile: run the same again", code="changed_meanwhile"
+            )
         if self.rows is None:
             return _none(rows)
         out: np.ndarray = self.rows[rows].astype(rows.dtype)
@@ -126,6 +128,7 @@ class RowMaps:
         if len(rows) != row.num_gaussians:
             raise CorruptError(
                 f"scene {row.name}: its row map keeps {len(rows)} Gaussians, the catalog {row.num_gaussians}: ingest "
-                "its capture again"
+                "its capture again",
+                code="catalog_invalid",
             )
         return RowMap(thinning.num_gaussians, row.num_gaussians, rows)

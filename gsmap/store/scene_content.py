@@ -150,7 +150,7 @@ def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:
     """What is written of a scene's cameras, by the names of its arrays."""
     for name in cameras.names:
         if "\n" in name:
-            raise InputError(f"camera name {name!r} has a line break")
+            raise InputError(f"camera name {name!r} has a line break", code="invalid_name")
     return {
         "cameras.T_frame_camera": cameras.T_frame_camera,
         "cameras.intrinsics_px": cameras.intrinsics_px,

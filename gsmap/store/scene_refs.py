@@ -46,7 +46,7 @@ def alive(connection: Connection, ref: str) -> Row[Any]:
     """As `find`, and NotFoundError where it was removed."""
     row = find(connection, ref)
     if row.removed_at is not None:
-        raise NotFoundError(f"scene {ref} was removed on {row.removed_at}")
+        raise NotFoundError(f"scene {ref} was removed on {row.removed_at}", code="scene_removed")
     return row
 
 
@@ -63,8 +63,13 @@ def find(connection: Connection, ref: str) -> Row[Any]:
         return rows[0]
     if rows:
         several = ", ".join(r.name for r in rows)
-        raise NotFoundError(f"{ref!r} is the beginning of several scene ids ({several}): add digits")
-    raise NotFoundError(f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes shows what there is")
+        raise NotFoundError(
+            f"{ref!r} is the beginning of several scene ids ({several}): add digits", code="scene_ambiguous"
+        )
+    raise NotFoundError(
+        f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes shows what there is",
+        code="scene_not_found",
+    )
 
 
 def find_removed(connection: Connection, ref: str) -> Row[Any]:
@@ -77,10 +82,14 @@ def find_removed(connection: Connection, ref: str) -> Row[Any]:
         return named[0]
     if named:
         several = ", ".join(f"{row.name} {row.id[:12]}" for row in named)
-        raise NotFoundError(f"several removed scenes are called {ref!r} ({several}): give more of an id")
+        raise NotFoundError(
+            f"several removed scenes are called {ref!r} ({several}): give more of an id", code="scene_ambiguous"
+        )
     with contextlib.suppress(NotFoundError):
-        raise InputError(f"scene {find(connection, ref).name} was not removed: there is nothing to bring back")
-    raise NotFoundError(f"no removed scene is called {ref!r}, and no id begins so")
+        raise InputError(
+            f"scene {find(connection, ref).name} was not removed: there is nothing to bring back", code="not_removed"
+        )
+    raise NotFoundError(f"no removed scene is called {ref!r}, and no id begins so", code="scene_not_found")
 
 
 def by_id(connection: Connection, wanted: str) -> Row[Any] | None:

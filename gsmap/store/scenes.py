@@ -103,7 +103,7 @@ class Scenes:
         facts.checked_text("the name of a scene", name)
         captured_at = None if captured_at is None else facts.checked_date(captured_at)
         if not gaussians.num_gaussians:
-            raise InputError(f"scene {name!r} has no Gaussians")
+            raise InputError(f"scene {name!r} has no Gaussians", code="no_gaussians")
         new_id = scene_id(gaussians, cameras)
         with self._catalog.read() as connection:
             row = by_id(connection, new_id)
@@ -259,9 +259,14 @@ class Scenes:
             new = [fact for fact in dict.fromkeys(new) if fact not in same]
             for kind, value in new:
                 if kind == "name" and name_taken(connection, value):
-                    raise InputError(f"another scene is called {value!r}: choose another name, or rename that one")
+                    raise InputError(
+                        f"another scene is called {value!r}: choose another name, or rename that one", code="name_taken"
+                    )
                 if kind == "untag" and value not in tags:
-                    raise NotFoundError(f"scene {row.name!r} has no tag {value!r}: it has {sorted(tags) or 'none'}")
+                    raise NotFoundError(
+                        f"scene {row.name!r} has no tag {value!r}: it has {sorted(tags) or 'none'}",
+                        code="tag_not_found",
+                    )
             facts.say(connection, row.id, new, author)
             columns = {kind: value or None for kind, value in new if kind in ("name", "captured_at")}
             if columns:
@@ -416,7 +421,9 @@ class Scenes:
             return before
         if len(shown) != before.num_gaussians or not shown.any():
             counts = f"{int(shown.sum())} of {len(shown)} Gaussians"
-            raise InputError(f"cannot keep {counts} of scene {before.name}, which has {before.num_gaussians}")
+            raise InputError(
+                f"cannot keep {counts} of scene {before.name}, which has {before.num_gaussians}", code="cannot_keep"
+            )
         own = self.gaussians(before.id)[shown]
         content = compact.pack(own) | compact.pack_kept(shown) | camera_arrays(self.cameras(before.id))
         boxes = chunk_boxes(own, CHUNK_ROWS, sigmas=_SIGMAS)
@@ -460,7 +467,9 @@ class Scenes:
         try:
             image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
         except UnicodeDecodeError as error:
-            raise CorruptError(f"scene {row.name}: the names of its cameras are no text: ingest it again") from error
+            raise CorruptError(
+                f"scene {row.name}: the names of its cameras are no text: ingest it again", code="catalog_invalid"
+            ) from error
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
 
     def remove(self, ref: str) -> Scene:
@@ -487,11 +496,14 @@ class Scenes:
             if not files:
                 raise NotFoundError(
                     f"the arrays of scene {row.name} ({row.id}) were pruned: bring them from another map, a branch or "
-                    "a restored backup with --from, or ingest its capture again"
+                    "a restored backup with --from, or ingest its capture again",
+                    code="arrays_pruned",
                 )
             problems = self._arrays.problems(KIND, row.group_id, files)
             if problems:
-                raise CorruptError(f"scene {row.name} stays removed, its arrays are damaged: {problems[0]}")
+                raise CorruptError(
+                    f"scene {row.name} stays removed, its arrays are damaged: {problems[0]}", code="arrays_corrupt"
+                )
             name = free_name(connection, row.name)
             back = {"removed_at": None, "ingested_at": now(), "name": name}
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(**back))
@@ -523,7 +535,9 @@ class Scenes:
         """The row of a new or returning scene, under a name that is free."""
         wanted, name = fields["name"], free_name(connection, fields["name"])
         if name != wanted and not rename:
-            raise InputError(f"another scene is called {wanted!r}: choose another name, or remove that one first")
+            raise InputError(
+                f"another scene is called {wanted!r}: choose another name, or remove that one first", code="name_taken"
+            )
         fields = fields | {"name": name, "ingested_at": now(), "removed_at": None}
         before = by_id(connection, new_id)
         if before is None:
@@ -543,7 +557,9 @@ def _rows_of(column: np.ndarray, spans: Sequence[tuple[int, int]]) -> np.ndarray
 
 def _manifest(connection: Connection, row: Row[Any]) -> tuple[StoredFile, ...]:
     if row.group_id is None:
-        raise NotFoundError(f"scene {row.name!r} was removed and its arrays were pruned: ingest it again")
+        raise NotFoundError(
+            f"scene {row.name!r} was removed and its arrays were pruned: ingest it again", code="scene_removed"
+        )
     return manifest(connection, row.group_id)
 
 

@@ -114,7 +114,8 @@ def engine(file: Path, *, writable: bool) -> Engine:
             # A reader in WAL mode must write an index, which it cannot here; then nobody is writing the log either.
             if _log_bytes(file):
                 raise StoreError(
-                    f"{file.parent} was not closed cleanly: open it once where it can be written"
+                    f"{file.parent} was not closed cleanly: open it once where it can be written",
+                    code="not_closed_cleanly",
                 ) from None
             still: sqlite3.Connection = _connect(f"{uri}&immutable=1")
             return still
@@ -211,7 +212,9 @@ def refuse_strange_files(file: Path) -> None:
     for ending in ("", "-wal", "-shm", "-journal"):
         path = file.with_name(file.name + ending)
         if os.path.lexists(path) and not is_file(path):
-            raise CorruptError(f"{path} is a link, a pipe or a device: gsmap makes none; put a file in its place")
+            raise CorruptError(
+                f"{path} is a link, a pipe or a device: gsmap makes none; put a file in its place", code="link_refused"
+            )
     journal = file.with_name(f"{file.name}-journal")
     try:
         with open(open_file(journal), "rb") as opened:
@@ -220,7 +223,10 @@ def refuse_strange_files(file: Path) -> None:
     except FileNotFoundError:
         return
     if ends == _JOURNAL_MAGIC:
-        raise CorruptError(f"{journal} names another file for SQLite to delete: gsmap writes no such thing; remove it")
+        raise CorruptError(
+            f"{journal} names another file for SQLite to delete: gsmap writes no such thing; remove it",
+            code="hostile_journal",
+        )
 
 
 def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
@@ -233,7 +239,7 @@ def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
     """
     if _log_bytes(file) >= at_bytes:
         if not digests.digests_of(file).exists() and (found := structure_damage(file)):
-            raise CorruptError(digests.damaged(file, found))
+            raise CorruptError(digests.damaged(file, found), code="catalog_damaged")
         digests.fold(file, handle(engine), lambda: _begun(engine), lambda: _folded(engine))
 
 

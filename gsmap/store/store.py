@@ -119,11 +119,11 @@ class Store:
         folder = branches.find(homes.local(path).absolute()).folder
         if folder.is_dir() and any(folder.iterdir()):
             is_map = "is a map already" if branches.holds_catalog(folder) else "is not empty"
-            raise StoreError(f"{path} {is_map}: open it, or choose another name")
+            raise StoreError(f"{path} {is_map}: open it, or choose another name", code="already_exists")
         if folder.exists() and not folder.is_dir():
-            raise StoreError(f"{path} is a file: a map is a folder; choose another name")
+            raise StoreError(f"{path} is a file: a map is a folder; choose another name", code="not_a_folder")
         if not folder.parent.is_dir():
-            raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist")
+            raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist", code="folder_not_found")
         with explained(folder, "no map was made"), staging.beside(folder) as staged:
             (staged / "arrays").mkdir()
             _make_catalog(staged, catalog_url)
@@ -232,23 +232,26 @@ class Store:
         verify: bool = True,
     ) -> Store:
         if mode not in ("r", "w"):
-            raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
+            raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}", code="invalid_choice")
         place = branches.find(path)
         folder = place.folder
         if place.remote is not None:
             place.remote.lay_out()
         if not folder.exists():
-            raise NotFoundError(f"no map at {path}: make one with gsmap init {path}")
+            raise NotFoundError(f"no map at {path}: make one with gsmap init {path}", code="map_not_found")
         if not branches.is_map(place.home):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
-            raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
+            raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init", code="not_a_map")
         _refuse_strange_entries(place.home)
         _refuse_strange_entries(folder)
         refusal = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
         if mode == "w" and place.is_tag and not even_tags:
-            raise StoreError(refusal)
+            raise StoreError(refusal, code="catalog_refused")
         if mode == "w" and not os.access(folder, os.W_OK):
-            raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
+            raise StoreError(
+                f"{path} cannot be written (read-only disk or missing permission): open it for reading",
+                code="not_writable",
+            )
         with explained(folder):
             if catalog_url is not None:
                 engine = _catalog.url_engine(catalog_url)
@@ -286,7 +289,8 @@ class Store:
         if known is not None and known != self.id:
             raise CorruptError(
                 f"{self.folder} belongs to map {known[:12]}, but the database named for it holds map {self.id[:12]}: "
-                f"name the right one in {trust.ENVIRONMENT}"
+                f"name the right one in {trust.ENVIRONMENT}",
+                code="wrong_catalog",
             )
 
     def check(self, progress: Progress | None = None) -> Check:
@@ -355,7 +359,8 @@ def _refuse_strange_entries(folder: Path) -> None:
             if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 what = "a link" if stat.S_ISLNK(mode) else "a pipe or a device"
                 raise CorruptError(
-                    f"{folder / name} is {what}: gsmap makes none in a map; put what belongs there in its place"
+                    f"{folder / name} is {what}: gsmap makes none in a map; put what belongs there in its place",
+                    code="not_a_plain_file",
                 )
 
 
@@ -364,16 +369,20 @@ def _claim(home: Home, catalog_url: str | None) -> None:
     if catalog_url is None:
         raise ConfigError(
             f"{home.url} is a bucket, which can hold no catalog: name an empty PostgreSQL database (gsmap init "
-            f"{home.url} --catalog postgresql+psycopg://...)"
+            f"{home.url} --catalog postgresql+psycopg://...)",
+            code="bucket_needs_catalog",
         )
     if home.exists():
-        raise StoreError(f"{home.url} is a map already: open it, or choose another name")
+        raise StoreError(f"{home.url} is a map already: open it, or choose another name", code="already_exists")
     if (found := home.place.anything()) is not None:
-        raise StoreError(f"{home.url} is not empty (it has {found}): choose another name")
+        raise StoreError(f"{home.url} is not empty (it has {found}): choose another name", code="folder_not_empty")
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
         _make_catalog(Path(folder), catalog_url)
         if not home.claim(Path(folder)):
-            raise StoreError(f"another process made a map at {home.url} meanwhile: open it, or choose another name")
+            raise StoreError(
+                f"another process made a map at {home.url} meanwhile: open it, or choose another name",
+                code="already_exists",
+            )
         trust.remember(Path(folder))
 
 

@@ -42,7 +42,8 @@ def ties_of(values: list[dict[str, Any]]) -> tuple[WorldTie, ...]:
     except (GsmapError, TypeError, ValueError, KeyError, AttributeError) as error:
         raise CorruptError(
             f"the catalog holds a place in the world, in revisions.world, that makes no sense ({error!r}): gsmap did "
-            "not write that; restore the catalog from a backup"
+            "not write that; restore the catalog from a backup",
+            code="catalog_invalid",
         ) from error
 
 

@@ -63,7 +63,7 @@ def between(
     """
     same_home = into.home.samefile(source.home)
     if same_home and into.folder.samefile(source.folder):
-        raise ConfigError(f"{into.location} and {source.location} are the same map: name two")
+        raise ConfigError(f"{into.location} and {source.location} are the same map: name two", code="same_map")
     with contextlib.ExitStack() as stack:
         staged: dict[tuple[str, str], Staged] = {}
         if not same_home:
@@ -238,7 +238,9 @@ class Transfer:
             publish(self.into.catalog, self.ours, self.into.arrays, staged, kind, group)
             self.counts["bytes"] += sum(file.size_bytes for file in files)
         else:
-            raise StoreError(f"{self.into.location} was pruned meanwhile; nothing was changed: try again")
+            raise StoreError(
+                f"{self.into.location} was pruned meanwhile; nothing was changed: try again", code="changed_meanwhile"
+            )
 
     # --- what was made of scenes, and said of pairs ------------------------------------------------------------------
 

@@ -83,7 +83,8 @@ def remembered(folder: Path) -> Remembered:
         raise CorruptError(
             f"{called(folder)}/{URL_FILE} does not name a PostgreSQL database (postgresql+psycopg://...), and gsmap "
             f"writes nothing else there: name the catalog in {ENVIRONMENT}, and do not trust a map that was sent to "
-            "you so"
+            "you so",
+            code="catalog_invalid",
         )
     return Remembered(lines[0], lines[1] if len(lines) > 1 else None)
 
@@ -109,7 +110,8 @@ def named_url(folder: Path) -> str:
     raise StoreError(
         f"{called(folder)} would connect to {found.server} (database {found.database!r}, user {found.user!r}), which "
         f"you have not trusted yet: run gsmap trust {called(folder)} if that is right, or name the catalog's URL in "
-        f"{ENVIRONMENT}"
+        f"{ENVIRONMENT}",
+        code="untrusted_catalog",
     )
 
 
@@ -138,7 +140,10 @@ def trusted() -> dict[str, tuple[str, ...]]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StoreError(f"{path} cannot be read ({error}): mend it, or remove it and trust your maps again") from error
+        raise StoreError(
+            f"{path} cannot be read ({error}): mend it, or remove it and trust your maps again",
+            code="trust_file_unreadable",
+        ) from error
     return known
 
 
@@ -158,7 +163,8 @@ def trust(map_id: str, url: str) -> None:
             os.close(handle)
     except OSError as error:
         raise StoreError(
-            f"cannot remember in {path} that the catalog is trusted ({error.strerror}): name its URL in {ENVIRONMENT}"
+            f"cannot remember in {path} that the catalog is trusted ({error.strerror}): name its URL in {ENVIRONMENT}",
+            code="not_writable",
         ) from error
 
 

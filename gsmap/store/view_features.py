@@ -50,7 +50,9 @@ class ViewFeatures:
             key: its recipe; among its inputs is the scene.
         """
         if found.scene not in key.inputs:
-            raise InputError(f"the key of features must name their scene {found.scene} among its inputs")
+            raise InputError(
+                f"the key of features must name their scene {found.scene} among its inputs", code="key_input_mismatch"
+            )
         arrays: dict[str, np.ndarray] = {
             "starts": found.starts.astype(np.int64),
             "points": found.points.astype(np.float32),
@@ -117,18 +119,18 @@ class ViewFeatures:
             return _features(scene, arrays, N)
         except (InputError, *MALFORMED) as error:
             raise CorruptError(
-                f"the features of scene {scene[:12]} make no sense ({error}): run gsmap check"
+                f"the features of scene {scene[:12]} make no sense ({error}): run gsmap check", code="arrays_corrupt"
             ) from error
 
 
 def _features(scene: str, arrays: dict[str, np.ndarray], num_features: int) -> SceneFeatures:
     for name, dtype in _ARRAYS.items():
         if arrays[name].dtype != dtype:
-            raise InputError(f"{name} are {arrays[name].dtype}")
+            raise InputError(f"{name} are {arrays[name].dtype}", code="invalid_record")
     starts = arrays["starts"]
     if starts[0] != 0 or starts[-1] != num_features or (np.diff(starts) < 0).any():
-        raise InputError("its views do not divide its features")
+        raise InputError("its views do not divide its features", code="invalid_record")
     if not np.isfinite(arrays["points"]).all():
-        raise InputError("a point holds NaN or infinity")
+        raise InputError("a point holds NaN or infinity", code="not_finite")
     cameras = Cameras(arrays["poses"].reshape(-1, 4, 4), arrays["intrinsics"], arrays["sizes"])
     return SceneFeatures(scene, cameras, starts, arrays["points"], arrays["descriptors"], arrays["angles"])

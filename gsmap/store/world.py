@@ -102,7 +102,10 @@ class World:
                     found |= said & wanted
             missing = sorted(wanted - found)
             if missing:
-                raise NotFoundError(f"no observation is called {missing[0]!r}: gsmap georeference MAP shows them")
+                raise NotFoundError(
+                    f"no observation is called {missing[0]!r}: gsmap georeference MAP shows them",
+                    code="observation_not_found",
+                )
             for number in gone:
                 mine = observations.c.number == number
                 connection.execute(update(observations).where(mine).values(removed_at=now()))
@@ -176,7 +179,8 @@ def _item(row: Row[Any]) -> Any:
     except (GsmapError, TypeError, ValueError, KeyError) as error:
         raise CorruptError(
             f"the catalog holds an observation ({row.kind} {row.name!r}) that makes no sense: {error}; gsmap did not "
-            "write that: restore the catalog from a backup"
+            "write that: restore the catalog from a backup",
+            code="catalog_invalid",
         ) from error
     return made
 

@@ -43,10 +43,10 @@ class Params:
     def __post_init__(self) -> None:
         for name in ("min_seen_again", "min_weight"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}")
+                raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}", code="out_of_range")
         for name in ("max_views", "longest_side_px"):
             if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}", code="out_of_range")
 
 
 def observed_fraction(older: PlacedScene, newer: Sequence[CaptureViews]) -> float:

@@ -42,24 +42,28 @@ class Cameras:
         if pose.shape != (count, 4, 4) or intrinsics.shape != (count, 4) or sizes.shape != (count, 2):
             raise InputError(
                 "Cameras need poses (C, 4, 4), intrinsics (C, 4) and sizes (C, 2), "
-                f"got {pose.shape}, {intrinsics.shape}, {sizes.shape}"
+                f"got {pose.shape}, {intrinsics.shape}, {sizes.shape}",
+                code="shape_mismatch",
             )
         names = tuple(str(n) for n in self.names) or tuple(str(i) for i in range(count))
         if len(names) != count:
-            raise InputError(f"{count} cameras but {len(names)} names")
+            raise InputError(f"{count} cameras but {len(names)} names", code="shape_mismatch")
         bad = ~(np.isfinite(pose).all((1, 2)) & np.isfinite(intrinsics).all(1))
         if bad.any():
-            raise InputError(f"camera {names[int(np.argmax(bad))]} holds NaN or infinity")
+            raise InputError(f"camera {names[int(np.argmax(bad))]} holds NaN or infinity", code="not_finite")
         rotation = pose[:, :3, :3]
         off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0) > 1e-3
         off |= np.linalg.det(rotation) < 0
         off |= np.abs(pose[:, 3] - [0, 0, 0, 1]).max(1, initial=0) > 1e-6
         if off.any():
-            raise InputError(f"camera {names[int(np.argmax(off))]} has a pose that is not a rigid transform")
+            raise InputError(
+                f"camera {names[int(np.argmax(off))]} has a pose that is not a rigid transform", code="invalid_camera"
+            )
         off = (intrinsics[:, :2] <= 0).any(1) | (sizes <= 0).any(1)
         if off.any():
             raise InputError(
-                f"camera {names[int(np.argmax(off))]} has a focal length or image size that is not positive"
+                f"camera {names[int(np.argmax(off))]} has a focal length or image size that is not positive",
+                code="invalid_camera",
             )
         object.__setattr__(self, "T_frame_camera", pose)
         object.__setattr__(self, "intrinsics_px", intrinsics)

@@ -45,14 +45,19 @@ class Gaussians:
             object.__setattr__(self, name, array)
         object.__setattr__(self, "origin", np.array(self.origin, dtype=np.float64))
         if self.origin.shape != (3,) or not np.isfinite(self.origin).all():
-            raise InputError(f"Gaussians.origin must be three finite numbers, got {self.origin}")
+            raise InputError(f"Gaussians.origin must be three finite numbers, got {self.origin}", code="invalid_vector")
         n = self.means.shape[0] if self.means.ndim else 0
         expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
-                raise InputError(f"Gaussians.{name} must have shape {shape}, got {getattr(self, name).shape}")
+                raise InputError(
+                    f"Gaussians.{name} must have shape {shape}, got {getattr(self, name).shape}", code="shape_mismatch"
+                )
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3 or self.sh.shape[1] not in _SH_DEGREE:
-            raise InputError(f"Gaussians.sh must have shape ({n}, K, 3) with K = 1, 4, 9 or 16, got {self.sh.shape}")
+            raise InputError(
+                f"Gaussians.sh must have shape ({n}, K, 3) with K = 1, 4, 9 or 16, got {self.sh.shape}",
+                code="shape_mismatch",
+            )
 
     def __len__(self) -> int:
         return len(self.means)

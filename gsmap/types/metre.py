@@ -25,7 +25,7 @@ def as_known_by(text: str) -> KnownBy:
     for known in KNOWN_BY:
         if text == known:
             return known
-    raise InputError(f"a metre is known by one of {', '.join(KNOWN_BY)}, got {text!r}")
+    raise InputError(f"a metre is known by one of {', '.join(KNOWN_BY)}, got {text!r}", code="invalid_metre")
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Metre:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.metres_per_unit) and self.metres_per_unit > 0):
-            raise InputError(f"metres per unit must be positive, got {self.metres_per_unit}")
+            raise InputError(f"metres per unit must be positive, got {self.metres_per_unit}", code="invalid_metre")
         as_known_by(self.known_by)
 
     @property

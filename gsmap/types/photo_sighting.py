@@ -32,9 +32,9 @@ class ThingInPhoto:
     def __post_init__(self) -> None:
         at = np.asarray(self.position, dtype=np.float64)
         if at.shape != (3,) or not (np.abs(at) < _FAR).all():
-            raise InputError("a thing in a photo needs a place of three numbers")
+            raise InputError("a thing in a photo needs a place of three numbers", code="invalid_record")
         if self.state not in ("seen", "absent") or not 0 <= self.share <= 1:
-            raise InputError("a thing in a photo is seen or absent, by a share in [0, 1]")
+            raise InputError("a thing in a photo is seen or absent, by a share in [0, 1]", code="invalid_record")
         object.__setattr__(self, "position", at)
 
 
@@ -75,13 +75,16 @@ class PhotoSighting:
         lens = np.asarray(self.intrinsics_px, np.float64)
         shapes = (pose.shape, known.shape, lens.shape)
         if shapes != ((4, 4), (6, 6), (4,)) or not all(np.isfinite(x).all() for x in (pose, known, lens)):
-            raise InputError(f"a photo needs a pose (4, 4), a covariance (6, 6) and intrinsics (4,), got {shapes}")
+            raise InputError(
+                f"a photo needs a pose (4, 4), a covariance (6, 6) and intrinsics (4,), got {shapes}",
+                code="shape_mismatch",
+            )
         turn = pose[:3, :3]
         if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0 or (np.abs(pose) >= _FAR).any():
-            raise InputError("the pose of a photo is no rigid transform")
+            raise InputError("the pose of a photo is no rigid transform", code="invalid_pose")
         if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6 or not 0 <= self.probability <= 1 or (lens[:2] <= 0).any():
-            raise InputError("the pose, intrinsics or probability of a photo cannot be")
+            raise InputError("the pose, intrinsics or probability of a photo cannot be", code="invalid_record")
         if len(self.size_px) != 2 or not all(isinstance(n, int) and 0 < n < 10**6 for n in self.size_px):
-            raise InputError("a photo has a width and a height in pixels")
+            raise InputError("a photo has a width and a height in pixels", code="invalid_record")
         for name, value in (("T_scene_camera", pose), ("covariance", known), ("intrinsics_px", lens)):
             object.__setattr__(self, name, value)

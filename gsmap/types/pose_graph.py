@@ -103,7 +103,9 @@ class EdgeOutcome:
 
     def __post_init__(self) -> None:
         if self.use not in EDGE_USES:
-            raise InputError(f"an edge outcome must be one of {', '.join(EDGE_USES)}, got {self.use!r}")
+            raise InputError(
+                f"an edge outcome must be one of {', '.join(EDGE_USES)}, got {self.use!r}", code="invalid_choice"
+            )
 
 
 @dataclass(frozen=True)
@@ -188,4 +190,6 @@ class PoseChange:
 
     def __post_init__(self) -> None:
         if self.kind not in POSE_CHANGES:
-            raise InputError(f"a scene's change must be one of {', '.join(POSE_CHANGES)}, got {self.kind!r}")
+            raise InputError(
+                f"a scene's change must be one of {', '.join(POSE_CHANGES)}, got {self.kind!r}", code="invalid_choice"
+            )

@@ -120,9 +120,13 @@ class Registration:
 
     def __post_init__(self) -> None:
         if self.status not in STATUSES:
-            raise InputError(f"registration status must be one of {', '.join(STATUSES)}, got {self.status!r}")
+            raise InputError(
+                f"registration status must be one of {', '.join(STATUSES)}, got {self.status!r}", code="invalid_choice"
+            )
         if self.status == "accepted" and (self.S_target_source is None or self.information is None):
-            raise InputError("an accepted registration needs a pose and an information matrix")
+            raise InputError(
+                "an accepted registration needs a pose and an information matrix", code="invalid_registration"
+            )
 
     @property
     def scale(self) -> float | None:

@@ -40,13 +40,17 @@ class Scan:
         object.__setattr__(self, "points", np.ascontiguousarray(self.points, dtype=np.float64))
         object.__setattr__(self, "origin", np.array(self.origin, dtype=np.float64))
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.origin.shape != (3,):
-            raise InputError(f"a scan has points (N, 3) about an origin (3,), got {self.points.shape}")
+            raise InputError(
+                f"a scan has points (N, 3) about an origin (3,), got {self.points.shape}", code="shape_mismatch"
+            )
         if not len(self.points) or not np.isfinite(self.points).all() or not np.isfinite(self.origin).all():
-            raise InputError("a scan has at least one point, and all of them are finite")
+            raise InputError("a scan has at least one point, and all of them are finite", code="empty_scan")
         if self.colours is not None:
             object.__setattr__(self, "colours", np.ascontiguousarray(self.colours, dtype=np.float32))
             if self.colours.shape != self.points.shape:
-                raise InputError(f"a scan of {len(self.points)} points has colours {self.colours.shape}")
+                raise InputError(
+                    f"a scan of {len(self.points)} points has colours {self.colours.shape}", code="shape_mismatch"
+                )
 
     def __len__(self) -> int:
         return len(self.points)

@@ -52,12 +52,12 @@ class NodeLayer:
         for name, dtype in kinds.items():
             array = np.ascontiguousarray(getattr(self, name), dtype=dtype)
             if len(array) != m:
-                raise InputError(f"NodeLayer.{name} has {len(array)} rows, positions have {m}")
+                raise InputError(f"NodeLayer.{name} has {len(array)} rows, positions have {m}", code="shape_mismatch")
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise InputError(f"NodeLayer.{name} holds NaN or infinity")
+                raise InputError(f"NodeLayer.{name} holds NaN or infinity", code="not_finite")
             object.__setattr__(self, name, array)
         if not (np.isfinite(self.unit_m) and self.unit_m > 0):
-            raise InputError(f"NodeLayer.unit_m must be positive, got {self.unit_m}")
+            raise InputError(f"NodeLayer.unit_m must be positive, got {self.unit_m}", code="invalid_metre")
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -106,18 +106,20 @@ class Segments:
         for name, shape in shapes.items():
             array = getattr(self, name)
             if array.shape != shape:
-                raise InputError(f"Segments.{name} must have shape {shape}, got {array.shape}")
+                raise InputError(f"Segments.{name} must have shape {shape}, got {array.shape}", code="shape_mismatch")
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise InputError(f"Segments.{name} holds NaN or infinity")
+                raise InputError(f"Segments.{name} holds NaN or infinity", code="not_finite")
         counted = int(self.sample_counts.sum())
         if (self.sample_counts < 0).any() or not self.samples.shape == self.sample_colours.shape == (counted, 3):
-            raise InputError(f"Segments has counts of {counted} samples and {self.samples.shape} of them")
+            raise InputError(
+                f"Segments has counts of {counted} samples and {self.samples.shape} of them", code="shape_mismatch"
+            )
         if not (np.isfinite(self.samples).all() and np.isfinite(self.sample_colours).all()):
-            raise InputError("Segments.samples holds NaN or infinity")
+            raise InputError("Segments.samples holds NaN or infinity", code="not_finite")
         if self.members.size and not (self.members.min() >= -1 and self.members.max() < m):
-            raise InputError(f"Segments.members names things outside -1 to {m - 1}")
+            raise InputError(f"Segments.members names things outside -1 to {m - 1}", code="shape_mismatch")
         if not (np.isfinite(self.unit_m) and self.unit_m > 0):
-            raise InputError(f"Segments.unit_m must be positive, got {self.unit_m}")
+            raise InputError(f"Segments.unit_m must be positive, got {self.unit_m}", code="invalid_metre")
 
     def __len__(self) -> int:
         return len(self.positions)

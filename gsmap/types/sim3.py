@@ -32,14 +32,18 @@ class Sim3:
         scale = float(self.scale)
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise InputError(
-                f"Sim3 needs a (3, 3) rotation and a (3,) translation, got {rotation.shape} and {translation.shape}"
+                f"Sim3 needs a (3, 3) rotation and a (3,) translation, got {rotation.shape} and {translation.shape}",
+                code="invalid_pose",
             )
         if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and np.isfinite(scale)):
-            raise InputError("Sim3 holds NaN or infinity: check where the transform was computed")
+            raise InputError("Sim3 holds NaN or infinity: check where the transform was computed", code="not_finite")
         if scale <= 0:
-            raise InputError(f"Sim3 scale must be positive, got {scale}")
+            raise InputError(f"Sim3 scale must be positive, got {scale}", code="invalid_pose")
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
-            raise InputError("Sim3 rotation is not orthonormal with determinant +1: pass scale apart from rotation")
+            raise InputError(
+                "Sim3 rotation is not orthonormal with determinant +1: pass scale apart from rotation",
+                code="invalid_pose",
+            )
         rotation.flags.writeable = False
         translation.flags.writeable = False
         object.__setattr__(self, "rotation", rotation)
@@ -57,10 +61,10 @@ class Sim3:
         scales = np.asarray(scales, dtype=np.float64)
         finite = np.isfinite(rotations).all() and np.isfinite(translations).all() and np.isfinite(scales).all()
         if not finite or not (scales > 0).all():
-            raise InputError("a pose holds NaN, infinity, or a scale that is not positive")
+            raise InputError("a pose holds NaN, infinity, or a scale that is not positive", code="not_finite")
         off = np.abs(np.einsum("nij,nkj->nik", rotations, rotations) - np.eye(3)).max(initial=0)
         if off > 1e-6 or (np.linalg.det(rotations) < 0).any():
-            raise InputError("a pose's rotation is not orthonormal with determinant +1")
+            raise InputError("a pose's rotation is not orthonormal with determinant +1", code="invalid_pose")
         rotations.flags.writeable = False
         translations.flags.writeable = False
         out = []
@@ -77,13 +81,17 @@ class Sim3:
         """From a (4, 4) matrix ``[sR t; 0 1]``. The rotation part is projected to SO(3) if it is within 1e-3 of it."""
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise InputError(f"a similarity needs a finite (4, 4) matrix, got shape {matrix.shape}")
+            raise InputError(
+                f"a similarity needs a finite (4, 4) matrix, got shape {matrix.shape}", code="invalid_pose"
+            )
         if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-            raise InputError(f"last row of a similarity must be 0 0 0 1, got {matrix[3].tolist()}")
+            raise InputError(f"last row of a similarity must be 0 0 0 1, got {matrix[3].tolist()}", code="invalid_pose")
         u, singular, vt = np.linalg.svd(matrix[:3, :3])
         scale = float(singular.mean())
         if scale <= 0 or np.abs(singular / scale - 1).max() > 1e-3 or np.linalg.det(u @ vt) < 0:
-            raise InputError("matrix is not a similarity: its 3x3 part is not a positive multiple of a rotation")
+            raise InputError(
+                "matrix is not a similarity: its 3x3 part is not a positive multiple of a rotation", code="invalid_pose"
+            )
         if abs(scale - 1) < 1e-9:
             scale = 1.0
         return cls(u @ vt, matrix[:3, 3], scale)
@@ -124,5 +132,6 @@ def check_sim3(value: object, name: str) -> None:
     if not isinstance(value, Sim3):
         raise InputError(
             f"{name} must be a gsmap.types.Sim3, got {type(value).__name__}; of a (4, 4) matrix M pass "
-            "Sim3.from_matrix(M)"
+            "Sim3.from_matrix(M)",
+            code="invalid_pose",
         )

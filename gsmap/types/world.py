@@ -36,7 +36,7 @@ class WorldFrame:
 
     def __post_init__(self) -> None:
         if not np.isfinite([self.latitude_deg, self.longitude_deg, self.height_m]).all():
-            raise InputError("the origin of a world frame must be finite")
+            raise InputError("the origin of a world frame must be finite", code="invalid_vector")
 
 
 OBSERVATION_KINDS = ("frame", "point", "image", "fix", "bar")
@@ -142,7 +142,7 @@ class Fix:
         _positive(where, *self.sigma_m)
         common = (*self.common_sigma_m, self.sea_level_sigma_m)
         if not (np.isfinite(common).all() and min(common) >= 0):
-            raise InputError(f"{where} needs common sigmas of at least 0, got {common}")
+            raise InputError(f"{where} needs common sigmas of at least 0, got {common}", code="invalid_observation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ class ScaleBar:
         _finite(f"scale bar {self.name}", self.points, 2, 3)
         _positive(f"scale bar {self.name}", self.length_m, self.sigma_m, *self.point_sigmas)
         if self.scenes[0] == self.scenes[1] and np.allclose(self.points[0], self.points[1], rtol=0, atol=1e-12):
-            raise InputError(f"the ends of scale bar {self.name} are one point: pick two")
+            raise InputError(f"the ends of scale bar {self.name} are one point: pick two", code="invalid_observation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +235,7 @@ class Residual:
 
     def __post_init__(self) -> None:
         if self.kind not in RESIDUAL_KINDS or self.use not in RESIDUAL_USES:
-            raise InputError(f"no such residual: {self.kind!r}, {self.use!r}")
+            raise InputError(f"no such residual: {self.kind!r}, {self.use!r}", code="invalid_observation")
 
 
 GROUP_KINDS = ("points", "photos", "scenes", "bars")
@@ -290,7 +290,10 @@ class Contradiction:
     def __post_init__(self) -> None:
         causes = {self.cause, *self.other_causes}
         if not ({self.group, self.against} <= set(GROUP_KINDS) and causes <= set(CAUSES) and self.kept in KEPT):
-            raise InputError(f"no such contradiction: {self.group!r}, {self.against!r}, {causes}, {self.kept!r}")
+            raise InputError(
+                f"no such contradiction: {self.group!r}, {self.against!r}, {causes}, {self.kept!r}",
+                code="invalid_observation",
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,7 +331,7 @@ class WorldTie:
 
     def __post_init__(self) -> None:
         if self.problem_code not in PROBLEMS:
-            raise InputError(f"no such problem: {self.problem_code!r}")
+            raise InputError(f"no such problem: {self.problem_code!r}", code="invalid_observation")
 
     def left_out(self) -> set[tuple[str, str, str]]:
         """(kind, name, scene) of the observations that were not solved from."""
@@ -338,10 +341,12 @@ class WorldTie:
 def _finite(where: str, values: np.ndarray, *shape: int) -> None:
     found = np.asarray(values, dtype=np.float64)
     if found.shape != shape or not np.isfinite(found).all():
-        raise InputError(f"{where} needs finite numbers of shape {shape}, got {found.shape}")
+        raise InputError(f"{where} needs finite numbers of shape {shape}, got {found.shape}", code="shape_mismatch")
 
 
 def _positive(where: str, *values: float) -> None:
     for value in values:
         if not (np.isfinite(value) and value > 0):
-            raise InputError(f"{where} needs finite positive sigmas and lengths, got {value}")
+            raise InputError(
+                f"{where} needs finite positive sigmas and lengths, got {value}", code="invalid_observation"
+            )

@@ -99,7 +99,7 @@ class Answers:
         for pattern, route in self._routes:
             if (found := pattern.fullmatch(path)) is not None:
                 return route(*found.groups(), **({"asked": asked} if route in self._asking else {}))
-        raise NotFoundError(f"there is no {path}")
+        raise NotFoundError(f"there is no {path}", code="page_not_found")
 
     @property
     def _asking(self) -> tuple[Callable[..., Answer], ...]:
@@ -131,7 +131,7 @@ class Answers:
     def _entry(self, key: str) -> ViewScene:
         found = next((one for one in self.content().scenes if one.key == key), None)
         if found is None:
-            raise NotFoundError("no scene has this content now: ask for map.json again")
+            raise NotFoundError("no scene has this content now: ask for map.json again", code="content_outdated")
         return found
 
     def _tileset(self, key: str, asked: Mapping[str, str]) -> Answer:
@@ -149,13 +149,13 @@ class Answers:
 
     def _merged(self, component: str, name: str) -> Answer:
         if not _MERGED.fullmatch(name) or int(component) not in self.content().merged:
-            raise NotFoundError(f"there is no merged/{component}/{name}")
+            raise NotFoundError(f"there is no merged/{component}/{name}", code="page_not_found")
         path = self._doors.merged(int(component)) / name
         try:
             with open(open_file(path), "rb") as file:
                 data = file.read()
         except (OSError, CorruptError) as error:
-            raise NotFoundError(f"there is no merged/{component}/{name}") from error
+            raise NotFoundError(f"there is no merged/{component}/{name}", code="page_not_found") from error
         return Answer(data, JSON if path.suffix == ".json" else "model/gltf-binary")
 
     # --- what is told ------------------------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ class Answers:
     def _history(self, asked: Mapping[str, str]) -> Answer:
         component = asked.get("component", "0")
         if not component.isdecimal() or len(component) > 8:
-            raise ConfigError(f"a component is a number, got {component!r}")
+            raise ConfigError(f"a component is a number, got {component!r}", code="invalid_request")
         return Answer.json(self._doors.history(asked.get("at", ""), int(component)))
 
     def _edge(self, target: str, source: str) -> Answer:
@@ -221,7 +221,7 @@ class Answers:
             else:
                 self._pictures.move_to_end(f"{state} {name}")
         if found is None:
-            raise NotFoundError(f"there is no such picture of {name.partition(' ')[0]}")
+            raise NotFoundError(f"there is no such picture of {name.partition(' ')[0]}", code="page_not_found")
         return Answer(found, JPEG)
 
 
@@ -248,5 +248,5 @@ def _number(text: str) -> float:
     try:
         value = float(text)
     except ValueError as error:
-        raise ConfigError(f"a rank is a number, got {text!r}") from error
+        raise ConfigError(f"a rank is a number, got {text!r}", code="invalid_request") from error
     return value if np.isfinite(value) else 0.0

@@ -20,6 +20,7 @@ def built_page() -> Path:
     if not (folder / "index.html").is_file() or not (folder / "page.js").is_file():
         raise ConfigError(
             "the page of gsmap view is not built: in a checkout run tools/build_page.sh (Node.js with npm); a package "
-            "has it where npm was there when it was built"
+            "has it where npm was there when it was built",
+            code="page_not_built",
         )
     return folder

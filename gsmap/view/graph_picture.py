@@ -41,12 +41,14 @@ def draw_graph(
         InputError: no cameras. NotFoundError: no camera of that name.
     """
     if len(cameras) == 0:
-        raise InputError("a picture of the graph needs a camera to look through")
+        raise InputError("a picture of the graph needs a camera to look through", code="nothing_to_draw")
     if camera is None:
         view = _best_view(gaussians, cameras, graph, width_px)
     else:
         if isinstance(camera, str) and camera not in cameras.names:
-            raise NotFoundError(f"no camera is named {camera}; the first is {cameras.names[0]}")
+            raise NotFoundError(
+                f"no camera is named {camera}; the first is {cameras.names[0]}", code="camera_not_found"
+            )
         row = cameras.names.index(camera) if isinstance(camera, str) else int(camera)
         view = _render(gaussians, _wide(cameras[row], width_px), 4 * width_px)
     picture = Image.fromarray(view.rgb).convert("RGBA")

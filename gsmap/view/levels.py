@@ -118,7 +118,9 @@ class Levels:
         """
         data = self._cache.tile(entry.key, uri)
         if data is None:
-            raise NotFoundError(f"{entry.scene.name} has no tile {uri} now: ask for its tileset again")
+            raise NotFoundError(
+                f"{entry.scene.name} has no tile {uri} now: ask for its tileset again", code="content_outdated"
+            )
         return data
 
     def read(self, entry: ViewScene, read: Callable[[Path], _T]) -> _T:
@@ -138,7 +140,9 @@ class Levels:
             with contextlib.suppress(FileNotFoundError):
                 if found is not None:
                     return read(found)
-        raise NotFoundError(f"the levels of detail of {entry.scene.name} are gone again: raise view.cache_gib")
+        raise NotFoundError(
+            f"the levels of detail of {entry.scene.name} are gone again: raise view.cache_gib", code="content_outdated"
+        )
 
     def _make_tree(self, scene: str, key: str, progress: Progress) -> None:
         if self._cache.tree(key) is not None:  # another process was faster
@@ -191,7 +195,7 @@ class Levels:
         """
         inside = members(view).get(component)
         if inside is None:
-            raise NotFoundError(f"there is no component {component}")
+            raise NotFoundError(f"there is no component {component}", code="component_not_found")
         with self._lock:
             told = self._overview(component, inside)
             if name == "none":
@@ -199,7 +203,7 @@ class Levels:
                 return Waiting(done / len(inside), told.pending)
             parts = self._files.get(name)
             if parts is None:
-                raise NotFoundError("this overview is another by now: ask for map.json again")
+                raise NotFoundError("this overview is another by now: ask for map.json again", code="content_outdated")
             if not isinstance(parts, bytes):
                 parts = self._files[name] = overview_file(parts)
             self._files.move_to_end(name)
@@ -230,7 +234,7 @@ class Levels:
             places.append(place)
             boxes[entry.key] = made.box
         if not parts:
-            raise InputError("nothing of it can be seen")
+            raise InputError("nothing of it can be seen", code="no_opaque_gaussians")
         counts = tuple(len(one.gaussians) for _, one in parts)
         heights, sides = extent_of(parts, up_of(list(inside.values())))
         return overview_file(parts), ViewOverview("", tuple(places), counts, 0, heights, sides), boxes

@@ -125,7 +125,7 @@ class Maker:
             except GsmapError as error:
                 job.error = error
             except Exception as error:
-                job.error = GsmapError(f"{name}: {type(error).__name__} {error}")
+                job.error = GsmapError(f"{name}: {type(error).__name__} {error}", code="internal_error")
             with self._changed:
                 if job.error is None:
                     self._jobs.pop(name, None)

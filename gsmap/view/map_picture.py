@@ -46,7 +46,7 @@ def map_picture(
     from PIL import Image, ImageDraw
 
     if not parts:
-        raise InputError("a picture of a map needs at least one placed scene")
+        raise InputError("a picture of a map needs at least one placed scene", code="nothing_to_draw")
     parts = _upright(parts, up)
     unit = width_px / 1600
     margin, head, foot = round(28 * unit), round((86 if title else 28) * unit), round(84 * unit)

@@ -47,12 +47,12 @@ class Params:
     def __post_init__(self) -> None:
         for name in ("workers", "overview_gaussians", "pair_views", "pictures_kept", "nodes", "cameras"):
             if getattr(self, name) < 1:
-                raise ConfigError(f"view.{name} must be at least 1, got {getattr(self, name)}")
+                raise ConfigError(f"view.{name} must be at least 1, got {getattr(self, name)}", code="out_of_range")
         for name in ("cache_gib", "overview_mb"):
             if not getattr(self, name) > 0:
-                raise ConfigError(f"view.{name} must be positive, got {getattr(self, name)}")
+                raise ConfigError(f"view.{name} must be positive, got {getattr(self, name)}", code="out_of_range")
         for name in ("picture_gaussians", "correspondences", "site_pairs", "site_changes"):
             if getattr(self, name) < 0:
-                raise ConfigError(f"view.{name} must not be negative, got {getattr(self, name)}")
+                raise ConfigError(f"view.{name} must not be negative, got {getattr(self, name)}", code="out_of_range")
         if self.picture_px < 16:
-            raise ConfigError(f"view.picture_px must be at least 16 pixels, got {self.picture_px}")
+            raise ConfigError(f"view.picture_px must be at least 16 pixels, got {self.picture_px}", code="out_of_range")

@@ -107,7 +107,9 @@ class ViewServer:
         try:
             self._http = LocalServer(port, handler)
         except (OSError, OverflowError) as error:
-            raise ConfigError(f"cannot serve on port {port}: {error}; try another --port, or 0") from error
+            raise ConfigError(
+                f"cannot serve on port {port}: {error}; try another --port, or 0", code="port_unavailable"
+            ) from error
         self.levels = Levels(doors, TreeCache(cache, int(params.cache_gib * 2**30)), params)
         handler.answers = Answers(doors, self.levels, params)
         self._thread: threading.Thread | None = None
@@ -211,20 +213,20 @@ class _Handler(BaseHTTPRequestHandler):
     def _act(self, body: bytes) -> Answer:
         named = _ACTION.fullmatch(self.path)
         if named is None:
-            raise NotFoundError(f"there is no {self.path}")
+            raise NotFoundError(f"there is no {self.path}", code="page_not_found")
         action = self.doors.actions.get(named[1])
         if action is None:
             if not self.doors.actions:
                 raise ReadOnlyError("this map was opened to be looked at: nothing can be changed from this page")
-            raise NotFoundError(f"there is no action {named[1]}")
+            raise NotFoundError(f"there is no action {named[1]}", code="page_not_found")
         try:
             said = json.loads(body)
         except (ValueError, RecursionError) as error:
-            raise InputError(f"an action is JSON: {error}") from error
+            raise InputError(f"an action is JSON: {error}", code="invalid_request") from error
         if not isinstance(said, dict):
-            raise InputError("an action is a JSON object")
+            raise InputError("an action is a JSON object", code="invalid_request")
         if not self.acting.acquire(blocking=False):
-            raise BusyError("another action is at work: wait until it is done")
+            raise BusyError("another action is at work: wait until it is done", code="server_busy")
         try:
             action(said)
         finally:
@@ -237,11 +239,12 @@ class _Handler(BaseHTTPRequestHandler):
             found = answer()
         except GsmapError as error:
             status = next((code for kind, code in _STATUS.items() if isinstance(error, kind)), 500)
-            found = Answer.json({"error": str(error)}, HTTPStatus(status))
+            found = Answer.json({"error": str(error), "code": error.code}, HTTPStatus(status))
         except (ConnectionError, TimeoutError):
             raise
         except Exception as error:
-            found = Answer.json({"error": f"{type(error).__name__}: {error}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
+            said = {"error": f"{type(error).__name__}: {error}", "code": "internal_error"}
+            found = Answer.json(said, HTTPStatus.INTERNAL_SERVER_ERROR)
         self._answer(found)
 
     def _is_own_host(self) -> bool:

@@ -303,7 +303,10 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
     html = (page / "index.html").read_text(encoding="utf-8")
     script, style = _SCRIPT.search(html), _STYLE.search(html)
     if script is None:
-        raise GsmapError(f"{page / 'index.html'} has no script of its own: build the page again (tools/build_page.sh)")
+        raise GsmapError(
+            f"{page / 'index.html'} has no script of its own: build the page again (tools/build_page.sh)",
+            code="page_not_built",
+        )
     code = (page / script[1]).read_text(encoding="utf-8").replace("</script", "<\\/script").replace("<!--", "<\\!--")
     packed = {address: base64.b64encode(data).decode() for address, data in files.items()}
     data = json.dumps(packed).replace("<", "\\u003c")
@@ -332,7 +335,9 @@ def _with_policy(html: str, policy: Mapping[str, str], mark: str = "") -> str:
     said = "; ".join(f"{name} {value}" for name, value in policy.items())
     head = _HEAD.search(html)
     if head is None:
-        raise GsmapError("the page has no head of its own: build the page again (tools/build_page.sh)")
+        raise GsmapError(
+            "the page has no head of its own: build the page again (tools/build_page.sh)", code="page_not_built"
+        )
     meta = f'{mark}<meta http-equiv="Content-Security-Policy" content="{said}" />'
     return html[: head.end()] + meta + html[head.end() :]
 

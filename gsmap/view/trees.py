@@ -54,7 +54,9 @@ class TreeParams:
     def __post_init__(self) -> None:
         for name, least in (("leaf_gaussians", 64), ("coarsening", 2), ("root_gaussians", 1)):
             if getattr(self, name) < least:
-                raise ConfigError(f"view.tree.{name} must be at least {least}, got {getattr(self, name)}")
+                raise ConfigError(
+                    f"view.tree.{name} must be at least {least}, got {getattr(self, name)}", code="out_of_range"
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +162,7 @@ def write_tree(
     builder = _Builder(folder, _Rows(source), params, progress or (lambda fraction, text: None), source.num_gaussians)
     made = builder.build(_octree(_codes(source), params.leaf_gaussians), "0")
     if made is None:
-        raise InputError("no Gaussian of it can be seen")
+        raise InputError("no Gaussian of it can be seen", code="no_opaque_gaussians")
     while len(made.content) > params.root_gaussians:
         made = builder.coarser([made], f"r{len(made.content)}", max(params.root_gaussians, 1))
     tiles3d.write_tileset(folder / FILE_NAME, made.node, transform=np.eye(4))
@@ -181,7 +183,7 @@ def sketch(source: GaussianSource, max_count: int) -> Sketch:
         at += len(chunk)
     found = Gaussians.concatenate(parts)
     if not len(found):
-        raise InputError("no Gaussian of it can be seen")
+        raise InputError("no Gaussian of it can be seen", code="no_opaque_gaussians")
     # Those that are left stand for the others: each stops as much light as all of them did.
     scales = found.log_scales + np.float32(np.log(every) / 2 if every > 1 else 0)
     box = robust_box(found.means, None, _STRAYS_OF_SCENE)

@@ -36,16 +36,18 @@ class Crs:
         except CRSError as error:
             raise ConfigError(
                 f"no coordinate reference system is called {_short(self.text)}: name one such as EPSG:25832, "
-                "EPSG:25832+7837 (with its height system) or EPSG:4326"
+                "EPSG:25832+7837 (with its height system) or EPSG:4326",
+                code="invalid_crs",
             ) from error
         horizontal = found.sub_crs_list[0] if found.is_compound else found
         if not (horizontal.is_projected or horizontal.is_geographic or horizontal.is_geocentric):
             raise ConfigError(
                 f"{_short(self.text)} is no system of places on the Earth ({found.type_name}): a height alone, or a "
-                "site's own grid, cannot tie a map to the world"
+                "site's own grid, cannot tie a map to the world",
+                code="unsupported_crs",
             )
         if horizontal.geodetic_crs is None:
-            raise ConfigError(f"{_short(self.text)} does not say which datum it is on")
+            raise ConfigError(f"{_short(self.text)} does not say which datum it is on", code="unsupported_crs")
         return found
 
     @cached_property
@@ -71,7 +73,10 @@ class Crs:
 
     @cached_property
     def _bare(self) -> Any:
-        raise ConfigError(f"{_short(self.text)} is Earth-centred on a datum of its own: use {ECEF} or a projected one")
+        raise ConfigError(
+            f"{_short(self.text)} is Earth-centred on a datum of its own: use {ECEF} or a projected one",
+            code="unsupported_crs",
+        )
 
     @property
     def name(self) -> str:
@@ -155,7 +160,8 @@ class Crs:
             lon, lat = lonlat[off[0]]
             raise InputError(
                 f"{names[off[0]]} lies at {lat:.4f} N {lon:.4f} E, outside of where {_short(self.text)} ({self.name}) "
-                f"is meant for ({area.name.split(':')[0]}): are the axes swapped, or is it another system?"
+                f"is meant for ({area.name.split(':')[0]}): are the axes swapped, or is it another system?",
+                code="outside_crs",
             )
 
 
@@ -167,7 +173,7 @@ def crs(text: str) -> Crs:
         ConfigError: PROJ knows none of that name, or it is none that places lie in.
     """
     if not isinstance(text, str) or not text.strip() or len(text) > 20_000:
-        raise ConfigError("a coordinate reference system is EPSG:N, a PROJ string or WKT")
+        raise ConfigError("a coordinate reference system is EPSG:N, a PROJ string or WKT", code="invalid_crs")
     found = Crs(text.strip())
     found.named  # noqa: B018  # refuse here
     return found
@@ -216,7 +222,9 @@ def _through(source: Any, target: Any, points: np.ndarray, text: str) -> np.ndar
         if (grid := _missing_grid(source, target)) is not None:
             raise _needs(text, grid)
         where = ", ".join(f"{x:.10g}" for x in points[int(np.argmax(bad))])
-        raise InputError(f"{where} is no place in {_short(text)}: are the axes swapped, or is it another system?")
+        raise InputError(
+            f"{where} is no place in {_short(text)}: are the axes swapped, or is it another system?", code="outside_crs"
+        )
     return found
 
 
@@ -235,13 +243,14 @@ def _no_way(text: str, error: Exception) -> ConfigError:
     said = str(error)
     if "Grid " in said:
         return _needs(text, said.split("Grid ", 1)[1].split(" ", 1)[0])
-    return ConfigError(f"PROJ knows no exact way from {_short(text)}: {said}")
+    return ConfigError(f"PROJ knows no exact way from {_short(text)}: {said}", code="no_exact_transform")
 
 
 def _needs(text: str, grid: str) -> ConfigError:
     return ConfigError(
         f"{_short(text)} needs the grid {grid}, which PROJ does not have here: run pyproj sync --file {grid}, or name "
-        "the system without its heights if they are ellipsoidal"
+        "the system without its heights if they are ellipsoidal",
+        code="grid_missing",
     )
 
 

@@ -57,11 +57,13 @@ def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | Non
     """
     folder = Path(os.path.abspath(folder))  # whose own name, and those above, may be that of a scene
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder of photos")
+        raise InputError(f"{folder} is no folder of photos", code="folder_not_found")
     photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
     found = {path.as_posix(): read(path) for path in photos}
     if not any(found.values()):
-        raise InputError(f"none of the {len(photos)} photos in {folder} says where it was taken (EXIF GPS)")
+        raise InputError(
+            f"none of the {len(photos)} photos in {folder} says where it was taken (EXIF GPS)", code="no_gnss"
+        )
     return found
 
 

@@ -42,4 +42,4 @@ class Params:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not value > 0:
-                raise ConfigError(f"{name} must be positive, got {value}")
+                raise ConfigError(f"{name} must be positive, got {value}", code="out_of_range")

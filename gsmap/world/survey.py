@@ -40,7 +40,10 @@ def frame_for(crs_text: str, survey: Survey) -> WorldFrame:
         own = crs(group[0].crs)
         found.append(own.to_geodetic(np.array([one.position for one in group])))
     if not found:
-        raise InputError(f"nothing lies in {system.text} yet: give control points, photos with GNSS, or a position")
+        raise InputError(
+            f"nothing lies in {system.text} yet: give control points, photos with GNSS, or a position",
+            code="not_georeferenced",
+        )
     # To four digits of a degree: a shift between datums is next to nothing here.
     near = system.of_geodetic(np.median(np.concatenate(found), axis=0)[None])
     return frame_at(system.text, near)

@@ -143,3 +143,16 @@ def test_a_broken_plug_in_that_is_chosen_is_an_error(empty: Path, cli: Run, sett
     assert done.code == 2
     assert "cannot be loaded" in done.stderr.splitlines()[-1]
     assert not (empty / "settings.toml").exists()
+
+
+def test_a_failure_with_json_is_one_object_with_a_code(empty: Path, cli: Run) -> None:
+    done = cli("measure", empty, "0,0,0", "1,0,0", "--json")
+    assert done.code == 1
+    assert done.json["error"]["code"] == "no_poses"
+    assert done.stderr == f"gsmap: {done.json['error']['message']}\n"
+    assert cli("list", empty, "tiles", "--set", "no.such=1", "--json").code == 2
+
+
+@pytest.mark.usefixtures("broken_list")
+def test_an_internal_error_with_json_has_a_code(empty: Path, cli: Run, logs: Path) -> None:
+    assert cli("list", empty, "scenes", "--json").json["error"]["code"] == "internal_error"

@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # the rows of this checkout, whichever one is installed
 
 from gsmap.cli.objects import OBJECTS, Many, Maybe, Object
+from gsmap.reason_codes import ERRORS
 from gsmap.settings import field_docs
 from gsmap.types.rows import SCHEMA, Row
 from gsmap.types.sim3 import Sim3
@@ -42,6 +43,10 @@ dataclasses of `gsmap.types.rows` with the same names.
 - A pose is a 4x4 matrix: `S_a_b` maps points from frame b to frame a. An array is a list of lists of the shape given.
 - Units are in the names: `_m`, `_rad`, `_deg`, `_s`, `_px`, `_db`. Dates are ISO 8601 with their zone.
 - A number that is not known or not finite is `null`.
+- A verb that fails (exit code 1 or 2) prints `"error"` beside `"schema"`: an object of `"code"`, one of the
+  [codes of errors](#codes-of-errors), and `"message"`, the line that stderr has, too. Wrong usage, such as an option
+  that does not exist, prints nothing on stdout. Codes stay as they are; messages may change with any version. In Python
+  the code is `GsmapError.code`; the server of `gsmap view` answers `{{"error": MESSAGE, "code": CODE}}`.
 """
 
 
@@ -52,6 +57,8 @@ def page() -> str:
     lines += ["", "## Rows\n"]
     for row in row_types():
         lines += section(row)
+    lines += ["## Codes of errors\n", "| code | cause |", "| --- | --- |"]
+    lines += [f"| `{code}` | {meaning} |" for code, meaning in sorted(ERRORS.items())]
     return "\n".join(lines).rstrip() + "\n"
 
 

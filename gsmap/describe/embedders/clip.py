@@ -110,7 +110,8 @@ class ClipEmbedder:
                 value = value.mean((2, 3)) if value.shape[1] >= value.shape[3] else value.mean((1, 2))
             if value.ndim != 2 or len(value) < used:
                 raise InputError(
-                    f"model {self.spec.kind} ({self.spec.path}) gives {list(value.shape)} for {used} pictures"
+                    f"model {self.spec.kind} ({self.spec.path}) gives {list(value.shape)} for {used} pictures",
+                    code="model_misfit",
                 )
             out.append(value[:used])
         return np.concatenate(out)

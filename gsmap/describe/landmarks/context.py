@@ -44,11 +44,14 @@ class Params:
         for name in ("radii_m", "heights_m", "shells_m"):
             edges = getattr(self, name)
             if len(edges) < 1 + (name == "heights_m") or any(b <= a for a, b in pairwise(edges)):
-                raise ConfigError(f"{name} must rise from one to the next, got {list(edges)}")
+                raise ConfigError(
+                    f"{name} must rise from one to the next, got {list(edges)}", code="edges_not_ascending"
+                )
         others = [f.name for f in fields(self) if f.name != "fitted" and getattr(self, f.name) != f.default]
         if self.fitted and others:
             raise ConfigError(
-                f"the fitted metric of landmarks holds for the default of {others[0]} alone: unset either"
+                f"the fitted metric of landmarks holds for the default of {others[0]} alone: unset either",
+                code="setting_mismatch",
             )
 
     @property

@@ -81,7 +81,8 @@ class Params:
         if not (self.model_time_s > 0 and self.model_memory_mb > 0):
             raise ConfigError(
                 "model_time_s and model_memory_mb of describe.object must be positive, got "
-                f"{self.model_time_s} and {self.model_memory_mb}"
+                f"{self.model_time_s} and {self.model_memory_mb}",
+                code="out_of_range",
             )
         for kind, name in (("segmenter", self.segmenter), ("embedder", self.embedder)):
             if name != "auto":
@@ -245,6 +246,7 @@ def _made(methods: Family, name: str, params: MethodParams, context: SceneContex
         raise ConfigError(
             f"{methods.name} {name} needs the models {' and '.join(missing)}: add them with `gsmap models add`"
             if len(missing) > 1
-            else f"{methods.name} {name} needs a model: add one with `gsmap models add MAP {missing[0]} FILE.onnx`"
+            else f"{methods.name} {name} needs a model: add one with `gsmap models add MAP {missing[0]} FILE.onnx`",
+            code="model_required",
         )
     return method.make(context, params[name])

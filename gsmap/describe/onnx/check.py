@@ -33,7 +33,8 @@ def kinds() -> dict[str, list[Any]]:
             method = methods.get(name)
             if method.MODELS and not hasattr(method, "probe"):
                 raise ConfigError(
-                    f"{methods.name} {name!r} lacks probe: see the contract in gsmap.methods.{methods.name}"
+                    f"{methods.name} {name!r} lacks probe: see the contract in gsmap.methods.{methods.name}",
+                    code="invalid_method",
                 )
             for kind in method.MODELS:
                 found.setdefault(kind, []).append(method)
@@ -56,7 +57,8 @@ def parse_preset(preset: str) -> tuple[tuple[float, float, float], tuple[float, 
     except (KeyError, ValueError):
         pass
     raise ConfigError(
-        f"pixel scaling must be {', '.join(PRESETS)} or mean=r,g,b;std=r,g,b with rgb in [0, 1], got {preset!r}"
+        f"pixel scaling must be {', '.join(PRESETS)} or mean=r,g,b;std=r,g,b with rgb in [0, 1], got {preset!r}",
+        code="invalid_choice",
     )
 
 
@@ -78,11 +80,11 @@ def check_model(
     """
     known = kinds()
     if kind not in known:
-        raise ConfigError(f"model kind must be one of {', '.join(sorted(known))}, got {kind!r}")
+        raise ConfigError(f"model kind must be one of {', '.join(sorted(known))}, got {kind!r}", code="invalid_choice")
     mean, std = parse_preset(preset)
     path = Path(path)
     if not path.is_file():
-        raise NotFoundError(f"no model file at {path}")
+        raise NotFoundError(f"no model file at {path}", code="file_not_found")
     if kind == text.TOKENIZER:
         return text.check_tokenizer(path)
     refuse_external_data(path)

@@ -38,17 +38,22 @@ def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
         verbs = " and ".join(f"gsmap models add MAP {kind} {files[kind]}" for kind in missing)
         raise ConfigError(
             f"words are looked for by the text tower of the map's image encoder, which the map lacks: {verbs}; or show "
-            "a thing: --picture FILE, --like SCENE:NODE, --at X,Y,Z"
+            "a thing: --picture FILE, --like SCENE:NODE, --at X,Y,Z",
+            code="model_required",
         )
     if len(text) > _MAX_CHARACTERS:
-        raise InputError(f"{len(text)} characters are more than a text tower reads: use a few words")
+        raise InputError(
+            f"{len(text)} characters are more than a text tower reads: use a few words", code="invalid_query"
+        )
     spec = models[TEXT]
     fixed = _ids_of(spec).shape[1]
     ids, mask = _tokens(text, models[TOKENIZER], fixed or _CONTEXT, pad=fixed is not None)
     found = _run(spec, ids, mask)
     norm = float(np.linalg.norm(found))
     if not np.isfinite(norm) or norm <= 0:
-        raise InputError(f"model {TEXT} ({spec.path}) says nothing of {text!r}: its vector has no direction")
+        raise InputError(
+            f"model {TEXT} ({spec.path}) says nothing of {text!r}: its vector has no direction", code="invalid_query"
+        )
     return (found / norm).astype(np.float32)
 
 
@@ -75,7 +80,9 @@ def check_tokenizer(path: Path) -> ModelSpec:
         MissingDependencyError: the package tokenizers is not installed.
     """
     if path.stat().st_size > _MAX_BYTES:
-        raise InputError(f"{path} is larger than any tokenizer: give the tokenizer.json of the model pack")
+        raise InputError(
+            f"{path} is larger than any tokenizer: give the tokenizer.json of the model pack", code="invalid_tokenizer"
+        )
     _tokenizer(path)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     return ModelSpec(TOKENIZER, str(path), sha256, "unit", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (), ())
@@ -90,16 +97,18 @@ def _tokens(text: str, spec: ModelSpec, length: int, *, pad: bool) -> tuple[np.n
     """
     path = Path(spec.path)
     if not path.is_file():
-        raise NotFoundError(f"the tokenizer is missing: {path}; add it again with gsmap models add")
+        raise NotFoundError(
+            f"the tokenizer is missing: {path}; add it again with gsmap models add", code="model_missing"
+        )
     if hashlib.sha256(path.read_bytes()).hexdigest() != spec.sha256:
-        raise InputError(f"the tokenizer has changed since it was added: {path}; add it again")
+        raise InputError(f"the tokenizer has changed since it was added: {path}; add it again", code="model_changed")
     tokenizer = _tokenizer(path)
     own = tokenizer.padding
     tokenizer.no_padding()
     tokenizer.enable_truncation(max_length=length)
     ids = list(tokenizer.encode(text).ids)
     if not ids:
-        raise InputError(f"the tokenizer {path} makes nothing of {text!r}")
+        raise InputError(f"the tokenizer {path} makes nothing of {text!r}", code="invalid_query")
     empty = int(own["pad_id"]) if own else ids[-1]
     rest = length - len(ids) if pad else 0
     found = np.array([ids + [empty] * rest], np.int64)
@@ -116,7 +125,9 @@ def _tokenizer(path: Path) -> Any:
     try:
         return Tokenizer.from_file(str(path))
     except Exception as error:  # it raises plain exceptions, whatever is wrong
-        raise InputError(f"{path} is not a tokenizer.json that can be read: {error}") from error
+        raise InputError(
+            f"{path} is not a tokenizer.json that can be read: {error}", code="invalid_tokenizer"
+        ) from error
 
 
 def _ids_of(spec: ModelSpec) -> Tensor:

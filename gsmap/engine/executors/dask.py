@@ -46,9 +46,12 @@ class Params:
 
     def __post_init__(self) -> None:
         if not self.ahead >= 0:
-            raise ConfigError(f"ahead must not be negative, got {self.ahead}")
+            raise ConfigError(f"ahead must not be negative, got {self.ahead}", code="out_of_range")
         if self.at_least < 1 or not self.timeout_s > 0:
-            raise ConfigError(f"at_least and timeout_s must be positive, got {self.at_least} and {self.timeout_s}")
+            raise ConfigError(
+                f"at_least and timeout_s must be positive, got {self.at_least} and {self.timeout_s}",
+                code="out_of_range",
+            )
 
 
 class DaskWorkers:
@@ -117,7 +120,10 @@ class DaskWorkers:
             try:
                 self._client = Client(self._address, timeout=self._params.timeout_s, set_as_default=False, name="gsmap")
             except (OSError, ValueError, TimeoutError) as error:
-                raise GsmapError(f"no Dask scheduler answers at {self._address} ({error}): is it running?") from error
+                raise GsmapError(
+                    f"no Dask scheduler answers at {self._address} ({error}): is it running?",
+                    code="scheduler_unreachable",
+                ) from error
         return self._client
 
     def _room(self) -> int:
@@ -146,7 +152,8 @@ class DaskWorkers:
             return None
         except (ImportError, pickle.UnpicklingError) as error:
             raise GsmapError(
-                f"a worker of {self._address} could not load its job ({error}): the same gsmap must be installed there"
+                f"a worker of {self._address} could not load its job ({error}): the same gsmap must be installed there",
+                code="worker_mismatch",
             ) from error
         returned, value = pickle.loads(zlib.decompress(packed))
         return returned, value
@@ -154,7 +161,8 @@ class DaskWorkers:
     def _lost(self) -> GsmapError:
         self._client = None
         return GsmapError(
-            f"the Dask scheduler at {self._address} was lost; what was finished is kept, run the same command again"
+            f"the Dask scheduler at {self._address} was lost; what was finished is kept, run the same command again",
+            code="scheduler_lost",
         )
 
     def _forget(self, run: str, futures: list[Any]) -> None:
@@ -170,7 +178,8 @@ def start(params: Params) -> DaskWorkers:
     address = params.scheduler or os.environ.get("GSMAP_SCHEDULER", "")
     if not address:
         raise ConfigError(
-            "the executor dask needs the address of its scheduler: --scheduler tcp://HOST:8786, or GSMAP_SCHEDULER"
+            "the executor dask needs the address of its scheduler: --scheduler tcp://HOST:8786, or GSMAP_SCHEDULER",
+            code="missing_option",
         )
     return DaskWorkers(address, params)
 

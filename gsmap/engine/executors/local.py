@@ -28,9 +28,9 @@ class Params:
 
     def __post_init__(self) -> None:
         if self.workers < 0:
-            raise ConfigError(f"the number of workers must not be negative, got {self.workers}")
+            raise ConfigError(f"the number of workers must not be negative, got {self.workers}", code="out_of_range")
         if not self.start_s >= 0:
-            raise ConfigError(f"start_s must not be negative, got {self.start_s}")
+            raise ConfigError(f"start_s must not be negative, got {self.start_s}", code="out_of_range")
 
 
 class LocalWorkers:

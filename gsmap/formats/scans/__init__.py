@@ -51,7 +51,8 @@ def holds_splat(path: str | os.PathLike[str]) -> bool:
         return glb.holds_splats(path)
     if not is_scan(path):
         raise InputError(
-            f"{path} has the suffix {suffix or '(none)'}: a scan is one of {', '.join(SUFFIXES)}, or a splat"
+            f"{path} has the suffix {suffix or '(none)'}: a scan is one of {', '.join(SUFFIXES)}, or a splat",
+            code="unsupported_format",
         )
     return suffix not in SUFFIXES
 
@@ -68,12 +69,15 @@ def read(path: str | os.PathLike[str], params: Params | None = None) -> Scan:
     suffix = _suffix(path)
     _require(path)
     if suffix not in SUFFIXES:
-        raise InputError(f"{path} has the suffix {suffix or '(none)'}: a scan is one of {', '.join(SUFFIXES)}")
+        raise InputError(
+            f"{path} has the suffix {suffix or '(none)'}: a scan is one of {', '.join(SUFFIXES)}",
+            code="unsupported_format",
+        )
     try:
         with np.errstate(all="ignore"):
             found = _read(path, suffix, params)
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+        raise InputError(f"cannot read {path}: {error.strerror or error}", code="file_unreadable") from error
     return found.about_its_middle()
 
 
@@ -102,6 +106,6 @@ def _suffix(path: Path) -> str:
 
 def _require(path: Path) -> None:
     if not path.exists():
-        raise NotFoundError(f"cannot read {path}: no such file")
+        raise NotFoundError(f"cannot read {path}: no such file", code="file_not_found")
     if not path.is_file():
-        raise InputError(f"cannot read {path}: it is a folder, a pipe or a device, not a file")
+        raise InputError(f"cannot read {path}: it is a folder, a pipe or a device, not a file", code="not_a_plain_file")

@@ -42,9 +42,14 @@ def read_depth(
     path = Path(path)
     picture, mode = _picture(path)
     if mode not in _DEPTHS:
-        raise InputError(f"{path} is a picture of mode {mode}: a depth picture has one channel of 16 bits or floats")
+        raise InputError(
+            f"{path} is a picture of mode {mode}: a depth picture has one channel of 16 bits or floats",
+            code="not_a_depth_picture",
+        )
     if not (np.isfinite(units_per_m) and units_per_m > 0):
-        raise InputError(f"a metre is a positive number of units of the depth picture, got {units_per_m}")
+        raise InputError(
+            f"a metre is a positive number of units of the depth picture, got {units_per_m}", code="invalid_depth_scale"
+        )
     fx, fy, cx, cy = _checked(intrinsics_px)
     depth = picture.astype(np.float64) / units_per_m
     height, width = depth.shape
@@ -54,7 +59,8 @@ def read_depth(
     if not len(rows):
         raise InputError(
             f"{path}: no pixel shows a surface between {MIN_DEPTH_M:g} and {MAX_DEPTH_M:g} m when "
-            f"{units_per_m:g} units are a metre: is the depth scale right?"
+            f"{units_per_m:g} units are a metre: is the depth scale right?",
+            code="invalid_depth_scale",
         )
     z = depth[rows, columns]
     points = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=1)
@@ -66,7 +72,10 @@ def read_depth(
 def _checked(intrinsics_px: Sequence[float]) -> np.ndarray:
     values = np.asarray(intrinsics_px, dtype=np.float64)
     if values.shape != (4,) or not np.isfinite(values).all() or not (values[:2] > 0).all():
-        raise InputError(f"intrinsics are fx, fy, cx, cy in pixels, focal lengths positive, got {list(intrinsics_px)}")
+        raise InputError(
+            f"intrinsics are fx, fy, cx, cy in pixels, focal lengths positive, got {list(intrinsics_px)}",
+            code="invalid_intrinsics",
+        )
     return values
 
 
@@ -98,7 +107,10 @@ def _colours(path: Path, shape: tuple[int, int]) -> np.ndarray:
     colours, _ = _picture(path, "RGB")
     tall, wide = colours.shape[:2]
     if abs(tall * width - wide * height) > max(tall * width, wide * height) * 0.02:
-        raise InputError(f"{path} is {wide} x {tall} pixels, the depth {width} x {height}: they are not of one view")
+        raise InputError(
+            f"{path} is {wide} x {tall} pixels, the depth {width} x {height}: they are not of one view",
+            code="size_mismatch",
+        )
     if (tall, wide) != shape:
         rows = np.minimum(((np.arange(height) + 0.5) * tall / height).astype(int), tall - 1)
         columns = np.minimum(((np.arange(width) + 0.5) * wide / width).astype(int), wide - 1)

@@ -35,11 +35,15 @@ def read(path: Path, params: limits.Params) -> Scan:
     counts, scales, offsets = found.get("counts", np.zeros((0, 3))), found["scales"], found["offsets"]
     total, seen = found["total"].tolist()
     if not (np.isfinite(scales).all() and np.isfinite(offsets).all() and (scales > 0).all()):
-        raise InputError(f"{path}: its scales {scales.tolist()} or offsets {offsets.tolist()} make no sense")
+        raise InputError(
+            f"{path}: its scales {scales.tolist()} or offsets {offsets.tolist()} make no sense", code="file_damaged"
+        )
     if seen < total:
-        raise InputError(f"{path} is truncated: its header promises {total:,} points, {seen:,} were found")
+        raise InputError(
+            f"{path} is truncated: its header promises {total:,} points, {seen:,} were found", code="file_truncated"
+        )
     if not len(counts):
-        raise InputError(f"{path} has no points: there is nothing to look for")
+        raise InputError(f"{path} has no points: there is nothing to look for", code="empty_scan")
     # The integers are exact, and so is an origin that is one of them: nothing is lost to large coordinates.
     middle = np.round(np.median(counts, axis=0))
     points = (counts - middle) * scales
@@ -56,7 +60,7 @@ def _require_header(path: Path) -> None:
     with open(path, "rb") as file:
         head = file.read(_HEADER_BYTES)
     if len(head) < _LEAST_HEADER_BYTES or head[:4] != b"LASF":
-        raise InputError(f"{path} is not a LAS file: it has no LAS header")
+        raise InputError(f"{path} is not a LAS file: it has no LAS header", code="wrong_file_type")
     own, points, records = struct.unpack_from("<HII", head, 94)
     (length,) = struct.unpack_from("<H", head, 105)
     extended = struct.unpack_from("<I", head, 243)[0] if head[25] >= 4 and len(head) == _HEADER_BYTES else 0
@@ -67,7 +71,10 @@ def _require_header(path: Path) -> None:
     room &= total * (1 if packed else 8 * length) <= 8 * (size - points)  # a packed point has a bit at the least
     room &= own + records * _RECORD_BYTES <= points and extended * _EXTENDED_BYTES <= size
     if not room or not length:
-        raise InputError(f"{path}: its LAS header does not fit the file of {size:,} bytes: it is truncated or damaged")
+        raise InputError(
+            f"{path}: its LAS header does not fit the file of {size:,} bytes: it is truncated or damaged",
+            code="file_truncated",
+        )
 
 
 def _colours(values: np.ndarray) -> np.ndarray | None:

@@ -25,4 +25,6 @@ class Params:
     def __post_init__(self) -> None:
         for field in fields(self):
             if not getattr(self, field.name) > 0:
-                raise ConfigError(f"scan.reading.{field.name} must be positive, got {getattr(self, field.name)}")
+                raise ConfigError(
+                    f"scan.reading.{field.name} must be positive, got {getattr(self, field.name)}", code="out_of_range"
+                )

@@ -36,7 +36,9 @@ def read(path: Path, params: limits.Params) -> Scan:
         colours = None  # what a library fills in where a file has none
     triangles = found.get("triangles", np.zeros((0, 3), np.int64))
     if not len(vertices):
-        raise InputError(f"{path} holds no {'points' if kind == 'cloud' else 'mesh'} that open3d can read")
+        raise InputError(
+            f"{path} holds no {'points' if kind == 'cloud' else 'mesh'} that open3d can read", code="wrong_file_type"
+        )
     if not len(triangles):
         total = len(vertices)
         rows = slice(None, None, -(-total // limits.MAX_POINTS))
@@ -48,12 +50,14 @@ def _sampled(path: Path, found: dict[str, Any], vertices: np.ndarray, colours: n
     """Points spread evenly over a mesh's area (Osada et al. 2002, eq. 1), the same for the same file."""
     triangles = _checked(found, "triangles", 3, path).astype(np.int64)
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise InputError(f"{path}: its triangles name vertices that it does not have: it is damaged")
+        raise InputError(
+            f"{path}: its triangles name vertices that it does not have: it is damaged", code="file_damaged"
+        )
     corners = vertices[triangles]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     areas = np.where(np.isfinite(areas), areas, 0.0)
     if not areas.sum() > 0:
-        raise InputError(f"{path}: its triangles have no area: there is no surface to look for")
+        raise InputError(f"{path}: its triangles have no area: there is no surface to look for", code="empty_scan")
     rng = np.random.default_rng(_SEED)
     # Strata of equal area: each point from its own, so that no patch is missed by chance.
     at = (np.arange(count) + rng.uniform(size=count)) / count
@@ -97,7 +101,7 @@ def _textured(found: dict[str, Any], rows: np.ndarray, shares: np.ndarray, path:
 def _checked(found: dict[str, np.ndarray], name: str, width: int, path: Path) -> np.ndarray:
     array = found.get(name, np.zeros((0, width)))
     if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in "fiu":
-        raise InputError(f"{path}: its {name} cannot be read: it is damaged")
+        raise InputError(f"{path}: its {name} cannot be read: it is damaged", code="file_damaged")
     return array
 
 
@@ -112,5 +116,6 @@ def _require_vertices(path: Path) -> None:
         if element.count * least > size + 1:
             raise InputError(
                 f"{path} is truncated: its header promises {element.count:,} rows of {element.name}, "
-                f"but {size:,} bytes follow"
+                f"but {size:,} bytes follow",
+                code="file_truncated",
             )

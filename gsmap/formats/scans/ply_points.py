@@ -31,7 +31,7 @@ def read(path: Path) -> Scan:
     rows = ply.read_element(path, header, "vertex")
     names = set(rows.dtype.names or ())
     if not {"x", "y", "z"} <= names:
-        raise InputError(f"{path}: its vertices lack x, y or z: it is no point cloud")
+        raise InputError(f"{path}: its vertices lack x, y or z: it is no point cloud", code="wrong_file_type")
     total = len(rows)
     rows = rows[:: -(-total // limits.MAX_POINTS)]
     points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)

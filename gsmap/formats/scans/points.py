@@ -24,7 +24,9 @@ def scan_of(points: np.ndarray, colours: np.ndarray | None, what: Path, total: i
         points, colours = points[finite], None if colours is None else colours[finite]
         notes.append(f"{int((~finite).sum()):,} points are not finite: left out")
     if not len(points):
-        raise InputError(f"{what} has no point with finite coordinates: there is nothing to look for")
+        raise InputError(
+            f"{what} has no point with finite coordinates: there is nothing to look for", code="empty_scan"
+        )
     if total > len(finite):
         notes.append(f"{len(finite):,} of its {total:,} points are used, evenly spread over the file")
     scan = Scan(points, colours, **about)

@@ -51,7 +51,8 @@ def asked(path: Path, kind: str, params: limits.Params) -> dict[str, np.ndarray]
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(
             f"{path} cannot be read: its reader gave it up, or needs more than {params.max_memory_mb} MB: it is "
-            "damaged or too large; convert it to a .ply"
+            "damaged or too large; convert it to a .ply",
+            code="reader_failed",
         ) from error
 
 
@@ -65,9 +66,13 @@ def _until_end(pipe: Any, process: subprocess.Popen[bytes], params: limits.Param
             parts.append(part)
             size += len(part)
             if size > params.max_memory_mb * _MIB:
-                raise InputError(f"{path} is larger than {params.max_memory_mb} MB in memory: thin it first")
+                raise InputError(
+                    f"{path} is larger than {params.max_memory_mb} MB in memory: thin it first", code="file_too_large"
+                )
         if not timer.is_alive():
-            raise InputError(f"{path} takes longer than {params.max_seconds:g} s to read: thin it first")
+            raise InputError(
+                f"{path} takes longer than {params.max_seconds:g} s to read: thin it first", code="file_too_large"
+            )
     finally:
         timer.cancel()
     return b"".join(parts)

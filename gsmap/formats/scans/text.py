@@ -27,7 +27,10 @@ def read(path: Path) -> Scan:
         InputError: no numbers, fewer than three in a line, or lines of different lengths.
     """
     if path.stat().st_size > _MOST_BYTES:
-        raise InputError(f"{path} is larger than {_MOST_BYTES >> 30} GiB of text: convert it to .ply or .laz first")
+        raise InputError(
+            f"{path} is larger than {_MOST_BYTES >> 30} GiB of text: convert it to .ply or .laz first",
+            code="file_too_large",
+        )
     skip, split, width = _layout(path)
     with open(path, encoding="utf-8", errors="replace") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -35,7 +38,9 @@ def read(path: Path) -> Scan:
         try:
             rows = np.loadtxt(lines, np.float64, comments="#", skiprows=skip, ndmin=2)
         except ValueError as error:
-            raise InputError(f"{path}: its rows cannot be read as {width} numbers each: {error}") from error
+            raise InputError(
+                f"{path}: its rows cannot be read as {width} numbers each: {error}", code="invalid_row"
+            ) from error
     total = len(rows)
     rows = rows[:: -(-total // limits.MAX_POINTS)] if total else rows
     points, rest = rows[:, :3], rows[:, 3:]
@@ -62,8 +67,13 @@ def _layout(path: Path) -> tuple[int, re.Pattern[str], int]:
             if len(numbers) >= 3:
                 return number, split, len(numbers)
             if len(numbers) not in (0, 1):  # a count in the first line is common
-                raise InputError(f"{path}: line {number + 1} has {len(numbers)} numbers: a point has x, y and z")
-    raise InputError(f"{path} begins with no point: a .xyz has x y z in every line, and perhaps r g b behind them")
+                raise InputError(
+                    f"{path}: line {number + 1} has {len(numbers)} numbers: a point has x, y and z", code="invalid_line"
+                )
+    raise InputError(
+        f"{path} begins with no point: a .xyz has x y z in every line, and perhaps r g b behind them",
+        code="wrong_file_type",
+    )
 
 
 def _are_bytes(values: np.ndarray) -> bool:

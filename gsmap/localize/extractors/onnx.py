@@ -98,7 +98,8 @@ class OnnxExtractor:
             told = ", ".join(f"{name} {list(value.shape)}" for name, value in given.items())
             raise InputError(
                 f"{self.spec.path} is no extractor: it gives {told or 'nothing'}, wanted are keypoints (N, 2) and "
-                "descriptors (N, D)"
+                "descriptors (N, D)",
+                code="model_misfit",
             )
         if len(descriptors) != len(pixels) and descriptors.shape[1] == len(pixels):
             descriptors = descriptors.T
@@ -108,7 +109,8 @@ class OnnxExtractor:
         finite = np.isfinite(descriptors.astype(np.float32)).all(1) if len(descriptors) == len(pixels) else None
         if finite is None or not finite.all():
             raise InputError(
-                f"{self.spec.path} gives {len(descriptors)} descriptors of {len(pixels)} keypoints, or NaN"
+                f"{self.spec.path} gives {len(descriptors)} descriptors of {len(pixels)} keypoints, or NaN",
+                code="model_misfit",
             )
         return pixels.astype(np.float64), descriptors, scores.astype(np.float64)
 

@@ -27,7 +27,10 @@ class ByScene(dict[str, Any]):
     """What is known of every scene, by its id. A row that names another one is not gsmap's."""
 
     def __missing__(self, scene: str) -> NoReturn:
-        raise CorruptError(f"the catalog has results of scene {scene[:12]}, which it does not have: run gsmap check")
+        raise CorruptError(
+            f"the catalog has results of scene {scene[:12]}, which it does not have: run gsmap check",
+            code="catalog_invalid",
+        )
 
 
 def refs(scenes: Iterable[str], name_of: Mapping[str, str]) -> tuple[SceneRef, ...]:
@@ -36,7 +39,7 @@ def refs(scenes: Iterable[str], name_of: Mapping[str, str]) -> tuple[SceneRef, .
 
 def one_of(value: str | None, known: Sequence[str]) -> None:
     if value is not None and value not in known:
-        raise ConfigError(f"there is no status {value!r}: choose one of {', '.join(known)}")
+        raise ConfigError(f"there is no status {value!r}: choose one of {', '.join(known)}", code="invalid_choice")
 
 
 def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
@@ -51,7 +54,10 @@ def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
             return checked_pair(store.scenes.get(pair[:at]), store.scenes.get(pair[at + 1 :]))
         except NotFoundError:
             continue
-    raise NotFoundError(f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows")
+    raise NotFoundError(
+        f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows",
+        code="scene_not_found",
+    )
 
 
 def checked_pair(a: Scene, b: Scene) -> tuple[Scene, Scene]:
@@ -61,5 +67,5 @@ def checked_pair(a: Scene, b: Scene) -> tuple[Scene, Scene]:
         ConfigError: they are one.
     """
     if a.id == b.id:
-        raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
+        raise ConfigError(f"{a.name} with itself is no pair: name two scenes", code="same_scene")
     return a, b

@@ -49,7 +49,9 @@ def wanted(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = 
     """
     graph = store.revisions.get()
     if graph is None:
-        raise NotFoundError("the map has no poses yet, so that nothing can be compared: run gsmap update first")
+        raise NotFoundError(
+            "the map has no poses yet, so that nothing can be compared: run gsmap update first", code="no_poses"
+        )
     scenes = store.scenes.list() if pair is None else list(pair)
     undated = [scene.name for scene in scenes if scene.captured_at is None]
     metres = metres_of_scenes(store, settings, graph)
@@ -73,14 +75,24 @@ def wanted(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = 
         return Wanted(visits, pairs_of_visits(list(visits.values()), settings.visits), tuple(notes))
     for scene in pair:
         if scene.id not in graph.poses:
-            raise NotFoundError(f"scene {scene.name} has no place in the map yet: run gsmap update first")
+            raise NotFoundError(
+                f"scene {scene.name} has no place in the map yet: run gsmap update first", code="scene_unplaced"
+            )
     if undated:
-        raise InputError(f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})")
+        raise InputError(
+            f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})", code="order_unknown"
+        )
     older, newer = sorted((visits[scene.id] for scene in pair), key=lambda visit: visit.when)
     if older.when == newer.when:
-        raise InputError(f"{pair[0].name} and {pair[1].name} have the same date: which one is newer is not known")
+        raise InputError(
+            f"{pair[0].name} and {pair[1].name} have the same date: which one is newer is not known",
+            code="order_unknown",
+        )
     if older.component != newer.component:
-        raise InputError(f"{pair[0].name} and {pair[1].name} lie in two components: nothing ties one to the other")
+        raise InputError(
+            f"{pair[0].name} and {pair[1].name} lie in two components: nothing ties one to the other",
+            code="different_components",
+        )
     return Wanted(visits, [(older.scene, newer.scene)], ())
 
 

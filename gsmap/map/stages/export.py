@@ -417,10 +417,13 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
 def _check(request: Request, recipe: TileRecipe) -> None:
     """Refuse what makes no sense before anything is read."""
     if request.budget_s is not None and not request.budget_s > 0:
-        raise ConfigError(f"the budget must be a positive number of seconds, got {request.budget_s}")
+        raise ConfigError(
+            f"the budget must be a positive number of seconds, got {request.budget_s}", code="invalid_budget"
+        )
     if recipe.is_tree and not request.tile_size_m > 0:
         raise ConfigError(
-            f"{recipe.format} is a tree of tiles: give --tile-size in metres, or use {recipe.suffix} for one file"
+            f"{recipe.format} is a tree of tiles: give --tile-size in metres, or use {recipe.suffix} for one file",
+            code="unsupported_output",
         )
 
 
@@ -428,16 +431,20 @@ def _placed(store: Store, revision: int | None, component: int | None) -> tuple[
     """A revision, and of it the poses of the scenes to export."""
     graph = store.revisions.get(revision)
     if graph is None:
-        raise NotFoundError("the map has no poses yet: run gsmap update or gsmap optimize first")
+        raise NotFoundError("the map has no poses yet: run gsmap update or gsmap optimize first", code="no_poses")
     living = {s.id for s in store.scenes.list()} if revision == store.revisions.current() else set(graph.poses)
     placed = {s: p for s, p in graph.poses.items() if s in living}
     if component is not None:
         placed = {s: p for s, p in placed.items() if p.component == component}
         if not placed:
             known = sorted({p.component for p in graph.poses.values()})
-            raise NotFoundError(f"revision {revision} has no component {component}: it has {known}")
+            raise NotFoundError(
+                f"revision {revision} has no component {component}: it has {known}", code="component_not_found"
+            )
     if not placed:
-        raise InputError("nothing to export: no scene has a place in the map yet; run gsmap update first")
+        raise InputError(
+            "nothing to export: no scene has a place in the map yet; run gsmap update first", code="nothing_to_export"
+        )
     return graph, placed
 
 
@@ -447,5 +454,8 @@ def _as_of(scenes: dict[str, Scene], as_of: str) -> tuple[dict[str, Scene], tupl
     found = {scene: one for scene, one in scenes.items() if is_until(one.captured_at, until)}
     note = undated_note(list(scenes.values()), as_of)
     if not found:
-        raise NotFoundError(f"no capture with a place in the map is dated {as_of} or earlier{note and f'; {note}'}")
+        raise NotFoundError(
+            f"no capture with a place in the map is dated {as_of} or earlier{note and f'; {note}'}",
+            code="no_placed_scene",
+        )
     return found, (note,) if note else ()

@@ -105,7 +105,10 @@ def georeference(
         noted.items.append(frame)
     _refuse_unreachable(before, frame or before.frame, places)
     if not noted.items:
-        raise ConfigError("say what ties the map to the world: --gcp FILE, --exif DIR, --scale-bar A B METRES")
+        raise ConfigError(
+            "say what ties the map to the world: --gcp FILE, --exif DIR, --scale-bar A B METRES",
+            code="nothing_requested",
+        )
     solution = _solved(store, noted.items, settings)
     store.world.add(noted.items)
     return tuple(noted.notes), solution
@@ -122,14 +125,16 @@ def _solved(store: Store, items: Sequence[Observation], settings: Settings) -> S
     except (np.linalg.LinAlgError, FloatingPointError, RuntimeError) as error:
         raise InputError(
             f"nothing was noted: the poses cannot be solved with these observations ({error}); check positions, "
-            "units and photos, or give fewer of them"
+            "units and photos, or give fewer of them",
+            code="unsolvable_observations",
         ) from error
     before = {tie.problem for tie in store.revisions.world()}
     for tie in solution.answer.world if solution is not None else ():
         if tie.problem == UNSOLVED and UNSOLVED not in before:
             raise InputError(
                 f"nothing was noted: in component {tie.component} {tie.problem}; check positions, units and photos, or "
-                "give fewer of them"
+                "give fewer of them",
+                code="unsolvable_observations",
             )
     return solution
 
@@ -181,7 +186,10 @@ def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | Fi
     if not points and not fixes:
         if crs_text is None:
             return None
-        raise InputError(f"nothing of this map lies in {crs_text} yet: give --gcp FILE or --exif DIR with it")
+        raise InputError(
+            f"nothing of this map lies in {crs_text} yet: give --gcp FILE or --exif DIR with it",
+            code="not_georeferenced",
+        )
     first: ControlPoint | Fix = next(iter(points.values())) if points else next(iter(fixes.values()))
     return frame_for(crs_text or first.crs, Survey(None, tuple(points.values()), (), tuple(fixes.values())))
 
@@ -235,7 +243,7 @@ def _read_gcp(
             missing.add(line.image)
             continue
         if (earlier := picked.setdefault((line.name, scene, named), where)) is not where:
-            raise InputError(f"{where}: point {line.name} in {line.image} again, as on {earlier}")
+            raise InputError(f"{where}: point {line.name} in {line.image} again, as on {earlier}", code="duplicate")
         seen.append(
             ImagePoint(line.name, named, scene, pixel, PIXEL_SIGMA_PX, np.array(pose), np.array(intrinsics), covariance)
         )
@@ -243,7 +251,8 @@ def _read_gcp(
         raise NotFoundError(
             f"none of the {len(missing)} photos that {path} names is a camera of this map (the first is "
             f"{sorted(missing)[0]}): a photo goes by the name that its capture's cameras have for it, SCENE/NAME where "
-            "several scenes have one of that name"
+            "several scenes have one of that name",
+            code="photos_not_matched",
         )
     if missing:
         some = ", ".join(sorted(missing)[:3])
@@ -266,13 +275,15 @@ def _pixel(
     if full is not None:
         if abs(full[0] / size[0] * size[1] / full[1] - 1) > 0.01:
             raise InputError(
-                f"{where}: {image} is {size[0]}x{size[1]}, which is no smaller picture of {full[0]}x{full[1]}"
+                f"{where}: {image} is {size[0]}x{size[1]}, which is no smaller picture of {full[0]}x{full[1]}",
+                code="size_mismatch",
             )
         at = at * np.array(size) / np.array(full)
     if not (0 <= at[0] <= size[0] and 0 <= at[1] <= size[1]):
         raise InputError(
             f"{where}: pixel {pixel[0]:g} {pixel[1]:g} lies outside of {image}, which is {size[0]}x{size[1]} in its "
-            "capture: say --photo-size WIDTH HEIGHT where pixels were picked in a larger picture"
+            "capture: say --photo-size WIDTH HEIGHT where pixels were picked in a larger picture",
+            code="pixel_outside",
         )
     return at
 
@@ -312,7 +323,8 @@ def _hold_out(before: Survey, names: set[str], noted: _Noted) -> None:
     known = fresh | {point.name for point in before.points}
     if unknown := sorted(names - known):
         raise NotFoundError(
-            f"no control point is called {unknown[0]!r}: {', '.join(sorted(known)[:8]) or 'there is none'}"
+            f"no control point is called {unknown[0]!r}: {', '.join(sorted(known)[:8]) or 'there is none'}",
+            code="observation_not_found",
         )
     for point in before.points:
         if point.name not in fresh and point.check != (point.name in names):
@@ -359,7 +371,8 @@ def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, n
     if not any(isinstance(one, Fix) for one in noted.items):
         raise NotFoundError(
             f"no photo in {folder} with a position and a height is a camera of this map: {'; '.join(told)}; photos go "
-            "by the names that their captures' cameras have for them, and by folders called as their scenes"
+            "by the names that their captures' cameras have for them, and by folders called as their scenes",
+            code="photos_not_matched",
         )
     if bare:
         scenes = sorted({matches.cameras[photo][0] for photo in bare})
@@ -386,7 +399,8 @@ def _refuse_moved(before: Survey, photos: Sequence[tuple[str, Fix]]) -> None:
         photo, old, _ = again[worst]
         raise InputError(
             f"{photo} has the file name of camera {old.name}, which is known to be {off[worst]:.3g} m away: if it is "
-            "that camera's photo, let a folder be called as the scene; if it is of another flight, leave it out"
+            "that camera's photo, let a folder be called as the scene; if it is of another flight, leave it out",
+            code="photo_ambiguous",
         )
 
 
@@ -410,13 +424,14 @@ def _refuse_other_days(store: Store, photos: Sequence[tuple[str, Fix]]) -> None:
                 raise InputError(
                     f"{photo} has the file name of a camera of {scene.name} and was taken {days} days from it, as were "
                     f"all {len(off)} with a date: if they are its photos, let a folder be called {scene.name}; if they "
-                    "are of another flight, leave them out"
+                    "are of another flight, leave them out",
+                    code="photo_ambiguous",
                 )
 
 
 def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None) -> ScaleBar:
     if not (np.isfinite(metres) and metres > 0):
-        raise ConfigError(f"a scale bar is so many metres long, got {metres:g}")
+        raise ConfigError(f"a scale bar is so many metres long, got {metres:g}", code="invalid_observation")
     ends: list[Place] = [place_in_scene(store, text) for text in (a, b)]
     scenes = (str(ends[0].scene), str(ends[1].scene))
     sigmas = [float(np.sqrt(np.trace(end.covariance) / 3)) for end in ends]

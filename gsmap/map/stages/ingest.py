@@ -161,19 +161,25 @@ def readers(
     check_scale(scale)
     memory = [source for source in sources if isinstance(source, Gaussians)]
     if memory and len(sources) > 1:
-        raise ConfigError("Gaussians in memory are ingested one capture at a time")
+        raise ConfigError("Gaussians in memory are ingested one capture at a time", code="in_memory_mismatch")
     if memory:
         if cameras is not None and not isinstance(cameras, Cameras):
-            raise ConfigError("Gaussians in memory go with gsmap.Cameras, or with none")
+            raise ConfigError("Gaussians in memory go with gsmap.Cameras, or with none", code="in_memory_mismatch")
         called = name or "capture"
         take = partial(take_capture, memory[0], cameras, name=called, captured_at=captured_at, scale_policy=scale)
         return [Reader(called, take)], Search()
     if isinstance(cameras, Cameras):
-        raise ConfigError("cameras in memory go with Gaussians in memory; for a file name a file of cameras")
+        raise ConfigError(
+            "cameras in memory go with Gaussians in memory; for a file name a file of cameras",
+            code="in_memory_mismatch",
+        )
     search = search_captures([Path(source) for source in sources if not isinstance(source, Gaussians)])
     found = search.captures
     if len(found) > 1 and (cameras is not None or name is not None):
-        raise ConfigError(f"cameras and name are for one capture, {len(found)} were found: ingest them one by one")
+        raise ConfigError(
+            f"cameras and name are for one capture, {len(found)} were found: ingest them one by one",
+            code="many_captures",
+        )
     options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale_policy": scale}
     return [Reader(files.name, partial(read_capture, files, **options), files.path) for files in found], search
 

@@ -68,7 +68,7 @@ def near_of(text: str, id_of: Callable[[str], str]) -> Near:
     except ValueError:
         return Near(id_of(text))
     if len(numbers) != 4 or not np.isfinite(numbers).all() or numbers[3] <= 0:
-        raise ConfigError(f"near is a scene, or X,Y,Z,R with a radius above 0, got {text!r}")
+        raise ConfigError(f"near is a scene, or X,Y,Z,R with a radius above 0, got {text!r}", code="invalid_point")
     return Near(None, (numbers[0], numbers[1], numbers[2]), numbers[3])
 
 
@@ -90,7 +90,9 @@ class Localizer:
         self.scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in poses}
         if not self.scenes:
             empty = "is empty: add captures" if not store.scenes.list() else "has no poses yet: run"
-            raise NotFoundError(f"{store.location} {empty} (gsmap update {store.location}), and localise then")
+            raise NotFoundError(
+                f"{store.location} {empty} (gsmap update {store.location}), and localise then", code="no_placed_scene"
+            )
         self.metres = {
             component: metre.metres_per_unit
             for component, metre in map_metres(store, settings, PoseGraph(poses)).items()
@@ -182,7 +184,10 @@ class Localizer:
         held = self._held.get(scene)
         found = held if held is not None else self.store.view_features.load(scene, self.keys[scene])
         if found is None:
-            raise NotFoundError(f"the features of scene {self.scenes[scene].name} were dropped meanwhile: try again")
+            raise NotFoundError(
+                f"the features of scene {self.scenes[scene].name} were dropped meanwhile: try again",
+                code="changed_meanwhile",
+            )
         return found
 
     def _use(self, scene: str) -> None:
@@ -231,7 +236,9 @@ def localizing_near(localizer: Localizer, near: Near) -> ViewIndex:
     metres = localizer.metres
     if near.scene is not None:
         if near.scene not in localizer.placed:
-            raise NotFoundError(f"scene {near.scene[:12]} has no place in the map yet: run gsmap update first")
+            raise NotFoundError(
+                f"scene {near.scene[:12]} has no place in the map yet: run gsmap update first", code="scene_unplaced"
+            )
         around = localizer.placed[near.scene]
         return localizer.index.only({one for one in localizer.placed if _overlap(localizer, around, one)})
     assert near.point is not None
@@ -273,7 +280,8 @@ def feature_keys(store: Store, scenes: Sequence[Scene], settings: Settings) -> d
         if kind not in specs:
             raise ConfigError(
                 f"extractor {settings.localize.extractor!r} needs a model of the kind {kind!r}: "
-                f"gsmap models add {store.location} {kind} FILE.onnx"
+                f"gsmap models add {store.location} {kind} FILE.onnx",
+                code="model_required",
             )
     recipe = localizing.recipe_key(settings.localize, specs)
     return {scene.id: recipe.of(scene.id, "" if scene.thinning is None else "thinned") for scene in scenes}

@@ -60,9 +60,13 @@ class Request:
 
     def __post_init__(self) -> None:
         if self.scale is not None and self.scale not in SCALE_POLICIES:
-            raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {self.scale!r}")
+            raise ConfigError(
+                f"scale must be one of {', '.join(SCALE_POLICIES)}, got {self.scale!r}", code="invalid_choice"
+            )
         if self.colour is not None and self.intrinsics_px is None:
-            raise ConfigError("colours belong to a depth picture: give its intrinsics fx,fy,cx,cy, too")
+            raise ConfigError(
+                "colours belong to a depth picture: give its intrinsics fx,fy,cx,cy, too", code="missing_option"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +162,7 @@ def _read(request: Request, settings: Settings) -> _Sought:
     if scans.holds_splat(request.file):
         captures = read_captures(request.file, scale_policy=request.scale or "auto")
         if len(captures) != 1:
-            raise ConfigError(f"{request.file} holds {len(captures)} captures: name one of them")
+            raise ConfigError(f"{request.file} holds {len(captures)} captures: name one of them", code="many_captures")
         capture = captures[0]
         notes = capture.notes
         gaussians, cameras = capture.gaussians, capture.cameras
@@ -186,7 +190,8 @@ def _asked(store: Store, scenes: dict[str, Scene], poses: PoseGraph | None, sett
     known = {scene: key for scene, key in keys.items() if scene not in lacking}
     if not known:
         raise NotFoundError(
-            f"no scene of {store.home} is described and has a place: run gsmap update {store.home} first"
+            f"no scene of {store.home} is described and has a place: run gsmap update {store.home} first",
+            code="no_placed_scene",
         )
     return known
 
@@ -204,7 +209,9 @@ def _near(store: Store, near: str) -> set[str]:
     else:
         assert said.scene is not None
         if said.scene not in placed:
-            raise NotFoundError(f"scene {near} has no place in the map yet: run gsmap update first")
+            raise NotFoundError(
+                f"scene {near} has no place in the map yet: run gsmap update first", code="scene_unplaced"
+            )
         one = placed[said.scene]
         at, radius, component = one.centre, one.radius, one.component
     found = {
@@ -213,7 +220,7 @@ def _near(store: Store, near: str) -> set[str]:
         if one.component == component and np.linalg.norm(one.centre - at) < radius + one.radius
     }
     if not found:
-        raise NotFoundError(f"no scene of the map lies near {near}")
+        raise NotFoundError(f"no scene of the map lies near {near}", code="nothing_near")
     return found
 
 

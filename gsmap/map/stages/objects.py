@@ -55,7 +55,8 @@ def objects_of_components(
     placed = store.revisions.get()
     if placed is None:
         raise NotFoundError(
-            "the map has no poses yet, so that things of captures are not known to be one: run gsmap update"
+            "the map has no poses yet, so that things of captures are not known to be one: run gsmap update",
+            code="no_poses",
         )
     scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in placed.poses}
     metres = {component: one.metres_per_unit for component, one in map_metres(store, settings, placed).items()}
@@ -83,7 +84,9 @@ def objects_of_components(
             parts.append(Part(component, kept, None, None))
             given |= {thing.id for thing in kept.objects}
         elif not make:
-            raise NotFoundError("the objects of the map are out of date: gsmap graph MAP makes them")
+            raise NotFoundError(
+                "the objects of the map are out of date: gsmap graph MAP makes them", code="objects_outdated"
+            )
         else:
             read = (
                 graphs if graphs is not None else {scene.id: store.graphs.load(scene.id) for scene in mine[component]}

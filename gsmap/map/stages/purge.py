@@ -63,7 +63,9 @@ def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, 
         if scene is None:
             done = done or [(one, p) for one in catalogs for p in purging.listed(one) if p.scene == ref]
             if not done:
-                raise NotFoundError(f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes")
+                raise NotFoundError(
+                    f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes", code="scene_not_found"
+                )
         else:
             holding = [one for one in catalogs if _holds(one, scene)]
             begun = [(one, purging.begin(one, scene)) for one in holding]

@@ -274,7 +274,9 @@ def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np
     check_sim3(S_target_source, "S_target_source")
     sigmas = np.asarray(sigmas, dtype=np.float64)
     if sigmas.shape != (7,) or not np.isfinite(sigmas).all() or not (sigmas > 0).all():
-        raise InputError(f"a measured edge needs 7 positive standard deviations, got {sigmas.tolist()}")
+        raise InputError(
+            f"a measured edge needs 7 positive standard deviations, got {sigmas.tolist()}", code="invalid_sigma"
+        )
     edge = Registration(
         target=a.id,
         source=b.id,
@@ -297,9 +299,9 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
-        raise NotFoundError(f"no file of pairs at {path}") from error
+        raise NotFoundError(f"no file of pairs at {path}", code="file_not_found") from error
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read pairs from {path}: {error}") from error
+        raise InputError(f"cannot read pairs from {path}: {error}", code="invalid_pairs_file") from error
     pairs = []
     for number, line in enumerate(lines, 1):
         text = line.partition("#")[0].strip()
@@ -310,9 +312,10 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
         except NotFoundError as error:
             if len(text.split()) != 2 and ":" not in text:
                 raise InputError(
-                    f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r}"
+                    f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r}",
+                    code="invalid_pairs_file",
                 ) from error
-            raise NotFoundError(f"{path}, line {number}: {error}") from error
+            raise NotFoundError(f"{path}, line {number}: {error}", code="invalid_pairs_file") from error
     return pairs
 
 
@@ -337,9 +340,11 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> lis
     for a, b in named:
         for scene in checked_pair(a, b):
             if scene.id not in work.graphs:
-                raise NotFoundError(f"scene {scene.name} was removed: ingest it again first")
+                raise NotFoundError(f"scene {scene.name} was removed: ingest it again first", code="scene_removed")
             if scene.id in work.lacking:
-                raise NotFoundError(f"scene {scene.name} has no graph: run gsmap describe MAP {scene.name!r} first")
+                raise NotFoundError(
+                    f"scene {scene.name} has no graph: run gsmap describe MAP {scene.name!r} first", code="no_graph"
+                )
         chosen.append(directed(a.id, b.id))
     return list(dict.fromkeys(chosen))
 

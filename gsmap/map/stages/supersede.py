@@ -76,7 +76,10 @@ def supersede(
     capture = _about(capture, old)
     coming = replace(old, id=scene_id(capture.gaussians, capture.cameras), scale_policy=capture.scale_policy)
     if any(coming.id == scene.id for scene in store.scenes.list()):
-        raise InputError(f"the capture to supersede {old.name} is in the map already: there is nothing to put in place")
+        raise InputError(
+            f"the capture to supersede {old.name} is in the map already: there is nothing to put in place",
+            code="already_in_map",
+        )
     progress("ingest", 0.0, f"comparing with {old.name}")
     graph = _describe(store, coming.id, capture, settings)
     view = SceneView(coming.id, capture.gaussians, capture.cameras, graph, capture.scale_policy)
@@ -146,12 +149,17 @@ def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings:
     found = registering.check_pose(old_view, new_view, as_they_lie, settings.register)
     advice = "ingest it without --supersedes, and registration finds where it lies"
     if found.status != "accepted" or found.S_target_source is None:
-        raise InputError(f"the capture does not lie where scene {old.name} lies ({found.reason}): {advice}")
+        raise InputError(
+            f"the capture does not lie where scene {old.name} lies ({found.reason}): {advice}",
+            code="supersede_no_match",
+        )
     corners = box_corners(old.bounds)
     unit_m = target_unit_m(old_view, with_scale=False)
     off = np.linalg.norm(found.S_target_source.apply(corners) - corners, axis=1).max() * unit_m
     if off > _SAME_FRAME_M:
-        raise InputError(f"the capture lies {off:.2f} m off where scene {old.name} lies: {advice}")
+        raise InputError(
+            f"the capture lies {off:.2f} m off where scene {old.name} lies: {advice}", code="supersede_too_far"
+        )
 
 
 def _carried(

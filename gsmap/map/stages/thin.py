@@ -49,19 +49,25 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         NotFoundError: the map has no poses.
     """
     if request.keep_days is None and request.budget_bytes is None:
-        raise ConfigError("say what to keep: days (--keep-days 365), a size (--budget 2GiB), or both")
+        raise ConfigError(
+            "say what to keep: days (--keep-days 365), a size (--budget 2GiB), or both", code="nothing_requested"
+        )
     if not (request.keep_days or 0) >= 0 or (request.budget_bytes or 0) < 0:
-        raise ConfigError("days and sizes must not be negative")
+        raise ConfigError("days and sizes must not be negative", code="out_of_range")
     graph = store.revisions.get()
     if graph is None:
-        raise NotFoundError("the map has no poses yet, so nobody knows what supersedes what: run gsmap update first")
+        raise NotFoundError(
+            "the map has no poses yet, so nobody knows what supersedes what: run gsmap update first", code="no_poses"
+        )
     living = {scene.id: scene for scene in store.scenes.list()}
     dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
     try:
         now = datetime.now(UTC) if request.now is None else _moment(request.now)
         before = now - timedelta(days=request.keep_days or 0)
     except OverflowError as error:
-        raise ConfigError(f"no date lies {request.keep_days:g} days before today: give fewer days") from error
+        raise ConfigError(
+            f"no date lies {request.keep_days:g} days before today: give fewer days", code="date_out_of_range"
+        ) from error
     known = [scene for scene in dated if scene.id in graph.poses]
     sizes = {scene: _num_bytes(store, scene) for scene in living}
     shares = _superseded(store, known, before, graph, settings, progress)
@@ -199,5 +205,7 @@ def _moment(text: str) -> datetime:
     try:
         moment = datetime.fromisoformat(text)
     except ValueError as error:
-        raise ConfigError(f"a time is ISO 8601 such as 2026-05-31T14:00:00+02:00, got {text!r}") from error
+        raise ConfigError(
+            f"a time is ISO 8601 such as 2026-05-31T14:00:00+02:00, got {text!r}", code="invalid_date"
+        ) from error
     return moment if moment.tzinfo else moment.replace(tzinfo=UTC)

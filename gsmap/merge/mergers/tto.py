@@ -103,18 +103,18 @@ class Params:
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 0:
-            raise ConfigError(f"steps must not be negative, got {self.steps}")
+            raise ConfigError(f"steps must not be negative, got {self.steps}", code="out_of_range")
         for name in ("voxel_m", "longest_side_px", "max_views"):
             if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}", code="out_of_range")
         for name in ("max_passes", "halo_m", "min_weight", "huber_delta", "photo_weight"):
             if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}", code="out_of_range")
         for name in ("kept_fraction", "ssim_weight"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}")
+                raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}", code="out_of_range")
         if not 0 <= self.momentum < 1:
-            raise ConfigError(f"momentum must be in [0, 1), got {self.momentum}")
+            raise ConfigError(f"momentum must be in [0, 1), got {self.momentum}", code="out_of_range")
 
 
 def reach_m(params: Params) -> float:

@@ -60,7 +60,8 @@ class Params:
     def __post_init__(self) -> None:
         if len(self.radii_m) != len(self.max_points):
             raise ConfigError(
-                f"colored_icp needs as many max_points as radii_m, got {len(self.max_points)} and {len(self.radii_m)}"
+                f"colored_icp needs as many max_points as radii_m, got {len(self.max_points)} and {len(self.radii_m)}",
+                code="setting_mismatch",
             )
 
 

@@ -98,7 +98,7 @@ class Backup:
         try:
             text = _read(place, MARKER, 1 << 16)
         except NotFoundError:
-            raise NotFoundError(f"{place.url} is no backup of a map: it lacks {MARKER}") from None
+            raise NotFoundError(f"{place.url} is no backup of a map: it lacks {MARKER}", code="not_a_backup") from None
         marker = _object(text, f"{place.url}/{MARKER}")
         return cls(place, _field(marker, "map_id", str, f"{place.url}/{MARKER}"))
 
@@ -115,7 +115,8 @@ class Backup:
             found = cls._begun(place, map_id)
         if found.map_id != map_id:
             raise StoreError(
-                f"{place.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its own place"
+                f"{place.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its own place",
+                code="backup_of_another_map",
             )
         return found
 
@@ -128,7 +129,9 @@ class Backup:
         try:
             return cls.at(place)  # which another may have begun at the same moment
         except NotFoundError:
-            raise StoreError(f"{place.url} holds other things ({other}): give the backup a place of its own") from None
+            raise StoreError(
+                f"{place.url} holds other things ({other}): give the backup a place of its own", code="folder_not_empty"
+            ) from None
 
     def names(self) -> list[str]:
         """Names of the snapshots, oldest first."""
@@ -154,7 +157,8 @@ class Backup:
             return after(datetime.strptime(newest, _TIME).replace(tzinfo=UTC))
         except (ValueError, OverflowError) as error:
             raise StoreError(
-                f"snapshot {names[-1]} of {self.place.url} has a time that nothing comes after: delete its file"
+                f"snapshot {names[-1]} of {self.place.url} has a time that nothing comes after: delete its file",
+                code="snapshot_in_future",
             ) from error
 
     def snapshot(self, name: str) -> Snapshot:
@@ -166,7 +170,7 @@ class Backup:
         where = f"{self.place.url}/{SNAPSHOTS}{name}.json"
         text = _read(self.place, f"{SNAPSHOTS}{name}.json", 1 << 20)
         if hashlib.sha256(text).hexdigest()[:16] != name[-16:]:
-            raise CorruptError(f"{where} is damaged: restore an earlier one, and delete it")
+            raise CorruptError(f"{where} is damaged: restore an earlier one, and delete it", code="backup_damaged")
         data = _object(text, where)
         kinds: dict[str, Any] = {"revision": int | None, "counts": dict}
         kinds |= dict.fromkeys(("files_bytes", "num_files", "num_bytes", "num_bytes_new"), int)
@@ -174,9 +178,9 @@ class Backup:
         found = Snapshot(name=name, **{key: _field(data, key, kinds.get(key, str), where) for key in keys})
         counts = all(key.isidentifier() and isinstance(count, int) for key, count in found.counts.items())
         if not _DIGEST.fullmatch(found.files) or found.map_id != self.map_id or not counts:
-            raise CorruptError(f"{where} is no snapshot of map {self.map_id}")
+            raise CorruptError(f"{where} is no snapshot of map {self.map_id}", code="backup_damaged")
         if found.time != name[: -len("Z-") - 16]:
-            raise CorruptError(f"{where} has another time than its name says")
+            raise CorruptError(f"{where} has another time than its name says", code="backup_damaged")
         return found
 
     def snapshots(self) -> list[Snapshot]:
@@ -195,16 +199,25 @@ class Backup:
         """
         names = self.names()
         if not names:
-            raise NotFoundError(f"{self.place.url} has no snapshot yet: a backup was begun there and never finished")
+            raise NotFoundError(
+                f"{self.place.url} has no snapshot yet: a backup was begun there and never finished",
+                code="snapshot_not_found",
+            )
         if name is not None:
             found = [one for one in names if name == one or (len(name) >= 6 and one[-16:].startswith(name))]
             if len(found) != 1:
                 hint = "gsmap backup MAP DEST --list shows what there is"
-                raise NotFoundError(f"{self.place.url} has no snapshot {name!r}, and it is no time either: {hint}")
+                raise NotFoundError(
+                    f"{self.place.url} has no snapshot {name!r}, and it is no time either: {hint}",
+                    code="snapshot_not_found",
+                )
             return self.snapshot(found[0])
         earlier = [one for one in names if at is None or one.split("Z-")[0] <= _compact(at)]
         if not earlier:
-            raise NotFoundError(f"{self.place.url} has no snapshot at or before {at}: the first one is {names[0]}")
+            raise NotFoundError(
+                f"{self.place.url} has no snapshot at or before {at}: the first one is {names[0]}",
+                code="snapshot_not_found",
+            )
         return self.snapshot(earlier[-1])
 
     def files(self, snapshot: Snapshot) -> list[StoredFile]:
@@ -215,14 +228,14 @@ class Backup:
         """
         where = f"{self.place.url}/{object_name(snapshot.files)}"
         if snapshot.files_bytes > _MAX_TEXT_BYTES:
-            raise CorruptError(f"{where} is too long for a list of files")
+            raise CorruptError(f"{where} is too long for a list of files", code="backup_damaged")
         listed = StoredFile("", snapshot.files_bytes, snapshot.files)
         text = b"".join(self.read(listed)).decode("utf-8", errors="replace")
         out: dict[str, StoredFile] = {}
         for line in text.splitlines():
             parts = _LINE.fullmatch(line)
             if parts is None or parts[3] in out:
-                raise CorruptError(f"{where} is no list of files: {line[:200]!r}")
+                raise CorruptError(f"{where} is no list of files: {line[:200]!r}", code="backup_damaged")
             out[check_path(parts[3])] = StoredFile(parts[3], int(parts[2]), parts[1])
         return list(out.values())
 
@@ -236,7 +249,7 @@ class Backup:
         try:
             yield from checked(self.place.get(object_name(file.sha256)), file, what)
         except NotFoundError:
-            raise CorruptError(f"{what} is missing") from None
+            raise CorruptError(f"{what} is missing", code="backup_damaged") from None
 
 
 def listed(files: list[StoredFile]) -> bytes:
@@ -266,7 +279,7 @@ def _read(place: Place, name: str, most_bytes: int) -> bytes:
     for chunk in place.get(name):
         out += chunk
         if len(out) > most_bytes:
-            raise CorruptError(f"{place.url}/{name} is too long")
+            raise CorruptError(f"{place.url}/{name} is too long", code="backup_damaged")
     return bytes(out)
 
 
@@ -274,16 +287,18 @@ def _object(text: bytes, where: str) -> dict[str, Any]:
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise CorruptError(f"{where} is damaged: it is no JSON") from error
+        raise CorruptError(f"{where} is damaged: it is no JSON", code="backup_damaged") from error
     if not isinstance(data, dict) or not isinstance(data.get("format"), int):
-        raise CorruptError(f"{where} is damaged: it lacks its format")
+        raise CorruptError(f"{where} is damaged: it lacks its format", code="backup_damaged")
     if data["format"] > FORMAT:
-        raise StoreError(f"{where} was written by a newer gsmap than this ({__version__}): upgrade gsmap")
+        raise StoreError(
+            f"{where} was written by a newer gsmap than this ({__version__}): upgrade gsmap", code="backup_version"
+        )
     return data
 
 
 def _field(data: Mapping[str, Any], key: str, kind: Any, where: str) -> Any:
     value = data.get(key)
     if not isinstance(value, kind) or (isinstance(value, str) and not value.isprintable()):
-        raise CorruptError(f"{where} is damaged: {key} is not what it should be")
+        raise CorruptError(f"{where} is damaged: {key} is not what it should be", code="backup_damaged")
     return value

@@ -133,7 +133,10 @@ def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silen
             _confirm(target)
             _note(store, made)
             return made
-    raise StoreError(f"{store.catalog.folder}: others pruned it faster than it could be copied; run it again")
+    raise StoreError(
+        f"{store.catalog.folder}: others pruned it faster than it could be copied; run it again",
+        code="changed_meanwhile",
+    )
 
 
 def _note(store: Store, made: Cloned) -> None:
@@ -148,9 +151,11 @@ def _note(store: Store, made: Cloned) -> None:
 def _free(path: str | os.PathLike[str]) -> Path:
     target = Path(path).absolute()
     if os.path.lexists(target) and not (target.is_dir() and not target.is_symlink() and not any(target.iterdir())):
-        raise StoreError(f"{path} is there already: name a folder that does not exist, or move it away first")
+        raise StoreError(
+            f"{path} is there already: name a folder that does not exist, or move it away first", code="already_exists"
+        )
     if not target.parent.is_dir():
-        raise NotFoundError(f"cannot make {path}: {target.parent} does not exist")
+        raise NotFoundError(f"cannot make {path}: {target.parent} does not exist", code="folder_not_found")
     return target
 
 
@@ -216,20 +221,27 @@ def _compared(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> Stat
     """What the catalogs name must be there, and the map be the one that the backup is of."""
     there = {file.path: (file.size_bytes, file.sha256) for file in files}
     if sqlite.FILE not in there:
-        raise CorruptError(f"snapshot {snapshot.name} has no {sqlite.FILE}")
+        raise CorruptError(f"snapshot {snapshot.name} has no {sqlite.FILE}", code="snapshot_lacks_file")
     for problem in sqlite.file_problems(folder / sqlite.FILE):
-        raise CorruptError(f"snapshot {snapshot.name}: its catalog is damaged ({problem})")
+        raise CorruptError(f"snapshot {snapshot.name}: its catalog is damaged ({problem})", code="backup_damaged")
     state = read_state(folder / sqlite.FILE)
     named = [*state.files]
     for branch in _branches(folder):
         for problem in sqlite.structure_damage(branch / sqlite.FILE):
-            raise CorruptError(f"snapshot {snapshot.name}: the catalog of branch {branch.name} is damaged ({problem})")
+            raise CorruptError(
+                f"snapshot {snapshot.name}: the catalog of branch {branch.name} is damaged ({problem})",
+                code="backup_damaged",
+            )
         named += read_state(branch / sqlite.FILE).files
     if (state.map_id, state.schema) != (snapshot.map_id, snapshot.schema):
-        raise CorruptError(f"snapshot {snapshot.name} holds another map, or another schema, than it says")
+        raise CorruptError(
+            f"snapshot {snapshot.name} holds another map, or another schema, than it says", code="backup_damaged"
+        )
     for file in named:
         if there.get(file.path) != (file.size_bytes, file.sha256):
-            raise CorruptError(f"snapshot {snapshot.name} lacks {file.path}, which its catalog names")
+            raise CorruptError(
+                f"snapshot {snapshot.name} lacks {file.path}, which its catalog names", code="snapshot_lacks_file"
+            )
     return state
 
 

@@ -66,12 +66,14 @@ def save(
         ConfigError: ``keep`` is less than 1; a branch instead of the map; a folder inside the map.
     """
     if keep is not None and keep < 1:
-        raise ConfigError(f"the number of snapshots to keep must be at least 1, got {keep}")
+        raise ConfigError(f"the number of snapshots to keep must be at least 1, got {keep}", code="out_of_range")
     home = home_of(store).resolve()
     if store.catalog.folder.resolve() != home:
-        raise ConfigError(f"branches are backed up with their map: name {home}")
+        raise ConfigError(f"branches are backed up with their map: name {home}", code="backup_of_branch")
     if isinstance(place, FolderPlace) and place.root.resolve().is_relative_to(home):
-        raise ConfigError(f"{place.url} lies inside the map: a backup must survive it; name another folder")
+        raise ConfigError(
+            f"{place.url} lies inside the map: a backup must survive it; name another folder", code="place_inside_map"
+        )
     backup = Backup.at_or_new(place, store.id)
     with Lease(place, SAVE) as lease:
         lease.wait_for_sweepers()
@@ -170,7 +172,10 @@ class _Run:
                     self._send(state, folder)
                     return self._write(state)
         name = self.store.catalog.folder
-        raise StoreError(f"{name}: others pruned it faster than it could be read; run it again, what was sent is kept")
+        raise StoreError(
+            f"{name}: others pruned it faster than it could be read; run it again, what was sent is kept",
+            code="changed_meanwhile",
+        )
 
     def verify(self) -> _Found:
         """Read every object that is there and compare it with its name, and with what the snapshots need."""
@@ -268,7 +273,7 @@ class _Run:
             listed_so = there.get(file.sha256) == file.size_bytes
             # A listing may lag behind; asking for each object alone is a request for each.
             if not listed_so and self.backup.place.size_bytes(name) != file.size_bytes:
-                raise StoreError(f"{self.backup.place.url} lost {name}: run it again")
+                raise StoreError(f"{self.backup.place.url} lost {name}: run it again", code="backup_file_missing")
         created_at = self.backup.time_of_next(state.created_at)
         if created_at != state.created_at:
             self.notes.append(

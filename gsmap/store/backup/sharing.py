@@ -64,13 +64,15 @@ class Lease:
             StoreError: the lease could not be renewed, or this process stood still for long.
         """
         if time.monotonic() - self._renewed > EXPIRES_S / 2:
-            raise StoreError(f"{self._place.url} could not be reached for {EXPIRES_S / 2:g} s: run it again")
+            raise StoreError(
+                f"{self._place.url} could not be reached for {EXPIRES_S / 2:g} s: run it again", code="place_failed"
+            )
 
     def others(self, task: str = "") -> list[str]:
         """Names of the leases of others that still count, of one task or of all."""
         listed = self._place.list(LEASES)
         if self.name not in listed:
-            raise StoreError(f"{self._place.url}: our lease was taken away; run it again")
+            raise StoreError(f"{self._place.url}: our lease was taken away; run it again", code="lease_lost")
         oldest = listed[self.name].modified_s - EXPIRES_S
         del listed[self.name]
         wanted = {name: about for name, about in listed.items() if name.startswith(LEASES + task)}
@@ -102,7 +104,10 @@ class Lease:
         deadline, pause = time.monotonic() + PATIENCE_S, 0.05
         while self.others(SWEEP):
             if time.monotonic() > deadline:
-                raise BusyError(f"{self._place.url}: another gsmap is deleting old snapshots there; try again later")
+                raise BusyError(
+                    f"{self._place.url}: another gsmap is deleting old snapshots there; try again later",
+                    code="backup_busy",
+                )
             time.sleep(pause)
             pause = min(2 * pause, 5.0)
             self.require()

@@ -126,7 +126,7 @@ def read_state(file: Path, created_at: str = "") -> State:
         for one in named:
             check_path(one.path)
             if not (isinstance(one.sha256, str) and _DIGEST.fullmatch(one.sha256) and isinstance(one.size_bytes, int)):
-                raise CorruptError(f"{file}: the digest of {one.path} is none")
+                raise CorruptError(f"{file}: the digest of {one.path} is none", code="backup_damaged")
         counts = {
             "scenes": "scenes WHERE removed_at IS NULL",
             "removed": "scenes WHERE removed_at IS NOT NULL",
@@ -141,7 +141,7 @@ def read_state(file: Path, created_at: str = "") -> State:
             counts={name: int(_one(connection, f"SELECT count(*) FROM {rest}")) for name, rest in counts.items()},
         )
     except (sqlite3.Error, TypeError) as error:
-        raise CorruptError(f"{file} is no catalog of a map ({error})") from error
+        raise CorruptError(f"{file} is no catalog of a map ({error})", code="backup_damaged") from error
     finally:
         connection.close()
 
@@ -153,7 +153,7 @@ def check_path(path: object) -> str:
         CorruptError: it would lie outside the map, or where a map keeps nothing.
     """
     if not isinstance(path, str) or not path.isprintable() or "\\" in path:
-        raise CorruptError(f"no path of a file in a map: {path!r}")
+        raise CorruptError(f"no path of a file in a map: {path!r}", code="invalid_stored_name")
     parts = path.split("/")
     sound = all(part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts)
     top, depth = parts[0], len(parts)
@@ -166,7 +166,7 @@ def check_path(path: object) -> str:
         or (parts[0] == ARRAYS and parts[1:2] not in (["staging"], []) and depth >= 4)
     )
     if not sound or not known or PurePosixPath(path).is_absolute():
-        raise CorruptError(f"no path of a file in a map: {path!r}")
+        raise CorruptError(f"no path of a file in a map: {path!r}", code="invalid_stored_name")
     return path
 
 
@@ -188,10 +188,12 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, 
         if immutable and not _still_named(store, file):
             raise Vanished(file.path) from error
         if isinstance(error, CorruptError):
-            raise CorruptError(f"{error}: {_mend(file)}") from error
-        raise CorruptError(f"{path} is missing: {_mend(file)}, or gsmap prune if one was interrupted") from error
+            raise CorruptError(f"{error}: {_mend(file)}", code="map_damaged") from error
+        raise CorruptError(
+            f"{path} is missing: {_mend(file)}, or gsmap prune if one was interrupted", code="map_damaged"
+        ) from error
     except OSError as error:
-        raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
+        raise StoreError(f"{path} cannot be read: {error.strerror or error}", code="file_unreadable") from error
 
 
 def _bytes_of(store: Store, file: StoredFile, path: Path) -> Iterator[bytes]:
@@ -223,9 +225,9 @@ def checked(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[by
         digest.update(chunk)
         yield chunk
     if seen != file.size_bytes:
-        raise CorruptError(f"{what} does not have the {file.size_bytes} bytes that were written")
+        raise CorruptError(f"{what} does not have the {file.size_bytes} bytes that were written", code="bytes_differ")
     if digest.hexdigest() != file.sha256:
-        raise CorruptError(f"{what} differs from what was written")
+        raise CorruptError(f"{what} differs from what was written", code="bytes_differ")
 
 
 def _capture_catalog(source: Catalog, folder: Path) -> State:
@@ -233,10 +235,12 @@ def _capture_catalog(source: Catalog, folder: Path) -> State:
     if source.is_sqlite:
         with explained(source.folder):
             for problem in source.page_problems():
-                raise CorruptError(f"{problem}: run gsmap check; nothing was backed up")
+                raise CorruptError(f"{problem}: run gsmap check; nothing was backed up", code="map_damaged")
             sqlite.backup(source.engine, file)
             for problem in sqlite.file_problems(file):
-                raise CorruptError(f"{source.folder / sqlite.FILE} is damaged ({problem}); nothing was backed up")
+                raise CorruptError(
+                    f"{source.folder / sqlite.FILE} is damaged ({problem}); nothing was backed up", code="map_damaged"
+                )
     else:
         made = empty_catalog(folder)
         try:

@@ -1,0 +1,88 @@
+"""Contract: every code of an error is registered once, and every registered code is used."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import pickle
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import gsmap
+from gsmap import errors
+from gsmap.errors import ConfigError, GsmapError, InputError, MissingDependencyError
+from gsmap.reason_codes import ERRORS
+
+PACKAGE = Path(gsmap.__file__).parent
+CLASSES = {name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, GsmapError)}
+PRECISE = {
+    "NotGaussiansError",
+    "NotPinholesError",
+    "DiskFullError",
+    "ReadOnlyError",
+    "DiskError",
+    "MissingDependencyError",
+}
+"""Classes with one cause, so that their own code is precise."""
+
+
+@functools.cache
+def _trees() -> list[tuple[Path, ast.AST]]:
+    return [(path, ast.parse(path.read_text())) for path in sorted(PACKAGE.rglob("*.py"))]
+
+
+def _constructions(tree: ast.AST) -> Iterator[tuple[ast.Call, str, str | None]]:
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+        given = {k.arg: k.value for k in node.keywords}.get("code")
+        if name in CLASSES:
+            yield node, name, given.value if isinstance(given, ast.Constant) else None if given is None else ""
+
+
+def test_every_error_is_raised_with_a_code() -> None:
+    without = [
+        f"{path.relative_to(PACKAGE)}:{node.lineno}"
+        for path, tree in _trees()
+        for node, name, code in _constructions(tree)
+        if code is None and name not in PRECISE and path.name not in ("errors.py", "app.py")
+    ]
+    assert without == []
+
+
+def test_codes_are_registered_and_used() -> None:
+    used = {kind.code for kind in CLASSES.values()}
+    words = set()
+    for path, tree in _trees():
+        used |= {code for _, _, code in _constructions(tree) if code}
+        if path.name not in ("reason_codes.py",):
+            words |= {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)}
+    assert used <= set(ERRORS), "register them in gsmap/reason_codes.py"
+    assert set(ERRORS) - used <= words, "delete what is not used from gsmap/reason_codes.py"
+
+
+def test_codes_are_words_and_meanings_are_sentences() -> None:
+    for code, meaning in ERRORS.items():
+        assert re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", code)
+        assert meaning[0].isupper() or meaning.startswith("gsmap")
+        assert meaning.endswith(".")
+
+
+@pytest.mark.parametrize("kind", CLASSES.values(), ids=list(CLASSES))
+def test_codes_survive_pickling(kind: type[GsmapError]) -> None:
+    for error in (kind("text"), kind("text", code="out_of_range")):
+        again = pickle.loads(pickle.dumps(error))
+        assert type(again) is kind
+        assert str(again) == "text"
+        assert again.code == error.code
+
+
+def test_without_a_code_an_error_has_that_of_its_class() -> None:
+    assert InputError("text").code == "input"
+    assert ConfigError("text").code == "config"
+    assert MissingDependencyError("text").code == "missing_dependency"
+    assert InputError("text", code="not_finite").code == "not_finite"
