@@ -30,7 +30,9 @@ MapPath = Annotated[
         show_default=False,
     ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; docs/json.md has its fields.")]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object on stdout; docs/reference/json.md lists its keys.")
+]
 Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="A.B=VALUE", help="Change a setting for this run; `gsmap settings MAP` lists them."),

@@ -1,4 +1,4 @@
-"""What each verb prints with ``--json``: one object, ``schema`` first. ``docs/json.md`` is made from this."""
+"""What each verb prints with ``--json``: one object, ``schema`` first. docs/reference/json.md is generated from it."""
 
 from __future__ import annotations
 

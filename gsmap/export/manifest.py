@@ -41,7 +41,7 @@ class Manifest:
         notes: what a person should know about the folder as it was found.
         doomed: paths of files that are no longer a tile's and are still to be deleted.
         metres: how long a metre is in the frame of each component, as the tiles were made.
-        world: where each component that is tied to the world lies in it, as JSON has it (docs/world.md).
+        world: where each component that is tied to the world lies in it, as JSON has it (docs/how-to/world.md).
         offsets: what was taken off the coordinates of each scene's file, of scenes in map coordinates.
     """
 
@@ -187,7 +187,7 @@ def _metre(entry: Mapping[str, Any]) -> Metre:
 
 
 def _entry(name: str, tile: Tile, num_bytes: int, metres_per_unit: float) -> dict[str, object]:
-    """A tile as ``tiles.json`` has it; docs/storage.md explains every field."""
+    """A tile as ``tiles.json`` has it; docs/reference/storage.md explains every field."""
     return {
         "name": name,
         "component": tile.component,

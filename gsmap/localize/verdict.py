@@ -19,7 +19,7 @@ class Params:
         min_probability: that it is right, of all evidence together.
         prior: share of the poses that are looked into that are right before anything is known of them ...
         alike: ... and of those that are of a room that looks like one of the map, and is not in it: more in a hotel or
-            a school, less where no two rooms are alike (``docs/localize.md`` says what either costs).
+            a school, less where no two rooms are alike (``docs/how-to/localize.md`` says what either costs).
         min_inliers: patches of renders that are found again in the photo where the pose predicts them.
         max_rival: another place may be this probable at most: what looks alike twice is not told apart.
         max_rotation_sigma_deg: a pose that is known less well is not said ...

@@ -3,7 +3,7 @@
 The map's frame stays held as it was (by its anchor scene, or by priors), and ``S_world_map`` is free: so observations
 bend the component where its edges leave room, and never move it as a whole. Everything is solved at once, by
 Gauss-Newton on one sparse system, whose inverse then tests every observation against all others and gives covariances.
-See docs/design/0037-the-world.md.
+See docs/design/0024-world-frame.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Control points, the photos of a capture, surveyed scenes and scale bars each err in common, so that no number of photos
 outvotes a control point. The most precise source that ties the component alone is the reference. Every other group is
 predicted from it, with its common errors as unknown as they are; one that agrees adds its information, one that does
-not is named with the shift and its likely reason. See docs/design/0037-the-world.md.
+not is named with the shift and its likely reason. See docs/design/0024-world-frame.md.
 """
 
 from __future__ import annotations

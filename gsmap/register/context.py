@@ -1,6 +1,6 @@
 """What stands around an object: a histogram of the features in its neighbourhood of the graph (Graph-GSReg).
 
-The paper's local graph reaches three hops far; on made places one tells objects best apart (`docs/design/0027`).
+The paper's local graph reaches three hops far; on made places one tells objects best apart (`docs/experiments.md`).
 """
 
 from __future__ import annotations

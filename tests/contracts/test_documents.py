@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import typer.main
-from test_families import _outside_package  # noqa: F401  # which docs/extending.md configures
+from test_families import _outside_package  # noqa: F401  # which docs/how-to/extending.md configures
 
 from gsmap.cli.app import build
 from gsmap.map.settings import settings_of
@@ -20,7 +20,7 @@ from tools.make import docs as make_docs
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-_GENERATED = ("_pictures/",)
+_GENERATED = ("_pictures/", "../_pictures/")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -38,7 +38,7 @@ def commands_in(text: str) -> Iterator[tuple[str, bool]]:
             if found := re.match(r"(?:\$ )?(gsmap [a-z-].*)", line):
                 yield found[1], True
     for found in re.findall(r"`(gsmap [a-z-][^`]*)`", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S)):
-        if found != "gsmap page digests 1":  # how a file begins (docs/storage.md)
+        if found != "gsmap page digests 1":  # how a file begins (docs/reference/storage.md)
             yield " ".join(found.split()), False
 
 

@@ -72,7 +72,7 @@ def test_the_map_stands_upright(site: Path) -> None:
 
 
 def test_json_keeps_the_contract(site: Path) -> None:
-    """The keys that scripts outside rely on; `docs/json.md` has them all."""
+    """The keys that scripts outside rely on; docs/reference/json.md lists all."""
     scenes = json.loads(cli("list", site, "scenes", "--json"))["scenes"]
     wanted = ["name", "id", "num_gaussians", "num_nodes", "component", "S_map_scene", "captured_at", "status"]
     assert list(scenes[0])[: len(wanted)] == wanted

@@ -1,10 +1,10 @@
-"""Builds the documents into a static site, with what they show made anew.
+"""Build the documents as a static site, with generated reference pages and new pictures.
 
     python -m tools.make.docs [--out docs/site] [--keep DIR]
 
-The commands of docs/start.md (blocks marked ``sh``) are run in a folder, in their order, as a newcomer would; the
-notebook runs on the map that they leave; pictures are of that map, those of the page from a headless Chromium. Then
-Sphinx builds, and any warning is an error. Needs what `tools/setup.sh test` installs.
+Runs the commands of docs/start.md (blocks marked ``sh``) in a folder, in order; the notebook runs on the map that they
+leave, and pictures show that map, those of the page in a headless Chromium. Writes the reference of settings, commands
+and JSON keys, then calls Sphinx, where a warning is an error. Needs what `tools/setup.sh test` installs.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ DOCS = ROOT / "docs"
 PICTURES = DOCS / "_pictures"
 SETTINGS = DOCS / "_build_settings.md"
 COMMANDS = DOCS / "_build_commands.md"
+JSON = DOCS / "_build_json.md"
 _BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def commands_of(page: str) -> list[str]:
-    """The blocks of a page that a reader would type, in order."""
+    """Return the blocks of a page that a reader would type, in order."""
     return _BLOCK.findall(page)
 
 
 def run_commands(blocks: list[str], folder: Path) -> None:
-    """Run them in a folder; the first that fails ends it.
+    """Run blocks of commands in a folder until one fails.
 
     Raises:
-        SystemExit: one failed, with what it printed.
+        SystemExit: a block failed; the message contains its output.
     """
     environment = os.environ | {"PATH": f"{_programs(folder)}:{os.environ['PATH']}", "COLUMNS": "160"}
     for block in blocks:
@@ -49,7 +50,7 @@ def run_commands(blocks: list[str], folder: Path) -> None:
 
 
 def _programs(folder: Path) -> Path:
-    """A folder with a ``gsmap`` that is this checkout's, run by this interpreter."""
+    """Make a folder with a ``gsmap`` program that runs this checkout with this interpreter."""
     programs = folder / "bin"
     programs.mkdir(exist_ok=True)
     program = programs / "gsmap"
@@ -59,7 +60,7 @@ def _programs(folder: Path) -> Path:
 
 
 def make_pictures(folder: Path) -> None:
-    """What the pages show, of the map in a folder."""
+    """Make the pictures of the documents from the map in a folder."""
     from PIL import Image
 
     shutil.rmtree(PICTURES, ignore_errors=True)
@@ -72,7 +73,7 @@ def make_pictures(folder: Path) -> None:
 
 
 def page_pictures(path: Path) -> None:
-    """The page of `gsmap view`: looking, an edge and a change under review, and a phone."""
+    """Take screenshots of `gsmap view`: the map, an edge and a change under review, and a phone."""
     sys.path.insert(0, str(ROOT / "tests" / "view"))
     from hands import Hands
     from headless import Page
@@ -115,7 +116,7 @@ def _save(page: Any, name: str) -> None:
 
 
 def write_settings() -> None:
-    """Every parameter with its default, unit and meaning, by the room it is of."""
+    """Write every setting with its default, unit and meaning, grouped by room."""
     from gsmap.map.reports import setting_rows
     from gsmap.map.settings import Settings
 
@@ -131,10 +132,15 @@ def write_settings() -> None:
 
 
 def write_commands() -> None:
-    """Every verb with its options, as typer tells them."""
+    """Write every verb with its options, as typer documents them."""
     typer = [sys.executable, "-m", "typer", str(DOCS / "gsmap_commands.py"), "utils", "docs", "--name", "gsmap"]
     done = subprocess.run(typer, cwd=ROOT, check=True, capture_output=True, text=True)
     COMMANDS.write_text(done.stdout.split("\n", 1)[1].replace("\n# ", "\n## "))  # its title is the page's
+
+
+def write_json() -> None:
+    """Write the JSON keys of every verb."""
+    subprocess.run([sys.executable, "-m", "tools.make.json_docs", "--out", JSON], cwd=ROOT, check=True)
 
 
 def main() -> None:
@@ -152,6 +158,7 @@ def main() -> None:
         make_pictures(folder)
         write_settings()
         write_commands()
+        write_json()
         os.environ["GSMAP_DOCS_RUN"] = str(folder.resolve())
         sys.exit(build(["-W", "--keep-going", "-q", "-b", "html", str(DOCS), str(arguments.out)]))
 

@@ -1,7 +1,8 @@
-"""Write docs/json.md: what every verb prints with ``--json``, from the rows themselves (`gsmap.types.rows`).
+"""Generate the list of JSON keys that every verb prints, from the row classes in `gsmap.types.rows`.
 
-python -m tools.make.json_docs            write the page
-python -m tools.make.json_docs --check    exit 1 where the page is not what would be written
+    python -m tools.make.json_docs [--out FILE]     print the page, or write it
+
+`tools.make.docs` calls it for the page docs/reference/json.md of the site.
 """
 
 # ruff: noqa: E402
@@ -27,32 +28,16 @@ from gsmap.settings import field_docs
 from gsmap.types.rows import SCHEMA, Row
 from gsmap.types.sim3 import Sim3
 
-PAGE = ROOT / "docs" / "json.md"
-
-HEAD = f"""# What `--json` prints
-
-<!-- Written by tools/make/json_docs.py from gsmap/types/rows/: change the rows, then run it. -->
-
-Every verb takes `--json`: one JSON object on stdout, `"schema": {SCHEMA}` first; progress and remarks stay on stderr,
-and the exit code is that of the verb without it. Keys are added as gsmap grows; where one goes or changes its meaning,
-the number under `schema` is raised. In Python the verbs are methods of `gsmap.Map` that return the same rows, as frozen
-dataclasses of `gsmap.types.rows` with the same names.
-
-- Ids and names go together: `scene` and `scene_name`, `target` and `target_name`, `source` and `source_name`. An id is
-  a digest of content; a scene, which is its own row, calls them `id` and `name`.
-- A pose is a 4x4 matrix: `S_a_b` maps points from frame b to frame a. An array is a list of lists of the shape given.
-- Units are in the names: `_m`, `_rad`, `_deg`, `_s`, `_px`, `_db`. Dates are ISO 8601 with their zone.
-- A number that is not known or not finite is `null`.
-- A verb that fails (exit code 1 or 2) prints `"error"` beside `"schema"`: an object of `"code"`, one of the
-  [codes of errors](#codes-of-errors), and `"message"`, the line that stderr has, too. Wrong usage, such as an option
-  that does not exist, prints nothing on stdout. Codes stay as they are; messages may change with any version. In Python
-  the code is `GsmapError.code`; the server of `gsmap view` answers `{{"error": MESSAGE, "code": CODE}}`.
-"""
-
 
 def page() -> str:
-    """The whole page."""
-    lines = [HEAD, "## Verbs\n", "| verb | prints beside `schema` |", "| --- | --- |"]
+    """Return the tables of verbs and rows in Markdown."""
+    lines = [
+        f"The number under `schema` is {SCHEMA}.",
+        "",
+        "## Verbs\n",
+        "| verb | keys beside `schema` |",
+        "| --- | --- |",
+    ]
     lines += [f"| `gsmap {_usage(verb)}` | {_shape(shape)} |" for verb, shape in OBJECTS.items()]
     lines += ["", "## Rows\n"]
     for row in row_types():
@@ -63,7 +48,7 @@ def page() -> str:
 
 
 def section(row: type[Row]) -> list[str]:
-    """What the page says of one type of row."""
+    """Return the section of one row class: its first sentence and a table of its keys."""
     docs, hints = docs_of(row), typing.get_type_hints(row)
     out = [f"### {row.__name__}\n", _first(row), "", "| key | value | meaning |", "| --- | --- | --- |"]
     for field in fields(row):  # type: ignore[arg-type]
@@ -73,7 +58,7 @@ def section(row: type[Row]) -> list[str]:
 
 
 def row_types() -> list[type[Row]]:
-    """Every type of row that a verb can print, nested ones after those that hold them."""
+    """Return every row class that a verb can print, each before the classes nested in it."""
     found: list[type[Row]] = []
     todo = [shape.type for shape in OBJECTS.values()]
     while todo:
@@ -86,7 +71,7 @@ def row_types() -> list[type[Row]]:
 
 
 def docs_of(row: type[Row]) -> dict[str, str]:
-    """The meaning of each field, those that it inherits included."""
+    """Return the meaning of each field, including inherited ones."""
     out: dict[str, str] = {}
     for cls in reversed(row.__mro__):
         if issubclass(cls, Row):
@@ -95,7 +80,7 @@ def docs_of(row: type[Row]) -> dict[str, str]:
 
 
 def json_type(hint: object) -> str:
-    """A field's type in JSON's words."""
+    """Name the JSON type of a field."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(json_type(part) for part in inner)
@@ -150,14 +135,15 @@ def _first(row: type[Row]) -> str:
     return " ".join(text.split()).replace("``", "`")
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true")
-    if parser.parse_args().check:
-        return int(not PAGE.exists() or PAGE.read_text(encoding="utf-8") != page())
-    PAGE.write_text(page(), encoding="utf-8")
-    return 0
+    parser.add_argument("--out", type=Path, help="file to write; default: standard output")
+    out = parser.parse_args().out
+    if out:
+        out.write_text(page(), encoding="utf-8")
+    else:
+        print(page(), end="")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
