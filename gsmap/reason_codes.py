@@ -30,7 +30,6 @@ ERRORS: Final[Mapping[str, str]] = {
     # Options and settings.
     "component_required": "A point in the map's frame needs the component whose frame it is in.",
     "conflicting_options": "Options that exclude each other, or that need another one, were given together.",
-    "edges_not_ascending": "The edges of histogram bins do not ascend.",
     "in_memory_mismatch": "Gaussians or cameras in memory were combined with files or given several times.",
     "invalid_assignment": "A setting is not written as NAME=VALUE.",
     "invalid_budget": "A budget of time or size is not positive or has the wrong unit.",

@@ -1,4 +1,4 @@
-"""From a capture to its scene graph."""
+"""Scene graphs of captures."""
 
 from gsmap.describe.graph import Params, describe, recipe_key
 

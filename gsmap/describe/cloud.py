@@ -1,8 +1,6 @@
-"""The surface of a scene as a coloured point cloud, taken from its Gaussians without rendering."""
+"""Surface of a scene as a coloured point cloud, from its Gaussians without rendering."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,57 +13,44 @@ from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians
 from gsmap.types.views import Cloud
 
-
-@dataclass(frozen=True)
-class Params:
-    """Which Gaussians make up the surface.
-
-    Args:
-        min_opacity: more transparent ones are left out.
-        max_relative_scale: those whose largest scale exceeds this many times the median one are left out.
-        floater_lab: how far a Gaussian's colour is from its neighbours', L*a*b* units, for it to be unlike them; see
-            `gsmap.geometry.floaters`.
-    """
-
-    min_opacity: float = 0.1
-    max_relative_scale: float = 3.5
-    floater_lab: float = 20.0
+_MAX_RELATIVE_SCALE = 3.5  # a Gaussian whose largest scale is so many times the median one is no surface
+_FLOATER_LAB = 20.0  # L*a*b* distance from the neighbours' colours from which a Gaussian floats
 
 
-def surface_cloud(gaussians: Gaussians, params: Params | None = None) -> Cloud:
-    """Centres of the Gaussians that make up the surface: opaque, not huge, not floating alone, not of a stray colour.
+def surface_cloud(gaussians: Gaussians, min_opacity: float = 0.1) -> Cloud:
+    """Return the centres of the Gaussians of the surface: opaque, not huge, not floating, not of a stray colour.
 
-    "Huge" and "alone" are told from the capture itself, so that the cloud of a scene does not depend on its unit: a
-    Gaussian is dropped when its largest scale exceeds a multiple of the median one, or it floats (`find_floaters`).
-    Colour is the view-independent part (SH degree 0).
+    All criteria are relative to the capture, so that the cloud of a scene does not depend on its unit: a Gaussian is
+    dropped when its largest scale exceeds a multiple of the median one, or it floats (`find_floaters`). Colour is the
+    view-independent part (SH degree 0).
 
     Args:
         gaussians: any frame and unit; NaN and infinity are left out.
+        min_opacity: Gaussians below it are left out.
 
     Returns:
         Points in the Gaussians' frame and unit.
     """
-    params = params or Params()
     x, y, z = gaussians.scales.T
     scale = np.maximum(np.maximum(x, y), z)
     finite = are_finite(gaussians.means) & np.isfinite(scale) & are_finite(gaussians.sh[:, 0])
-    keep = np.flatnonzero((gaussians.opacities > params.min_opacity) & finite)
+    keep = np.flatnonzero((gaussians.opacities > min_opacity) & finite)
     if len(keep):
-        keep = keep[scale[keep] <= params.max_relative_scale * np.median(scale[keep])]
+        keep = keep[scale[keep] <= _MAX_RELATIVE_SCALE * np.median(scale[keep])]
     points = gaussians.means.take(keep, axis=0).astype(np.float64)
     lab = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[:, 0].take(keep, axis=0)), 0.0, 1.0))
-    stray, spacing = find_floaters(points, lab, params.floater_lab)
+    stray, spacing = find_floaters(points, lab, _FLOATER_LAB)
     rows = np.flatnonzero(~stray)
     return Cloud(points.take(rows, axis=0), lab.take(rows, axis=0), np.pi / 8 * spacing[rows] ** 2, keep[rows])
 
 
 def downsample(points: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean position and mean value of the points of each occupied cell of a grid; ``values`` is (N, 3)."""
+    """Return the mean position and mean value of the points of each occupied grid cell; ``values`` is (N, 3)."""
     return cell_means(points, values, cell, origin=box_around(points)[0] if len(points) else None)[:2]
 
 
 def local_planes(points: np.ndarray, num_neighbours: int = 16) -> tuple[np.ndarray, np.ndarray]:
-    """Normal (N, 3; sign arbitrary) and planarity (N,) in [0, 1] of each point's neighbourhood (principal axes)."""
+    """Compute normals (N, 3; sign arbitrary) and planarity (N,) in [0, 1] from the principal axes of neighbourhoods."""
     k = min(num_neighbours, len(points))
     if k < 4:
         return np.zeros((len(points), 3)), np.zeros(len(points))

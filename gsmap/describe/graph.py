@@ -1,72 +1,60 @@
-"""Scene graphs from captures."""
+"""Scene graph of a capture: surface, vertical, unit, landmark layers, object layer and segments."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from gsmap.describe.cloud import Params as SurfaceParams
 from gsmap.describe.cloud import surface_cloud
-from gsmap.describe.gravity import Params as GravityParams
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks import layer as landmarks
-from gsmap.describe.landmarks.detect import Octaves
+from gsmap.describe.landmarks.detect import OctaveCache
 from gsmap.describe.landmarks.layer import Params as LandmarkParams
 from gsmap.describe.landmarks.layer import gravity_free, landmark_layer
-from gsmap.describe.objects import things
+from gsmap.describe.objects import segments
 from gsmap.describe.objects.layer import Params as ObjectParams
-from gsmap.describe.objects.layer import object_layer, resolved
-from gsmap.describe.objects.things import Params as ThingParams
-from gsmap.describe.objects.things import find_things
-from gsmap.describe.precision import Params as PrecisionParams
-from gsmap.describe.precision import rounded
-from gsmap.describe.unit import Params as UnitParams
-from gsmap.describe.unit import estimate_unit_m, landmark_units, working_unit_m
+from gsmap.describe.objects.layer import choose_methods, object_layer
+from gsmap.describe.objects.segments import find_segments
+from gsmap.describe.precision import round_graph
+from gsmap.describe.unit import VIEW_DISTANCE_M, estimate_unit_m, landmark_units, working_unit_m
 from gsmap.errors import ConfigError
 from gsmap.methods import RecipeKey
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
 from gsmap.types.model import ModelSpec
-from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 from gsmap.types.scene import SCALE_POLICIES
 from gsmap.types.views import SceneContext
 
 VERSION = 5
+_FEW_NODES = 20  # a scene none of whose layers has as many nodes gets a note
 
 
 @dataclass(frozen=True)
 class Params:
-    """What to describe and how.
+    """Settings of `describe`.
 
     Args:
-        landmarks: whether to make the layers of landmarks.
-        objects: whether to make the layer of objects.
-        things: whether to tell which Gaussians are one thing.
-        surface: which Gaussians make up the surface.
-        gravity: how the vertical is found.
-        unit: what the metre is guessed from.
-        landmark: how landmarks are found.
-        object: how objects are found.
-        thing: how things are told apart.
-        precision: how finely positions, embeddings and colours are told.
-        few_nodes: a scene none of whose layers has as many nodes gets a note.
+        landmarks: Make the landmark layers, which registration and retrieval match; without them only objects do.
+        objects: Make the object layer, which is rendered and segmented and takes most of the time.
+        things: Group Gaussians into segments, one per physical object, for changes and objects over time.
+        min_opacity: Opacity in [0, 1] below which a Gaussian is not part of the surface; larger ignores more haze.
+        view_distance_m: Typical distance in metres, positive, from a camera to what it sees, by which the unit of a
+            scene without metric scale is estimated; the default fits rooms, and outdoor captures need a larger one.
+        landmark: Settings of the landmark layers.
+        object: Settings of the object layer.
     """
 
     landmarks: bool = True
     objects: bool = True
     things: bool = True
-    surface: SurfaceParams = field(default_factory=SurfaceParams)
-    gravity: GravityParams = field(default_factory=GravityParams)
-    unit: UnitParams = field(default_factory=UnitParams)
+    min_opacity: float = 0.1
+    view_distance_m: float = VIEW_DISTANCE_M
     landmark: LandmarkParams = field(default_factory=LandmarkParams)
     object: ObjectParams = field(default_factory=ObjectParams)
-    thing: ThingParams = field(default_factory=ThingParams)
-    precision: PrecisionParams = field(default_factory=PrecisionParams)
-    few_nodes: int = 20
 
 
 def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | None = None) -> RecipeKey:
-    """What names the graphs that `describe` makes with these parameters and models, but for the scene and its policy.
+    """Return the recipe of the graphs that `describe` makes, without the scene and its scale policy.
 
     Raises:
         ConfigError: a segmenter or embedder that does not exist.
@@ -75,20 +63,19 @@ def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | N
     version = {"describe": VERSION}
     settings: dict[str, object] = {
         "layers": [name for name in ("landmarks", "objects", "things") if getattr(params, name)],
-        **{name: plain(getattr(params, name)) for name in ("surface", "gravity", "unit", "precision", "few_nodes")},
+        **{name: getattr(params, name) for name in ("min_opacity", "view_distance_m")},
     }
     backend = ""
     if params.landmarks:
         version["landmarks"] = landmarks.VERSION
         settings["landmark"] = landmarks.settings(params.landmark)
     if params.objects:
-        chosen = resolved(params.object, models)
+        chosen = choose_methods(params.object, models)
         version |= chosen.versions
         settings["object"] = chosen.settings(models)
         backend = chosen.params.render_backend
     if params.things:
-        version["things"] = things.VERSION
-        settings["thing"] = plain(params.thing)
+        version["things"] = segments.VERSION
     return RecipeKey("describe", "graph", version, settings, backend)
 
 
@@ -102,7 +89,7 @@ def describe(
     scale_policy: str = "auto",
     progress: Progress = silent,
 ) -> SceneGraph:
-    """The scene graph of one capture: find the surface, what is up and how long a metre is; then each layer.
+    """Describe one capture: find its surface, vertical and unit, then compute each layer of its scene graph.
 
     Args:
         scene_id: recorded in the graph.
@@ -112,7 +99,7 @@ def describe(
             ``auto`` (both, where a metre is plausible).
 
     Returns:
-        Layers, vertical and extents in the scene's frame and unit; ``notes`` say what a person should know.
+        Layers, vertical and extents in the scene's frame and unit; ``notes`` for the user.
 
     Raises:
         ConfigError: an unknown policy, segmenter or embedder, or one of these without its model.
@@ -123,11 +110,11 @@ def describe(
             f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}", code="invalid_choice"
         )
     progress(0.0, "surface")
-    cloud = surface_cloud(gaussians, params.surface)
-    up = estimate_up(cloud.points, cameras, params.gravity)
-    guess_m = estimate_unit_m(cloud.points, cameras, up, params.unit)
+    cloud = surface_cloud(gaussians, params.min_opacity)
+    up = estimate_up(cloud.points, cameras)
+    guess_m = estimate_unit_m(cloud.points, cameras, up, params.view_distance_m)
     working_m = working_unit_m(guess_m, cameras)
-    units = landmark_units(guess_m, scale_policy, params.unit, working_m=working_m)
+    units = landmark_units(guess_m, scale_policy, working_m=working_m)
     if "landmarks" not in units:  # the unit is no metre
         working_m = guess_m
     unit_m = 1.0 if scale_policy == "known" else guess_m
@@ -138,7 +125,7 @@ def describe(
     elif up is None:
         notes.append("up is unknown (no cameras that turn about it, no clear floor): landmarks are matched without it")
     if params.landmarks:
-        octaves = Octaves()
+        octaves = OctaveCache()
         for i, (name, layer_unit_m) in enumerate(units.items()):
             progress(0.05 + 0.55 * i / len(units), name)
             layers[name] = landmark_layer(cloud, up, layer_unit_m, params.landmark, octaves)
@@ -153,12 +140,12 @@ def describe(
             gaussians, cameras, context, params.object, lambda fraction, text: progress(0.6 + 0.35 * fraction, text)
         )
         notes += remarks
-    if len(cloud) and not any(len(layer) >= params.few_nodes for layer in layers.values()):
-        notes.append(f"fewer than {params.few_nodes} nodes in every layer: little colour or shape to hold on to")
+    if len(cloud) and not any(len(layer) >= _FEW_NODES for layer in layers.values()):
+        notes.append(f"fewer than {_FEW_NODES} nodes in every layer: little colour or shape to hold on to")
     found = None
     if params.things:
         progress(0.95, "things")
-        found = find_things(gaussians, cloud, up, 1.0 if "landmarks" in units else unit_m, params.thing)
+        found = find_segments(gaussians, cloud, up, 1.0 if "landmarks" in units else unit_m)
     progress(1.0, "described")
     graph = SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found, working_m)
-    return rounded(graph, params.precision)
+    return round_graph(graph)

@@ -1,81 +1,75 @@
-"""As many digits of a graph as it is sure of: what is matched is then what is stored, bit for bit, in few bytes.
+"""Rounding of scene graphs to their significant digits, so that stored and matched values are equal and small.
 
-Everything is rounded to multiples of powers of two, which small integers hold without loss (`gsmap.store.narrow`).
-Landmarks are placed to centimetres, and one place's embeddings differ by tenths between captures: a millimetre and a
-256th are far below that.
+All numbers are rounded to multiples of powers of two, which small integers hold without loss (`gsmap.store.narrow`).
+Landmarks are localized to centimetres, and embeddings of one place differ by tenths between captures: a millimetre and
+1/256 are far below that.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from gsmap.types import NodeLayer, SceneGraph, Segments
 
+LENGTH_M = 0.001
+"""Step of positions and extents in working metres; the nearest power of two of the scene's unit is taken."""
 
-@dataclass(frozen=True)
-class Params:
-    """How finely the numbers of a graph are told.
+EMBEDDING = 1 / 256
+"""Step of the components of landmark embeddings, a power of two. Components are clipped to 128 such steps, so that a
+byte holds each: of real landmarks' components seven in a million are larger than half."""
 
-    Args:
-        length_m: positions and extents, in working metres; the nearest power of two of the scene's unit is taken.
-        embedding: components of the unit vectors that tell landmarks apart; a power of two. They are cut off at 128
-            such steps, so that a byte holds each: of a real landmark's, seven in a million are larger than half.
-        lab: colours of things, L*a*b* units; a power of two.
-        digits: significant binary digits of the numbers of any size: weights, and features of nodes.
-    """
+LAB = 0.5
+"""Step of colours, L*a*b* units; a power of two."""
 
-    length_m: float = 0.001
-    embedding: float = 1 / 256
-    lab: float = 0.5
-    digits: int = 11
+DIGITS = 11
+"""Significant binary digits of weights and of features of nodes."""
 
 
-def rounded(graph: SceneGraph, params: Params | None = None) -> SceneGraph:
-    """The graph with its numbers rounded."""
-    params = params or Params()
-    step = float(2.0 ** np.round(np.log2(params.length_m / graph.working_m)))
-    layers = {name: _layer(layer, step, params) for name, layer in graph.layers.items()}
-    return replace(graph, layers=layers, things=None if graph.things is None else _things(graph.things, step, params))
+def round_graph(graph: SceneGraph) -> SceneGraph:
+    """Return the graph with its numbers rounded."""
+    step = float(2.0 ** np.round(np.log2(LENGTH_M / graph.working_m)))
+    layers = {name: _layer(layer, step) for name, layer in graph.layers.items()}
+    return replace(graph, layers=layers, things=None if graph.things is None else _things(graph.things, step))
 
 
-def _layer(layer: NodeLayer, step: float, params: Params) -> NodeLayer:
-    features = _significant(layer.features, params.digits)
+def _layer(layer: NodeLayer, step: float) -> NodeLayer:
+    features = _significant(layer.features, DIGITS)
     # An object's embedding is its feature; an image encoder's features all lie in one narrow cone.
     same = np.array_equal(layer.embeddings, layer.features)
-    embeddings = features if same else _to(_within(layer.embeddings, params.embedding), params.embedding)
+    embeddings = features if same else _to(_within(layer.embeddings, EMBEDDING), EMBEDDING)
     positions = _to(layer.positions, step)
-    around = layer.extents - layer.positions[:, None]  # of a landmark the same to all sides, and so it stays
+    around = layer.extents - layer.positions[:, None]  # relative, so that a landmark stays symmetric
     return replace(
         layer,
         positions=positions,
         embeddings=embeddings,
-        weights=_significant(layer.weights, params.digits),
+        weights=_significant(layer.weights, DIGITS),
         extents=positions[:, None] + _to(around, step),
         features=features,
     )
 
 
-def _things(things: Segments, step: float, params: Params) -> Segments:
+def _things(things: Segments, step: float) -> Segments:
     return replace(
         things,
         positions=_to(things.positions, step),
         extents=_to(things.extents, step),
-        colours=_to(things.colours, params.lab),
+        colours=_to(things.colours, LAB),
         samples=_to(things.samples, step),
-        sample_colours=_to(things.sample_colours, params.lab),
+        sample_colours=_to(things.sample_colours, LAB),
     )
 
 
 def _to(values: np.ndarray, step: float) -> np.ndarray:
-    """Multiples of a power of two; those are exact."""
+    """Round to multiples of a power of two, which are exact."""
     out: np.ndarray = np.round(values / step) * step + 0.0  # no -0
     return out
 
 
 def _within(values: np.ndarray, step: float) -> np.ndarray:
-    """Cut off at what a signed byte holds in such steps."""
+    """Clip to the range of a signed byte in such steps."""
     out: np.ndarray = np.clip(values, -128 * step, 127 * step)
     return out
 

@@ -1,4 +1,4 @@
-"""Where stage jobs run: the executors, the choice of one, and workers that are kept from stage to stage."""
+"""Execution of stage jobs: the executors, the choice of one, and workers that are kept between stages."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import Any
 from gsmap.methods import MethodParams, family
 from gsmap.methods.executor import SetAside, Workers
 
-__all__ = ["Kept", "Params", "SetAside", "is_beginning", "run_jobs"]
+__all__ = ["WorkerSession", "Params", "SetAside", "is_beginning", "run_jobs"]
 
 AUTO = "auto"
 
 
 @dataclass(frozen=True)
 class Params:
-    """Where jobs run. A map's own settings choose none: whoever runs gsmap does.
+    """Settings of job execution. They belong to a run: a map's own settings may not choose an executor.
 
     Args:
-        executor: ``local`` (processes of this machine), ``dask`` (a cluster that runs), or one that another package
-            adds; ``auto`` takes what ``GSMAP_EXECUTOR`` says, ``local`` else.
-        executors: settings of each executor.
+        executor: Executor that runs jobs: ``local`` (processes of this machine), ``dask`` (a running cluster), or one
+            from another package; ``auto`` takes ``GSMAP_EXECUTOR``, or ``local``.
+        executors: Settings of each executor.
     """
 
     executor: str = AUTO
@@ -36,7 +36,7 @@ class Params:
             family("executor").get(self.executor)
 
     def chosen(self) -> tuple[str, Any]:
-        """Name and settings of the executor that is used.
+        """Return name and settings of the executor to use.
 
         Raises:
             ConfigError: there is none of that name.
@@ -47,7 +47,7 @@ class Params:
 
 
 def is_beginning() -> bool:
-    """Whether this process is a worker that still reads the script it was started by: nothing there may start work."""
+    """Return True in a worker that still imports the script it was started by, where no work may be started."""
     return bool(getattr(current_process(), "_inheriting", False))
 
 
@@ -56,25 +56,25 @@ def run_jobs(
 ) -> Iterator[tuple[int, Any]]:
     """Yield ``(index, job(*arguments))`` as each is done; see `gsmap.methods.executor.Workers.run`.
 
-    Workers that it starts stay for the next call as long as anything keeps them (`Kept`).
+    Workers that it starts stay for the next call as long as anything keeps them (`WorkerSession`).
 
     Raises:
         ConfigError: there is no such executor.
     """
     name, settings = (params or Params()).chosen()
-    workers = _KEPT.take(name, settings)
+    workers = _IDLE_WORKERS.take(name, settings)
     try:
         yield from workers.run(job, arguments, quick=quick)
     finally:
-        _KEPT.give_back(name, settings, workers)
+        _IDLE_WORKERS.give_back(name, settings, workers)
 
 
-class Kept(AbstractContextManager["Kept"]):
-    """While one of these is open, workers are kept; an open map has one. With the last one all of them end."""
+class WorkerSession(AbstractContextManager["WorkerSession"]):
+    """Reference that keeps idle workers alive; an open map holds one. With the last one all workers end."""
 
     def __init__(self) -> None:
         self._open = True
-        _KEPT.begin()
+        _IDLE_WORKERS.begin()
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -85,11 +85,11 @@ class Kept(AbstractContextManager["Kept"]):
     def close(self) -> None:
         if self._open:
             self._open = False
-            _KEPT.end()
+            _IDLE_WORKERS.end()
 
 
-class _Keeper:
-    """The idle workers of this process, by executor and settings."""
+class _IdleWorkers:
+    """Idle workers of this process, by executor and settings."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()  # a finalizer may call within any call
@@ -127,4 +127,4 @@ class _Keeper:
         workers.close()
 
 
-_KEPT = _Keeper()
+_IDLE_WORKERS = _IdleWorkers()

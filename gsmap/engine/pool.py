@@ -1,8 +1,8 @@
-"""A pool of processes of which none outlives this one, and which is ended by killing: no running job is waited for.
+"""Pool of processes that never outlive this one, and that end by being killed: no running job is waited for.
 
-The pools of the standard library wait for what runs when they are left, and their workers for ever when their parent is
-killed; one worker that dies ends them. Workers start afresh ("spawn"): a forked child inherits threads and locks of
-torch and OpenMP that no longer run in it.
+The pools of the standard library wait for running jobs on exit, their workers outlive a killed parent, and one dead
+worker ends them. Workers are spawned: a forked child inherits threads and locks of torch and OpenMP that do not run in
+it.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from gsmap.methods.executor import SetAside
 
 _WORKER = Path(__file__).with_name("worker.py")
 _NOT_TO_WORKERS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
-"""A terminal and a service manager signal the whole group: what becomes of a worker is for its parent to say."""
+"""Terminals and service managers signal the whole process group; only the parent decides on its workers."""
 
-_REMEMBERED = 4
-"""Jobs of a worker by which its next one is chosen: about as many as it keeps what it read for."""
+_RECENT_JOBS = 4
+"""Recent jobs of a worker by which its next one is chosen: about the number whose inputs it caches."""
 
-_LOSSES = 2
-"""A job that took so many processes with it is set aside."""
+_MAX_LOSSES = 2
+"""A job that ended so many processes is quarantined."""
 
-_FALSE_STARTS = 3
-"""Workers that may end before they have begun, one after another."""
+_MAX_FALSE_STARTS = 3
+"""Consecutive workers that may end before they have begun."""
 
 
 class WorkerDied(Exception):
-    """The process of a worker has ended; says how."""
+    """The process of a worker has ended."""
 
 
 @dataclass(eq=False)
 class _Task:
-    """A job that was taken, which of its arguments may name what it reads, and how many workers it was lost with."""
+    """A job with its arguments, those of them that may name input data, and the number of workers lost with it."""
 
     index: int
     arguments: tuple[Any, ...]
@@ -51,20 +51,20 @@ class _Task:
 
 
 class Worker:
-    """A process that does one job after another."""
+    """A process that runs one job after another."""
 
     def __init__(self) -> None:
-        self.connection, theirs = Pipe()
+        self.connection, worker_end = Pipe()
         self.has_begun = False
-        self.read: deque[frozenset[Hashable]] = deque(maxlen=_REMEMBERED)
+        self.read: deque[frozenset[Hashable]] = deque(maxlen=_RECENT_JOBS)
         command = spawn.get_command_line()  # of which the interpreter and its options are wanted
-        command = [*command[: command.index("-c")], str(_WORKER), str(theirs.fileno()), str(os.getpid())]
+        command = [*command[: command.index("-c")], str(_WORKER), str(worker_end.fileno()), str(os.getpid())]
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _NOT_TO_WORKERS)  # which the process inherits
         try:
-            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
+            self._process = subprocess.Popen(command, pass_fds=(worker_end.fileno(),), stdin=subprocess.DEVNULL)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-            theirs.close()
+            worker_end.close()
         about = spawn.get_preparation_data("gsmap worker")  # the search path, the folder, and what `__main__` is
         about.pop("authkey", None)  # a secret, and of no use here
         self._unsent = [pickle.dumps(about)]
@@ -84,7 +84,7 @@ class Worker:
         self.read.append(reads)
 
     def answer(self) -> tuple[bool, Any] | None:
-        """Whether the job returned, and what it returned or raised; None if the worker has only begun. Waits for it.
+        """Wait for (returned, value or error) of the job; None if the worker has only begun.
 
         Raises:
             WorkerDied: the process ended.
@@ -117,7 +117,7 @@ class Worker:
 
 
 class Pool:
-    """At most ``size`` workers, started as jobs come and kept from run to run until the pool is closed."""
+    """Pool of at most ``size`` workers, started on demand and kept from run to run until the pool is closed."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -125,7 +125,7 @@ class Pool:
 
     @property
     def num_idle(self) -> int:
-        """Workers that are there and wait for jobs."""
+        """Number of live workers that wait for jobs."""
         for worker in [worker for worker in self._idle if not worker.is_alive()]:
             self._idle.remove(worker)
             worker.kill()
@@ -140,9 +140,8 @@ class Pool:
     ) -> Iterator[tuple[int, Any]]:
         """Yield ``(index, result)`` of each ``(index, arguments)`` as it is done: see `gsmap.methods.executor.Workers`
 
-        As many arguments as there may be workers are taken ahead, so that each worker is given a job whose scenes it
-        has read. A job that was lost with its worker is tried again when nothing else runs: if memory was short, it
-        has all there is.
+        As many arguments as there may be workers are taken ahead, so that each worker gets a job whose scenes it has
+        cached. A job that was lost with its worker is tried again when nothing else runs, with all memory to itself.
         """
         todo = iter(numbered)
         ahead: deque[_Task] = deque()
@@ -151,20 +150,20 @@ class Pool:
         false_starts = 0
 
         def lost(worker: Worker, task: _Task, died: WorkerDied) -> bool:
-            """Whether the job is to be set aside; else it will be tried again."""
+            """Return True if the job is to be quarantined; otherwise it will be tried again."""
             nonlocal false_starts
             if not worker.has_begun:
                 false_starts += 1
-                if false_starts > _FALSE_STARTS:
+                if false_starts > _MAX_FALSE_STARTS:
                     raise GsmapError(
                         f"worker processes end before they do anything: {died}", code="workers_die"
                     ) from died
                 (again if task.losses else ahead).appendleft(task)
                 return False
             task.losses += 1
-            if task.losses < _LOSSES:
+            if task.losses < _MAX_LOSSES:
                 again.append(task)
-            return task.losses >= _LOSSES
+            return task.losses >= _MAX_LOSSES
 
         def begin_all() -> None:
             while len(at) < self.size:
@@ -221,7 +220,7 @@ class Pool:
         return self._idle.pop() if self.num_idle else Worker()
 
     def _matched(self, ahead: deque[_Task]) -> tuple[Worker, _Task]:
-        """Of idle workers and jobs ahead those that share most of what is read, earlier ones first; or a new worker."""
+        """Match an idle worker with the job ahead that shares most input data with it; or start a new worker."""
         if not self.num_idle:
             return Worker(), ahead.popleft()
         known = [set().union(*worker.read) for worker in self._idle]
@@ -233,7 +232,7 @@ class Pool:
 
 
 def _reads(arguments: tuple[Any, ...]) -> frozenset[Hashable]:
-    """The texts and tuples among the arguments of a job but the first, which is the map of all of them."""
+    """Return the texts and tuples among the arguments of a job but the first, which is the map of all jobs."""
     found = set()
     for argument in arguments[1:]:
         if isinstance(argument, (str, tuple)):

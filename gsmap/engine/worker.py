@@ -1,8 +1,8 @@
-"""What a worker process of `gsmap.engine.pool` runs, as a script: ``worker.py SOCKET PARENT``.
+"""Script of a worker process of `gsmap.engine.pool`: ``worker.py SOCKET PARENT``.
 
-It ends with its parent, whatever ends that: SIGKILL included, and from before it has imported anything. On Linux the
-kernel sees to it. Elsewhere, or where the parent's thread may end before the parent, a thread does, which reads the
-socket that only the parent holds the other end of; it cannot while native code keeps the interpreter to itself.
+It ends with its parent, however that ends (SIGKILL included), even before imports. On Linux the kernel kills it.
+Elsewhere, or where the parent's thread may end before the parent, a thread ends it that reads the socket to the parent;
+that fails while native code holds the interpreter lock.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 
 
 def end_with_parent(parent: int) -> None:
-    """Have the kernel kill this process when the thread that started it ends; nothing where there is no such thing.
+    """Let the kernel kill this process when the thread that started it ends (Linux only).
 
     Args:
         parent: id of the process that started this one.
@@ -23,12 +23,12 @@ def end_with_parent(parent: int) -> None:
 
         pr_set_pdeathsig = 1  # <linux/prctl.h>
         ctypes.CDLL(None, use_errno=True).prctl(pr_set_pdeathsig, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before the kernel was told
+    if os.getppid() != parent:  # it ended before the call above
         os._exit(1)
 
 
 def work(socket: int) -> None:
-    """Answer jobs until the parent ends or closes the socket. The first message says what to import."""
+    """Run jobs until the parent ends or closes the socket. The first message lists the modules to import."""
     import logging
     import pickle
     import queue
@@ -54,13 +54,13 @@ def work(socket: int) -> None:
     spawn.prepare(pickle.loads(received.get()))
     del current._inheriting  # type: ignore[attr-defined]
     logging.getLogger("gsmap.methods").setLevel(logging.ERROR)  # the parent has warned of methods that do not load
-    parent.send_bytes(b"")  # it has begun: what ends it from now on is a job
+    parent.send_bytes(b"")  # the worker has begun: from now on only a job can end it
     while True:
         parent.send_bytes(answer(received.get()))
 
 
 def answer(message: bytes) -> bytes:
-    """What a job returned or raised, as the parent can load it: ``(True, result)`` or ``(False, error)``."""
+    """Return the pickled result or error of a job: ``(True, result)`` or ``(False, error)``."""
     import pickle
     import traceback
 
@@ -68,13 +68,13 @@ def answer(message: bytes) -> bytes:
         job, arguments = pickle.loads(message)
         return pickle.dumps((True, job(*arguments)), pickle.HIGHEST_PROTOCOL)
     except BaseException as error:
-        told = "".join(traceback.format_exception(error))
-        error.add_note(f"in a worker process:\n{told.rstrip()}")
+        trace = "".join(traceback.format_exception(error))
+        error.add_note(f"in a worker process:\n{trace.rstrip()}")
         try:
             packed = pickle.dumps((False, error.with_traceback(None)), pickle.HIGHEST_PROTOCOL)
             pickle.loads(packed)
         except Exception:  # an error whose class cannot be made again from its arguments
-            packed = pickle.dumps((False, RuntimeError(told.rstrip())), pickle.HIGHEST_PROTOCOL)
+            packed = pickle.dumps((False, RuntimeError(trace.rstrip())), pickle.HIGHEST_PROTOCOL)
         return packed
 
 

@@ -11,6 +11,9 @@ import numpy as np
 from gsmap.types import Gaussians, ScenePose, Sim3
 from gsmap.types.metre import KnownBy, Metre
 
+PLAUSIBLE_M = (0.25, 4.0)
+"""Estimated metres per scene unit between which a scene's own unit may be the metre."""
+
 # Devices' metres are off by 1 to 3 percent, all captures of one device alike: many of them are no better than one.
 _TOLD_SIGMA = 0.01  # of what a person measured: a tape is that good, and so is a look at where it was laid
 _MEASURED_SIGMA = 0.02  # of captures that are said to be in metres

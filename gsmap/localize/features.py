@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.localize import views
 from gsmap.localize.filters import highest, lowest
 from gsmap.methods.extractor import Extractor
-from gsmap.render import Rendered, render
+from gsmap.render import Rendering, render
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.localization import Keypoints, SceneFeatures
 
@@ -89,13 +89,13 @@ def _largest_first(found: Keypoints, rows: np.ndarray) -> np.ndarray:
     return np.argsort(-found.sizes_px[rows], kind="stable")
 
 
-def picture(shown: Rendered, row: int = 0) -> np.ndarray:
+def picture(shown: Rendering, row: int = 0) -> np.ndarray:
     """(H, W, 3) uint8 of a render."""
     return (np.clip(np.nan_to_num(shown.colour[row]), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def lifted(
-    found: Keypoints, shown: Rendered, camera: Cameras, params: Params | None = None
+    found: Keypoints, shown: Rendering, camera: Cameras, params: Params | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which features lie on a surface whose place is known, and where.
 
@@ -116,7 +116,7 @@ def lifted(
     return rows, unprojected(found.pixels[rows], depth, camera)
 
 
-def sound_depth(shown: Rendered, params: Params | None = None) -> np.ndarray:
+def sound_depth(shown: Rendering, params: Params | None = None) -> np.ndarray:
     """(H, W) depth where the surface is opaque and smooth, else 0."""
     params = params or Params()
     depth, size = shown.depth[0], 2 * params.around_px + 1

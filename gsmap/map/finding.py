@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmap import find
 from gsmap.describe.objects.layer import descriptor_id
-from gsmap.describe.seeing import embedded_picture, embedded_text
+from gsmap.describe.query_embedding import embed_query_picture, embed_query_text
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map import models
 from gsmap.map.objects import Known, known_objects
@@ -281,14 +281,14 @@ def _shown(store: Store, request: Request, settings: Settings) -> _Vector | None
     params, specs = settings.describe.object, models.specs(store)
     if request.text is not None:
         try:
-            features = embedded_text(request.text, params, specs)
+            features = embed_query_text(request.text, params, specs)
         except ConfigError as error:
             raise ConfigError(
                 f"no object is called {request.text!r} (gsmap edit MAP o12 --name), and {error}",
                 code="object_not_found",
             ) from error
         return _Vector(features, np.ones(len(features), bool))
-    return None if request.picture is None else _Vector(*embedded_picture(request.picture, params, specs))
+    return None if request.picture is None else _Vector(*embed_query_picture(request.picture, params, specs))
 
 
 def _asked(store: Store, request: Request, index: _Index) -> Sequence[Sighting] | _Vector:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmap.engine import Kept
+from gsmap.engine import WorkerSession
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
@@ -156,7 +156,7 @@ class Map(AbstractContextManager["Map"]):
         self.store = store
         self._progress = logged(progress)
         self._run: tuple[str | None, dict[str, Any]] = (None, {})
-        self._workers = Kept()
+        self._workers = WorkerSession()
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from gsmap.errors import NotFoundError
-from gsmap.geometry.metres import SceneUnit, metre_of
+from gsmap.geometry.metres import PLAUSIBLE_M, SceneUnit, metre_of
 from gsmap.store import Store
 from gsmap.types import PoseGraph, ScenePose
 from gsmap.types.metre import Metre
@@ -35,7 +35,7 @@ def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dic
     told, policies = store.scenes.told_metres(), {scene.id: scene.scale_policy for scene in store.scenes.brief()}
     guesses = {graph.scene: graph.unit_m for graph in store.graphs.says()}  # oldest first: the newest stays
     components: dict[int, list[tuple[SceneUnit, ScenePose]]] = {}
-    low, high = settings.describe.unit.plausible_m
+    low, high = PLAUSIBLE_M
     for pose in graph.poses.values() if graph else ():
         policy, guess = policies.get(pose.scene), guesses.get(pose.scene)
         if policy is None:

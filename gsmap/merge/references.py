@@ -13,7 +13,7 @@ from gsmap.merge import photos
 from gsmap.merge.changes import Settled, newest_first
 from gsmap.merge.placed import share_in_view
 from gsmap.merge.sights import surface_axes
-from gsmap.render import Rendered, render
+from gsmap.render import Rendering, render
 from gsmap.types import Cameras, Gaussians, PlacedScene
 from gsmap.types.progress import Progress
 
@@ -212,7 +212,7 @@ def _best_views(
 
 
 def _count(
-    seen: Rendered, disputed: np.ndarray | None, pixels: np.ndarray, sure: np.ndarray, largest: np.ndarray
+    seen: Rendering, disputed: np.ndarray | None, pixels: np.ndarray, sure: np.ndarray, largest: np.ndarray
 ) -> None:
     """What shows where something was taken away was never seen there: it counts for nothing."""
     shown = seen.dominant_id[0]

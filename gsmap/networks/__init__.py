@@ -1,4 +1,4 @@
-"""Networks that users give, as ONNX files: run in processes of their own, within limits. Only here is onnxruntime."""
+"""ONNX networks from users, run in processes of their own within limits. Only this room imports onnxruntime."""
 
 from gsmap.networks.file import refuse_external_data
 from gsmap.networks.process import ModelProcess

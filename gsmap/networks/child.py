@@ -1,8 +1,7 @@
-"""The process that runs one ONNX model, within limits that it sets itself: memory, files, and the life of its parent.
+"""Script of the process that runs one ONNX model, within limits on memory, files and its parent's life.
 
-It is run as a script, knows nothing of gsmap, and is asked and answers over one socket (`gsmap.networks.process`
-is the other end): headers in JSON; arrays lie in memory that both share, what does not fit there follows its header.
-Nothing that is received is executed.
+It imports nothing of gsmap, and exchanges messages with `gsmap.networks.process` over one socket: headers in JSON,
+arrays in shared memory, and arrays that do not fit there after their header. Nothing received is executed.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _ALIGNED = 64
 
 
 class Channel:
-    """One end of the conversation.
+    """One end of the socket between the model process and its parent.
 
     Args:
         link: to the other end.
@@ -40,7 +39,7 @@ class Channel:
         self._size = 0
 
     def reserve(self, size: int) -> None:
-        """Make the shared memory at least so large; for the end whose files are not limited."""
+        """Grow the shared memory to at least this size; only for the end whose files are not limited."""
         if size > self._size:
             os.ftruncate(self.shared, size)
 
@@ -95,7 +94,7 @@ class Channel:
         return header, arrays
 
     def _map(self) -> None:
-        """See the shared memory in the size that it has now."""
+        """Map the shared memory in its current size."""
         size = os.fstat(self.shared).st_size
         if size != self._size:
             self._memory, self._size = mmap.mmap(self.shared, size), size
@@ -116,7 +115,7 @@ class Channel:
 
 
 def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
-    """Load the model, say what it takes and gives, then run it as often as asked."""
+    """Load the model, send its inputs and outputs, then run it for every request."""
     channel = Channel(socket.socket(fileno=link), shared)
     _end_with_parent()
     # Of all processes this one goes first when the machine runs out of memory.
@@ -137,21 +136,21 @@ def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
         return
     while True:
         try:
-            asked, arrays = channel.receive(memory_bytes)
+            request, arrays = channel.receive(memory_bytes)
         except EOFError:
             return
         try:
-            given = session.run(asked["outputs"], dict(zip(asked["names"], arrays, strict=True)))
-            if not all(isinstance(value, np.ndarray) and value.dtype.kind in "biufc" for value in given):
+            results = session.run(request["outputs"], dict(zip(request["names"], arrays, strict=True)))
+            if not all(isinstance(value, np.ndarray) and value.dtype.kind in "biufc" for value in results):
                 raise TypeError("it gives something else than arrays of numbers")
-            channel.send({}, given)
-            del given, arrays
+            channel.send({}, results)
+            del results, arrays
         except BaseException as error:
             channel.send(_problem(error), [])
 
 
 def _limit(memory_bytes: int) -> None:
-    """From now on: so many bytes beyond what the libraries have mapped, no file made longer, no core dumped."""
+    """Limit this process: so much memory beyond the mapped libraries, no file made longer, no core dump."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     with contextlib.suppress(OSError, ValueError):  # not Linux, where nothing limits the memory of a process
@@ -161,7 +160,7 @@ def _limit(memory_bytes: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """Its end of the pipe closes however the parent ends, SIGKILL included, and that ends this process."""
+    """End this process with its parent: the parent's end of the pipe closes however it ends, SIGKILL included."""
     if sys.platform.startswith("linux"):  # by the kernel's hand, whatever keeps the threads here
         fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
         fcntl.fcntl(0, fcntl.F_SETFL, fcntl.fcntl(0, fcntl.F_GETFL) | os.O_ASYNC)

@@ -1,4 +1,4 @@
-"""Reading just enough of an ONNX file to know that all its weights are inside it."""
+"""Check that an ONNX file holds all its weights."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmap.errors import InputError
 
-# Which fields of which message lead to tensors (onnx.proto3); a tensor's field 13 names a file outside the model.
+# Fields that lead to tensors, by message (onnx.proto3); a tensor's field 13 names a file outside the model.
 _CHILDREN = {
     "model": {7: "graph", 25: "function"},
     "graph": {1: "node", 5: "tensor", 15: "sparse"},
@@ -20,10 +20,10 @@ _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
 
 
 def refuse_external_data(path: Path) -> None:
-    """Refuse a model that asks for other files to be read.
+    """Refuse a model that refers to other files.
 
     Raises:
-        InputError: it does, or the file is not a protobuf message.
+        InputError: weights are in other files, or the file is not a protobuf message.
     """
     try:
         outside = _has_external(memoryview(path.read_bytes()), "model", 0)

@@ -1,4 +1,4 @@
-"""Models run in processes of their own, which end when a model takes too long, when nobody needs them, and with us."""
+"""Models in processes of their own, which end on a time limit, when unused, and with this process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsmap.networks import child
 from gsmap.types.model import ModelLimits, Tensor
 
 _MIB = 1 << 20
-_MOST_S, _MOST_BYTES = 1e6, 1 << 50  # what the system takes for a timeout and a limit
+_MAX_S, _MAX_BYTES = 1e6, 1 << 50  # largest timeout and limit that the system accepts
 _PER_ARRAY_BYTES = 64  # of shared memory, so that each can be aligned
 
 
@@ -44,30 +44,30 @@ class ModelProcess:
 
     def __init__(self, path: str, limits: ModelLimits) -> None:
         self.path, self.limits = path, limits
-        self._memory_bytes = min(limits.memory_mb * _MIB, _MOST_BYTES)
-        self._time_s = min(limits.time_s, _MOST_S)
+        self._memory_bytes = min(limits.memory_mb * _MIB, _MAX_BYTES)
+        self._time_s = min(limits.time_s, _MAX_S)
         self._lock = threading.Lock()
-        self._given_bytes = 0
-        link, theirs = socket.socketpair()
+        self._result_bytes = 0
+        link, child_link = socket.socketpair()
         shared = _shared_memory()
-        command = [sys.executable, "-P", child.__file__, str(theirs.fileno()), str(shared)]
+        command = [sys.executable, "-P", child.__file__, str(child_link.fileno()), str(shared)]
         self._process = subprocess.Popen(
             [*command, path, str(self._memory_bytes)],
             stdin=subprocess.PIPE,  # nothing is written to it: it closes when this process ends
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            pass_fds=(theirs.fileno(), shared),
+            pass_fds=(child_link.fileno(), shared),
             start_new_session=True,  # Ctrl-C is for this process, which ends that one
             env={**os.environ, "MALLOC_ARENA_MAX": "4"},  # each thread's own arena would count as memory
         )
-        theirs.close()
+        child_link.close()
         self._channel = child.Channel(link, shared)
         self.close = weakref.finalize(self, _end, self._process, link, shared)
-        said, _ = self._exchange("loading it", None, {})
-        if "error" in said:
+        answer, _ = self._exchange("loading it", None, {})
+        if "error" in answer:
             self.close()
-            raise InputError(f"{path} is not an ONNX model that can be run: {said['error']}", code="not_a_model")
-        self.inputs, self.outputs = (_tensors(said[end]) for end in ("inputs", "outputs"))
+            raise InputError(f"{path} is not an ONNX model that can be run: {answer['error']}", code="not_a_model")
+        self.inputs, self.outputs = (_tensors(answer[end]) for end in ("inputs", "outputs"))
 
     @property
     def pid(self) -> int:
@@ -78,36 +78,38 @@ class ModelProcess:
         return self.close.alive and self._process.poll() is None
 
     def run(self, outputs: list[str] | None, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        """What the model gives for these inputs.
+        """Run the model on these inputs.
 
         Args:
-            outputs: names; all without.
+            outputs: names; None for all.
 
         Raises:
             InputError: it went beyond a limit, and its process was ended.
-            RuntimeError: what onnxruntime says.
+            RuntimeError: an error of onnxruntime.
         """
         given = ", ".join(f"{name} {list(value.shape)}" for name, value in feed.items())
         with self._lock:
-            said, arrays = self._exchange(f"a run on {given}", outputs, feed)
+            answer, arrays = self._exchange(f"a run on {given}", outputs, feed)
             arrays = [array.copy() for array in arrays]
-        if "error" in said:
-            raise RuntimeError(said["error"])
-        self._given_bytes = sum(array.nbytes + _PER_ARRAY_BYTES for array in arrays)
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        self._result_bytes = sum(array.nbytes + _PER_ARRAY_BYTES for array in arrays)
         return arrays
 
     def _exchange(
         self, what: str, outputs: list[str] | None, feed: Mapping[str, np.ndarray]
     ) -> tuple[dict[str, Any], list[np.ndarray]]:
-        """Its answer to inputs, or what it says when it has loaded; it is ended where there is none in time."""
+        """Send inputs and receive outputs, or the declaration after loading; the process is ended after the time
+        limit.
+        """
         deadline = time.monotonic() + self._time_s
         try:
             if feed:
                 taken = sum(array.nbytes + _PER_ARRAY_BYTES for array in feed.values())
-                self._channel.reserve(max(taken, self._given_bytes))
+                self._channel.reserve(max(taken, self._result_bytes))
                 self._channel.link.settimeout(self._time_s)
                 self._channel.send({"outputs": outputs, "names": list(feed)}, list(feed.values()))
-            said, arrays = self._channel.receive(self._memory_bytes, deadline)
+            answer, arrays = self._channel.receive(self._memory_bytes, deadline)
         except TimeoutError as error:
             self.close()
             raise InputError(
@@ -119,13 +121,13 @@ class ModelProcess:
             self.close()
             code = self._process.returncode
             raise self._too_large(what, signal.Signals(-code).name if code < 0 else f"code {code}") from error
-        except BaseException:  # Ctrl-C: a run that goes on would answer the next question
+        except BaseException:  # Ctrl-C: the answer of a run that goes on would be taken for the next one
             self.close()
             raise
-        if said.get("lacks_memory"):
+        if answer.get("lacks_memory"):
             self.close()
             raise self._too_large(what, "no memory left")
-        return said, arrays
+        return answer, arrays
 
     def _too_large(self, what: str, ended: str) -> InputError:
         return InputError(
@@ -147,7 +149,7 @@ def _tensors(listed: list[Any]) -> tuple[Tensor, ...]:
 
 
 def _shared_memory() -> int:
-    """A file without a name, in memory where the system can."""
+    """Open an unnamed file, in memory where the system can."""
     if hasattr(os, "memfd_create"):
         return os.memfd_create("gsmap-model")
     with tempfile.TemporaryFile() as file:

@@ -1,4 +1,4 @@
-"""Running ONNX models, each in a process of its own (`gsmap.networks`)."""
+"""Sessions of ONNX models, each in a process of its own (`gsmap.networks`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _lock = threading.Lock()
 
 
 def open_session(spec: ModelSpec) -> ModelProcess:
-    """A checked model, ready to `run` within its limits.
+    """Open a checked model, ready to `run` within its limits.
 
     Raises:
         NotFoundError: the file is gone.
@@ -36,10 +36,10 @@ def open_session(spec: ModelSpec) -> ModelProcess:
 
 
 def run(spec: ModelSpec, session: ModelProcess, outputs: list[str] | None, feed: dict[str, Any]) -> list[Any]:
-    """The session's outputs.
+    """Compute the session's outputs.
 
     Raises:
-        InputError: what onnxruntime says of these inputs, or which limit the run went beyond.
+        InputError: onnxruntime refuses these inputs, or the run exceeds a limit.
     """
     try:
         return list(session.run(outputs, feed))
@@ -52,7 +52,7 @@ def run(spec: ModelSpec, session: ModelProcess, outputs: list[str] | None, feed:
 
 
 def declared(path: Path, sha256: str, limits: ModelLimits) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Inputs and outputs of the model in a file whose bytes have this digest.
+    """Return the inputs and outputs of the model in a file whose bytes have this digest.
 
     Raises:
         InputError: not a model that onnxruntime runs within the limits.
@@ -62,7 +62,7 @@ def declared(path: Path, sha256: str, limits: ModelLimits) -> tuple[tuple[Tensor
 
 
 def misfit(spec: ModelSpec, problem: str) -> InputError:
-    """The error for a model whose inputs and outputs are not those of its kind."""
+    """Return the error for a model whose inputs and outputs are not those of its kind."""
     have = ", ".join(f"{t.name} {list(t.shape)}" for t in spec.inputs)
     return InputError(
         f"{spec.path} is not a {spec.kind} model: {problem}; its inputs are {have or 'none'}", code="model_misfit"
@@ -70,7 +70,7 @@ def misfit(spec: ModelSpec, problem: str) -> InputError:
 
 
 def _process(path: str, sha256: str, limits: ModelLimits) -> ModelProcess:
-    """The process of a model; one that was not asked for lately makes room for it, once nobody else holds it."""
+    """Return the process of a model; the least recently used one is dropped, and ends once unused."""
     key = path, sha256, limits
     with _lock:
         found = _processes.pop(key, None)

@@ -1,7 +1,7 @@
-"""Edges in, one pose per scene out: robust, incremental, in as many components as the evidence ties together.
+"""Robust pose-graph optimization: one pose per scene from pairwise edges, in as many components as they connect.
 
-`optimize` is the entry, and `grow` that of who knows that only scenes came; `recipe_key` names its answers; `diff` and
-`moved` compare two of them, `gravity_align` turns one upright, `kept_still` leaves alone what it did not change.
+`optimize` solves a map, and `grow` adds scenes to one whose other measurements are unchanged. `diff` and `moved`
+compare two answers, `gravity_align` turns one upright, and `keep_unchanged_poses` keeps poses that did not change.
 Solvers (gtsam, networkx) load on first use.
 """
 
@@ -11,13 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsmap.optimize.changes import diff, motion, moved
+from gsmap.optimize.edge_likelihood import log_odds_wrong
 from gsmap.optimize.gravity import gravity_align
-from gsmap.optimize.likelihood import log_odds_wrong
 from gsmap.optimize.measurements import check_priors
 from gsmap.optimize.params import Params
+from gsmap.optimize.pose_changes import diff, motion, moved
 from gsmap.optimize.recipe import recipe_key
-from gsmap.optimize.stillness import kept_still
+from gsmap.optimize.unchanged_poses import keep_unchanged_poses
 from gsmap.types import Edge, PoseGraph, Prior
 from gsmap.types.progress import Progress, silent
 from gsmap.types.world import Survey
@@ -29,7 +29,7 @@ __all__ = [
     "gravity_align",
     "grow",
     "joint_covariance",
-    "kept_still",
+    "keep_unchanged_poses",
     "log_odds_wrong",
     "motion",
     "moved",
@@ -48,24 +48,25 @@ def optimize(
     progress: Progress = silent,
     survey: Survey | None = None,
 ) -> PoseGraph:
-    """Poses of all scenes from pairwise edges, some of which are wrong. Pure and deterministic.
+    """Estimate the poses of all scenes from pairwise edges, some of which are wrong. Pure and deterministic.
 
-    Recipe: every edge is voted on by the triangles through it; poses start along the best supported edges; a chordal
-    relaxation and graduated non-convexity refine them; edges that contradict the result are let go and those that agree
-    with it taken in; components join where the evidence suffices, and part where places that look alike tied them; a
-    Levenberg-Marquardt solve per component, with one gauge prior each, gives poses and marginal covariances.
+    Recipe: triangles test the cycle consistency of every edge; poses are initialized along the best supported edges;
+    chordal relaxation and graduated non-convexity refine them; edges that contradict the result are excluded, and
+    edges that agree with it accepted; components join where the evidence suffices, and are split where only places that
+    look alike connect them; a Levenberg-Marquardt solve per component, with one gauge prior each, gives poses and
+    marginal covariances.
 
     Args:
         scene_ids: all scenes of the map, oldest first. The oldest scene of a component holds its frame, and of
             components of one size that of the oldest scene comes first; nothing else depends on their order.
         edges: the measurements to consider, in any order; leave out what a person rejected.
-        priors: outside knowledge. A component whose priors leave a freedom open is held there by its anchor scene.
-        previous: the last answer. Its largest component's frame survives, so that maps do not jump. In large maps, if
-            only few scenes are new, they are placed in it (``provenance.method == "incremental"``); see `Params`.
+        priors: pose priors. The anchor scene of a component fixes the freedom that its priors leave open.
+        previous: the previous answer. The frame of its largest component is kept, so that maps do not jump. In large
+            maps a few new scenes are placed in it (``provenance.method == "incremental"``); see `Params`.
         params: see `Params`.
         progress: called with a fraction and a short text.
-        survey: observations of the world, positions in the world frame. They bend the components that they tie to the
-            world, and never move one as a whole: where it lies is in ``world`` of the answer.
+        survey: observations of the world, positions in the world frame. They deform the components that they
+            georeference, and never move one as a whole: its pose in the world is in ``world`` of the answer.
 
     Raises:
         InputError: an edge or prior is unusable, or confirmed edges contradict each other; the message names it.
@@ -74,7 +75,7 @@ def optimize(
     from gsmap.optimize.incremental import place_new
 
     params = params or Params()
-    # What is summed, numbered or tried first may decide what is close: by content, not by who came first.
+    # The order of sums and trials may decide close cases: order by content, not by arrival.
     edges = sorted(edges, key=lambda edge: (edge.target, edge.source))
     priors = sorted(priors, key=lambda prior: prior.scene)
     if previous is not None:
@@ -87,8 +88,7 @@ def optimize(
 def surroundings(
     scene_ids: Sequence[str], pairs: Sequence[tuple[str, str]], previous: PoseGraph, params: Params
 ) -> tuple[set[str], set[str]]:
-    """The scenes that placing the new ones in the last answer looks at, and the outermost of them, in which nothing may
-    move without a look further; none where everything is solved anew.
+    """Return the scenes within reach of the new scenes in the previous answer, and the outermost ring of them.
 
     Args:
         pairs: (target, source) of all edges that `optimize` would be given.
@@ -99,12 +99,12 @@ def surroundings(
 
 
 def grow(scene_ids: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, params: Params) -> PoseGraph | None:
-    """What `optimize` answers where it can place the new scenes in the last answer; None where it cannot.
+    """Place the new scenes in the previous answer; None where only a full solve will do.
 
-    For who knows that nothing else has changed: edges between old scenes, priors, observations.
+    The caller guarantees that edges between old scenes, priors and observations have not changed.
 
     Args:
-        edges: those among the `surroundings`, by (target, source).
+        edges: edges among the `surroundings`, by (target, source).
     """
     from gsmap.optimize.incremental import grow
 
@@ -119,13 +119,13 @@ def joint_covariance(
     scenes: Sequence[str],
     component: int,
 ) -> np.ndarray | None:
-    """(7 + 7 S, 7 + 7 S) covariance of ``S_world_map`` and the poses of some scenes of a component, together.
+    """Compute the joint covariance (7 + 7 S, 7 + 7 S) of ``S_world_map`` and the poses of S scenes of a component.
 
     Each over [rotation, translation, log scale] on its source side; zero for the world where the component is not tied.
-    Marginals do not tell how well two scenes are known to each other: next to each other they err alike.
+    Marginals do not give the uncertainty between two scenes: neighbouring scenes have common errors.
 
     Args:
-        answer: as `optimize` gave it, with the edges, priors and observations that it rests on.
+        answer: an answer of `optimize`, with its edges, priors and observations.
 
     Returns:
         None where the scenes are alone, or the system cannot be solved.

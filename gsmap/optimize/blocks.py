@@ -49,7 +49,7 @@ class BlockSystem:
         W: np.ndarray,
         r: np.ndarray,
     ) -> np.ndarray:
-        """One least-squares solve.
+        """Solve one least-squares problem.
 
         Args:
             A, B: (E, M, dim). W: (E, M, M). r: (E, M, K): K right-hand sides at once.

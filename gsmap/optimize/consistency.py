@@ -1,4 +1,4 @@
-"""Whether edges agree with the component they lie in, and with each other (pairwise consistency, as in PCM)."""
+"""Pairwise consistency of edges (as in PCM, Mangelson et al. 2018), and consistency with their component."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsmap.optimize.structure import ranges
 def consistent_with_component(
     edges: Measurements, rows: np.ndarray, drift: DriftModel, probability: float, gates: float = 1.0
 ) -> np.ndarray:
-    """(len(rows),) bool: the edge, inside one component, agrees with the component's own prediction of it.
+    """Test edges inside a component: (len(rows),) bool, True where the component's own prediction agrees.
 
     Args:
         gates: an edge agrees up to this many times the chi-square of ``probability``.
@@ -37,7 +37,7 @@ def consistent_with_component(
 
 @dataclass(frozen=True, eq=False)
 class DirectedEdges:
-    """Edges read as statements of how the part of the map at their ``far`` end lies in that at their ``near`` end.
+    """Edges as measurements of the pose of the part at their ``far`` end in the part at their ``near`` end.
 
     Args:
         near, far: (K,) scenes.
@@ -52,7 +52,7 @@ class DirectedEdges:
 
     @classmethod
     def of(cls, edges: Measurements, rows: np.ndarray, turned: np.ndarray) -> DirectedEdges:
-        """Edges at ``rows``, read from source to target where ``turned``."""
+        """Direct the edges at ``rows``, from source to target where ``turned``."""
         a, b, measured, dim = edges.targets[rows], edges.sources[rows], edges.measured[rows], edges.dim
         covariance = edges.covariance[rows].copy()
         adjoint = measured[turned].adjoint()[:, :dim, :dim]
@@ -63,7 +63,9 @@ class DirectedEdges:
     def pairwise_consistent(
         self, first: np.ndarray, second: np.ndarray, drift: DriftModel, probability: float
     ) -> np.ndarray:
-        """(P,) bool: edges ``first`` and ``second`` say the same, within their noise and that of the map between."""
+        """Test pairs of edges: (P,) bool, True where both agree within their noise and the drift of the map between
+        them.
+        """
         poses, dim = drift.poses, self.covariance.shape[1]
         a, b, measured, covariance = self.near, self.far, self.measured, self.covariance
         limit = chi2_quantile(probability, dim)
@@ -85,7 +87,7 @@ class DirectedEdges:
 def agreeing_pairs(
     edges: Measurements, rows: np.ndarray, drift: DriftModel, ends: np.ndarray, probability: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (positions in ``rows``) of edges between the same two components that predict the same relative pose."""
+    """Find pairs (positions in ``rows``) of edges between two components that predict the same relative pose."""
     poses, labels = drift.poses, drift.labels
     # Direct every edge from the component of lower number.
     directed = DirectedEdges.of(edges, rows, labels[edges.targets[rows]] > labels[edges.sources[rows]])

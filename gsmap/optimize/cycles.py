@@ -1,4 +1,4 @@
-"""The 3-cycle vote: an edge that closes a triangle with two others, within their noise, is supported by it."""
+"""Cycle consistency over triangles: an edge that closes a triangle within the noise is supported by it."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from gsmap.optimize.structure import ranges
 
 
 @dataclass(frozen=True, eq=False)
-class Vote:
-    """What the cycles through each edge say.
+class CycleSupport:
+    """Cycle support of E edges.
 
     Args:
         agree: (E,) number of triangles that agree.
-        support: (E,) of the pairs of a neighbour of one end and one of the other, the share that is tied as well (or is
-            one scene). High inside a place, whose scenes see the same neighbours; low for edges to a place that only
-            looks the same, unless every single pair there was mistaken. Neighbours are counted over edges that some
-            triangle bears out.
+        support: (E,) fraction of the pairs of a neighbour of one end and one of the other that an edge connects (or
+            that are one scene). High inside a place, whose scenes share neighbours; low for edges to a place that only
+            looks the same, unless every pair there was mistaken. Neighbours are counted over edges with an agreeing
+            triangle.
     """
 
     agree: np.ndarray
     support: np.ndarray
 
-    def spread(self, rows: np.ndarray, count: int) -> Vote:
-        """The vote on the edges at ``rows`` as one on all ``count``; on the others nothing was said."""
+    def spread(self, rows: np.ndarray, count: int) -> CycleSupport:
+        """Extend the support of the edges at ``rows`` to all ``count`` edges; the others have none."""
         agree, support = np.zeros(count, dtype=self.agree.dtype), np.zeros(count)
         agree[rows], support[rows] = self.agree, self.support
-        return Vote(agree, support)
+        return CycleSupport(agree, support)
 
     @classmethod
-    def of(cls, edges: Measurements, agree: np.ndarray) -> Vote:
+    def of(cls, edges: Measurements, agree: np.ndarray) -> CycleSupport:
         n, a, b = edges.num_scenes, edges.targets, edges.sources
         good = np.flatnonzero(agree > 0)
         tied = sp.coo_matrix((np.ones(len(good)), (a[good], b[good])), shape=(n, n)).tocsr()
@@ -53,11 +53,11 @@ class Vote:
         )
         # Paths a - i - j - b, less those that walk the edge itself to and fro.
         paths = three - own * (degree[a] + degree[b] - 1)
-        # Half a path of three is assumed, so that few neighbours say little.
+        # Half a path of three is assumed, so that few neighbours count for little.
         return cls(agree, (paths + shared + 0.5) / ((degree[a] - own) * (degree[b] - own) + 3.0))
 
 
-def vote(edges: Measurements, probability: float) -> Vote:
+def count_cycle_support(edges: Measurements, probability: float) -> CycleSupport:
     """Count the triangles through every edge that close within their noise.
 
     A triangle agrees if the chi-square of the product of its three measurements, with their covariances transported
@@ -65,11 +65,11 @@ def vote(edges: Measurements, probability: float) -> Vote:
     """
     triangles, signs = list_triangles(edges.targets, edges.sources, edges.num_scenes)
     agrees = cycle_chi2(edges, triangles, signs) < chi2_quantile(probability, edges.dim)
-    return Vote.of(edges, np.bincount(triangles[agrees].ravel(), minlength=len(edges)))
+    return CycleSupport.of(edges, np.bincount(triangles[agrees].ravel(), minlength=len(edges)))
 
 
 def list_triangles(targets: np.ndarray, sources: np.ndarray, num_scenes: int) -> tuple[np.ndarray, np.ndarray]:
-    """All triangles of a multigraph.
+    """List all triangles of a multigraph.
 
     Every edge is directed from its end of lower degree to the other, which bounds the pairs of edges to look at by
     E^1.5 however many edges one scene has (Chiba and Nishizeki 1985).
@@ -104,7 +104,7 @@ def list_triangles(targets: np.ndarray, sources: np.ndarray, num_scenes: int) ->
 
 
 def cycle_chi2(edges: Measurements, cycles: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """(T,) chi-square of the product around each cycle of three edges, with D degrees of freedom.
+    """Compute the chi-square (T,) of the product around each cycle of three edges, with D degrees of freedom.
 
     The noise of a stored edge sits on its source side; traversed forwards it already sits at the far end of that edge,
     traversed backwards it is moved there by the adjoint. From there the rest of the cycle carries it to the start.

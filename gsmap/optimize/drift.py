@@ -1,4 +1,4 @@
-"""How far a prediction along a chain of edges may be off."""
+"""Drift model: uncertainty of a pose predicted along a chain of edges."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _MAX_EXACT_HOPS = 20_000_000  # shortest paths (scenes times sources); beyond it
 
 @dataclass(frozen=True, eq=False)
 class DriftModel:
-    """How far the prediction between two scenes may be off: a random walk along the accepted edges between them.
+    """Uncertainty of the predicted relative pose of two scenes: a random walk along the accepted edges between them.
 
     After h edges with rotation variance sr^2, translation variance st^2 and length l, a walk is off by h sr^2 in
-    rotation and h st^2 + sr^2 l^2 h^3 / 3 in position (the rotation errors act on ever longer levers). More paths than
-    one only make the truth better than this, so the bound is on the side of letting edges be compared.
+    rotation and h st^2 + sr^2 l^2 h^3 / 3 in position (the rotation errors act on ever longer levers). Further
+    paths only reduce the error, so that the bound errs on the side of comparing edges.
 
     Assumes that the edges between are right and their errors independent, and that one typical edge stands for all:
     a component that holds a wrong edge, or whose edges share a bias, drifts further than this.
@@ -67,11 +67,11 @@ class DriftModel:
         return cls(graph, labels, depth, step, poses)
 
     def bound(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Hops from a to b at most: through the root of their component."""
+        """Return an upper bound of the hops from a to b: through the root of their component."""
         return self.depth[a] + self.depth[b]
 
     def hops(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Hops between scenes of one component."""
+        """Compute the hops between scenes of one component."""
         out = np.zeros(len(a))
         starts, which = np.unique(a, return_inverse=True)
         if len(starts) * len(self.depth) > _MAX_EXACT_HOPS:
@@ -85,7 +85,7 @@ class DriftModel:
         return np.minimum(out, self.bound(a, b))
 
     def variances(self, hops: np.ndarray, at: np.ndarray, dim: int) -> np.ndarray:
-        """(K, dim) diagonal covariance after ``hops``, in the unit of scene ``at``."""
+        """Compute the diagonal covariance (K, dim) after ``hops``, in the unit of scene ``at``."""
         rotation, translation, scale, length = self.step
         unit = np.exp(-2 * self.poses.log_scales[at])
         out = np.empty((len(hops), dim))

@@ -1,4 +1,4 @@
-"""What an answer rests on, in 64 bits."""
+"""64-bit fingerprint of the measurements that an answer was computed from."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from gsmap.types.world import Survey
 
 
 def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = (), survey: Survey | None = None) -> int:
-    """64-bit sum over hashes of all measurements: what an answer rests on must be unchanged to be built upon.
+    """Compute a 64-bit sum over hashes of all measurements, by which unchanged measurements are recognized.
 
-    Independent of their order, and that of two sets is the sum of both (modulo 2^64). Meant to notice change, not to
-    resist an attacker.
+    Independent of the order of measurements, and additive over sets (modulo 2^64). It detects changes, not attacks.
     """
     flat = [(e.S_target_source, e.information, _named(e), 2 + e.confirmed) for e in edges]
     flat += [(p.S_map_scene, np.diag(p.sigmas), f"{p.scene}\0{p.up!r}{p.up_sigma_rad!r}", 4) for p in priors]
@@ -31,10 +30,10 @@ def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = (), survey: Sur
     factors = np.random.default_rng(0).integers(1, 2**63, 64, dtype=np.uint64) | np.uint64(1)
     mixed = ((values.view(np.uint64) ^ (values.view(np.uint64) >> np.uint64(29))) * factors).sum(1)
     mixed = (mixed ^ (mixed >> np.uint64(32))) * factors[0]
-    told = zlib.crc32(canonical(survey).encode()) if survey else 0
-    return int((mixed ^ (mixed >> np.uint64(29))).sum()) + told * 0x9E3779B97F4A7C15
+    observed = zlib.crc32(canonical(survey).encode()) if survey else 0
+    return int((mixed ^ (mixed >> np.uint64(29))).sum()) + observed * 0x9E3779B97F4A7C15
 
 
 def _named(edge: Edge) -> str:
-    """What is hashed of an edge besides its numbers."""
+    """Return the text that is hashed of an edge besides its numbers."""
     return f"{edge.target}\0{edge.source}\0{edge.disagreement!r}{edge.same_visit!r}{edge.log_odds_wrong!r}"

@@ -1,6 +1,6 @@
-"""The gauge of a component: what its priors leave open of its frame, and the anchor scene that holds it there.
+"""Gauge (datum) of a component: the freedom that its priors leave open, and the anchor scene that fixes it.
 
-Turning solved components upright, by what their scenes know of gravity, is another matter: `gsmap.optimize.gravity`.
+`gsmap.optimize.gravity` aligns solved components with the vertical.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ _OUTLIER_ROTATION_DEG = 10.0  # and by more than this, so that drift is not mist
 _OUTLIER_DRAWS = 200  # random triples of position priors that are tried as the frame of a component
 
 
-def anchor_of(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGraph | None) -> int:
-    """The scene that holds the component's frame: its first one from the largest component it had before.
+def choose_anchor(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGraph | None) -> int:
+    """Choose the scene that fixes the component's frame: its oldest one from the largest component it had before.
 
-    Scenes come oldest first, so a component that swallows another keeps its own frame, and re-optimising moves nothing
-    that need not move.
+    Scenes come oldest first, so a component that absorbs another keeps its frame, and solving again moves no scene
+    without need.
     """
     if previous is None:
         return int(scenes[0])
@@ -37,8 +37,11 @@ def anchor_of(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGrap
     return int(known[components.index(surviving)])
 
 
-def open_gauge(poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int) -> np.ndarray:
-    """(K, dim) directions, as steps of the anchor's scene, in which the whole component moves unseen by its priors.
+def free_gauge_directions(
+    poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int
+) -> np.ndarray:
+    """Compute the directions (K, dim), as steps of the anchor, in which the component moves without residual of its
+    priors.
 
     All of them (K = dim) without priors; none if the priors fix rotation, position and, in a graph of similarities,
     scale.
@@ -48,22 +51,24 @@ def open_gauge(poses: Similarities, scenes: np.ndarray, anchor: int, priors: Pri
     start = poses[np.array([anchor])]
     size = max(1e-9, float(np.ptp(poses.translations[scenes], axis=0).max())) * float(np.exp(-start.log_scales[0]))
     unit = np.array([1.0] * 3 + [size] * 3 + [1.0])[:dim]
-    _, J = priors.linearised(poses)
+    _, J = priors.linearize(poses)
     carry = (poses[priors.scenes].inverse() @ poses[np.full(len(priors), anchor)]).adjoint()
     moved = (J @ carry)[:, :, :dim] * unit
     values, vectors = np.linalg.eigh(np.einsum("pij,pik->jk", moved, moved))
     return vectors[:, values < _LOOSE**-2].T / unit
 
 
-def onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose: Sim3) -> Similarities:
+def move_onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose: Sim3) -> Similarities:
     """Move a component as one so that its anchor has the given pose."""
     rows = np.full(len(scenes), anchor)
     move = Similarities.stack([pose] * len(scenes)) @ poses[rows].inverse()
     return poses.replaced(scenes, (move @ poses[scenes]).orthonormalised())
 
 
-def onto_priors(poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int) -> Similarities:
-    """Move a component as one to where its priors want it; what they leave open stays as it is.
+def move_onto_priors(
+    poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int
+) -> Similarities:
+    """Move a component as a whole to fit its priors; the directions that they leave open stay.
 
     A closed-form guess from full poses, positions or up directions, then Gauss-Newton over the component's own degrees
     of freedom.
@@ -72,22 +77,22 @@ def onto_priors(poses: Similarities, scenes: np.ndarray, anchor: int, priors: Pr
         return poses
     poses = _guess(poses, scenes, priors, dim)
     for _ in range(20):
-        held = open_gauge(poses, scenes, anchor, priors, dim)
-        r, J = priors.linearised(poses)
+        held = free_gauge_directions(poses, scenes, anchor, priors, dim)
+        r, J = priors.linearize(poses)
         carry = (poses[priors.scenes].inverse() @ poses[np.full(len(priors), anchor)]).adjoint()
         moved = (J @ carry)[:, :, :dim]
         H = np.einsum("pij,pik->jk", moved, moved) + held.T @ held
         step = -np.linalg.lstsq(H, np.einsum("pij,pi->j", moved, r), rcond=1e-14)[0]
         start = poses[np.array([anchor])]
         target = (start @ exp(step[None])).orthonormalised().item(0)
-        poses = onto_anchor(poses, scenes, anchor, target)
+        poses = move_onto_anchor(poses, scenes, anchor, target)
         if np.abs(step).max() < 1e-10:
             break
     return poses
 
 
-def outlier_priors(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarray:
-    """(P,) bool: priors that stay far off under the one motion of the component that satisfies most of them.
+def find_outlier_priors(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarray:
+    """Find outlier priors (P,): those far off under the motion of the component that satisfies most priors.
 
     Far is more than `_OUTLIER_SIGMAS`, and than `_OUTLIER_ROTATION_DEG` or a typical edge's length. The motions tried
     are those of single full poses and of triples of positions, drawn with a fixed seed.
@@ -117,7 +122,7 @@ def outlier_priors(poses: Similarities, priors: PriorTerms, length: float) -> np
             turn = np.maximum(np.radians(_OUTLIER_ROTATION_DEG), _OUTLIER_SIGMAS / priors.root_weights[:, :3].min(1))
         angle = np.linalg.norm(rotation_vectors(priors.expected.rotations.transpose(0, 2, 1) @ moved.rotations), axis=1)
         good = (shift < allowed) & (angle < turn)
-        # Of motions that satisfy as many, the one that does it better: positions along a line allow two.
+        # Of motions that satisfy equally many, the closer one: positions along a line allow two.
         worth = good.sum() - 0.5 * float(((shift / allowed) ** 2)[good].mean()) if good.any() else 0.0
         best, most = (good, worth) if worth > most else (best, most)
     return ~best if best.any() else best
@@ -132,13 +137,13 @@ def _guess(poses: Similarities, scenes: np.ndarray, priors: PriorTerms, dim: int
         scene = int(priors.scenes[best])
         if dim == 6 or not knows[best, 6]:
             pose = Sim3(pose.rotation, pose.translation, float(np.exp(poses.log_scales[scene])))
-        return onto_anchor(poses, scenes, scene, pose)
+        return move_onto_anchor(poses, scenes, scene, pose)
     placed = np.flatnonzero(knows[:, 3:6].all(1))
     rows = priors.scenes[placed]
     if len(np.unique(rows)) >= 3:
         try:
             S = umeyama(priors.expected.translations[placed], poses.translations[rows], with_scale=dim == 7)
-        except InputError:  # all at one place: they say nothing about orientation
+        except InputError:  # all at one place: orientation is undetermined
             S = Sim3.identity()
         return _moved(poses, scenes, S)
     upright = np.flatnonzero(knows[:, 7:].all(1))

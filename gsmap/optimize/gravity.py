@@ -1,4 +1,4 @@
-"""Turning components upright: the map's z against gravity, where scenes know what is up."""
+"""Upright components: align z of the map with the vertical of its scenes."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _MIN_AGREEMENT = 0.5  # length of the median of unit up directions below which s
 def gravity_align(
     graph: PoseGraph, ups: Mapping[str, np.ndarray], fixed: Collection[str] = (), params: Params | None = None
 ) -> PoseGraph:
-    """The same answer with every component turned as a whole so that up is +z, unless it nearly is already.
+    """Rotate every component as a whole so that up is +z, unless it nearly is already.
 
     Poses relative to each other, and covariances (which are on the scenes' side), do not change.
 
     Args:
-        ups: (3,) direction against gravity in the scene's frame, by scene id; scenes that cannot tell are left out.
+        ups: (3,) direction against gravity in the scene's frame, by scene id, where known.
         fixed: scenes held by a prior; their components stay as they are.
         params: ``max_tilt_deg`` is used.
     """
@@ -35,10 +35,10 @@ def gravity_align(
     poses = dict(graph.poses)
     world = {tie.component: tie for tie in graph.world}
     for component, members in components.items():
-        votes = [p.S_map_scene.rotation @ ups[p.scene] for p in members if p.scene in ups]
-        if not votes or any(p.scene in fixed for p in members):
+        ups_in_map = [p.S_map_scene.rotation @ ups[p.scene] for p in members if p.scene in ups]
+        if not ups_in_map or any(p.scene in fixed for p in members):
             continue
-        up = np.median(votes, axis=0)  # one scene that took a wall for the floor must not tilt the map
+        up = np.median(ups_in_map, axis=0)  # robust to a scene that mistook a wall for the floor
         length = np.linalg.norm(up)
         if length < _MIN_AGREEMENT:
             continue
@@ -53,7 +53,7 @@ def gravity_align(
 
 
 def _turned(tie: WorldTie, turn: Sim3) -> WorldTie:
-    """Where a component lies in the world whose frame was turned."""
+    """Return the world tie of a component whose frame was turned."""
     if tie.S_world_map is None or tie.covariance is None:
         return tie
     to_new = Similarities.stack([turn]).adjoint()[0]

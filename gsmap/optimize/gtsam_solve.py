@@ -1,4 +1,4 @@
-"""The last, exact step: Levenberg-Marquardt and marginal covariances of one component, whose wrong edges are gone."""
+"""Exact solve with GTSAM: Levenberg-Marquardt and marginal covariances of one component without outlier edges."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.gauge import open_gauge
+from gsmap.optimize.gauge import free_gauge_directions
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.priors import PriorTerms
 
@@ -19,13 +19,13 @@ GAUGE_SIGMAS = np.array([1e-4] * 3 + [1e-3] * 3 + [1e-4])
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What a solve found.
+    """Result of `solve`.
 
     Args:
         poses: all of them, those of other scenes as given.
         covariances: (N, 7, 7) marginals on the scene side, zero for other scenes and in the log scale of a rigid
-            graph; None where they were not asked for or could not be computed.
-        problem: why they could not be computed.
+            graph; None where they were not requested or could not be computed.
+        problem: reason why they could not be computed.
     """
 
     poses: Similarities
@@ -34,7 +34,7 @@ class Solution:
 
 
 def solve(edges: Measurements, poses: Similarities, anchor: int, priors: PriorTerms, marginal_scenes: int) -> Solution:
-    """Optimise the scenes that ``edges`` reach, from a good guess, with one gauge prior on ``anchor``.
+    """Optimize the scenes that ``edges`` reach, from a good guess, with one gauge prior on ``anchor``.
 
     The cost is gtsam's: half the sum of ``xi^T information xi`` with ``xi = Log(S_target_source^-1 S_target^-1
     S_source)``, as of its `BetweenFactor`, plus the priors' terms.
@@ -46,7 +46,7 @@ def solve(edges: Measurements, poses: Similarities, anchor: int, priors: PriorTe
     scenes = np.unique(np.r_[edges.targets, edges.sources, anchor])
     factors = _factors(edges, dim)
     start = poses[np.array([anchor])]
-    root = held_directions(edges, poses, scenes, anchor, priors)
+    root = anchor_directions(edges, poses, scenes, anchor, priors)
     if len(root):
         factors.push_back(_gauge_factor(anchor, start, root, dim))
     for k in range(len(priors)):
@@ -68,11 +68,11 @@ def solve(edges: Measurements, poses: Similarities, anchor: int, priors: PriorTe
         return Solution(out, None, str(error).strip().splitlines()[0] if str(error).strip() else "singular")
 
 
-def held_directions(
+def anchor_directions(
     edges: Measurements, poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms
 ) -> np.ndarray:
-    """(K, D) whitened steps of the anchor's scene in which it is held: those that no prior decides."""
-    held = open_gauge(poses, scenes, anchor, priors, edges.dim)
+    """Compute the whitened steps (K, D) of the anchor in which it is fixed: those that no prior determines."""
+    held = free_gauge_directions(poses, scenes, anchor, priors, edges.dim)
     full = len(held) == edges.dim
     out: np.ndarray = held / (GAUGE_SIGMAS[: edges.dim] if full else np.full(edges.dim, GAUGE_SIGMAS[0]))
     return out
@@ -130,7 +130,7 @@ def _prior_factor(prior: PriorTerms, dim: int) -> gtsam.CustomFactor:
     alone = PriorTerms(np.zeros(1, dtype=np.int64), prior.expected, prior.root_weights, prior.ups)
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
-        r, J = alone.linearised(_pose_of(values, scene, dim))
+        r, J = alone.linearize(_pose_of(values, scene, dim))
         if jacobians is not None:
             jacobians[0] = J[0, :, :dim]
         return r[0]
@@ -149,7 +149,7 @@ def _marginals(
 
 
 def objective(edges: Measurements, poses: Similarities) -> float:
-    """gtsam's ``graph.error`` of the edges alone: half the sum of their chi-squares."""
+    """Compute GTSAM's ``graph.error`` of the edges alone: half the sum of their chi-squares."""
     values = gtsam.Values()
     for scene in np.unique(np.r_[edges.targets, edges.sources]).tolist():
         values.insert(scene, to_gtsam(poses, scene, edges.dim))

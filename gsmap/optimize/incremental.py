@@ -1,4 +1,4 @@
-"""Placing new scenes in a solved map: by the edges of the scene alone, with a solve of its surroundings."""
+"""Incremental placement of new scenes in a solved map, by their own edges and a solve of their neighbourhood."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 
 from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.contradictions import contested, contradicting
-from gsmap.optimize.cycles import Vote
-from gsmap.optimize.doubt import find_doubtful
+from gsmap.optimize.aliasing_evidence import find_doubtful
+from gsmap.optimize.component_growth import accept_edges
+from gsmap.optimize.contradictions import find_contested_edges, find_contradicting_edges
+from gsmap.optimize.cycles import CycleSupport
 from gsmap.optimize.fingerprint import fingerprint
-from gsmap.optimize.growing import take_in
 from gsmap.optimize.measurements import Measurements, all_rigid, measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.recipe import recipe_key
 from gsmap.optimize.report import pose_graph
-from gsmap.optimize.robust import Descent, chi_squares
+from gsmap.optimize.robust import GaussNewton, chi_squares
 from gsmap.optimize.state import State
 from gsmap.optimize.structure import component_labels
 from gsmap.types import Edge, EdgeOutcome, PoseGraph, Prior, ScenePose, Sim3
@@ -36,12 +36,12 @@ def place_new(
     params: Params,
     survey: Survey,
 ) -> PoseGraph | None:
-    """The previous answer with the new scenes placed in it, or None where only a full solve will do.
+    """Place the new scenes in the previous answer, or return None where only a full solve will do.
 
     A full solve is due when scenes, measurements between old scenes or the recipe changed, when the map grew by
-    ``params.max_growth`` since the last one, or when a new scene ties components together, closes a long loop or comes
-    with edges that are in doubt or contradict each other. Poses placed here are provisional: only the surroundings of a
-    new scene give way to it.
+    ``params.max_growth`` since the last one, or when a new scene joins components, closes a long loop or has edges that
+    are doubtful or contradict each other. Poses placed here are provisional: only the neighbourhood of a new scene is
+    solved with it.
     """
     new = _to_place(scene_ids, previous, params)
     if not new or not {*survey.scenes(), *(prior.scene for prior in priors)} <= set(previous.poses):
@@ -54,11 +54,10 @@ def place_new(
 
 
 def grow(scene_ids: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, params: Params) -> PoseGraph | None:
-    """As `place_new`, of a caller who knows that all measurements between old scenes, priors and observations are those
-    of the previous answer.
+    """Place new scenes like `place_new`, if all measurements between old scenes, priors and observations are unchanged.
 
     Args:
-        edges: those between the `surroundings`; the others are not asked for.
+        edges: those between the `surroundings`; the others are not needed.
     """
     new = _to_place(scene_ids, previous, params)
     return _place_all(scene_ids, new, edges, previous, params) if new else None
@@ -67,19 +66,19 @@ def grow(scene_ids: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, p
 def surroundings(
     scene_ids: Sequence[str], pairs: Sequence[tuple[str, str]], previous: PoseGraph, params: Params
 ) -> tuple[set[str], set[str]]:
-    """The scenes that placing the new ones looks at, with two rings around them, and the outer of these.
+    """Return the scenes needed to place the new ones, with two more rings around them, and the outermost ring.
 
-    So an edge of any scene but those of the outer ring is one between two of these scenes, and who finds nothing moved
-    in the outer ring (`kept_still` may let more give way) has looked far enough. Empty where only a full solve will do.
+    All edges of scenes inside the outermost ring are between the returned scenes, so that the result is exact if no
+    scene of that ring moves (`keep_unchanged_poses` may move more scenes). Empty where only a full solve will do.
 
     Args:
         pairs: (target, source) of all edges that may be used.
     """
     reached = set(_to_place(scene_ids, previous, params))
-    ties = {pair for pair in pairs if not reached.isdisjoint(pair)}
-    ties |= {pair for pair, outcome in previous.outcomes.items() if outcome.use != "unused"}
+    connected = {pair for pair in pairs if not reached.isdisjoint(pair)}
+    connected |= {pair for pair, outcome in previous.outcomes.items() if outcome.use != "unused"}
     beside: dict[str, list[str]] = {}
-    for a, b in ties:
+    for a, b in connected:
         beside.setdefault(a, []).append(b)
         beside.setdefault(b, []).append(a)
     ring = set(reached)
@@ -90,7 +89,7 @@ def surroundings(
 
 
 def _to_place(scene_ids: Sequence[str], previous: PoseGraph, params: Params) -> list[str]:
-    """The new scenes; none where there are none, or they may not be placed one by one."""
+    """Return the new scenes; none where they may not be placed one by one."""
     known, provenance = previous.poses, previous.provenance
     new = [scene for scene in scene_ids if scene not in known]
     if provenance.recipe != recipe_key(params).recipe or not provenance.measured or params.max_growth <= 0:
@@ -136,14 +135,16 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     before = component_labels(m, np.flatnonzero(accepted))
     nothing = np.zeros(len(m), dtype=np.int64)
     state = State.fresh(m, poses, accepted, PriorTerms.stack((), ()))
-    take_in(m, state, params)
+    accept_edges(m, state, params)
     rows = np.flatnonzero(state.accepted)
     after = component_labels(m, rows)
     mine = np.flatnonzero(after == after[-1])[:-1]
     if len(np.unique(before[mine])) > 1:
         return None
-    # What one edge ties and another contradicts is for the whole map to decide.
-    at_odds = np.union1d(contradicting(m, state, params), np.flatnonzero(contested(m, state, params)))
+    # A scene that one edge connects and another contradicts needs the whole map to decide.
+    at_odds = np.union1d(
+        find_contradicting_edges(m, state, params), np.flatnonzero(find_contested_edges(m, state, params))
+    )
     if state.accepted[len(around) :].sum() < 2 and (at_odds >= len(around)).any():
         return None
     component = max((p.component for p in previous.poses.values()), default=-1) + 1
@@ -159,7 +160,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
         fixed = np.r_[np.array([s in rim for s in near], dtype=bool), False] | (after != after[-1])
         if fixed[mine].all() or not fixed[mine].any():
             fixed[mine] = True
-        descent = Descent(m[rows], fixed)
+        descent = GaussNewton(m[rows], fixed)
         state.poses = descent.fit(state.poses, max_steps=5)
         components[-1] = components[first[0]]
         covariances[-1] = _covariance(len(near), rows, m, state.poses, [previous.poses[s] for s in near])
@@ -167,7 +168,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
         bad = chi_squares(m, state.poses) > gate
         if (bad & state.accepted)[: len(around)].any():
             return None
-    local = pose_graph(m, state.poses, components, covariances, state, Vote.of(m, nothing), params)
+    local = pose_graph(m, state.poses, components, covariances, state, CycleSupport.of(m, nothing), params)
     own_keys = {(e.target, e.source) for e in own}
     poses_now = dict(previous.poses)
     for k, s in enumerate(near):
@@ -186,13 +187,15 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
 
 
 def _updated(old: EdgeOutcome, new: EdgeOutcome) -> EdgeOutcome:
-    """An edge between old scenes after a scene was placed beside it: it may only gain."""
+    """Update an edge between old scenes after a scene was placed beside it: it may only gain."""
     residual = old.residual_chi2 if new.residual_chi2 is None else new.residual_chi2
     return EdgeOutcome("used", residual) if new.use == "used" else replace(old, residual_chi2=residual)
 
 
 def _surroundings(scene: str, own: list[Edge], taken: list[Edge], hops: int) -> tuple[list[str], set[str], list[Edge]]:
-    """Scenes within ``hops`` of the new scene's neighbours, the outermost of them, and the edges between them."""
+    """Return scenes within ``hops`` of the new scene's neighbours, the outermost of them, and the edges between
+    them.
+    """
     reached = {e.source if e.target == scene else e.target: 0 for e in own}
     for hop in range(1, hops + 1):
         ring = {b for e in taken for a, b in ((e.target, e.source), (e.source, e.target)) if reached.get(a) == hop - 1}
@@ -204,7 +207,9 @@ def _surroundings(scene: str, own: list[Edge], taken: list[Edge], hops: int) -> 
 
 
 def _covariance(scene: int, rows: np.ndarray, m: Measurements, poses: Similarities, old: list[ScenePose]) -> np.ndarray:
-    """Provisional: that of the best neighbour, carried over, plus that of the new scene's own edges together."""
+    """Estimate a provisional covariance: that of the best neighbour, propagated, plus that of the new scene's own
+    edges.
+    """
     dim = m.dim
     own = rows[(m.sources[rows] == scene) | (m.targets[rows] == scene)]
     information = np.zeros((dim, dim))

@@ -1,4 +1,4 @@
-"""How densely two parts of a map are tied: what tells places that touch from places that look alike."""
+"""Density of the edges between two parts of a map, which separates adjacent places from similar ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SPARSER = 3.0  # factor by which links between places that look alike are spars
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A set of edges that ties two parts of a map.
+    """A set of edges that connects two parts of a map.
 
     Args:
         rows: its edges.
@@ -35,17 +35,17 @@ class Link:
 
 @dataclass(frozen=True)
 class LinkDensity:
-    """How densely the scenes of a map are tied, against which the density of a link is weighed.
+    """Density of the edges of a map, against which the density of a link is compared.
 
-    Assumption: the places of a true link are tied as often as any, those of look-alikes only where the mistake was
-    made. Of the pairs of a link's end scenes, one of either part, that lie near each other, the share that is tied is
-    Beta distributed about that of the whole map under a true link, and about a part of it (``sparser``) under
-    look-alikes. It fails where every single pair of two places was mistaken, and where a true link is sparse because
-    few pairs were tried.
+    Assumption: a true link has edges as often as any part of the map, one between places that look alike only where
+    registration was mistaken. Of the nearby pairs of a link's end scenes, one of either part, the fraction with an
+    edge is Beta distributed about that of the whole map for a true link, and about a part of it (`_SPARSER`) for a
+    wrong one. It fails where every pair of two places was mistaken, and where a true link is sparse because few
+    pairs were tried.
 
     Args:
-        length: up to which scenes count as near each other, in map units.
-        share: of near pairs, that is tied.
+        length: distance in map units up to which scenes are near each other.
+        share: fraction of near pairs with an edge.
     """
 
     length: float
@@ -71,7 +71,7 @@ class LinkDensity:
         return cls(length, float(np.clip(share, 0.05, 0.9)))
 
     def link(self, edges: Measurements, rows: np.ndarray, moving: np.ndarray, poses: Similarities) -> Link:
-        """A link by its rows, and the log odds that it is wrong."""
+        """Return a link with the log-odds that it is wrong."""
         ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
         still = cKDTree(poses.translations[ends[~moving[ends]]])
         pairs = int(still.count_neighbors(cKDTree(poses.translations[ends[moving[ends]]]), self.length))
@@ -84,14 +84,14 @@ class LinkDensity:
 
 
 def _tied(edges: Measurements, rows: np.ndarray, poses: Similarities, length: float) -> np.ndarray:
-    """(P, 2) pairs of scenes that edges at ``rows`` tie and that lie near each other."""
+    """Return the pairs (P, 2) of nearby scenes that the edges at ``rows`` connect."""
     ends = np.sort(np.stack([edges.targets[rows], edges.sources[rows]], axis=1), axis=1)
     near = np.linalg.norm(poses.translations[ends[:, 0]] - poses.translations[ends[:, 1]], axis=1) <= length
     return np.unique(ends[near], axis=0)
 
 
 def typical_length(edges: Measurements, poses: Similarities) -> float:
-    """Median length of an edge in map units; 0 where there is none."""
+    """Compute the median length of an edge in map units; 0 without edges."""
     if not len(edges):
         return 0.0
     unit = np.exp(poses.log_scales[edges.targets])

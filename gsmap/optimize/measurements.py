@@ -1,4 +1,4 @@
-"""Edges and priors as arrays, every value checked before any solver sees it."""
+"""Edges and priors as arrays, validated before any solver uses them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Measurements:
         information: (E, D, D); D is 6 where every edge is rigid, whatever the scale is then, else 7.
         confirmed: (E,) bool.
         disagreement: (E,) share of the surface seen twice that is not the same, NaN where unknown.
-        same_visit: (E,) bool, next to nothing can have changed between the two captures.
+        same_visit: (E,) bool, both captures are of one visit, so that nothing changed between them.
         log_odds_wrong: (E,) of the evidence, up to a constant; NaN where unknown.
     """
 
@@ -62,7 +62,7 @@ class Measurements:
         return [(ids[a], ids[b]) for a, b in zip(self.targets.tolist(), self.sources.tolist(), strict=True)]
 
     def __getitem__(self, rows: np.ndarray) -> Measurements:
-        """Some of the edges, between the same scenes."""
+        """Select some of the edges, between the same scenes."""
         return Measurements(
             self.scene_ids,
             self.targets[rows],
@@ -132,7 +132,7 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
 
 
 def all_rigid(edges: Sequence[Edge], priors: Sequence[Prior], previous: PoseGraph | None) -> bool:
-    """Whether scale can be left out: nothing has one, so six dimensions suffice."""
+    """Return True if no measurement has a scale, so that six dimensions suffice."""
     return (
         all(e.S_target_source.is_rigid for e in edges)
         and all(p.S_map_scene.is_rigid for p in priors)
@@ -164,7 +164,7 @@ def check_priors(scene_ids: Sequence[str], priors: Sequence[Prior]) -> None:
 
 
 def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
-    """gtsam's noise models accept NaN, singular and non-SPD matrices silently, so none may reach it."""
+    """Validate information matrices: GTSAM's noise models accept NaN, singular and non-SPD ones silently."""
     if not len(information):
         return
     finite = np.isfinite(information).all((1, 2))

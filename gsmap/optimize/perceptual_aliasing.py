@@ -1,12 +1,12 @@
 """Perceptual aliasing: groups of edges that agree with each other and contradict the map, because places look alike.
 
-One such edge is noise; a group means that two places look the same, or that the map is folded. Which of the two
-cannot be told from the group itself, only from the weight of what holds the map together the other way round.
+One such edge is noise; a group means that two places look the same, or that the map is folded. The group alone does not
+decide between both; the weight of the edges that connect the map the other way round does.
 
 Assumptions: of the links of one contradictory loop exactly one is wrong; links are wrong independently of each other;
 and a wrong link is sparser than the map around it (`gsmap.optimize.link_density`). They fail where a place is torn and
-taken for another one at once, where every pair of two places was mistaken, and where so few edges lead round that a
-true link looks as sparse as a wrong one: the map may then fold, or single scenes go to the wrong place.
+mistaken for another one at once, where every pair of two places was mistaken, and where so few edges lead round that a
+true link is as sparse as a wrong one: the map may then fold, or single scenes get a wrong pose.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.consistency import DirectedEdges
 from gsmap.optimize.contradictions import MAX_SUSPECTS
-from gsmap.optimize.cycles import Vote
+from gsmap.optimize.cycles import CycleSupport
 from gsmap.optimize.drift import DriftModel
-from gsmap.optimize.gauge import outlier_priors
+from gsmap.optimize.gauge import find_outlier_priors
 from gsmap.optimize.link_density import Link, LinkDensity, typical_length
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
@@ -41,18 +41,18 @@ _CONTESTED_RATIO = 3  # scenes of which more than one edge in so many crosses a 
 _PRIOR_EDGES = 10.0  # a prior weighs as much as so many edges without a triangle,
 _PRIOR_FACTOR = 2.0  # and is outweighed by a cut of more than so many times its weight
 MAX_WEIGHT = 20_000  # sums of weights must stay within 32 bits
-# The side of this direction tells a motion from its inverse; motions are hardly ever at right angles to odd numbers.
+# The side of this direction separates a motion from its inverse; no motion is likely to be perpendicular to it.
 _GENERIC = np.array([0.8164, 0.5213, 0.2483])
 
 
 @dataclass(eq=False)
-class Findings:
-    """What contradictory loops say, as (E,) bool.
+class AliasingResult:
+    """Edges of contradictory loops, as (E,) bool.
 
     Args:
-        wrong: edges that are surely wrong.
+        wrong: edges that are wrong.
         right: edges of groups that are right against the map.
-        undecided: everything that may be wrong without it being clear what is.
+        undecided: edges that may be wrong, where the evidence does not decide.
     """
 
     wrong: np.ndarray
@@ -60,7 +60,7 @@ class Findings:
     undecided: np.ndarray
 
     @classmethod
-    def none(cls, count: int) -> Findings:
+    def none(cls, count: int) -> AliasingResult:
         return cls(*(np.zeros(count, dtype=bool) for _ in range(3)))
 
 
@@ -69,20 +69,20 @@ def resolve_aliased_loops(
     accepted: np.ndarray,
     settled: np.ndarray,
     poses: Similarities,
-    votes: Vote,
+    cycles: CycleSupport,
     params: Params,
-) -> Findings:
-    """Edges to let go, and the groups that contradict them.
+) -> AliasingResult:
+    """Find the edges to exclude, and the groups of edges that contradict them.
 
-    A group of edges asks for one part of a component to move against another. It and the accepted links on the way
-    round form a loop, and one link of the loop is wrong. The one that surely is is let go (the map stands if it is the
-    group); where none is sure, the group and all links that may be wrong are, and their parts become components of
-    their own: nothing known ties them.
+    A group of edges demands that one part of a component moves against another. It forms a loop with the accepted links
+    on the way round, and one link of the loop is wrong. A link that is probably wrong is excluded (the map stands if it
+    is the group); where none is, the group and all links that may be wrong are undecided, and the parts that they
+    connect become components.
 
     Args:
-        settled: (E,) bool, edges that were let go before and do not count.
+        settled: (E,) bool, edges that were excluded before and do not count.
     """
-    found = Findings.none(len(edges))
+    found = AliasingResult.none(len(edges))
     labels = component_labels(edges, np.flatnonzero(accepted))
     inside = labels[edges.targets] == labels[edges.sources]
     rows = np.flatnonzero(inside & ~accepted & ~settled)
@@ -91,15 +91,15 @@ def resolve_aliased_loops(
     length = typical_length(edges, poses)
     density = LinkDensity.of(edges, accepted, labels, poses)
     drift = DriftModel.over(edges, np.flatnonzero(accepted), poses)
-    # A torn place and the look-alikes that tore it ask for one motion: the place's own edges are those that their
-    # neighbours support, and come first.
-    supported = votes.support >= _WELL_SUPPORTED * np.median(votes.support[accepted])
+    # The edges of a torn place and the wrong edges that tore it demand one motion: edges inside the place are
+    # supported by their neighbours, and are considered first.
+    supported = cycles.support >= _WELL_SUPPORTED * np.median(cycles.support[accepted])
     for group in _groups(edges, rows, drift, length, params.gate_probability):
         inner = supported[group.rows]
         for candidate in (group,) if inner.all() else (group[inner], group):
             if found.wrong.any() or found.undecided.any() or len(np.unique(np.r_[candidate.near, candidate.far])) < 3:
                 continue
-            links = _links(edges, accepted, votes, density, poses, candidate.near, candidate.far, _CUT_DEPTH)
+            links = _links(edges, accepted, cycles, density, poses, candidate.near, candidate.far, _CUT_DEPTH)
             if links:
                 hypothesis = candidate.hypothesis(edges, density, poses)
                 _decide(found, edges, accepted, group, candidate, [hypothesis, *links], params)
@@ -107,21 +107,21 @@ def resolve_aliased_loops(
 
 
 def _decide(
-    found: Findings,
+    found: AliasingResult,
     edges: Measurements,
     accepted: np.ndarray,
-    group: Group,
-    candidate: Group,
+    group: EdgeGroup,
+    candidate: EdgeGroup,
     loop: list[Link],
     params: Params,
 ) -> None:
-    """Which link of a loop is wrong; the first of ``loop`` is the candidate itself, all or a part of the group."""
+    """Decide which link of a loop is wrong; the first of ``loop`` is the candidate, all or a part of the group."""
     log_odds = np.array([link.log_odds_wrong for link in loop])
     probability = np.exp(log_odds - log_odds.max())
     probability /= probability.sum()
     worst = int(probability.argmax())
     if probability[worst] >= params.min_wrong_probability and worst > 0:
-        # What too few edges speak against is not called wrong; the parts that they tie stay apart.
+        # A link that too few edges contradict is undecided, not wrong.
         least = loop[worst].rows
         verdict = found.wrong if len(candidate.rows) >= params.min_bridge_edges or len(least) == 1 else found.undecided
         verdict[least] = True
@@ -135,31 +135,33 @@ def _decide(
         suspects = [
             link for link, p in zip(loop[1:], probability[1:], strict=True) if p * _SPARE_RATIO > probability[worst]
         ]
-        # Where hardly any stands out the wrong one is not among them: parting all would lose what is known.
+        # If many are suspect, the wrong one is not clearly among them, and excluding all would lose right edges.
         suspects = suspects if len(suspects) <= MAX_SUSPECTS else []
         for link in suspects:
             found.undecided[link.rows] = True
             found.undecided |= _contested(edges, accepted, link.rows)
-        # A link deep in the loop may leave other ways round: then the group asks again.
+        # After a cut deep in the loop other ways round may remain: then the group is considered again.
         parts = component_labels(edges, np.flatnonzero(accepted & ~found.undecided))
         if not suspects or (parts[group.near] != parts[group.far]).all():
             found.undecided[group.rows] = True
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
-    """Edges (``rows``) that ask for one motion of the scenes at their ``far`` ends against those at their ``near``."""
+class EdgeGroup:
+    """Edges (``rows``) that demand one motion of the scenes at their ``far`` ends against those at their ``near``
+    ends.
+    """
 
     rows: np.ndarray
     near: np.ndarray
     far: np.ndarray
     motion: Similarities
 
-    def __getitem__(self, keep: np.ndarray) -> Group:
-        return Group(self.rows[keep], self.near[keep], self.far[keep], self.motion)
+    def __getitem__(self, keep: np.ndarray) -> EdgeGroup:
+        return EdgeGroup(self.rows[keep], self.near[keep], self.far[keep], self.motion)
 
     def hypothesis(self, edges: Measurements, density: LinkDensity, poses: Similarities) -> Link:
-        """The link that the group would be, once its scenes have moved."""
+        """Return the link that the group would be once its scenes have moved."""
         ends = np.zeros(edges.num_scenes, dtype=bool)
         ends[self.far] = True
         moved = self.motion[np.zeros(len(self.far), dtype=np.int64)] @ poses[self.far]
@@ -167,7 +169,7 @@ class Group:
 
 
 def _contested(edges: Measurements, accepted: np.ndarray, link: np.ndarray) -> np.ndarray:
-    """(E,) bool: edges of scenes of which one edge in `_CONTESTED_RATIO` or more crosses a link; they join no side."""
+    """Find edges (E,) of scenes of which one edge in `_CONTESTED_RATIO` or more crosses a link; they join no side."""
     n = edges.num_scenes
     across = np.bincount(np.r_[edges.targets[link], edges.sources[link]], minlength=n)
     rows = np.union1d(np.flatnonzero(accepted), link)
@@ -181,15 +183,15 @@ def _contested(edges: Measurements, accepted: np.ndarray, link: np.ndarray) -> n
 def _links(
     edges: Measurements,
     accepted: np.ndarray,
-    votes: Vote,
+    cycles: CycleSupport,
     density: LinkDensity,
     poses: Similarities,
     near: np.ndarray,
     far: np.ndarray,
     depth: int,
 ) -> list[Link]:
-    """The weak links on the way between two sets of scenes: the lightest cut, and then those on either side of it."""
-    parts = smallest_cut(edges, accepted, votes, near, far, _SUPPORT_POWER) if depth else None
+    """Find the weak links between two sets of scenes: the lightest cut, then those on either side of it."""
+    parts = smallest_cut(edges, accepted, cycles, near, far, _SUPPORT_POWER) if depth else None
     if parts is None:
         return []
     rows, moving = parts
@@ -200,20 +202,20 @@ def _links(
     before = ~moving[edges.targets] & ~moving[edges.sources]
     still_end, moving_end = ends[~moving[ends]], ends[moving[ends]]
     return [
-        *_links(edges, accepted & before, votes, density, poses, near, still_end, depth - 1),
+        *_links(edges, accepted & before, cycles, density, poses, near, still_end, depth - 1),
         density.link(edges, rows, moving, poses),
-        *_links(edges, accepted & beyond, votes, density, poses, moving_end, far, depth - 1),
+        *_links(edges, accepted & beyond, cycles, density, poses, moving_end, far, depth - 1),
     ]
 
 
 def contradicted_priors(
-    edges: Measurements, accepted: np.ndarray, poses: Similarities, votes: Vote, priors: PriorTerms
+    edges: Measurements, accepted: np.ndarray, poses: Similarities, cycles: CycleSupport, priors: PriorTerms
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Edges to let go because priors at either end of them contradict each other; priors that are outweighed.
+    """Find the edges to exclude because priors at their ends contradict each other, and the priors that are outweighed.
 
-    The priors of a component are compared under the motion of the component that satisfies most of them. Those it
-    leaves far off either name a part that belongs elsewhere, and the smallest cut to it is let go, or they are wrong
-    themselves, if that cut weighs more than `_PRIOR_FACTOR` times as much.
+    The priors of a component are compared under the motion of the component that satisfies most of them. Outliers
+    either belong to a part of the component that lies elsewhere, and the smallest cut to it is excluded, or they are
+    wrong, if that cut weighs more than `_PRIOR_FACTOR` times as much.
 
     Returns:
         (E,) bool: cut edges; (P,) bool: outweighed priors.
@@ -222,21 +224,23 @@ def contradicted_priors(
     labels = component_labels(edges, np.flatnonzero(accepted))
     for label in np.unique(labels[priors.scenes]):
         mine = np.flatnonzero(labels[priors.scenes] == label)
-        off = outlier_priors(poses, priors[mine], typical_length(edges, poses))
+        off = find_outlier_priors(poses, priors[mine], typical_length(edges, poses))
         if not off.any() or off.all():
             continue
         near, far = priors.scenes[mine[~off]], priors.scenes[mine[off]]
-        parts = smallest_cut(edges, accepted, votes, near, far, _PRIOR_SUPPORT_POWER)
+        parts = smallest_cut(edges, accepted, cycles, near, far, _PRIOR_SUPPORT_POWER)
         bearable = _PRIOR_FACTOR * _PRIOR_EDGES * off.sum()
-        if parts is not None and (1 + votes.agree[parts[0]]).sum() <= bearable:
+        if parts is not None and (1 + cycles.agree[parts[0]]).sum() <= bearable:
             cut[parts[0]] = True
         else:
             outweighed[mine[off]] = True
     return cut, outweighed
 
 
-def _groups(edges: Measurements, rows: np.ndarray, drift: DriftModel, length: float, probability: float) -> list[Group]:
-    """Edges of one component that ask for the same motion."""
+def _groups(
+    edges: Measurements, rows: np.ndarray, drift: DriftModel, length: float, probability: float
+) -> list[EdgeGroup]:
+    """Group the edges of one component that demand the same motion."""
     poses, labels = drift.poses, drift.labels
     a, b = edges.targets[rows], edges.sources[rows]
     motion = poses[a] @ edges.measured[rows] @ poses[b].inverse()
@@ -249,7 +253,7 @@ def _groups(edges: Measurements, rows: np.ndarray, drift: DriftModel, length: fl
     corners = middle + 10 * length * np.eye(3)
     feature = np.concatenate([motion.apply(np.tile(c, (len(rows), 1))) - c for c in corners], axis=1)
     off = np.abs(feature).max(1) > _MIN_MOTION_LENGTHS * length
-    # Motions that are nearly alike, and then those that are the same within what the map knows.
+    # First similar motions, then those that are equal within the uncertainty of the map.
     pairs = cKDTree(feature).query_pairs(_GROUP_LENGTHS * length, p=np.inf, output_type="ndarray")
     pairs = pairs[off[pairs].all(1) & (labels[a[pairs[:, 0]]] == labels[a[pairs[:, 1]]])]
     pairs = pairs[directed.pairwise_consistent(pairs[:, 0], pairs[:, 1], drift, probability)]
@@ -257,29 +261,29 @@ def _groups(edges: Measurements, rows: np.ndarray, drift: DriftModel, length: fl
     which = connected_components(graph, directed=False)[1]
     order = np.argsort(which, kind="stable")
     return [
-        Group(rows[mine], directed.near[mine], directed.far[mine], motion[mine[:1]])
+        EdgeGroup(rows[mine], directed.near[mine], directed.far[mine], motion[mine[:1]])
         for mine in np.split(order, np.flatnonzero(np.diff(which[order])) + 1)
         if len(mine) > 1
     ]
 
 
 def smallest_cut(
-    edges: Measurements, accepted: np.ndarray, votes: Vote, near: np.ndarray, far: np.ndarray, power: float
+    edges: Measurements, accepted: np.ndarray, cycles: CycleSupport, near: np.ndarray, far: np.ndarray, power: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The lightest set of accepted edges, none of them confirmed, that parts ``near`` from ``far``.
+    """Find the lightest set of accepted edges, none of them confirmed, that separates ``near`` from ``far`` (max-flow).
 
     An edge weighs a power of its share of agreeing neighbours: edges inside a place are heavy, so that the cut runs
     between places rather than around the few scenes that are named.
 
     Returns:
-        Rows of the edges, and (N,) bool for the side of ``far``; None where no such set exists, or where a scene is
-        asked to be on both sides.
+        Rows of the edges, and (N,) bool for the side of ``far``; None where no such set exists, or where a scene would
+        have to be on both sides.
     """
     near, far = np.setdiff1d(near, far), np.setdiff1d(far, near)
     if not len(near) or not len(far):
         return None
     n, rows = edges.num_scenes, np.flatnonzero(accepted)
-    good = votes.support[rows] / max(float(np.median(votes.support[rows])), 1e-9)
+    good = cycles.support[rows] / max(float(np.median(cycles.support[rows])), 1e-9)
     weight = 1 + np.round(np.minimum(500 * good**power, MAX_WEIGHT)).astype(np.int64)
     heavy = int(weight.sum()) + 1
     flow = np.where(edges.confirmed[rows], heavy, weight)
@@ -302,7 +306,7 @@ def smallest_cut(
 
 
 def _smoothed(side: np.ndarray, a: np.ndarray, b: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """The cut with scenes moved to the side that most of their edges go to, as long as fewer edges are cut.
+    """Move scenes to the side that most of their edges go to, as long as fewer edges are cut.
 
     Weights draw the cut between places; at its rim a scene of few and light edges may be left on the wrong side.
     """

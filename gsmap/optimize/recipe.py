@@ -1,4 +1,4 @@
-"""What names an answer of the optimiser."""
+"""Recipe of an answer: the versions, settings and solver that determine it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ VERSIONS = {
     "optimize.incremental": 4,
     "perceptual_aliasing": 1,
     "gravity_align": 1,
-    "kept_still": 1,
+    "keep_unchanged_poses": 1,
     "survey": 2,
 }
-"""By piece: raised whenever its answer changes for the same input. They stand here, and not in the modules, because
-those load solvers."""
+"""Version by part, raised whenever its answer changes for the same input. Here, because the modules load solvers."""
 
 
 def recipe_key(params: Params) -> RecipeKey:
-    """The recipe of a solve, without its inputs (scenes, edges, reviews, priors); every setting takes part."""
+    """Return the recipe of a solve without its inputs (scenes, edges, reviews, priors); every setting takes part."""
     return RecipeKey("optimize", "pose_graph", dict(VERSIONS), plain(params), _gtsam())
 
 
 def _gtsam() -> str:
-    """The solver of the last, exact step: another release of it may round otherwise."""
+    """Return the release of the solver of the exact step: another one may round differently."""
     try:
         return f"gtsam {version('gtsam')}"
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""An answer as people read it: scenes and edges by id, with reasons in words."""
+"""Pose graph for callers: scenes and edges by id, with reasons."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.cycles import Vote
+from gsmap.optimize.cycles import CycleSupport
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.robust import chi_squares
@@ -22,17 +22,17 @@ def pose_graph(
     component: np.ndarray,
     covariances: np.ndarray,
     state: State,
-    votes: Vote,
+    cycles: CycleSupport,
     params: Params,
 ) -> PoseGraph:
-    """Scenes and edges by id; its provenance is left to the caller."""
+    """Build the `PoseGraph` of scenes and edges by id; its provenance is left to the caller."""
     sure = state.accepted & ~state.doubtful
     tied = component_labels(m, np.flatnonzero(sure))
-    borne_out = state.accepted & state.doubtful & (tied[m.targets] == tied[m.sources])
+    supported = state.accepted & state.doubtful & (tied[m.targets] == tied[m.sources])
     if not (state.doubtful & ~state.accepted).any():
-        sure |= borne_out  # two captures of places that look alike do not agree with the way round by chance
+        sure |= supported  # two different places do not agree with the way round by chance
     firm = sure & (~bridges(m, sure) | m.confirmed)
-    # Else what is in doubt confirms nothing, and is itself confirmed by what holds without it.
+    # Otherwise doubtful edges confirm no other edge, and are confirmed by undoubted edges.
     blocks = component_labels(m, np.flatnonzero(firm))
     firm |= state.accepted & state.doubtful & (blocks[m.targets] == blocks[m.sources])
     status = _statuses(m, state.accepted, firm)
@@ -47,7 +47,7 @@ def pose_graph(
             )
             for k, scene in enumerate(m.scene_ids)
         },
-        outcomes=_outcomes(m, poses, component, firm, status, state, votes, params),
+        outcomes=_outcomes(m, poses, component, firm, status, state, cycles, params),
         settings=plain(params),
     )
 
@@ -59,7 +59,7 @@ def _outcomes(
     firm: np.ndarray,
     status: np.ndarray,
     state: State,
-    votes: Vote,
+    cycles: CycleSupport,
     params: Params,
 ) -> dict[tuple[str, str], EdgeOutcome]:
     gate = float(chi2_quantile(params.gate_probability, m.dim))
@@ -71,13 +71,14 @@ def _outcomes(
         if firm[k]:
             out[key] = EdgeOutcome("used", residual)
         elif state.accepted[k] and state.doubtful[k]:
-            out[key] = EdgeOutcome("tentative", residual, f"{_unlike(m, k)}: the place changed, or it is another")
+            reason = f"{_disagreement_text(m, k)}: the place changed, or it is another"
+            out[key] = EdgeOutcome("tentative", residual, reason)
         elif state.accepted[k]:
             out[key] = EdgeOutcome("tentative", residual, "in no agreeing cycle: rests on its own verdict alone")
         elif not together[k]:
             reason = state.pending.get(k, "contradicts what else is known of the two components")
             if state.doubtful[k]:
-                reason = f"{_unlike(m, k)}; {reason}"
+                reason = f"{_disagreement_text(m, k)}; {reason}"
             elif state.ambiguous[k]:
                 reason = "contradicts an edge whose evidence is about as good: one is of another place that looks alike"
             elif state.undecided[k]:
@@ -85,22 +86,24 @@ def _outcomes(
             out[key] = EdgeOutcome("unused", None, reason, undecided=True)
         else:
             reason = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
-            if votes.agree[k] > 0:
+            if cycles.agree[k] > 0:
                 reason += "; it agrees with others that do too (a place that looks alike?)"
             if state.doubtful[k]:
-                reason += f"; {_unlike(m, k)}: another place that looks alike"
+                reason += f"; {_disagreement_text(m, k)}: another place that looks alike"
             doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
-            undecided = bool(votes.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
+            undecided = bool(cycles.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
             out[key] = EdgeOutcome("unused", residual, reason, undecided)
     return out
 
 
-def _unlike(m: Measurements, row: int) -> str:
+def _disagreement_text(m: Measurements, row: int) -> str:
     return f"{m.disagreement[row]:.0%} of what both saw is not the same in both"
 
 
 def _statuses(m: Measurements, accepted: np.ndarray, firm: np.ndarray) -> np.ndarray:
-    """(N,) ``placed`` in the largest firmly tied part of a component, ``tentative`` beside it, ``isolated`` alone."""
+    """Return (N,) ``placed`` in the largest firmly connected part of a component, ``tentative`` beside it, ``isolated``
+    alone.
+    """
     component = component_labels(m, np.flatnonzero(accepted))
     blocks = component_labels(m, np.flatnonzero(firm))
     sizes = np.bincount(blocks, minlength=1)[blocks]

@@ -1,4 +1,4 @@
-"""Poses from edges that may be wrong: from a spanning tree, chordal relaxation, graduated non-convexity."""
+"""Robust poses from edges that may be wrong: spanning tree, chordal relaxation, graduated non-convexity."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _GNC_SHRINK = 4.0  # factor by which the robust kernel narrows from one width to
 
 
 def spanning_tree_init(edges: Measurements, rows: np.ndarray, cost: np.ndarray, poses: Similarities) -> Similarities:
-    """Poses by following the cheapest spanning forest of the edges at ``rows`` from each component's first scene.
+    """Initialize poses along the cheapest spanning forest of the edges at ``rows``, from each component's first scene.
 
     Args:
         cost: (len(rows),) positive; a lower one is trusted more.
@@ -58,13 +58,15 @@ def spanning_tree_init(edges: Measurements, rows: np.ndarray, cost: np.ndarray, 
 
 
 def residuals(edges: Measurements, poses: Similarities) -> np.ndarray:
-    """(E, D) ``Log(S_target_source^-1 S_map_target^-1 S_map_source)`` on the source side."""
+    """Compute ``Log(S_target_source^-1 S_map_target^-1 S_map_source)`` (E, D) on the source side."""
     predicted = poses[edges.targets].inverse() @ poses[edges.sources]
     return (edges.measured.inverse() @ predicted).log()[:, : edges.dim]
 
 
-def linearised(edges: Measurements, poses: Similarities, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(E, D, D) derivatives of the residuals ``r`` by a step of the target and of the source, on their source sides."""
+def linearize(edges: Measurements, poses: Similarities, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute derivatives (E, D, D) of the residuals ``r`` by a step of the target and of the source, on their source
+    sides.
+    """
     d = edges.dim
     full = np.zeros((len(edges), 7))
     full[:, :d] = r
@@ -76,13 +78,13 @@ def linearised(edges: Measurements, poses: Similarities, r: np.ndarray) -> tuple
 
 
 def chi_squares(edges: Measurements, poses: Similarities) -> np.ndarray:
-    """(E,) chi-square of every edge under ``poses``, with D degrees of freedom."""
+    """Compute the chi-square (E,) of every edge under ``poses``, with D degrees of freedom."""
     r = residuals(edges, poses)
     return np.einsum("ed,edf,ef->e", r, edges.information, r)
 
 
 def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Similarities:
-    """Least-squares poses without a starting guess; fixed scenes keep theirs.
+    """Estimate poses by least squares without a starting guess; fixed scenes keep theirs.
 
     Rotations by the chordal relaxation (Martinec and Pajdla 2007; Carlone et al. 2015, sec. III-B): solve
     ``R_source^T = R_target_source^T R_target^T`` over all edges as if the entries were free, then project to SO(3).
@@ -97,7 +99,7 @@ def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Simi
     weight_t = 3 / np.einsum("eii->e", covariance[:, 3:6, 3:6])
 
     def solve(A: np.ndarray, B: np.ndarray, weight: np.ndarray, r: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """x over all scenes, from 0 at the unknown ones and ``known`` at the fixed ones."""
+        """Solve for x over all scenes, from 0 at the unknown ones and ``known`` at the fixed ones."""
         start = np.where(still[:, None, None], known, 0.0)
         system = BlockSystem(a, b, still, A.shape[2])
         W = weight[:, None, None] * np.eye(A.shape[1])
@@ -122,8 +124,8 @@ def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Simi
 
 
 @dataclass(frozen=True, eq=False)
-class Descent:
-    """Gauss-Newton over a fixed set of edges.
+class GaussNewton:
+    """Gauss-Newton optimization over a fixed set of edges.
 
     Args:
         edges: what to fit.
@@ -141,14 +143,16 @@ class Descent:
         return BlockSystem(self.edges.targets, self.edges.sources, still, self.edges.dim)
 
     def step(self, poses: Similarities, weights: np.ndarray, r: np.ndarray) -> np.ndarray:
-        """(N, D) Gauss-Newton step from residuals ``r`` and a weight per edge."""
+        """Compute the Gauss-Newton step (N, D) from residuals ``r`` and a weight per edge."""
         edges = self.edges
-        A, B = linearised(edges, poses, r)
+        A, B = linearize(edges, poses, r)
         W = edges.information * weights[:, None, None]
         return self.system.solve(A, B, W, r[:, :, None])[:, :, 0]
 
     def fit(self, poses: Similarities, max_steps: int = 20, tolerance: float = 1e-6) -> Similarities:
-        """Least squares from a good guess, with step halving; stops when the cost gains less than ``tolerance``."""
+        """Fit poses by least squares from a good guess, with step halving; stops when the cost gains less than
+        ``tolerance``.
+        """
         cost = self._cost(poses)
         ones = np.ones(len(self.edges))
         for _ in range(max_steps):
@@ -167,7 +171,7 @@ class Descent:
         return poses
 
     def solve_gnc(self, poses: Similarities, gate: float, widest: float, trusted: np.ndarray) -> Similarities:
-        """Iteratively reweighted least squares with Geman-McClure weights, from wide to the width of the gate.
+        """Fit poses by iteratively reweighted least squares with Geman-McClure weights of decreasing width.
 
         ``w = (c / (c + chi2))^2``; c starts at ``widest`` gates and shrinks by a factor (graduated non-convexity,
         Yang et al. 2020, with a start that cycle consistency makes narrow). ``trusted`` edges keep weight 1.

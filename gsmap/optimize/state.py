@@ -1,4 +1,4 @@
-"""What the solve believes at the moment, its start, and its refinement."""
+"""State of the robust solve: poses and accepted edges, their initialization and refinement."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.consistency import consistent_with_component
-from gsmap.optimize.cycles import Vote
+from gsmap.optimize.cycles import CycleSupport
 from gsmap.optimize.drift import DriftModel
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.priors import PriorTerms
-from gsmap.optimize.robust import Descent, chi_squares, chordal, spanning_tree_init
+from gsmap.optimize.robust import GaussNewton, chi_squares, chordal, spanning_tree_init
 from gsmap.optimize.structure import component_labels, roots
 
 _MAX_FAILURES = 2  # an edge that was excluded so often is not taken in again
@@ -22,16 +22,16 @@ _RESTART_GATES = 4.0  # poses from which an edge is further off are no start for
 
 @dataclass(eq=False)
 class State:
-    """Where scenes are, and which edges are taken in.
+    """Current poses of the scenes, and the edges that are accepted.
 
     Args:
-        poses: N. accepted: (E,) bool, edges taken in.
-        failures: (E,) how often an edge was taken in and let go.
-        undecided, rejected: (E,) bool, edges that places that look alike leave open, or that are surely wrong.
-        terms: priors that are believed.
-        pending: by edge, why the components that it ties may not join.
-        doubtful: (E,) bool, edges whose captures disagree in too much of what both show.
-        ambiguous: (E,) bool, edges that contradict each other and of which the evidence does not tell which is wrong.
+        poses: N. accepted: (E,) bool, accepted edges.
+        failures: (E,) number of times that an edge was accepted and excluded again.
+        undecided, rejected: (E,) bool, edges left open by perceptual aliasing, and edges that are wrong.
+        terms: priors in use.
+        pending: by edge, the reason why its components may not join.
+        doubtful: (E,) bool, edges whose captures disagree in too much of their common surface.
+        ambiguous: (E,) bool, edges that contradict each other where the evidence does not decide.
     """
 
     poses: Similarities
@@ -46,13 +46,13 @@ class State:
 
     @classmethod
     def fresh(cls, m: Measurements, poses: Similarities, accepted: np.ndarray, terms: PriorTerms) -> State:
-        """Nothing has failed yet."""
+        """Return a state in which no edge has failed yet."""
         failures = np.zeros(len(m), dtype=np.int64)
         undecided, rejected, doubtful, ambiguous = np.zeros((4, len(m)), dtype=bool)  # they change in place
         return cls(poses, accepted, failures, undecided, rejected, terms, {}, doubtful, ambiguous)
 
     def spread(self, rows: np.ndarray, count: int) -> State:
-        """The state of the edges at ``rows`` as that of all ``count``, of which the others are not taken in."""
+        """Extend the state of the edges at ``rows`` to all ``count`` edges, of which the others are not accepted."""
 
         def put(values: np.ndarray) -> np.ndarray:
             out = np.zeros(count, dtype=values.dtype)
@@ -66,28 +66,28 @@ class State:
             put(self.undecided),
             put(self.rejected),
             self.terms,
-            {int(rows[row]): why for row, why in self.pending.items()},
+            {int(rows[row]): reason for row, reason in self.pending.items()},
             put(self.doubtful),
             put(self.ambiguous),
         )
 
     def open(self) -> np.ndarray:
-        """Rows of the edges that may still be taken in."""
+        """Return the rows of the edges that may still be accepted."""
         settled = self.accepted | self.undecided | self.rejected
         return np.flatnonzero(~settled & (self.failures < _MAX_FAILURES))
 
     def drift(self, m: Measurements) -> DriftModel:
-        """How far predictions along the accepted edges may be off."""
+        """Return the drift model along the accepted edges."""
         return DriftModel.over(m, np.flatnonzero(self.accepted), self.poses)
 
 
-def initial_state(m: Measurements, votes: Vote, terms: PriorTerms, params: Params) -> State:
-    """Poses along the best supported edges; the supported edges that agree with them are taken in."""
-    accepted = (votes.agree > 0) | m.confirmed
+def initial_state(m: Measurements, cycles: CycleSupport, terms: PriorTerms, params: Params) -> State:
+    """Initialize poses along the best supported edges, and accept the supported edges that agree with them."""
+    accepted = (cycles.agree > 0) | m.confirmed
     rows = np.flatnonzero(accepted)
-    # Confirmed edges first, then what neighbours support, then the more certain measurement.
+    # Confirmed edges first, then by support of neighbours, then by certainty.
     certainty = np.trace(m.covariance[rows], axis1=1, axis2=2)
-    order = np.lexsort((certainty, -votes.support[rows], ~m.confirmed[rows]))
+    order = np.lexsort((certainty, -cycles.support[rows], ~m.confirmed[rows]))
     cost = np.empty(len(rows))
     cost[order] = np.arange(1, len(rows) + 1)
     poses = spanning_tree_init(m, rows, cost, Similarities.identity(m.num_scenes))
@@ -98,7 +98,7 @@ def initial_state(m: Measurements, votes: Vote, terms: PriorTerms, params: Param
 
 
 def refine(m: Measurements, state: State, gate: float, widest: float = 1.0) -> None:
-    """Robust poses of every component from its accepted edges; edges that do not fit are let go.
+    """Refine the poses of every component robustly from its accepted edges; edges that do not fit are excluded.
 
     Args:
         gate: chi-square up to which an edge fits.
@@ -112,7 +112,7 @@ def refine(m: Measurements, state: State, gate: float, widest: float = 1.0) -> N
     edges = m[rows]
     if (chi_squares(edges, state.poses) > _RESTART_GATES * gate).any():
         state.poses = chordal(edges, fixed, state.poses)
-    descent = Descent(edges, fixed)
+    descent = GaussNewton(edges, fixed)
     state.poses = descent.solve_gnc(state.poses, gate, widest, edges.confirmed)
     bad = (chi_squares(edges, state.poses) > gate) & ~edges.confirmed
     state.accepted[rows[bad]] = False

@@ -1,4 +1,4 @@
-"""The structure of the graph of scenes and edges: its components, their first scenes, and its bridges."""
+"""Structure of the graph of scenes and edges: components, their first scenes, and bridges."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsmap.optimize.measurements import Measurements
 
 
 def component_labels(edges: Measurements, rows: np.ndarray) -> np.ndarray:
-    """(N,) component of each scene, tied by the edges at ``rows``; components are numbered by their first scene."""
+    """Label the component (N,) of each scene, connected by the edges at ``rows``, numbered by their first scene."""
     n = edges.num_scenes
     graph = sp.coo_matrix((np.ones(len(rows)), (edges.targets[rows], edges.sources[rows])), shape=(n, n))
     labels = connected_components(graph, directed=False)[1]
@@ -21,12 +21,12 @@ def component_labels(edges: Measurements, rows: np.ndarray) -> np.ndarray:
 
 
 def roots(labels: np.ndarray) -> np.ndarray:
-    """First scene of each component."""
+    """Return the first scene of each component."""
     return np.unique(labels, return_index=True)[1]
 
 
 def bridges(edges: Measurements, accepted: np.ndarray) -> np.ndarray:
-    """(E,) bool: accepted edges on no cycle of accepted edges.
+    """Find bridges (E,): accepted edges on no cycle of accepted edges.
 
     Direct the edges of a depth-first tree downwards and all others, which go to an ancestor, upwards: what is then
     strongly connected is what two edge-disjoint paths connect (Robbins 1939), and the edges between are the bridges.
@@ -53,7 +53,7 @@ def bridges(edges: Measurements, accepted: np.ndarray) -> np.ndarray:
 
 
 def ranges(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row k repeated ``counts[k]`` times, and 0, 1, ... within each row."""
+    """Repeat row k ``counts[k]`` times, with 0, 1, ... within each row."""
     rows = np.repeat(np.arange(len(counts)), counts)
     offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     return rows, offsets

@@ -1,9 +1,9 @@
-"""A component tied to the world: scene poses, ``S_world_map`` and control points from edges and observations together.
+"""Georeferencing of a component: scene poses, ``S_world_map`` and control points from edges and observations together.
 
-The map's frame stays held as it was (by its anchor scene, or by priors), and ``S_world_map`` is free: so observations
-bend the component where its edges leave room, and never move it as a whole. Everything is solved at once, by
-Gauss-Newton on one sparse system, whose inverse then tests every observation against all others and gives covariances.
-See docs/design/0024-world-frame.md.
+The datum of the map stays as it was (its anchor scene, or priors), and ``S_world_map`` is free: so observations deform
+the component within the uncertainty of its edges, and never move it as a whole. All unknowns are solved together by
+Gauss-Newton on one sparse system, whose inverse tests every observation against all others and gives covariances. See
+docs/design/0024-world-frame.md.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.gtsam_solve import held_directions
+from gsmap.optimize.gtsam_solve import anchor_directions
 from gsmap.optimize.measurements import all_rigid, measurements
 from gsmap.optimize.priors import PriorTerms
-from gsmap.optimize.survey_groups import Refusal, solve_groups
-from gsmap.optimize.survey_report import active_of, lengths_only, report
+from gsmap.optimize.survey_groups import SurveyFailure, solve_groups
+from gsmap.optimize.survey_report import active_observations, build_world_tie, tie_by_bars
 from gsmap.optimize.survey_system import Component, System
 from gsmap.optimize.survey_terms import SurveyTerms
 from gsmap.types import Edge, PoseGraph, Prior, Sim3
@@ -27,13 +27,13 @@ from gsmap.types.world import UNSOLVED, Survey, WorldTie
 
 
 @dataclass(frozen=True, eq=False)
-class Surveyed:
-    """A component solved with what was observed of the world.
+class ComponentSolution:
+    """Solution of a component with its observations of the world.
 
     Args:
         poses: all scenes; those of other components as given.
-        covariances: (n, 7, 7) of the component's scenes, in the map's frame; None where it stays as the edges have it.
-        tie: where it lies.
+        covariances: (n, 7, 7) of the component's scenes, in the map's frame; None where observations change nothing.
+        tie: its tie to the world.
     """
 
     poses: Similarities
@@ -43,8 +43,8 @@ class Surveyed:
 
 def tie_component(
     whole: Component, poses: Similarities, survey: Survey, index: int, marginal_scenes: int
-) -> Surveyed | None:
-    """Solve a component with its observations, from poses that its edges alone gave; None where it has none.
+) -> ComponentSolution | None:
+    """Solve a component with its observations, from the poses of its edges alone; None where it has no observations.
 
     Args:
         index: of the component.
@@ -61,23 +61,23 @@ def tie_component(
     except (np.linalg.LinAlgError, RuntimeError, InputError):  # of numpy, a singular factor in scipy, and Sim3
         surveyed = None
     if surveyed is None or not _is_finite(surveyed):
-        return Surveyed(poses, None, lengths_only(system, index, survey, Refusal(UNSOLVED, "unsolved")))
+        return ComponentSolution(poses, None, tie_by_bars(system, index, survey, SurveyFailure(UNSOLVED, "unsolved")))
     return surveyed
 
 
 def _surveyed(
     system: System, whole: Component, poses: Similarities, survey: Survey, index: int, marginal_scenes: int
-) -> Surveyed:
+) -> ComponentSolution:
     found = solve_groups(system, survey.frame)
-    if isinstance(found, Refusal):
-        return Surveyed(poses, None, lengths_only(system, index, survey, found))
+    if isinstance(found, SurveyFailure):
+        return ComponentSolution(poses, None, tie_by_bars(system, index, survey, found))
     x, factor = found.x, found.factor
-    tie = report(system, found, index, survey.frame)
+    tie = build_world_tie(system, found, index, survey.frame)
     covariances = factor.scene_covariances() if len(whole.scenes) <= marginal_scenes else None
-    return Surveyed(poses.replaced(whole.scenes, x.scenes), covariances, tie)
+    return ComponentSolution(poses.replaced(whole.scenes, x.scenes), covariances, tie)
 
 
-def _is_finite(surveyed: Surveyed) -> bool:
+def _is_finite(surveyed: ComponentSolution) -> bool:
     poses, tie = surveyed.poses, surveyed.tie
     numbers = [poses.rotations, poses.translations, poses.log_scales]
     if tie.S_world_map is not None and tie.covariance is not None:
@@ -93,7 +93,7 @@ def joint_of_answer(
     scenes: Sequence[str],
     component: int,
 ) -> np.ndarray | None:
-    """See `gsmap.optimize.joint_covariance`. Nothing is solved but for what the observations alone hold."""
+    """Compute `gsmap.optimize.joint_covariance` by linearizing at the answer; only points without poses are solved."""
     ids = sorted(scene for scene, pose in answer.poses.items() if pose.component == component)
     inside = set(ids)
     mine = [e for e in edges if {e.target, e.source} <= inside and answer.use(e.target, e.source) != "unused"]
@@ -102,10 +102,10 @@ def joint_of_answer(
     m = measurements(ids, mine, rigid=all_rigid(mine, here, answer))
     poses = Similarities.stack([answer.poses[scene].S_map_scene for scene in ids])
     rows, terms = np.arange(len(ids)), PriorTerms.stack(ids, here)
-    # The scene that holds the frame is the one that is known best.
+    # The scene with the smallest covariance is the anchor.
     sure = [answer.poses[scene].covariance for scene in ids]
     anchor = int(np.argmin([np.inf if c is None else float(np.trace(c)) for c in sure]))
-    held = held_directions(m, poses, rows, anchor, terms)
+    held = anchor_directions(m, poses, rows, anchor, terms)
     tie = answer.tie(component)
     tied = tie is not None and tie.S_world_map is not None
     own = SurveyTerms.of(survey if tied else Survey(), m.scene_ids, m.dim)
@@ -117,7 +117,7 @@ def joint_of_answer(
         joint = system.factor(x, system.usable, world_held=True).joint(wanted)
         joint[:7] = joint[:, :7] = 0.0
         return joint
-    active = active_of(system, tie)
+    active = active_observations(system, tie)
     weights = system.as_weights(active)
     x = system.fit(replace(x, points=system.points_at(x, active)), weights, hold=True)
     return system.factor(x, weights).joint(wanted)

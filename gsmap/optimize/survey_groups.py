@@ -1,9 +1,9 @@
-"""Groups of observations with common errors: which of them a component is tied by, and which contradict them.
+"""Groups of observations with common errors: select those that agree, and explain those that contradict.
 
-Control points, the photos of a capture, surveyed scenes and scale bars each err in common, so that no number of photos
-outvotes a control point. The most precise source that ties the component alone is the reference. Every other group is
-predicted from it, with its common errors as unknown as they are; one that agrees adds its information, one that does
-not is named with the shift and its likely reason. See docs/design/0024-world-frame.md.
+Control points, the photos of a capture, surveyed scenes and scale bars each have common errors, so that no number of
+photos outweighs a control point. The most precise source that determines the component alone is the reference. Every
+other group is predicted from it, including the uncertainty of its common errors; one that agrees is used, one that does
+not is reported with its shift and likely cause. See docs/design/0024-world-frame.md.
 """
 
 from __future__ import annotations
@@ -14,34 +14,34 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.optimize.survey_places import NOTHING, Places, known_places
-from gsmap.optimize.survey_report import Refusal, Solution
+from gsmap.optimize.survey_common_points import NOTHING, CommonPoints, collect_common_points
+from gsmap.optimize.survey_report import Solution, SurveyFailure
 from gsmap.optimize.survey_shifts import (
     FEET,
     GROUPS,
-    Shift,
+    CommonShift,
     altitudes,
-    causes,
-    clusters,
-    contradiction,
+    average_shifts,
+    cluster_shifts,
+    describe_contradiction,
+    estimate_shift,
+    format_causes,
     is_unmeasured,
-    joined,
-    reason_of,
-    shift_of,
+    likely_causes,
 )
-from gsmap.optimize.survey_snooping import MAX_ROUNDS, first_points, weakness, without_outliers
+from gsmap.optimize.survey_snooping import MAX_ROUNDS, describe_weakness, exclude_outliers, initial_points
 from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, System
 from gsmap.optimize.survey_terms import Unknowns
 from gsmap.types import Sim3
 from gsmap.types.world import UNSOLVED, Contradiction, WorldFrame
 
-_EQUAL = 2.0  # groups whose sigmas differ by less than this factor are equally precise; votes are counted by it too
-_SPECIFIC = ("altitude_zero", "feet", "above_takeoff")  # reasons that leave a mark of their own in the heights
+_EQUAL = 2.0  # groups whose sigmas differ by less than this factor are equally precise; majorities are judged by it too
+_SPECIFIC = ("altitude_zero", "feet", "above_takeoff")  # causes with a characteristic pattern in the heights
 
 
 @dataclass(frozen=True, eq=False)
-class _Tie:
-    """A solve from some of the places.
+class _PartialSolution:
+    """A solution from some of the places.
 
     Args:
         rows: the places that may be solved from.
@@ -54,7 +54,7 @@ class _Tie:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rival:
+class _ContradictingGroup:
     """A group that contradicts the reference.
 
     Args:
@@ -63,21 +63,21 @@ class _Rival:
     """
 
     rows: np.ndarray
-    shift: Shift
+    shift: CommonShift
     whole: bool
     if_wrong: tuple[str, ...]
     if_right: tuple[str, ...]
 
 
 @dataclass(eq=False)
-class _Verdicts:
-    """Contradictions that were found, and the places that each leaves out."""
+class _ContradictionLog:
+    """Contradictions found so far, and the places that each excludes."""
 
     found: list[Contradiction] = field(default_factory=list)
     rows: list[np.ndarray] = field(default_factory=list)
     reasons: dict[tuple[str, int], str] = field(default_factory=dict)
 
-    def add(self, one: Contradiction, places: Places, rows: np.ndarray | None = None) -> None:
+    def add(self, one: Contradiction, places: CommonPoints, rows: np.ndarray | None = None) -> None:
         if one not in self.found:
             self.found.append(one)
             self.rows.append(np.zeros(0, dtype=np.int64) if rows is None else rows)
@@ -85,20 +85,20 @@ class _Verdicts:
             self.reasons["point" if kind == "points" else "fix", row] = one.text
 
 
-def solve_groups(system: System, frame: WorldFrame | None) -> Solution | Refusal:
-    """Tie a component by the groups of observations that agree, or tell what is missing or contradicts."""
-    places = known_places(system)
+def solve_groups(system: System, frame: WorldFrame | None) -> Solution | SurveyFailure:
+    """Georeference a component by the groups of observations that agree, or return what is missing or contradictory."""
+    places = collect_common_points(system)
     if frame is None or not len(places):
-        return Refusal(NOTHING, "undetermined")
-    return _Groups(system, places, frame).solve()
+        return SurveyFailure(NOTHING, "undetermined")
+    return _GroupSolver(system, places, frame).solve()
 
 
-class _Groups:
-    def __init__(self, system: System, places: Places, frame: WorldFrame) -> None:
+class _GroupSolver:
+    def __init__(self, system: System, places: CommonPoints, frame: WorldFrame) -> None:
         self.system, self.places, self.frame = system, places, frame
-        self.verdicts = _Verdicts()
+        self.verdicts = _ContradictionLog()
 
-    def solve(self) -> Solution | Refusal:
+    def solve(self) -> Solution | SurveyFailure:
         left = self._measured(np.arange(len(self.places)))
         while True:
             found = self._reference(left)
@@ -107,7 +107,7 @@ class _Groups:
             reference, left = found
             rivals, agreeing = self._compared(reference, left)
             wrong = self._resolved(reference, rivals, agreeing)
-            if isinstance(wrong, Refusal):
+            if isinstance(wrong, SurveyFailure):
                 return wrong
             if wrong is None:
                 break
@@ -115,17 +115,17 @@ class _Groups:
         self._explain(reference)
         return self._all(reference, agreeing)
 
-    def _explain(self, reference: _Tie) -> None:
-        """Compare sources that contradict themselves with the reference: it may tell the reason."""
+    def _explain(self, reference: _PartialSolution) -> None:
+        """Compare sources that contradict themselves with the reference, which may reveal the reason."""
         own = str(self.places.kinds[reference.rows[0]])
         for k, (one, rows) in enumerate(zip(self.verdicts.found, self.verdicts.rows, strict=True)):
             if one.cause == "split" and one.kept == "none" and len(rows) >= 2:
                 some = self.places[rows]
                 terms = self.system.terms.observations(reference.x)
-                shift = shift_of(self.system, terms, reference.factor, some, used=False)
+                shift = estimate_shift(self.system, terms, reference.factor, some, used=False)
                 if shift.log_p < np.log(1 - GATE_PROBABILITY):
-                    why = causes(some, replace(shift, shaped=True), self.frame, self._ground(reference.rows))
-                    found = contradiction(some, self._scenes(rows), shift, own, why, "against")
+                    why = likely_causes(some, replace(shift, shaped=True), self.frame, self._ground(reference.rows))
+                    found = describe_contradiction(some, self._scenes(rows), shift, own, why, "against")
                     others = tuple(dict.fromkeys([*found.other_causes, "split", *one.other_causes]))
                     others = tuple(cause for cause in others if cause != found.cause)
                     self.verdicts.found[k] = replace(found, other_causes=others, text=f"{one.text}; {found.text}")
@@ -133,7 +133,7 @@ class _Groups:
     # --- the reference -----------------------------------------------------------------------------------------------
 
     def _measured(self, rows: np.ndarray) -> np.ndarray:
-        """Places without photos whose device wrote no altitude."""
+        """Drop photos whose device wrote no altitude."""
         keep = np.ones(len(rows), dtype=bool)
         for unit in np.unique(self.places.units[rows]):
             mine = rows[self.places.units[rows] == unit]
@@ -159,7 +159,7 @@ class _Groups:
         ]
 
     def _sources(self, rows: np.ndarray) -> list[np.ndarray]:
-        """Rows by source, the most precise first."""
+        """Group rows by source, the most precise first."""
         sources = self.places.sources[rows]
         groups = [rows[sources == source] for source in np.unique(sources)]
         return sorted(groups, key=lambda one: self._sigma_m(one))
@@ -168,34 +168,35 @@ class _Groups:
         reach = self.places[rows].reach_m()
         return float(np.median(np.linalg.norm(reach, axis=1) if axis is None else reach[:, axis]))
 
-    def _reference(self, rows: np.ndarray) -> tuple[_Tie, np.ndarray] | str:
-        """The most precise source that ties the component alone, or else all together; and the places left over.
+    def _reference(self, rows: np.ndarray) -> tuple[_PartialSolution, np.ndarray] | str:
+        """Solve from the most precise source that determines the component alone, or from all; also return the
+        remaining places.
 
         A source that contradicts itself is left out.
         """
-        said, sources = "", self._sources(rows)
+        problem, sources = "", self._sources(rows)
         for mine in sources:
             found = self._alone(mine)
-            if isinstance(found, _Tie):
+            if isinstance(found, _PartialSolution):
                 return found, rows
             if isinstance(found, Contradiction):
                 self.verdicts.add(found, self.places[mine], mine)
                 rows = rows[~np.isin(rows, mine)]
             else:
-                said = said or found
+                problem = problem or found
         remaining = self._sources(rows)
         if not len(remaining):
-            return self.verdicts.found[-1].text if self.verdicts.found else said or NOTHING
+            return self.verdicts.found[-1].text if self.verdicts.found else problem or NOTHING
         if len(remaining) == 1 and len(sources) == 1:
-            return said
+            return problem
         found = self._alone(rows, bars=True)
         if isinstance(found, Contradiction):
             self.verdicts.add(found, self.places[rows])
             return found.text
         return found if isinstance(found, str) else (found, rows)
 
-    def _alone(self, rows: np.ndarray, *, bars: bool = False) -> _Tie | Contradiction | str:
-        """The tie by some places alone, why they contradict each other, or what they do not determine."""
+    def _alone(self, rows: np.ndarray, *, bars: bool = False) -> _PartialSolution | Contradiction | str:
+        """Solve from some places alone; or return their contradiction, or the missing observations."""
         some = self.places[rows]
         if (missing := some.missing()) is not None:
             return missing
@@ -209,46 +210,46 @@ class _Groups:
         if missing is not None:
             return missing if near.all() else self._contradicted(rows[~near], rows[near], world, missing)
         x = self.system.terms.start(self.system.scenes, world)
-        x = replace(x, points=first_points(self.system, x))
+        x = replace(x, points=initial_points(self.system, x))
         allowed = self._allowed(rows, bars=bars)
         gross = tuple(a & ~b for a, b in zip(allowed, self._allowed(rows[near], bars=bars), strict=True))
         try:
-            x, active = without_outliers(self.system, x, allowed, gross)  # type: ignore[arg-type]
+            x, active = exclude_outliers(self.system, x, allowed, gross)  # type: ignore[arg-type]
             x, active, factor, rows_kept = self._without_units(x, active, rows)
         except (np.linalg.LinAlgError, RuntimeError):
             return UNSOLVED
-        tie = _Tie(x, active, factor, rows_kept)
+        tie = _PartialSolution(x, active, factor, rows_kept)
         split = self._split(tie, rows)
         if split is not None:
             return split
-        return weakness(self.system, factor) or tie
+        return describe_weakness(self.system, factor) or tie
 
     def _contradicted(self, rows: np.ndarray, others: np.ndarray, world: Sim3, missing: str) -> Contradiction:
-        """Places that contradict others that are too few to tie the component by.
+        """Describe places that contradict others that are too few to georeference the component.
 
         Args:
             world: the similarity that the others agree with.
         """
         some = self.places[rows]
         off = np.median(some.in_world - world.apply(some.in_map), axis=0)
-        shift = Shift(off, np.diag(np.median(some.reach_m(), axis=0)) ** 2, 0.0, rows >= 0)
+        shift = CommonShift(off, np.diag(np.median(some.reach_m(), axis=0)) ** 2, 0.0, rows >= 0)
         group, against = self._most(rows), self._most(others if len(others) else rows)
-        why = causes(some, shift, self.frame, self._ground(others))
+        why = likely_causes(some, shift, self.frame, self._ground(others))
         if group == against:
             why = ("split", *why)
         else:
-            back = causes(self.places[others], replace(shift, shift_m=-off), self.frame, self._ground(rows))
+            back = likely_causes(self.places[others], replace(shift, shift_m=-off), self.frame, self._ground(rows))
             if set(back) & set(_SPECIFIC) and not set(why) & set(_SPECIFIC):
                 rows, shift, group, against, why = others, replace(shift, shift_m=-off), against, group, back
         scenes = tuple(sorted(set(self._scenes(rows))))
         sigma = tuple(np.sqrt(np.diag(shift.covariance)).tolist())
-        text = f"{missing} ({GROUPS[group]} contradict {GROUPS[against]}: {reason_of(why)})"
+        text = f"{missing} ({GROUPS[group]} contradict {GROUPS[against]}: {format_causes(why)})"
         return Contradiction(
             group, against, why[0], why[1:], "none", tuple(shift.shift_m.tolist()), sigma, None, len(rows), scenes, text
         )
 
     def _most(self, rows: np.ndarray) -> str:
-        """The kind that most of some places are of."""
+        """Return the most frequent kind of some places."""
         kinds, counts = np.unique(self.places.kinds[rows], return_counts=True)
         return str(kinds[np.argmax(counts)])
 
@@ -260,7 +261,7 @@ class _Groups:
         return points, usable[1].copy(), fixes, usable[3] & bars
 
     def _is_active(self, active: Active, rows: np.ndarray) -> np.ndarray:
-        """(n,) of places."""
+        """Return (n,) bool: the places that the solution uses."""
         some = self.places[rows]
         out = np.zeros(len(rows), dtype=bool)
         of_points = some.kinds == "points"
@@ -270,7 +271,9 @@ class _Groups:
     def _without_units(
         self, x: Unknowns, active: Active, rows: np.ndarray
     ) -> tuple[Unknowns, Active, Factor, np.ndarray]:
-        """Data snooping by captures: photos whose common error is beyond what they state go, the worst first."""
+        """Apply data snooping to captures: exclude photos whose common error exceeds their stated one, the worst
+        first.
+        """
         for _ in range(MAX_ROUNDS):
             factor, terms = self.system.factor(x, self.system.as_weights(active)), self.system.terms.observations(x)
             use = rows[self._is_active(active, rows)]
@@ -280,7 +283,7 @@ class _Groups:
             for unit in units:
                 mine = use[self.places.units[use] == unit]
                 if len(mine) >= 2:
-                    log_p = shift_of(self.system, terms, factor, self.places[mine], used=True).log_p
+                    log_p = estimate_shift(self.system, terms, factor, self.places[mine], used=True).log_p
                     if log_p < worst - 1e-9:
                         worst, out = log_p, unit
             if out is None:
@@ -291,14 +294,16 @@ class _Groups:
             if not (fixes.any() or active[0].any()):
                 return x, active, factor, rows
             active = active[0], active[1], fixes, active[3]
-            x, active = without_outliers(
+            x, active = exclude_outliers(
                 self.system, x, (active[0], active[1], allowed[2], active[3]),
                 (~active[0], ~active[1], allowed[2] & ~fixes, ~active[3]),
             )  # fmt: skip
         return x, active, self.system.factor(x, self.system.as_weights(active)), rows
 
-    def _split(self, tie: _Tie, rows: np.ndarray) -> Contradiction | None:
-        """Whether places that contradict the tie by them are too many, or agree with each other, to be blunders."""
+    def _split(self, tie: _PartialSolution, rows: np.ndarray) -> Contradiction | None:
+        """Return the contradiction if excluded places are too many, or agree too well with each other, to be
+        blunders.
+        """
         use = self._is_active(tie.active, rows)
         units, unit = np.unique(self.places.units[rows], return_inverse=True)
         kept = np.bincount(unit, use, len(units)) * 2 > np.bincount(unit, minlength=len(units))
@@ -308,20 +313,20 @@ class _Groups:
             return feet
         dropped = [rows[unit == k] for k in np.flatnonzero(~kept).tolist()]
         terms = self.system.terms.observations(tie.x)
-        shifts = [shift_of(self.system, terms, tie.factor, self.places[mine], used=False) for mine in dropped]
-        groups = clusters(shifts, GATE_PROBABILITY)
+        shifts = [estimate_shift(self.system, terms, tie.factor, self.places[mine], used=False) for mine in dropped]
+        groups = cluster_shifts(shifts, GATE_PROBABILITY)
         largest = max(len(groups[0]), self._elsewhere(np.concatenate(dropped)))
         if kept.sum() > len(dropped) and (largest == 1 or kept.sum() >= _EQUAL * largest):
             for group in groups:
                 self._blunder([dropped[k] for k in group.tolist()], [shifts[k] for k in group.tolist()], rows)
             return None
         some = np.concatenate([dropped[k] for k in groups[0].tolist()])
-        shift = joined([shifts[k] for k in groups[0].tolist()])
-        one = contradiction(
+        shift = average_shifts([shifts[k] for k in groups[0].tolist()])
+        one = describe_contradiction(
             self.places[some], self._scenes(some), shift, str(self.places.kinds[rows[0]]), ("split",), "none"
         )
         if len(some) > 1:
-            why = causes(self.places[some], shift, self.frame, self._ground(rows))
+            why = likely_causes(self.places[some], shift, self.frame, self._ground(rows))
             if self._fits_in_feet(rows, 0.9 / FEET):
                 why = tuple(dict.fromkeys(["feet", *why]))
             one = replace(one, other_causes=why)
@@ -329,18 +334,18 @@ class _Groups:
             one, text=f"{one.text} ({len(rows) - len(some)} against {len(some)}): cannot tell which are right"
         )
 
-    def _blunder(self, dropped: Sequence[np.ndarray], shifts: Sequence[Shift], rows: np.ndarray) -> None:
-        """Name a minority of several places that contradicts its own source in common."""
+    def _blunder(self, dropped: Sequence[np.ndarray], shifts: Sequence[CommonShift], rows: np.ndarray) -> None:
+        """Record a minority of several places that share a contradiction with their own source."""
         mine = np.concatenate(dropped)
         if len(mine) < 2:
             return
-        some, shift = self.places[mine], joined(shifts)
-        why = causes(some, shift, self.frame, self._ground(rows))
+        some, shift = self.places[mine], average_shifts(shifts)
+        why = likely_causes(some, shift, self.frame, self._ground(rows))
         kind = str(self.places.kinds[rows[0]])
-        self.verdicts.add(contradiction(some, self._scenes(mine), shift, kind, why, "against"), some)
+        self.verdicts.add(describe_contradiction(some, self._scenes(mine), shift, kind, why, "against"), some)
 
     def _elsewhere(self, rows: np.ndarray) -> int:
-        """How many units of some places agree on a similarity of their own."""
+        """Count the units of some places that agree on a similarity of their own."""
         if len(rows) < 4:
             return 0
         try:
@@ -350,7 +355,7 @@ class _Groups:
         return len(np.unique(self.places.units[rows[near]])) if near.sum() >= 4 else 0
 
     def _in_feet(self, rows: np.ndarray) -> Contradiction | None:
-        """Whether places have the shape of the map once their heights are converted from or to feet."""
+        """Return a contradiction if places fit the map once their heights are converted from or to feet."""
         some = self.places[rows]
         if len(some) < 4:
             return None
@@ -362,36 +367,38 @@ class _Groups:
         return Contradiction(kind, kind, "feet", count=len(some), scenes=tuple(sorted(set(scenes))), text=text)
 
     def _fits_in_feet(self, rows: np.ndarray, better: float) -> bool:
-        """Whether heights converted from or to feet fit the map within their errors, and better by a factor."""
+        """Return True if heights converted from or to feet fit the map within their errors, and better by a factor."""
         some = self.places[rows]
         left = min(self._converted(rows, factor)[rows].misfit_m() for factor in (FEET, 1 / FEET))
         return bool(some.misfit_m() > better * left and left < some.noise_m(sea=False))
 
-    def _converted(self, rows: np.ndarray, factor: float) -> Places:
-        """All places, the altitudes of some multiplied."""
+    def _converted(self, rows: np.ndarray, factor: float) -> CommonPoints:
+        """Return all places, with the altitudes of some multiplied."""
         own = altitudes(self.frame, self.places[rows].in_world)
         return self.places.moved(rows, np.outer(own * (factor - 1), [0, 0, 1]))
 
     def _ground(self, rows: np.ndarray) -> np.ndarray | None:
-        """Altitudes of marks on the ground among some places."""
+        """Return the altitudes of marks on the ground among some places."""
         marks = self.places[rows[self.places.kinds[rows] == "points"]]
         return altitudes(self.frame, marks.in_world) if len(marks) else None
 
     # --- every other group -------------------------------------------------------------------------------------------
 
-    def _compared(self, reference: _Tie, left: np.ndarray) -> tuple[list[_Rival], np.ndarray]:
-        """Groups that contradict the reference, and the places that agree with it."""
-        rivals: list[_Rival] = []
+    def _compared(self, reference: _PartialSolution, left: np.ndarray) -> tuple[list[_ContradictingGroup], np.ndarray]:
+        """Compare groups with the reference: those that contradict it, and the places that agree with it."""
+        rivals: list[_ContradictingGroup] = []
         agreeing: list[np.ndarray] = []
         terms = self.system.terms.observations(reference.x)
         sources = np.unique(self.places.sources[reference.rows])
         for mine in self._sources(left[~np.isin(self.places.sources[left], sources)]):
             units = [mine[self.places.units[mine] == unit] for unit in np.unique(self.places.units[mine])]
-            shifts = [shift_of(self.system, terms, reference.factor, self.places[unit], used=False) for unit in units]
+            shifts = [
+                estimate_shift(self.system, terms, reference.factor, self.places[unit], used=False) for unit in units
+            ]
             alpha = np.log((1 - GATE_PROBABILITY) / len(units))
             bad = [k for k, one in enumerate(shifts) if one.log_p < alpha or not one.shaped]
             # What is common to a source takes along those of its units that alone are just below the gate.
-            bad += [k for k, one in enumerate(shifts) if k not in bad and any(_like(one, shifts[j]) for j in bad)]
+            bad += [k for k, one in enumerate(shifts) if k not in bad and any(_is_similar(one, shifts[j]) for j in bad)]
             good = [k for k in range(len(units)) if k not in bad]
             agreeing += [units[k][shifts[k].agree] for k in good]
             if bad:
@@ -399,33 +406,35 @@ class _Groups:
         return rivals, np.concatenate([np.zeros(0, dtype=np.int64), *agreeing])
 
     def _rivals(
-        self, units: Sequence[np.ndarray], shifts: Sequence[Shift], num_good: int, reference: _Tie
-    ) -> list[_Rival]:
-        """Groups of two places or more that are off in common; single ones are blunders, and left out."""
+        self, units: Sequence[np.ndarray], shifts: Sequence[CommonShift], num_good: int, reference: _PartialSolution
+    ) -> list[_ContradictingGroup]:
+        """Form groups of two or more places with a common shift; single ones are blunders and excluded."""
         unshaped = [k for k, one in enumerate(shifts) if not one.shaped]
         shaped = [k for k in range(len(shifts)) if k not in unshaped]
         sets = [np.array(unshaped)] if unshaped else []
-        sets += [np.array(shaped)[one] for one in clusters([shifts[k] for k in shaped], GATE_PROBABILITY)]
+        sets += [np.array(shaped)[one] for one in cluster_shifts([shifts[k] for k in shaped], GATE_PROBABILITY)]
         out = []
         for some in sets:
             rows = np.concatenate([units[k] for k in some.tolist()])
             if len(rows) < 2:
                 continue
-            shift = joined([shifts[k] for k in some.tolist()])
+            shift = average_shifts([shifts[k] for k in some.tolist()])
             used = reference.rows[self._is_active(reference.active, reference.rows)]
-            wrong = causes(self.places[rows], shift, self.frame, self._ground(used))
+            wrong = likely_causes(self.places[rows], shift, self.frame, self._ground(used))
             back = replace(shift, shift_m=-shift.shift_m)
             # A wrong reference is bent out of shape itself, so that the shape tells nothing of it.
-            right = causes(self.places[used], replace(back, shaped=True), self.frame, self._ground(rows))
+            right = likely_causes(self.places[used], replace(back, shaped=True), self.frame, self._ground(rows))
             together = np.concatenate([used, rows])
             shifted = self.places.moved(rows, -shift.shift_m)[together].misfit_m()
             converted = self._converted(used, FEET)[together].misfit_m()
             if shifted > 2 * converted and converted < self.places[together].noise_m():
                 right, wrong = ("feet",), tuple(why for why in wrong if why not in _SPECIFIC) or ("vertical_shift",)
-            out.append(_Rival(rows, shift, len(some) > num_good, wrong, right))
+            out.append(_ContradictingGroup(rows, shift, len(some) > num_good, wrong, right))
         return out
 
-    def _resolved(self, reference: _Tie, rivals: Sequence[_Rival], agreeing: np.ndarray) -> np.ndarray | Refusal | None:
+    def _resolved(
+        self, reference: _PartialSolution, rivals: Sequence[_ContradictingGroup], agreeing: np.ndarray
+    ) -> np.ndarray | SurveyFailure | None:
         """Decide between the reference and the groups that contradict it.
 
         Returns:
@@ -433,7 +442,7 @@ class _Groups:
         """
         used = reference.rows[self._is_active(reference.active, reference.rows)]
         own = str(self.places.kinds[used[0]])
-        named: list[tuple[Contradiction, Places]] = []
+        named: list[tuple[Contradiction, CommonPoints]] = []
         for rival in rivals:
             some, scenes = self.places[rival.rows], self._scenes(rival.rows)
             axis = 2 if abs(rival.shift.shift_m[2]) >= np.linalg.norm(rival.shift.shift_m[:2]) else 0
@@ -454,17 +463,17 @@ class _Groups:
             if rival.whole and own_marked and not (marked or equal or supported):
                 back = replace(rival.shift, shift_m=-rival.shift.shift_m)
                 wrong, its = self.places[reference.rows], self._scenes(reference.rows)
-                one = contradiction(wrong, its, back, str(some.kinds[0]), rival.if_right, "against")
+                one = describe_contradiction(wrong, its, back, str(some.kinds[0]), rival.if_right, "against")
                 self.verdicts.add(one, wrong)
                 keep = self.places.sources != self.places.sources[used[0]]
                 return np.setdiff1d(np.flatnonzero(keep), self._left_out())
             precise = ratio >= _EQUAL and not (marked and own_marked)
             marked = marked and not (own_marked or equal)
             if supported or not rival.whole or ((precise or marked) and not seconded):
-                named.append((contradiction(some, scenes, rival.shift, own, rival.if_wrong, "against"), some))
+                named.append((describe_contradiction(some, scenes, rival.shift, own, rival.if_wrong, "against"), some))
                 continue
             both = tuple(dict.fromkeys([*rival.if_wrong, *rival.if_right]))
-            one = contradiction(some, scenes, rival.shift, own, both, "none")
+            one = describe_contradiction(some, scenes, rival.shift, own, both, "none")
             one = replace(one, text=f"{one.text} Cannot tell which are right")
             self.verdicts.add(one, some)
             return self._refusal(one.text)
@@ -473,22 +482,24 @@ class _Groups:
         return None
 
     def _left_out(self) -> np.ndarray:
-        """Rows of places that a contradiction has left out."""
+        """Return the rows of places that a contradiction has excluded."""
         kinds = np.where(self.places.kinds == "points", "point", "fix")
         pairs = zip(kinds.tolist(), self.places.rows.tolist(), strict=True)
         return np.flatnonzero([pair in self.verdicts.reasons for pair in pairs])
 
-    def _refusal(self, problem: str) -> Refusal:
+    def _refusal(self, problem: str) -> SurveyFailure:
         found = self.verdicts.found
         if not found:
-            return Refusal(problem, "unsolved" if problem == UNSOLVED else "undetermined")
+            return SurveyFailure(problem, "unsolved" if problem == UNSOLVED else "undetermined")
         texts = dict.fromkeys([*(one.text for one in found), problem])
-        return Refusal("; ".join(texts), "contradiction", tuple(found))
+        return SurveyFailure("; ".join(texts), "contradiction", tuple(found))
 
     # --- everything that agrees --------------------------------------------------------------------------------------
 
-    def _all(self, reference: _Tie, agreeing: np.ndarray) -> Solution:
-        """The solve with all groups that agree; the reference alone where they leave more open than it does."""
+    def _all(self, reference: _PartialSolution, agreeing: np.ndarray) -> Solution:
+        """Solve with all groups that agree; or with the reference alone where they leave more undetermined than it
+        does.
+        """
         rows = np.concatenate([reference.rows, agreeing])
         bars = self._bars(reference)
         best = reference
@@ -498,26 +509,28 @@ class _Groups:
             gross = self._allowed(reference.rows[~start], bars=False)
             gross = (gross[0], allowed[1] & ~reference.active[1], gross[2], np.zeros_like(bars))
             try:
-                x, active = without_outliers(self.system, reference.x, allowed, gross)
+                x, active = exclude_outliers(self.system, reference.x, allowed, gross)
                 x, active, factor, kept = self._without_units(x, active, rows)
                 lost = start.sum() > 2 * self._is_active(active, reference.rows).sum()
-                if not (lost or weakness(self.system, factor)):
-                    best = _Tie(x, active, factor, kept)
+                if not (lost or describe_weakness(self.system, factor)):
+                    best = _PartialSolution(x, active, factor, kept)
                     self._name_units(best, np.setdiff1d(rows, kept))
             except (np.linalg.LinAlgError, RuntimeError):
                 pass
         return Solution(best.x, best.active, best.factor, tuple(self.verdicts.found), dict(self.verdicts.reasons))
 
-    def _name_units(self, tie: _Tie, rows: np.ndarray) -> None:
-        """Name captures that were left out at last."""
+    def _name_units(self, tie: _PartialSolution, rows: np.ndarray) -> None:
+        """Record captures that were excluded at last."""
         terms = self.system.terms.observations(tie.x)
         for unit in np.unique(self.places.units[rows]):
             mine = rows[self.places.units[rows] == unit]
-            shift = shift_of(self.system, terms, tie.factor, self.places[mine], used=False)
+            shift = estimate_shift(self.system, terms, tie.factor, self.places[mine], used=False)
             self._blunder([mine], [shift], tie.rows)
 
-    def _bars(self, reference: _Tie) -> np.ndarray:
-        """(G,) bool, the scale bars to solve from; those that contradict the reference in common are named."""
+    def _bars(self, reference: _PartialSolution) -> np.ndarray:
+        """Select the scale bars to solve from (G,) bool; bars with a common contradiction to the reference are
+        recorded.
+        """
         bars = self.system.terms.bars
         if not bars:
             return np.zeros(0, dtype=bool)
@@ -537,7 +550,7 @@ class _Groups:
         own = str(self.places.kinds[reference.rows[0]])
         text = (
             f"{int(same.sum())} scale bars say {ratio:.4g} times the length that the {GROUPS[own]} give: "
-            f"{reason_of([cause])}"
+            f"{format_causes([cause])}"
         )
         self.verdicts.add(
             Contradiction("bars", own, cause, (), "against", (), (), ratio, int(same.sum()), (), text),
@@ -548,6 +561,6 @@ class _Groups:
         return ~bad
 
 
-def _like(one: Shift, other: Shift) -> bool:
+def _is_similar(one: CommonShift, other: CommonShift) -> bool:
     off = np.linalg.norm(one.shift_m - other.shift_m)
     return other.shaped and bool(off < 0.3 * np.linalg.norm(other.shift_m))

@@ -1,4 +1,4 @@
-"""What a solved component says of each observation, and of where it lies in the world."""
+"""Residuals of observations, and the tie of a component to the world."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gsmap.geometry.chi_square import chi2_quantile
-from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, System, Tests
+from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, ObservationTests, System
 from gsmap.optimize.survey_terms import Terms, Unknowns
 from gsmap.types.world import Contradiction, Residual, Survey, WorldFrame, WorldTie
 
@@ -17,11 +17,11 @@ _CONTRADICTS = "it contradicts the other observations"
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A solved component.
+    """A georeferenced component.
 
     Args:
         active: observations that it was solved from.
-        contradictions: groups that were left out, or the observations that cannot be told apart.
+        contradictions: groups that were left out, or the observations that cannot be determined apart.
         reasons: by (kind, row) of an observation, the contradiction that left it out.
     """
 
@@ -33,8 +33,8 @@ class Solution:
 
 
 @dataclass(frozen=True, eq=False)
-class Refusal:
-    """Why a component is not tied.
+class SurveyFailure:
+    """Reason why a component is not georeferenced.
 
     Args:
         problem: observations that are missing, or that contradict each other.
@@ -47,8 +47,8 @@ class Refusal:
     contradictions: tuple[Contradiction, ...] = ()
 
 
-def active_of(system: System, tie: WorldTie) -> Active:
-    """What an answer was solved from."""
+def active_observations(system: System, tie: WorldTie) -> Active:
+    """Return the observations that an answer was solved from."""
     out = tie.left_out()
     terms = system.terms
     names = (
@@ -64,8 +64,8 @@ def active_of(system: System, tie: WorldTie) -> Active:
     return points, images, fixes, bars
 
 
-def report(system: System, solved: Solution, index: int, frame: WorldFrame | None) -> WorldTie:
-    """The tie with all residuals."""
+def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFrame | None) -> WorldTie:
+    """Build the tie to the world with all residuals."""
     x, active, factor = solved.x, solved.active, solved.factor
     tests = system.tests(x, active, factor)
     rows = _point_rows(system, solved, tests)
@@ -79,7 +79,7 @@ def report(system: System, solved: Solution, index: int, frame: WorldFrame | Non
             "is widened by that"
         )
     if sum(float(tests.redundancies[kind].sum()) for kind in (0, 2, 3)) < _MIN_CHECKS:
-        notes.append("hardly anything checks these observations: a blunder in one of them could not be told")
+        notes.append("hardly anything checks these observations: a blunder in one of them could not be determined")
     world = x.world.item(0)
     return WorldTie(
         index,
@@ -94,8 +94,8 @@ def report(system: System, solved: Solution, index: int, frame: WorldFrame | Non
     )
 
 
-def lengths_only(system: System, index: int, survey: Survey, refusal: Refusal) -> WorldTie:
-    """What scale bars alone tell, where positions do not determine the rest: the metre, and nothing else."""
+def tie_by_bars(system: System, index: int, survey: Survey, refusal: SurveyFailure) -> WorldTie:
+    """Build a tie from scale bars alone, where positions do not determine the rest: metric scale and nothing else."""
     terms, missing = system.terms, refusal.problem
     nothing = WorldTie(
         index, frame=survey.frame, problem=missing, problem_code=refusal.code, contradictions=refusal.contradictions
@@ -130,7 +130,7 @@ def lengths_only(system: System, index: int, survey: Survey, refusal: Refusal) -
 
 
 def world_covariance(system: System, factor: Factor) -> np.ndarray:
-    """(7, 7) of ``S_world_map`` with the anchor's scene taken as exact."""
+    """Compute the covariance (7, 7) of ``S_world_map`` with the anchor's scene taken as exact."""
     joint = factor.joint([system.own.anchor])
     back = system.scenes[np.array([system.own.anchor])]
     # W X: on the scene's side the steps of both add; then back to the map's side.
@@ -140,8 +140,8 @@ def world_covariance(system: System, factor: Factor) -> np.ndarray:
     return out
 
 
-def _variance_factor(system: System, x: Unknowns, active: Active, tests: Tests) -> float:
-    """How much larger residuals are than they claim, where chance does not explain it; at least 1."""
+def _variance_factor(system: System, x: Unknowns, active: Active, tests: ObservationTests) -> float:
+    """Compute the variance factor of the residuals where chance does not explain it; at least 1."""
     terms = system.terms.observations(x)
     total = sum(float(t.squares[a].sum()) for t, a in zip(terms, active, strict=True))
     count = sum(int(t.residuals.shape[1] * a.sum()) for t, a in zip(terms, active, strict=True))
@@ -155,10 +155,10 @@ def _variance_factor(system: System, x: Unknowns, active: Active, tests: Tests) 
     return total / free
 
 
-def _point_rows(system: System, solved: Solution, tests: Tests) -> list[Residual]:
+def _point_rows(system: System, solved: Solution, tests: ObservationTests) -> list[Residual]:
     x, active, factor = solved.x, solved.active, solved.factor
     show = active[1] | (system.is_check[system.terms.image_points] if len(system.terms.images) else active[1])
-    met, picking, told = system.terms.triangulated(x, show)
+    met, picking, determined = system.terms.triangulate(x, show)
     at = replace(x, points=met)
     images = system.terms.observations(at)[1]
     rows = []
@@ -167,7 +167,7 @@ def _point_rows(system: System, solved: Solution, tests: Tests) -> list[Residual
         error: tuple[float, ...] = ()
         sigma: tuple[float, ...] = ()
         statistic, dof, reason = _given(tests.statistics[0][k], tests.dofs[0][k]), int(tests.dofs[0][k]), ""
-        if told[k]:
+        if determined[k]:
             off = met[k] - point.position
             covariance = picking[k] + _carried(system, k, images, picking[k], factor, show)
             error = (float(off[0]), float(off[1]), float(off[2]))
@@ -187,7 +187,7 @@ def _point_rows(system: System, solved: Solution, tests: Tests) -> list[Residual
 def _carried(
     system: System, k: int, images: Terms, picking: np.ndarray, factor: Factor, show: np.ndarray
 ) -> np.ndarray:
-    """(3, 3) what a triangulated point gets from poses that are not exact."""
+    """Propagate the uncertainty of poses to a triangulated point, (3, 3)."""
     mine = np.flatnonzero((system.terms.image_points == k) & show & images.valid)
     some = Terms(
         "image", images.residuals[mine], tuple((f[mine], J[mine]) for f, J in images.parts), images.valid[mine]
@@ -201,10 +201,10 @@ def _carried(
     return (out + out.T) / 2
 
 
-def _image_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> list[Residual]:
+def _image_rows(system: System, x: Unknowns, active: Active, tests: ObservationTests) -> list[Residual]:
     checked = system.is_check[system.terms.image_points] if len(system.terms.images) else active[1]
-    met, _, told = system.terms.triangulated(x, active[1] | checked)
-    points = np.where((told & ~active[0])[:, None], met, x.points)
+    met, _, determined = system.terms.triangulate(x, active[1] | checked)
+    points = np.where((determined & ~active[0])[:, None], met, x.points)
     errors = system.terms.image_errors_px(replace(x, points=points))
     rows = []
     for k, image in enumerate(system.terms.images):
@@ -221,7 +221,7 @@ def _image_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> li
     return rows
 
 
-def _fix_rows(system: System, solved: Solution, tests: Tests) -> list[Residual]:
+def _fix_rows(system: System, solved: Solution, tests: ObservationTests) -> list[Residual]:
     rows, x, active = [], solved.x, solved.active
     at = x.world.item(0).apply(system.terms.fix_points(x.scenes))
     for k, fix in enumerate(system.terms.fixes):
@@ -239,7 +239,7 @@ def _fix_rows(system: System, solved: Solution, tests: Tests) -> list[Residual]:
     return rows
 
 
-def _bar_rows(system: System, solved: Solution, tests: Tests) -> list[Residual]:
+def _bar_rows(system: System, solved: Solution, tests: ObservationTests) -> list[Residual]:
     rows, x, active = [], solved.x, solved.active
     terms = system.terms.observations(x)[3]
     for k, bar in enumerate(system.terms.bars):
@@ -260,7 +260,9 @@ def _bar_rows(system: System, solved: Solution, tests: Tests) -> list[Residual]:
 
 
 def _agreed(logs: np.ndarray, variances: np.ndarray, probability: float) -> tuple[float, np.ndarray]:
-    """The mean of those that agree, and which do: where three or more are there, those far from the median go."""
+    """Average values that agree; with three or more, those far from the median are excluded. Also return which were
+    used.
+    """
     use = np.ones(len(logs), dtype=bool)
     if len(logs) >= 3:
         use = (logs - np.median(logs)) ** 2 <= chi2_quantile(probability, 1) * (variances + np.median(variances))

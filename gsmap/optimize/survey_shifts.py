@@ -1,4 +1,4 @@
-"""Common shifts of groups of observations against the rest of a solve, and the likely reasons of them."""
+"""Common shifts of groups of observations against the rest of a solution, and their likely causes."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.geometry.chi_square import chi2_log_survival, chi2_quantile
-from gsmap.optimize.survey_places import Places
+from gsmap.optimize.survey_common_points import CommonPoints
 from gsmap.optimize.survey_system import GATE_PROBABILITY, MIN_REDUNDANCY, Factor, System
 from gsmap.optimize.survey_terms import Terms
 from gsmap.types.world import Contradiction, WorldFrame
 
 FEET = 0.3048
-GEOID_M = 110.0  # the geoid lies between 107 m below and 86 m above the ellipsoid
+GEOID_M = 110.0  # the geoid is between 107 m below and 86 m above the ellipsoid
 _EARTH_M = 6_371_000.0
 _SITE_M = 10.0  # how far above or below the marks of a site a drone takes off
 _FLOWN_M = 150.0  # how high above that it flies
@@ -34,8 +34,8 @@ _REASONS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Shift:
-    """The common shift of some places against a solve.
+class CommonShift:
+    """The common shift of some places against a solution.
 
     Args:
         shift_m: (3,) measured less predicted. covariance: (3, 3) with all common errors; of directions that nothing
@@ -51,14 +51,16 @@ class Shift:
     shaped: bool = True
 
 
-def shift_of(system: System, all_terms: Sequence[Terms], factor: Factor, places: Places, *, used: bool) -> Shift:
-    """The shift that some places have in common.
+def estimate_shift(
+    system: System, all_terms: Sequence[Terms], factor: Factor, places: CommonPoints, *, used: bool
+) -> CommonShift:
+    """Estimate the shift that some places have in common.
 
     Args:
         all_terms: of points, images, fixes and bars at the answer that the factor is of.
         places: all control points, or all fixes.
-        used: whether the solve rests on them: then its own share is taken out (Baarda 1968, with one alternative
-            hypothesis for all of them); else they are predicted.
+        used: True if the solution uses them: then their own contribution is removed (Baarda 1968, with one
+            alternative hypothesis for all of them); otherwise they are predicted.
     """
     terms = all_terms[0 if places.kinds[0] == "points" else 2]
     weights = 1 / places.own_m
@@ -77,7 +79,7 @@ def shift_of(system: System, all_terms: Sequence[Terms], factor: Factor, places:
     if not used:
         shift, covariance = b / own, (np.diag(own) + V) / own / own[:, None]
         log_p = float(chi2_log_survival(shift @ np.linalg.solve(covariance, shift), 3))
-        return Shift(shift, covariance, log_p, agree, _shaped(system, factor, terms, mine, apart[agree], W, own))
+        return CommonShift(shift, covariance, log_p, agree, _shaped(system, factor, terms, mine, apart[agree], W, own))
     root = np.sqrt(own)
     values, axes = np.linalg.eigh((np.diag(own) - V) / root / root[:, None])
     checked = values > MIN_REDUNDANCY
@@ -87,11 +89,11 @@ def shift_of(system: System, all_terms: Sequence[Terms], factor: Factor, places:
     covariance = (axes * spread) @ axes.T / root / root[:, None]
     statistic = float((along[checked] ** 2 / values[checked]).sum())
     log_p = float(chi2_log_survival(statistic, int(checked.sum()))) if checked.any() else 0.0
-    return Shift(shift, covariance, log_p, agree)
+    return CommonShift(shift, covariance, log_p, agree)
 
 
 def _crossed(terms: Terms, rows: np.ndarray, W: np.ndarray, size: int) -> np.ndarray:
-    """(size, 3) derivatives by all columns against a shift of some measured positions."""
+    """Compute derivatives (size, 3) by all columns against a shift of some measured positions."""
     out = np.zeros((size, 3))
     for first, J in terms.parts:
         there = first[rows] >= 0
@@ -105,7 +107,7 @@ def _crossed(terms: Terms, rows: np.ndarray, W: np.ndarray, size: int) -> np.nda
 def _shaped(
     system: System, factor: Factor, terms: Terms, rows: np.ndarray, apart: np.ndarray, W: np.ndarray, own: np.ndarray
 ) -> bool:
-    """Whether places lie beside each other as the map has them, within their own errors and the map's."""
+    """Return True if the relative positions of places match the map, within their own errors and the map's."""
     gate = chi2_quantile(GATE_PROBABILITY, 3)
     mean = (W**2 * apart).sum(0) / own
     if len(rows) < 3 or np.median((((apart - mean) * W) ** 2).sum(1)) <= gate:
@@ -127,18 +129,20 @@ def _shaped(
 
 
 def altitudes(frame: WorldFrame, positions: np.ndarray) -> np.ndarray:
-    """(N,) heights above the surface that the world frame's origin counts from, of (N, 3) positions in that frame."""
+    """Compute heights (N,) above the reference surface of the world frame's origin, of positions (N, 3) in that
+    frame.
+    """
     out: np.ndarray = positions[:, 2] + frame.height_m + (positions[:, :2] ** 2).sum(1) / (2 * _EARTH_M)
     return out
 
 
-def is_unmeasured(places: Places, frame: WorldFrame) -> bool:
-    """Whether the altitudes of photos are all 0: the device wrote none."""
+def is_unmeasured(places: CommonPoints, frame: WorldFrame) -> bool:
+    """Return True if the altitudes of photos are all 0, which means that the device wrote none."""
     return len(places) >= 3 and bool((np.abs(altitudes(frame, places.in_world)) < 0.02).all())
 
 
-def clusters(shifts: Sequence[Shift], probability: float) -> list[np.ndarray]:
-    """Rows of shifts that agree with each other, the largest set first."""
+def cluster_shifts(shifts: Sequence[CommonShift], probability: float) -> list[np.ndarray]:
+    """Cluster shifts that agree with each other, the largest set first."""
     left, out = list(range(len(shifts))), []
     gate = chi2_quantile(probability, 3)
     while left:
@@ -151,22 +155,25 @@ def clusters(shifts: Sequence[Shift], probability: float) -> list[np.ndarray]:
     return sorted(out, key=len, reverse=True)
 
 
-def _agree(a: Shift, b: Shift, gate: float) -> bool:
+def _agree(a: CommonShift, b: CommonShift, gate: float) -> bool:
     off = a.shift_m - b.shift_m
     slack = (0.05 * max(np.abs(a.shift_m).max(), np.abs(b.shift_m).max())) ** 2
     return bool(off @ np.linalg.solve(a.covariance + b.covariance + slack * np.eye(3), off) < gate)
 
 
-def joined(shifts: Sequence[Shift]) -> Shift:
-    """The mean of shifts that agree; as uncertain as the best of them, for their errors are shared."""
+def average_shifts(shifts: Sequence[CommonShift]) -> CommonShift:
+    """Average shifts that agree; as uncertain as the best of them, for their errors are shared."""
     best = min(shifts, key=lambda one: float(np.trace(one.covariance)))
     mean = np.mean([one.shift_m for one in shifts], axis=0)
-    return Shift(mean, best.covariance, min(one.log_p for one in shifts), best.agree, all(one.shaped for one in shifts))
+    return CommonShift(
+        mean, best.covariance, min(one.log_p for one in shifts), best.agree, all(one.shaped for one in shifts)
+    )
 
 
-def causes(places: Places, shift: Shift, frame: WorldFrame, ground_m: np.ndarray | None) -> tuple[str, ...]:
-    """Reasons that explain a shift, the likeliest first, if these places are wrong and what they are compared with is
-    right.
+def likely_causes(
+    places: CommonPoints, shift: CommonShift, frame: WorldFrame, ground_m: np.ndarray | None
+) -> tuple[str, ...]:
+    """List causes that explain a shift, the likeliest first, if these places are wrong and the others right.
 
     Args:
         ground_m: altitudes of marks on the ground, or None where there are none.
@@ -184,7 +191,7 @@ def causes(places: Places, shift: Shift, frame: WorldFrame, ground_m: np.ndarray
 
 
 def _heights(
-    places: Places, up: float, sigma_m: float, frame: WorldFrame, ground_m: np.ndarray | None
+    places: CommonPoints, up: float, sigma_m: float, frame: WorldFrame, ground_m: np.ndarray | None
 ) -> tuple[str, ...]:
     own = altitudes(frame, places.in_world)
     if len(places) >= 2 and np.abs(own).max() < 0.5:
@@ -206,10 +213,10 @@ def _heights(
     return tuple(dict.fromkeys(out)) or ("vertical_shift",)
 
 
-def contradiction(
-    places: Places, scenes: Sequence[str], shift: Shift, against: str, why: tuple[str, ...], kept: str
+def describe_contradiction(
+    places: CommonPoints, scenes: Sequence[str], shift: CommonShift, against: str, why: tuple[str, ...], kept: str
 ) -> Contradiction:
-    """A group of places beside what it contradicts, in numbers and in words.
+    """Build the record of a group of places that contradicts other observations.
 
     Args:
         scenes: ids of the captures that the places are of.
@@ -224,13 +231,13 @@ def contradiction(
     known = sigma[2] if across <= abs(up) else max(sigma[:2])
     of = f" of {len(set(scenes))} captures" if group == "photos" else ""
     other = "where others of them put them" if group == against else f"where the {GROUPS[against]} put them"
-    text = f"{n} {GROUPS[group]}{of} lie {way} {other} (known to {known:.2g} m): {reason_of(why)}"
+    text = f"{n} {GROUPS[group]}{of} lie {way} {other} (known to {known:.2g} m): {format_causes(why)}"
     return Contradiction(
         group, against, why[0], tuple(why[1:]), kept, tuple(size), tuple(sigma), None, n, tuple(sorted(set(scenes))),
         text,
     )  # fmt: skip
 
 
-def reason_of(why: Sequence[str]) -> str:
-    """The likely reasons as a question."""
+def format_causes(why: Sequence[str]) -> str:
+    """Format the likely causes as a question."""
     return ", or ".join(_REASONS[one] for one in why) + ("" if why[0] in ("vertical_shift", "split") else "?")

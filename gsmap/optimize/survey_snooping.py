@@ -1,4 +1,4 @@
-"""Least squares of a chosen set of observations, without those that contradict the rest one by one."""
+"""Data snooping (Baarda 1968): least squares of observations without those that contradict the rest."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ from dataclasses import replace
 import numpy as np
 
 from gsmap.geometry.chi_square import chi2_quantile
-from gsmap.optimize.survey_places import MAX_LOG_SCALE_SIGMA, MAX_ROTATION_SIGMA_DEG
+from gsmap.optimize.survey_common_points import MAX_LOG_SCALE_SIGMA, MAX_ROTATION_SIGMA_DEG
 from gsmap.optimize.survey_report import world_covariance
-from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, System, Tests
+from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, ObservationTests, System
 from gsmap.optimize.survey_terms import Terms, Unknowns
 
 MAX_ROUNDS = 50  # of leaving out the worst observation and solving again
 
 
-def first_points(system: System, x: Unknowns) -> np.ndarray:
-    """(K, 3) check points from photos, the others as they are."""
-    met, _, told = system.terms.triangulated(x, np.ones(len(system.terms.images), dtype=bool))
-    return np.where((told & system.is_check)[:, None], met, x.points)
+def initial_points(system: System, x: Unknowns) -> np.ndarray:
+    """Return points (K, 3): check points triangulated from photos, the others as they are."""
+    met, _, determined = system.terms.triangulate(x, np.ones(len(system.terms.images), dtype=bool))
+    return np.where((determined & system.is_check)[:, None], met, x.points)
 
 
-def without_outliers(system: System, x: Unknowns, allowed: Active, gross: Active) -> tuple[Unknowns, Active]:
-    """Graduated non-convexity (Geman-McClure) first; then data snooping: the worst out, what fits again in.
+def exclude_outliers(system: System, x: Unknowns, allowed: Active, gross: Active) -> tuple[Unknowns, Active]:
+    """Solve without outliers: graduated non-convexity (Geman-McClure), then exclude the worst and readmit what fits
+    again.
 
     Args:
         allowed: observations that may be solved from. gross: those of them that are left out to begin with.
@@ -55,8 +56,10 @@ def _seen(system: System, x: Unknowns, active: Active, bars: Sequence[float]) ->
     return list(zip(system.terms.observations(x), active, bars, strict=True))
 
 
-def _exchange(system: System, active: Active, allowed: Active, tests: Tests, failures: list[np.ndarray]) -> bool:
-    """Leave out the observation that contradicts the others most, or take back one that does not; whether any."""
+def _exchange(
+    system: System, active: Active, allowed: Active, tests: ObservationTests, failures: list[np.ndarray]
+) -> bool:
+    """Exclude the observation that contradicts the others most, or readmit one that fits; True if any changed."""
     worst, place = 0.0, None
     alpha = np.log(1 - GATE_PROBABILITY)
     for kind, (use, log_p) in enumerate(zip(active, tests.log_p, strict=True)):
@@ -78,8 +81,8 @@ def _exchange(system: System, active: Active, allowed: Active, tests: Tests, fai
     return False
 
 
-def weakness(system: System, factor: Factor) -> str:
-    """What an answer leaves open after all; empty where it leaves nothing open."""
+def describe_weakness(system: System, factor: Factor) -> str:
+    """Describe the directions that a solution leaves undetermined; empty where there are none."""
     covariance = world_covariance(system, factor)
     values, axes = np.linalg.eigh(covariance[:3, :3])
     turn = float(np.degrees(np.sqrt(max(0.0, values[-1]))))

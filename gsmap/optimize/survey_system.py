@@ -1,4 +1,4 @@
-"""The sparse system of one component and what was observed of it: its least squares, its inverse, and its tests."""
+"""Sparse normal equations of one component with its observations: solve, covariances and tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmap.geometry.chi_square import chi2_log_survival
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.priors import PriorTerms
-from gsmap.optimize.robust import linearised, residuals
+from gsmap.optimize.robust import linearize, residuals
 from gsmap.optimize.survey_terms import SurveyTerms, Terms, Unknowns
 
 GATE_PROBABILITY = 0.999  # quantile of the chi-square of an observation against all others; beyond it is an outlier
@@ -26,12 +26,12 @@ Active = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """What a component is solved from besides observations.
+    """Scenes, edges and priors that a component is solved from, besides observations.
 
     Args:
         scenes: (n,) its rows among all scenes.
-        edges: those taken in, between all scenes. priors: those of its scenes.
-        anchor: the row that holds its frame.
+        edges: the accepted edges, between all scenes. priors: those of its scenes.
+        anchor: row of its anchor scene.
         held: (K, dim) whitened directions in which the anchor is held, see `gsmap.optimize.gtsam_solve`.
     """
 
@@ -46,7 +46,7 @@ class Component:
         return self.edges.dim
 
     def local(self) -> Component:
-        """The same with rows counted within the component."""
+        """Return the component with rows counted within it."""
         row = np.full(int(self.scenes.max()) + 1, -1)
         row[self.scenes] = np.arange(len(self.scenes))
         ids = tuple(self.edges.scene_ids[k] for k in self.scenes.tolist())
@@ -57,7 +57,7 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """The factorised normal equations at an answer.
+    """Factorised normal equations at an answer.
 
     Args:
         lu: of the matrix with a unit diagonal. root: (size,) what its diagonal was divided by.
@@ -69,18 +69,18 @@ class Factor:
     num_scenes: int
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
-        """(size, K)."""
+        """Solve for right-hand sides (size, K)."""
         out: np.ndarray = self.lu.solve(np.ascontiguousarray(rhs / self.root[:, None])) / self.root[:, None]
         return out
 
     def columns(self, wanted: np.ndarray) -> np.ndarray:
-        """(size, K) of the inverse."""
+        """Compute columns (size, K) of the inverse."""
         rhs = np.zeros((len(self.root), len(wanted)))
         rhs[wanted, np.arange(len(wanted))] = 1.0
         return self.solve(rhs)
 
     def scene_covariances(self) -> np.ndarray:
-        """(n, 7, 7) marginals of the scenes."""
+        """Compute the marginal covariances (n, 7, 7) of the scenes."""
         d = self.dim
         out = np.zeros((self.num_scenes, 7, 7))
         for start in range(0, self.num_scenes, 64):
@@ -92,7 +92,7 @@ class Factor:
         return out
 
     def joint(self, rows: Sequence[int]) -> np.ndarray:
-        """Of the world and of scenes, 7 each."""
+        """Compute the joint covariance of the world and of scenes, 7 each."""
         d, world = self.dim, self.num_scenes * self.dim
         places = [world + k for k in range(7)] + [row * d + k for row in rows for k in range(d)]
         found = self.columns(np.array(places))[places]
@@ -103,10 +103,10 @@ class Factor:
 
 
 @dataclass(frozen=True, eq=False)
-class Tests:
-    """By points, images, fixes and bars: (G,) chi-square against all others, its degrees of freedom, the logarithm of
-    the probability of one as large, and of those that were solved from the redundancy: in how many directions others
-    check them."""
+class ObservationTests:
+    """Test statistics of points, images, fixes and bars, (G,) each: chi-square against all other observations, its
+    degrees of freedom, its log p-value, and the redundancy of observations in use.
+    """
 
     statistics: tuple[np.ndarray, ...]
     dofs: tuple[np.ndarray, ...]
@@ -115,7 +115,7 @@ class Tests:
 
 
 class System:
-    """One component and what was observed of it."""
+    """Least-squares system of one component with its observations."""
 
     def __init__(self, own: Component, terms: SurveyTerms, scenes: Similarities) -> None:
         self.own, self.terms = own, terms
@@ -139,12 +139,12 @@ class System:
         out = []
         if len(own.edges) and self.roots is not None:
             r = residuals(own.edges, x.scenes)
-            A, B = linearised(own.edges, x.scenes, r)
+            A, B = linearize(own.edges, x.scenes, r)
             whitened = np.einsum("eij,ej->ei", self.roots, r)
             parts = ((own.edges.targets * d, self.roots @ A), (own.edges.sources * d, self.roots @ B))
             out.append(Terms("", whitened, parts, np.ones(len(r), dtype=bool)))
         if len(own.priors):
-            r, J = own.priors.linearised(x.scenes)
+            r, J = own.priors.linearize(x.scenes)
             out.append(Terms("", r, ((own.priors.scenes * d, J[:, :, :d]),), np.ones(len(r), dtype=bool)))
         if len(own.held):
             off = (self.start.inverse() @ x.scenes[np.array([own.anchor])]).log()[:, :d]
@@ -182,7 +182,7 @@ class System:
         return Factor(lu, root, self.own.dim, len(self.scenes))
 
     def factor(self, x: Unknowns, weights: Active, *, world_held: bool = False) -> Factor:
-        """The normal equations at an answer.
+        """Factorise the normal equations at an answer.
 
         Args:
             world_held: ``S_world_map`` is no unknown, for nothing was observed.
@@ -194,7 +194,7 @@ class System:
         return self._factored(H)
 
     def fit(self, x: Unknowns, weights: Active, max_steps: int = 30, *, hold: bool = False) -> Unknowns:
-        """Least squares with fixed weights, by Gauss-Newton with step halving.
+        """Fit by least squares with fixed weights: Gauss-Newton with step halving.
 
         Args:
             hold: scenes and the world stay as they are.
@@ -228,12 +228,12 @@ class System:
         return points, images, fixes, bars
 
     def points_at(self, x: Unknowns, active: Active) -> np.ndarray:
-        """Points that are not held by their survey, from photos."""
-        met, _, told = self.terms.triangulated(x, active[1])
-        return np.where((told & ~active[0])[:, None], met, x.points)
+        """Triangulate the points that are not fixed by their survey."""
+        met, _, determined = self.terms.triangulate(x, active[1])
+        return np.where((determined & ~active[0])[:, None], met, x.points)
 
-    def tests(self, x: Unknowns, active: Active, factor: Factor) -> Tests:
-        """Each observation against all others (Baarda 1968): the residual by what it can be, given them.
+    def tests(self, x: Unknowns, active: Active, factor: Factor) -> ObservationTests:
+        """Test each observation against all others (Baarda 1968): its residual relative to its covariance given them.
 
         Of one that was solved from, its own part is taken out: ``r^T (Q - A S A^T)^-1 r``; of another it is not in:
         ``r^T (Q + A S A^T)^-1 r``.
@@ -269,4 +269,4 @@ class System:
             )
             log_p[-1][~terms.valid] = -1e12
             redundancies.append(np.where(use, redundancy, 0.0))
-        return Tests(tuple(statistics), tuple(dofs), tuple(log_p), tuple(redundancies))
+        return ObservationTests(tuple(statistics), tuple(dofs), tuple(log_p), tuple(redundancies))

@@ -1,11 +1,11 @@
-"""Observations of the world as least-squares terms over scene poses, and the unknowns that only they have.
+"""Observations of the world as least-squares terms over scene poses, and the unknowns that they add.
 
 Unknowns are scene poses ``S_map_scene``, the component's ``S_world_map``, the control points (world frame), cameras of
 photos that were localised, and the errors that fixes have in common: offset and drift of a capture, the sea level.
 Steps are on the source side, as everywhere; a point ``x`` in the source frame moves by ``G(x) step`` with
 ``G(x) = [-skew(x), I, x]``.
 
-Sums of few terms with many unknowns are what a survey is, so that everything here is arrays by kind of term.
+All observations are stored as arrays by kind of term.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from gsmap.geometry.similarities import Similarities, commutator, exp
 from gsmap.types import Sim3
 from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey
 
-_FAR = 1e6  # m: how little is known of a point that no term holds; keeps the system regular and pulls at nothing
-_BEHIND = 1e3  # standard deviations of a photo that has the point behind it
+_FAR = 1e6  # m: sigma of points without other terms, which keeps the system regular without effect
+_BEHIND = 1e3  # residual in standard deviations of a point behind the camera
 _DRIFT = 0.5  # of a common sigma: errors of satellites last hours, a flight a quarter of one (Gauss-Markov, 2 h: 0.48)
-_CORRECTED = 0.5  # m: receivers with corrections are better than this, those without are not
+_CORRECTED = 0.5  # m: sigma below which a receiver has corrections (RTK, PPK)
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """An estimate of everything.
+    """Estimate of all unknowns.
 
     Args:
         scenes: N poses. world: ``S_world_map``, as one row. points: (K, 3). cameras: M poses, scene frame.
@@ -44,7 +44,7 @@ class Unknowns:
     offsets: np.ndarray
 
     def moved(self, step: np.ndarray, dim: int) -> Unknowns:
-        """After a step over all columns, see `Columns`."""
+        """Return the estimate after a step over all columns, see `Columns`."""
         n, k, m = len(self.scenes), len(self.points), len(self.cameras)
         ends = np.cumsum([n * dim, 7, 3 * k, 6 * m])
         scenes, world, points, cameras, offsets = np.split(step, ends)
@@ -59,7 +59,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Columns:
-    """Where the unknowns lie in a step: scenes (``dim`` each), world (7), points (3), cameras (6), offsets (3)."""
+    """Column layout of a step: scenes (``dim`` each), world (7), points (3), cameras (6), offsets (3)."""
 
     num_scenes: int
     dim: int
@@ -106,12 +106,12 @@ class Terms:
 
     @cached_property
     def squares(self) -> np.ndarray:
-        """(G,) chi-square of each term by itself."""
+        """Compute the chi-square (G,) of each term by itself."""
         out: np.ndarray = (self.residuals**2).sum(1)
         return out
 
     def rows(self, size: int) -> np.ndarray:
-        """(G, m, size) dense derivatives by all columns; of few terms only."""
+        """Expand dense derivatives (G, m, size) by all columns; of few terms only."""
         g, m = self.residuals.shape
         out = np.zeros((g, m, size))
         for first, J in self.parts:
@@ -139,7 +139,9 @@ class SurveyTerms:
 
     @classmethod
     def of(cls, survey: Survey, scene_ids: Sequence[str], dim: int) -> SurveyTerms:
-        """Those of the scenes of one component; points that none of their photos shows are left out."""
+        """Select the observations of the scenes of one component; points that none of their photos shows are left
+        out.
+        """
         mine = set(scene_ids)
         known = {point.name for point in survey.points}
         images = tuple(i for i in survey.images if i.scene in mine and i.point in known)
@@ -170,17 +172,17 @@ class SurveyTerms:
 
     @cached_property
     def image_points(self) -> np.ndarray:
-        """(I,) the point that each image shows."""
+        """Index (I,) of the point that each image shows."""
         return np.array([self._point_row[i.point] for i in self.images], dtype=np.int64)
 
     @cached_property
     def image_scenes(self) -> np.ndarray:
-        """(I,) the scene that each image's camera is in."""
+        """Index (I,) of the scene that each image's camera is in."""
         return np.array([self._row[i.scene] for i in self.images], dtype=np.int64)
 
     @cached_property
     def _uncertain(self) -> dict[tuple[str, str], ImagePoint]:
-        """By (scene, photo), the first image of each photo whose camera is not exact."""
+        """First image of each photo with an uncertain camera, by (scene, photo)."""
         out: dict[tuple[str, str], ImagePoint] = {}
         for image in self.images:
             if image.camera_covariance is not None:
@@ -193,14 +195,14 @@ class SurveyTerms:
 
     @cached_property
     def _image_cameras(self) -> np.ndarray:
-        """(I,) the camera of each image, -1 where it is exact."""
+        """Index (I,) of the camera of each image, -1 where it is exact."""
         return np.array([self._camera_rows.get((i.scene, i.image), -1) for i in self.images], dtype=np.int64)
 
     @cached_property
     def fix_groups(self) -> list[tuple[str, bool]]:
-        """(F) by fix, what it shares its common error with: its scene, and whether its receiver has corrections.
+        """Group (F) of each fix with a common error: its scene, and whether its receiver has corrections.
 
-        Receivers with and without corrections err by themselves, also where both are of one capture.
+        Receivers with and without corrections have independent errors, even in one capture.
         """
         return [(f.scene, float(np.hypot(f.sigma_m[0], f.common_sigma_m[0])) < _CORRECTED) for f in self.fixes]
 
@@ -209,7 +211,7 @@ class SurveyTerms:
         """By kind of common error (offset, drift, sea level): its row of each fix, -1 where none, and (F, 3) metres of
         a standard deviation of it; and the number of rows.
 
-        A fix carries its own sigma of what it shares: one that is poor makes the others no worse.
+        Each fix has its own sigma of the common error, so that a poor fix does not degrade the others.
         """
         sigmas = np.array([_per_axis(f.common_sigma_m) for f in self.fixes]).reshape(-1, 3)
         sea = np.array([[0.0, 0.0, f.sea_level_sigma_m] for f in self.fixes]).reshape(-1, 3)
@@ -226,7 +228,7 @@ class SurveyTerms:
         return kinds, 2 * len(groups) + int(sea.any())
 
     def start(self, scenes: Similarities, world: Sim3) -> Unknowns:
-        """Points where they were surveyed, cameras where they were localised, no common errors."""
+        """Initialize points at their survey, cameras as localized, and no common errors."""
         cameras = [Sim3.from_matrix(image.T_scene_camera) for image in self._uncertain.values()]
         return Unknowns(
             scenes,
@@ -239,11 +241,11 @@ class SurveyTerms:
     # --- terms -------------------------------------------------------------------------------------------------------
 
     def observations(self, x: Unknowns) -> tuple[Terms, Terms, Terms, Terms]:
-        """Of points, images, fixes and bars."""
+        """Return the terms of points, images, fixes and bars."""
         return self._points(x), self._images(x), self._fixes(x), self._bars(x)
 
     def others(self, x: Unknowns, at: Unknowns) -> tuple[Terms, ...]:
-        """What is known of localised cameras and common errors, and next to nothing of the points.
+        """Return the terms of localized cameras and common errors, and very weak ones of the points.
 
         Args:
             at: where the steps of points are counted from.
@@ -329,7 +331,7 @@ class SurveyTerms:
         return Terms("image", r, parts, valid)
 
     def cameras_at(self, x: Unknowns) -> Similarities:
-        """(I) the camera of each image in its scene."""
+        """Return the camera (I) of each image in its scene."""
         rows = np.flatnonzero(self._image_cameras >= 0)
         exact = self._exact_cameras
         return exact.replaced(rows, x.cameras[self._image_cameras[rows]]) if len(rows) else exact
@@ -339,7 +341,7 @@ class SurveyTerms:
         return Similarities.stack([Sim3.from_matrix(image.T_scene_camera) for image in self.images])
 
     def image_errors_px(self, x: Unknowns) -> np.ndarray:
-        """(I, 2) from where points were picked to where they fall."""
+        """Compute reprojection errors (I, 2) in pixels."""
         terms = self._images(x)
         sigmas = np.array([image.sigma_px for image in self.images])
         out: np.ndarray = terms.residuals[:, :2] * sigmas[:, None]
@@ -372,7 +374,7 @@ class SurveyTerms:
         return Terms("fix", residual, parts, np.ones(count, dtype=bool))
 
     def fix_points(self, scenes: Similarities) -> np.ndarray:
-        """(F, 3) where they lie in the map."""
+        """Return the positions (F, 3) of fixes in the map."""
         rows = np.array([self._row[fix.scene] for fix in self.fixes], dtype=np.int64)
         return scenes[rows].apply(np.array([fix.point for fix in self.fixes], dtype=np.float64).reshape(-1, 3))
 
@@ -392,7 +394,7 @@ class SurveyTerms:
         sigma = np.array([bar.sigma_m for bar in self.bars])
         sizes = np.stack([np.exp(pose.log_scales) for pose in poses], axis=1)
         measured = np.array([bar.length_m for bar in self.bars])
-        # In metres by the bar itself: by the estimate, a larger world would make its own errors count for less.
+        # In metres by the bar itself: by the estimate, a larger world would reduce the weight of its own errors.
         metres = (measured / np.maximum(across, 1e-300))[:, None]
         picked = np.array([bar.point_sigmas for bar in self.bars]) * sizes * metres
         weight = 1 / np.sqrt(sigma**2 + (picked**2).sum(1))
@@ -411,27 +413,27 @@ class SurveyTerms:
 
     # --- points from photos alone ------------------------------------------------------------------------------------
 
-    def triangulated(self, x: Unknowns, use: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where photos alone have the points, all poses held.
+    def triangulate(self, x: Unknowns, use: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Triangulate points from photos alone, all poses fixed.
 
-        Two rays or more are met where their least-squares point lies; a single one where the rendered surface is.
+        Two or more rays intersect at their least-squares point; a single ray at the rendered surface.
 
         Args:
             use: (I,) bool, images to take.
 
         Returns:
-            (K, 3) world frame, (K, 3, 3) covariance of picking alone, (K,) bool whether the photos tell.
+            (K, 3) world frame, (K, 3, 3) covariance of picking alone, (K,) bool, points that the photos determine.
         """
         world = x.world[np.zeros(len(self.images), dtype=np.int64)]
         full = world @ x.scenes[self.image_scenes] @ self.cameras_at(x) if len(self.images) else world
-        points, covariances, told = x.points.copy(), np.zeros((len(self.points), 3, 3)), []
+        points, covariances, flags = x.points.copy(), np.zeros((len(self.points), 3, 3)), []
         for k in range(len(self.points)):
             mine = np.flatnonzero((self.image_points == k) & use)
             found = self._meeting(full[mine], [self.images[i] for i in mine.tolist()])
-            told.append(found is not None)
+            flags.append(found is not None)
             if found is not None:
                 points[k] = found
-        told_ = np.array(told, dtype=bool)
+        determined = np.array(flags, dtype=bool)
         at = replace(x, points=points)
         for _ in range(10):
             terms = self._images(at)
@@ -440,17 +442,19 @@ class SurveyTerms:
             H, g = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
             np.add.at(H, self.image_points[live], np.einsum("iab,iac->ibc", J[live], J[live]))
             np.add.at(g, self.image_points[live], np.einsum("iab,ia->ib", J[live], terms.residuals[live]))
-            told_ &= np.array([np.linalg.cond(h) < 1e12 if h.any() else False for h in H], dtype=bool)
+            determined &= np.array([np.linalg.cond(h) < 1e12 if h.any() else False for h in H], dtype=bool)
             step = np.zeros_like(points)
-            step[told_] = -np.linalg.solve(H[told_], g[told_][:, :, None])[:, :, 0]
+            step[determined] = -np.linalg.solve(H[determined], g[determined][:, :, None])[:, :, 0]
             at = replace(at, points=at.points + step)
             if np.abs(step).max(initial=0) < 1e-9:
                 break
-        covariances[told_] = np.linalg.inv(H[told_]) if len(points) else covariances[told_]
-        return at.points, covariances, told_
+        covariances[determined] = np.linalg.inv(H[determined]) if len(points) else covariances[determined]
+        return at.points, covariances, determined
 
     def _meeting(self, cameras: Similarities, images: Sequence[ImagePoint]) -> np.ndarray | None:
-        """A first guess of where rays meet; None where they are too few or parallel and no surface is known."""
+        """Return a first guess of the intersection of rays; None where they are too few or parallel and no surface is
+        known.
+        """
         if not images:
             return None
         centres = cameras.translations
@@ -480,18 +484,18 @@ def _per_axis(sigma_m: tuple[float, float]) -> np.ndarray:
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Order of names as people count: 2 before 10."""
+    """Return the sort key of names in natural order: 2 before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _linear(poses: Similarities) -> np.ndarray:
-    """(N, 3, 3) ``s R``."""
+    """Compute ``s R`` (N, 3, 3)."""
     out: np.ndarray = poses.rotations * np.exp(poses.log_scales)[:, None, None]
     return out
 
 
 def _moves(points: np.ndarray) -> np.ndarray:
-    """(N, 3, 7) how points of a frame move by a step of it: ``[-skew(x), I, x]``."""
+    """Compute derivatives (N, 3, 7) of points by a step of their frame: ``[-skew(x), I, x]``."""
     out = np.zeros((len(points), 3, 7))
     out[:, :, :3] = -skew(points)
     out[:, :, 3:6] = np.eye(3)
@@ -500,6 +504,6 @@ def _moves(points: np.ndarray) -> np.ndarray:
 
 
 def _whitener(covariance: np.ndarray) -> np.ndarray:
-    """(6, 6) ``L^-1`` of a covariance ``L L^T``."""
+    """Compute ``L^-1`` (6, 6) of a covariance ``L L^T``."""
     out: np.ndarray = np.linalg.inv(np.linalg.cholesky((covariance + covariance.T) / 2))
     return out

@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.register.surface import Surface
 from gsmap.register.view_cache import ViewCache
-from gsmap.render import Rendered, render
+from gsmap.render import Rendering, render
 from gsmap.types import Sim3
 
 
@@ -235,9 +235,9 @@ def _cross_view(
 
 def _compare(
     stats: CrossViewStats,
-    own: Rendered,
+    own: Rendering,
     unit_m: float,
-    other: Rendered,
+    other: Rendering,
     scale: float,
     focal_px: float,
     params: Params,

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmap.geometry.projection import in_image, project, project_all
 from gsmap.geometry.vantage import synthesise_cameras
-from gsmap.render import Rendered, render
+from gsmap.render import Rendering, render
 from gsmap.types import Cameras, Gaussians
 
 _KEPT = 64  # renders of 128 x 96 pixels: 16 MB; bounds memory, changes no answer
@@ -55,7 +55,7 @@ class ViewCache:
         self.gaussians = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, g.sh[:, :1])
         self.cameras = self._with_made(cameras).resized(self.params.image_size_px)
         self.num_own = 0 if cameras.synthesised else len(cameras)  # the first; those that follow are made
-        self._renders: OrderedDict[int, Rendered] = OrderedDict()
+        self._renders: OrderedDict[int, Rendering] = OrderedDict()
 
     def _with_made(self, cameras: Cameras) -> Cameras:
         """The scene's own cameras and, where they see too little of it, made ones."""
@@ -76,7 +76,7 @@ class ViewCache:
             seen[at[z <= nearest[pixel]]] = True
         return float(seen.mean()) if len(seen) else 1.0
 
-    def render(self, row: int) -> Rendered:
+    def render(self, row: int) -> Rendering:
         """Colour, alpha and depth (1, H, W) of the view of one camera."""
         if row not in self._renders:
             # On the CPU everywhere: a verdict is the same bits on every machine and in every run, and pictures this

@@ -10,7 +10,7 @@ from gsmap.render.fit import make_fitter
 from gsmap.render.fitter import FitOptions, Fitter, LearningRates
 from gsmap.render.index import ChunkIndex
 from gsmap.render.native import num_threads, set_num_threads
-from gsmap.render.outputs import Rendered
+from gsmap.render.outputs import Rendering
 from gsmap.render.rendering import render
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ __all__ = [
     "Fitter",
     "GaussianTensors",
     "LearningRates",
-    "Rendered",
+    "Rendering",
     "backend",
     "make_fitter",
     "num_threads",

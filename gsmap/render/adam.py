@@ -25,7 +25,7 @@ class Corrections:
         return torch.stack([1 / (1 - beta1**t), 1 / (1 - beta2**t).sqrt()], 1).float().to(self._device)
 
     def next(self) -> torch.Tensor:
-        """The table for one step more than before: no Gaussian was updated more often than there were steps."""
+        """Return the table for one more step: no Gaussian was updated more often than there were steps."""
         self._steps += 1
         if self._steps >= len(self._table):
             self._table = self._upto(2 * len(self._table))
@@ -33,7 +33,7 @@ class Corrections:
 
 
 def touched(gradients: Sequence[torch.Tensor]) -> torch.Tensor:
-    """(N,) whether anything was added to the gradient of a Gaussian; of colours the mean tells."""
+    """Find Gaussians (N,) whose gradient is not zero; of colours the mean is tested."""
     means, quats, scales, opacities, sh = gradients
     found = (means != 0).any(1) | (quats != 0).any(1) | (scales != 0).any(1) | (opacities != 0)
     return found | (sh[:, 0] != 0).any(1)
@@ -106,7 +106,7 @@ def _by_triton(
     betas: tuple[float, float],
     epsilon: float,
 ) -> None:
-    """As `_by_torch`, in one launch."""
+    """Compute `_by_torch` in one launch."""
     from gsmap.render.triton_kernels import adam_rows
 
     n, columns = len(values[0]), 3 * values[4].shape[1]

@@ -10,7 +10,7 @@ import torch
 from gsmap.errors import ConfigError
 from gsmap.render import native
 from gsmap.render.index import ChunkIndex
-from gsmap.render.outputs import Rendered, image_size
+from gsmap.render.outputs import Rendering, image_size
 from gsmap.render.tensors import GaussianTensors
 from gsmap.types import Cameras
 
@@ -24,8 +24,8 @@ def render_tensors(
     dominant_id: bool,
     max_weight: bool,
     index: ChunkIndex | None,
-) -> Rendered:
-    """`gsmap.render.render` for tensors on the CPU."""
+) -> Rendering:
+    """Run `gsmap.render.render` for tensors on the CPU."""
     if gaussians.means.device.type == "cuda":
         raise ConfigError(
             "the native backend renders CPU tensors: move them to the CPU or use backend='auto'",
@@ -33,7 +33,7 @@ def render_tensors(
         )
     width, height = image_size(cameras)
     options = (cameras.intrinsics_px, width, height, background, depth, dominant_id, max_weight, index)
-    return Rendered(*_Render.apply(*gaussians.tensors(), T_camera_frame, options))
+    return Rendering(*_Render.apply(*gaussians.tensors(), T_camera_frame, options))
 
 
 class _Render(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""What renders: the native kernel on the CPU, or gsplat on CUDA."""
+"""Choice of the renderer: the native kernel on the CPU, or gsplat on CUDA."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from gsmap.errors import ConfigError
 
 
 def backend(name: str = "auto") -> Literal["native", "gsplat"]:
-    """The backend that a name stands for here: ``native`` or ``gsplat``.
+    """Resolve the name of a backend to ``native`` or ``gsplat``.
 
     The two do not give the same bits, so the answer belongs to the recipe of whatever is rendered. torch is imported
     only where gsplat and NVIDIA's driver are installed.
 
     Args:
-        name: ``native``, ``gsplat``, or ``auto``: gsplat where it is installed and torch sees a GPU, else native.
+        name: ``native``, ``gsplat``, or ``auto``: gsplat where it is installed and torch finds a GPU, otherwise native.
 
     Raises:
         ConfigError: an unknown name.
@@ -32,7 +32,7 @@ def backend(name: str = "auto") -> Literal["native", "gsplat"]:
 
 @functools.cache
 def gsplat_available() -> bool:
-    """Whether gsplat is installed and torch sees a GPU."""
+    """Return True if gsplat is installed and torch finds a GPU."""
     # torch is slow to import, and naming a recipe can do without it where there is no gsplat or no driver.
     if importlib.util.find_spec("gsplat") is None or not _has_driver():
         return False
@@ -43,12 +43,12 @@ def gsplat_available() -> bool:
 
 @functools.cache
 def has_triton() -> bool:
-    """Whether Triton is installed; without it torch does what its kernels do, more slowly."""
+    """Return True if Triton is installed; without it torch runs the same operations, more slowly."""
     return importlib.util.find_spec("triton") is not None
 
 
 def _has_driver() -> bool:
-    """Whether NVIDIA's driver is installed."""
+    """Return True if NVIDIA's driver is installed."""
     try:
         ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
     except OSError:

@@ -20,7 +20,7 @@ MIN_TRANSMITTANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """What gsplat blended C images from.
+    """Lists of Gaussians by tile from which gsplat blended C images.
 
     Args:
         means2d, conics, opacities: (C, N, 2), (C, N, 3), (C, N); or packed, a row for each Gaussian and image.
@@ -41,7 +41,7 @@ class TileLists:
 def blending_weights(
     lists: TileLists, height: int, width: int, num_gaussians: int, max_weight: bool
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Blend what gsplat projected once more.
+    """Blend the Gaussians that gsplat projected once more, to get their blending weights.
 
     Args:
         num_gaussians: N, of what was rasterised.
@@ -85,7 +85,9 @@ def _by_torch(
     size: int,
     max_weight: bool,
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """All tiles in step, the k-th Gaussian of each at once: (C, H, W) int64 row shown, and (M,) largest weights."""
+    """Blend all tiles in parallel, the k-th Gaussian of each at once: (C, H, W) int64 row shown, and (M,) largest
+    weights.
+    """
     views, height, width = shape
     where = means2d.device
     down, across = -(-height // size), -(-width // size)
@@ -133,7 +135,7 @@ def _by_triton(
     size: int,
     max_weight: bool,
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """As `_by_torch`, a tile to a warp."""
+    """Compute `_by_torch` with one warp per tile."""
     from gsmap.render.triton_kernels import blend_tile
 
     _, height, width = shape

@@ -1,4 +1,4 @@
-"""The fitter of a backend, and what to do where a GPU cannot hold a fit."""
+"""Choice of the fitter of a backend, and the fallback where a GPU cannot hold a fit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def make_fitter(
     options: FitOptions | None = None,
     backend: str = "auto",
 ) -> Fitter:
-    """The fitter of a backend; see `Fitter`.
+    """Create the fitter of a backend; see `Fitter`.
 
     Args:
         backend: as for `gsmap.render.render`. The native one gives the same bits for any number of threads; gsplat adds
@@ -34,7 +34,7 @@ def make_fitter(
     Raises:
         ConfigError: an unknown backend.
         InputError: arrays that do not fit together.
-        MissingDependencyError: gsplat is asked for and not installed.
+        MissingDependencyError: gsplat is requested and not installed.
     """
     if resolved(backend) == "gsplat":
         from gsmap.render.gsplat_fit import GsplatFitter

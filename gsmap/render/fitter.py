@@ -1,4 +1,4 @@
-"""The contract of what optimizes Gaussians against images of known cameras."""
+"""Contract of fitters, which optimize Gaussians against images of known cameras."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How a fitter steps.
+    """Options of the optimization steps of a fitter.
 
     Args:
         ssim_weight: share of ``1 - SSIM`` in the loss; the rest is Huber's of the colours.
@@ -46,7 +46,7 @@ class FitOptions:
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """What a densifier or pruner needs to know of N Gaussians.
+    """Statistics of N Gaussians for densification and pruning.
 
     Args:
         gradient_norm: (N,) float32, sum over views of the norm of dL/d(projected centre), in halves of the image's
@@ -99,7 +99,7 @@ class Fitter(ABC):
 
     @abstractmethod
     def gaussians(self) -> Gaussians:
-        """The Gaussians as they are now (a copy)."""
+        """Return the current Gaussians (a copy)."""
 
     @abstractmethod
     def step(self, cameras: Cameras, images: Any, masks: Any = None) -> Any:
@@ -138,11 +138,11 @@ class Fitter(ABC):
 
     @abstractmethod
     def statistics(self) -> Statistics:
-        """What was counted since the last reset; all zeros unless ``options.statistics``."""
+        """Return the statistics since the last reset; all zeros unless ``options.statistics``."""
 
 
 def checked_mask(mask: np.ndarray | None, n: int) -> np.ndarray | None:
-    """(N,) bool of ``frozen``, or None."""
+    """Validate ``frozen``: (N,) bool, or None."""
     if mask is None:
         return None
     mask = np.ascontiguousarray(mask, dtype=bool)

@@ -17,7 +17,7 @@ import torch
 
 from gsmap.errors import MissingDependencyError
 from gsmap.render.blending_weights import TILE_PX, TileLists, blending_weights
-from gsmap.render.outputs import Rendered, image_size
+from gsmap.render.outputs import Rendering, image_size
 from gsmap.render.tensors import GaussianTensors
 from gsmap.types import Cameras, Gaussians
 
@@ -36,13 +36,13 @@ class DeviceMemoryError(Exception):
 
 
 def device() -> torch.device:
-    """The device that gsplat renders on."""
+    """Return the device that gsplat renders on."""
     return torch.device("cuda")
 
 
 @functools.cache
 def load() -> Any:
-    """The package, with its kernels.
+    """Import the package, with its kernels.
 
     Raises:
         MissingDependencyError: gsplat or its CUDA kernels are missing.
@@ -132,22 +132,22 @@ class DeviceViews:
 
 
 def drawable(values: Sequence[torch.Tensor]) -> torch.Tensor:
-    """(N,) whether means, quats, log_scales, logit_opacities and sh are numbers that float32 can draw."""
+    """Find Gaussians (N,) whose means, quats, log_scales, logit_opacities and sh are numbers that float32 can draw."""
     means, quats, log_scales, logits, sh = values
     sound = torch.isfinite(means).all(1) & torch.isfinite(quats).all(1) & torch.isfinite(sh).flatten(1).all(1)
     return sound & ~(torch.isnan(log_scales) | (log_scales >= 80)).any(1) & ~torch.isnan(logits)
 
 
 def without_zeros(quats: torch.Tensor) -> torch.Tensor:
-    """(N, 4) quaternions as they are, but the identity in place of those of length zero."""
+    """Replace quaternions (N, 4) of length zero by the identity."""
     identity = quats.new_tensor([1.0, 0, 0, 0])
     return torch.where(quats.square().sum(1, keepdim=True) > 1e-30, quats, identity)
 
 
-class _Kept:
-    """Gaussians that were rendered lately, on the GPU: a scene is rendered through many cameras, one after another.
+class _DeviceCache:
+    """Cache of recently rendered Gaussians on the GPU: a scene is rendered through many cameras, one after another.
 
-    They are known by the object that holds them; Gaussians are not changed in place after they were rendered.
+    The key is the `Gaussians` object, which is not changed in place after it was rendered.
     """
 
     def __init__(self) -> None:
@@ -162,7 +162,7 @@ class _Kept:
                 return self._entries[key][1]
             moved = DrawableGaussians.of(GaussianTensors.of(gaussians, device=str(device())))
             self._entries[key] = weakref.ref(gaussians, lambda _: self._entries.pop(key, None)), moved
-            while len(self._entries) > 1 and sum(d.nbytes for _, d in self._entries.values()) > _kept_bytes():
+            while len(self._entries) > 1 and sum(d.nbytes for _, d in self._entries.values()) > _cache_bytes():
                 self._entries.popitem(last=False)
             return moved
 
@@ -170,10 +170,10 @@ class _Kept:
         self._entries.clear()
 
 
-_kept = _Kept()
+_device_cache = _DeviceCache()
 
 
-def _kept_bytes() -> int:
+def _cache_bytes() -> int:
     if device().type != "cuda":
         return 1 << 30
     return int(torch.cuda.get_device_properties(device()).total_memory) // 8
@@ -201,7 +201,7 @@ def render_numpy(gaussians: Gaussians, cameras: Cameras, background: np.ndarray,
     wants = {name: images[name] is not None for name in ("depth", "dominant_id", "max_weight")}
 
     def draw(first: int, last: int) -> None:
-        scene = _kept.get(gaussians)
+        scene = _device_cache.get(gaussians)
         found = _draw(scene, DeviceViews.of(cameras[first:last]), background, **wants)
         for name in ("colour", "alpha", "depth", "dominant_id"):
             if images[name] is not None:
@@ -214,7 +214,7 @@ def render_numpy(gaussians: Gaussians, cameras: Cameras, background: np.ndarray,
 
 
 def in_batches(count: int, size: int, do: Callable[[int, int], None]) -> None:
-    """Call ``do(first, last)`` for ranges that cover ``count``, each half as large where the GPU's memory runs out.
+    """Call ``do(first, last)`` for ranges that cover ``count``, halved where the GPU's memory is exhausted.
 
     Raises:
         DeviceMemoryError: one at a time does not fit.
@@ -225,7 +225,7 @@ def in_batches(count: int, size: int, do: Callable[[int, int], None]) -> None:
         try:
             do(first, last)
         except torch.cuda.OutOfMemoryError as error:
-            _kept.clear()
+            _device_cache.clear()
             if device().type == "cuda":
                 torch.cuda.empty_cache()
             if size == 1:
@@ -243,8 +243,8 @@ def render_tensors(
     depth: bool,
     dominant_id: bool,
     max_weight: bool,
-) -> Rendered:
-    """`gsmap.render.render` for tensors; those on the CPU go to the GPU and the answer comes back."""
+) -> Rendering:
+    """Run `gsmap.render.render` for tensors; tensors on the CPU are moved to the GPU and the result back."""
     load()
     width, height = image_size(cameras)
     home = gaussians.means.device
@@ -254,7 +254,7 @@ def render_tensors(
     moved = GaussianTensors(*(t.to(device()) for t in gaussians.tensors()))
     views_there = DeviceViews.of(cameras, T_camera_frame)
     found = _draw(DrawableGaussians.of(moved), views_there, background, depth, dominant_id, max_weight)
-    return Rendered(*(None if t is None else t.to(home) for t in vars(found).values()))
+    return Rendering(*(None if t is None else t.to(home) for t in vars(found).values()))
 
 
 def _draw(
@@ -264,7 +264,7 @@ def _draw(
     depth: bool,
     dominant_id: bool,
     max_weight: bool,
-) -> Rendered:
+) -> Rendering:
     """Render on the GPU; every tensor of the answer lies there."""
     colour, alpha, depths, lists = rasterize(scene, views, depth)
     if background.any():
@@ -276,7 +276,7 @@ def _draw(
             ids = torch.where(ids >= 0, scene.rows.to(torch.int32)[ids.clamp_min(0)], ids)
             if weights is not None:
                 weights = weights.new_zeros(scene.num_all).index_copy(0, scene.rows, weights)
-    return Rendered(colour, alpha[..., 0], depths, ids if dominant_id else None, weights if max_weight else None)
+    return Rendering(colour, alpha[..., 0], depths, ids if dominant_id else None, weights if max_weight else None)
 
 
 def rasterize(
@@ -355,9 +355,9 @@ def _nothing(
     dominant_id: bool,
     max_weight: bool,
     device: torch.device,
-) -> Rendered:
+) -> Rendering:
     shape = (views, height, width)
-    return Rendered(
+    return Rendering(
         torch.tensor(background, device=device).expand(*shape, 3).clone(),
         torch.zeros(shape, device=device),
         torch.zeros(shape, device=device) if depth else None,

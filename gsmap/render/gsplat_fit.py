@@ -124,7 +124,7 @@ class GsplatFitter(Fitter):
 
     @torch.no_grad()
     def _drawn(self) -> gsplat.DrawableGaussians:
-        """The Gaussians as they are drawn; leaves of a new graph."""
+        """Return the Gaussians as drawn; leaves of a new graph."""
         means, quats, log_scales, logits, sh = self._values
         scales, opacities = log_scales.exp(), torch.sigmoid(logits)
         if self._hidden is not None:
@@ -142,7 +142,7 @@ class GsplatFitter(Fitter):
         )
 
     def _seen_from(self, cameras: Cameras) -> gsplat.DeviceViews:
-        """The cameras on the GPU, moved there once: a schedule uses the same ones again and again."""
+        """Return the cameras on the GPU, cached: a schedule uses the same ones many times."""
         if cameras not in self._views:
             self._views[cameras] = gsplat.DeviceViews.of(cameras)
         return self._views[cameras]
@@ -187,7 +187,7 @@ class GsplatFitter(Fitter):
         )
 
     def _pixels(self, values: Any, shape: tuple[int, ...], name: str) -> torch.Tensor:
-        """Images or masks on the GPU, bytes or float32."""
+        """Move images or masks to the GPU, as bytes or float32."""
         check_pixels(values, shape, name)
         if not isinstance(values, torch.Tensor):
             values = torch.from_numpy(np.ascontiguousarray(values))

@@ -24,7 +24,7 @@ def image_loss(
     ssim_weight: float,
     huber_delta: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """``(1 - s) * Huber + s * (1 - SSIM)`` of images, each a mean over its pixels weighed by a mask.
+    """Compute ``(1 - s) * Huber + s * (1 - SSIM)`` of images, each a mean over its pixels weighted by a mask.
 
     Args:
         images: (V, H, W, 3) float32.
@@ -83,7 +83,7 @@ def _by_triton(
     ssim_weight: float,
     huber_delta: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """As `_by_torch`, in four launches for each view."""
+    """Compute `_by_torch` in four launches per view."""
     from gsmap.render.triton_kernels import loss_gradient, slope_columns, ssim_columns, ssim_rows
 
     views, height, width, _ = images.shape
@@ -127,7 +127,7 @@ def _window_on(device: torch.device) -> torch.Tensor:
 def _structural_similarity(
     images: torch.Tensor, targets: torch.Tensor, weights: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """SSIM (V, H, W, 3) times weights (V, H, W, 1), and the gradient of its sum with respect to the images."""
+    """Compute SSIM (V, H, W, 3) times weights (V, H, W, 1), and the gradient of its sum with respect to the images."""
     a, b = images.permute(0, 3, 1, 2), targets.permute(0, 3, 1, 2)
     mean_a, mean_b, aa, bb, ab = _blurred(torch.cat([a, b, a * a, b * b, a * b], 1)).split(3, 1)
     w = weights.permute(0, 3, 1, 2)
@@ -146,7 +146,9 @@ def _structural_similarity(
 
 
 def _blurred(maps: torch.Tensor) -> torch.Tensor:
-    """(V, C, H, W) maps under the window, in full float32: a variance is the difference of two nearly equal numbers."""
+    """Blur maps (V, C, H, W) by the window, in full float32: a variance is the difference of two nearly equal
+    numbers.
+    """
     channels = maps.shape[1]
     window = torch.tensor(_WINDOW, dtype=maps.dtype, device=maps.device)
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):

@@ -1,4 +1,4 @@
-"""Boxes of chunks of Gaussians, so that a camera that sees a corner of a site touches only that corner."""
+"""Bounding boxes of chunks of Gaussians, so that a camera only touches the chunks that it sees."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ChunkIndex:
 
     @classmethod
     def build(cls, gaussians: Gaussians, chunk: int = 4096) -> ChunkIndex:
-        """Boxes of runs of ``chunk`` Gaussians, in the order they are stored.
+        """Compute the boxes of runs of ``chunk`` Gaussians, in stored order.
 
         Sort scattered Gaussians first (`gsmap.geometry.morton`); scenes from the store are sorted.
         """
@@ -61,7 +61,7 @@ class ChunkIndex:
         return int(self.starts[-1])
 
     def visible_ranges(self, pose: np.ndarray, intrinsics_px: np.ndarray, width: int, height: int) -> np.ndarray:
-        """(R, 2) int64 ranges of Gaussians that a camera may see; never leaves out one that it draws.
+        """Find ranges (R, 2) int64 of Gaussians that a camera may see; none that it draws is left out.
 
         Args:
             pose: (3, 4) or (4, 4) frame-to-camera.

@@ -29,7 +29,7 @@ __all__ = [
 
 
 def set_num_threads(count: int | None = None) -> None:
-    """How many threads render; None is every core this process may use, or OMP_NUM_THREADS where that is set."""
+    """Set the number of render threads; None uses every core this process may use, or OMP_NUM_THREADS where set."""
     if count is None:
         try:
             count = int(os.environ.get("OMP_NUM_THREADS", ""))
@@ -42,7 +42,7 @@ def set_num_threads(count: int | None = None) -> None:
 
 
 def arrays_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
-    """The five arrays in the kernel's order."""
+    """Return the five arrays in the kernel's order."""
     return gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh
 
 
@@ -52,8 +52,7 @@ _KEPT_BYTES = 1 << 27  # at most: what a view of a room needs, and of a street d
 
 @contextmanager
 def workspace() -> Iterator[Any]:
-    """A view to render through, whose memory this thread has used before: to clear new memory takes a tenth of a small
-    picture's time."""
+    """Return a view with reused memory of this thread: clearing new memory takes a tenth of a small image's time."""
     view = _kept.__dict__.pop("view", None) or View()
     yield view
     if view.workspace_bytes <= _KEPT_BYTES:
@@ -63,7 +62,7 @@ def workspace() -> Iterator[Any]:
 def allocate(
     views: int, height: int, width: int, num_gaussians: int, depth: bool, dominant_id: bool, max_weight: bool
 ) -> dict[str, Any]:
-    """Output arrays of `Rendered` by field name; None where one is not wanted."""
+    """Allocate output arrays of `Rendering` by field name; None where one is not requested."""
     shape = (views, height, width)
     return {
         "colour": np.empty((*shape, 3), np.float32),
@@ -85,7 +84,7 @@ def forward(
     index: ChunkIndex | None,
     looked_at: np.ndarray | None = None,
 ) -> None:
-    """Render view ``i`` into ``images``; ``view`` keeps what its backward pass needs.
+    """Render view ``i`` into ``images``; ``view`` keeps the state of its backward pass.
 
     Where no pixel of ``looked_at`` (H, W) in reach of SSIM's windows differs from 0, nothing need be drawn.
     """

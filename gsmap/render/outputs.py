@@ -1,4 +1,4 @@
-"""What a rendering is made of: the images, and the size that they share."""
+"""Images of a rendering, and the size that they share."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from gsmap.types import Cameras
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
-    """What C cameras see; numpy arrays or torch tensors, as the Gaussians were.
+class Rendering:
+    """Images of C cameras; numpy arrays or torch tensors, like the Gaussians.
 
     Args:
         colour: (C, H, W, 3) float32, not clamped above.
@@ -29,7 +29,7 @@ class Rendered:
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:
-    """``(width, height)`` that all cameras share.
+    """Return the ``(width, height)`` that all cameras share.
 
     Raises:
         InputError: not `Cameras`, several sizes, or larger than the rasteriser's 65,535 tiles of 32 pixels a side.

@@ -1,4 +1,4 @@
-"""The one function that renders."""
+"""Rendering of Gaussians: one function for all backends, numpy and torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.render import backends, native
 from gsmap.render.index import ChunkIndex
-from gsmap.render.outputs import Rendered, image_size
+from gsmap.render.outputs import Rendering, image_size
 from gsmap.types import Cameras, Gaussians
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def render(
     index: ChunkIndex | None = None,
     T_camera_frame: torch.Tensor | None = None,
     backend: str = "auto",
-) -> Rendered:
+) -> Rendering:
     """Render Gaussians through cameras that share one image size.
 
     `Gaussians` in, numpy out. `GaussianTensors` in, torch out, differentiable with respect to every tensor in it and to
@@ -51,13 +51,13 @@ def render(
         T_camera_frame: (C, 4, 4) tensor of view matrices that replaces the cameras' poses, where the pose is to be
             optimised. The viewing direction is taken from the centre ``-R^T t``.
         backend: ``native`` (CPU), ``gsplat`` (CUDA; gradients are not the same bits in every run), or ``auto``: gsplat
-            where it is installed and torch sees a GPU, else native. What the GPU's memory cannot hold is rendered in
-            batches of fewer cameras, at last on the CPU with a warning.
+            where it is installed and torch finds a GPU, otherwise native. What the GPU's memory cannot hold is rendered
+            in batches of fewer cameras, at last on the CPU with a warning.
 
     Raises:
         InputError: shapes or dtypes that do not fit, cameras of several sizes, a view matrix with NaN.
         ConfigError: an unknown backend, or one that cannot take these inputs.
-        MissingDependencyError: gsplat is asked for and not installed.
+        MissingDependencyError: gsplat is requested and not installed.
     """
     chosen = backends.backend(backend)
     width, height = image_size(cameras)
@@ -76,7 +76,7 @@ def render(
 
             try:
                 gsplat.render_numpy(gaussians, cameras, colour, images)
-                return Rendered(**images)
+                return Rendering(**images)
             except gsplat.DeviceMemoryError as error:
                 logger.warning(
                     "the GPU's memory cannot hold a view of %d Gaussians at %d x %d pixels; rendering on the CPU: %s",
@@ -88,7 +88,7 @@ def render(
         with native.workspace() as view:
             for i in range(len(cameras)):
                 native.forward(view, arrays, poses[i], cameras.intrinsics_px[i], colour, images, i, index)
-        return Rendered(**images)
+        return Rendering(**images)
 
     from gsmap.render import autograd, gsplat
     from gsmap.render.tensors import GaussianTensors
@@ -98,14 +98,14 @@ def render(
             f"render needs Gaussians or GaussianTensors, got {type(gaussians).__name__}", code="wrong_type"
         )
     pose = _view_matrices(cameras, T_camera_frame)
-    # Tensors that lie on the GPU are rendered there, even where gsplat turns out to be missing: its error says so.
+    # Tensors that lie on the GPU are rendered there, even where gsplat is missing, for its error names the reason.
     if chosen == "gsplat" or (backend == "auto" and gaussians.means.device.type == "cuda"):
         return gsplat.render_tensors(gaussians, cameras, pose, colour, depth, dominant_id, max_weight)
     return autograd.render_tensors(gaussians, cameras, pose, colour, depth, dominant_id, max_weight, index)
 
 
 def _view_matrices(cameras: Cameras, T_camera_frame: torch.Tensor | None) -> torch.Tensor:
-    """(C, 4, 4) those given, or the cameras' own."""
+    """Return view matrices (C, 4, 4): the given ones, or the cameras' own."""
     import torch
 
     if T_camera_frame is None:

@@ -52,12 +52,12 @@ class GaussianTensors:
 
     @classmethod
     def of(cls, gaussians: Gaussians, device: str = "cpu", requires_grad: bool = False) -> GaussianTensors:
-        """Copies of numpy Gaussians."""
+        """Copy numpy Gaussians to tensors."""
         tensors = (torch.tensor(a, device=device, requires_grad=requires_grad) for a in native.arrays_of(gaussians))
         return cls(*tensors)
 
     def numpy(self) -> Gaussians:
-        """The same as numpy Gaussians (a copy)."""
+        """Copy to numpy Gaussians."""
         return Gaussians(*(t.detach().cpu().numpy().copy() for t in self.tensors()))
 
     def tensors(self) -> tuple[torch.Tensor, ...]:

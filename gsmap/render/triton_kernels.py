@@ -38,7 +38,7 @@ def blend_tile(
     alive = tl.where(inside, 1, 0)
     clear = tl.full((SIZE * SIZE,), 1.0, tl.float32)
     best = tl.zeros((SIZE * SIZE,), tl.float32)
-    who = tl.full((SIZE * SIZE,), -1, tl.int32)
+    dominant = tl.full((SIZE * SIZE,), -1, tl.int32)
     at = tl.load(starts + tile)
     end = tl.load(ends + tile)
     going = tl.max(alive, 0)
@@ -58,7 +58,7 @@ def blend_tile(
         weight = tl.where(drawn, alpha * clear, 0.0)
         clear = tl.where(drawn, behind, clear)
         better = weight > best
-        who = tl.where(better, g.to(tl.int32), who)
+        dominant = tl.where(better, g.to(tl.int32), dominant)
         best = tl.where(better, weight, best)
         if MAX_WEIGHT:
             most = tl.max(weight, 0)
@@ -66,7 +66,7 @@ def blend_tile(
                 tl.atomic_max(largest + g, most)
         at += 1
         going = tl.max(alive, 0)
-    tl.store(shown + (view * height + row) * width + column, who, mask=inside)
+    tl.store(shown + (view * height + row) * width + column, dominant, mask=inside)
 
 
 @triton.jit(do_not_specialize=["n"])
@@ -111,7 +111,7 @@ def adam_rows(
     SH_PADDED: tl.constexpr,
     ROWS: tl.constexpr,
 ):
-    """One Adam step of all attributes of the rows that have a gradient and are not frozen.
+    """Apply one Adam step of all attributes to the rows that have a gradient and are not frozen.
 
     Gradients are with respect to scales and opacities as they are drawn; the chain rule to their logarithms and logits
     is applied here.
@@ -241,7 +241,7 @@ def _adam_part(
     SCALED: tl.constexpr,
     ROWS: tl.constexpr,
 ):
-    """`adam_rows` of one attribute of several columns; of SH the first three have a rate of their own."""
+    """Apply `adam_rows` to one attribute of several columns; the first three columns of SH have a rate of their own."""
     column = tl.arange(0, PADDED)
     at = row.to(tl.int64)[:, None] * COLUMNS + column[None, :]
     mask = touched[:, None] & (column < COLUMNS)[None, :]
@@ -413,7 +413,7 @@ def loss_gradient(
     SSIM: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """The gradient of the loss of one view times its share, and, once, the loss."""
+    """Compute the gradient of the loss of one view times its share, and, once, the loss."""
     y = tl.program_id(0)
     x = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside = x < width3

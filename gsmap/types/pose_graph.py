@@ -27,7 +27,7 @@ class Edge:
             place that changed, or two that look alike); NaN where nobody looked.
         same_visit: both were captured so shortly after each other that next to nothing can have changed.
         log_odds_wrong: natural log-odds that the pose is wrong, by the evidence of registration and up to a constant
-            that all edges share (`gsmap.optimize.likelihood`); NaN where that is not known.
+            that all edges share (`gsmap.optimize.edge_likelihood`); NaN where that is not known.
     """
 
     target: str

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from unittest import mock
 
 import numpy as np
 from describe_places import room
 
-from gsmap.describe import Params, describe
+from gsmap.describe import Params, describe, gravity
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.embedders import builtin as embedder
-from gsmap.describe.gravity import Params as GravityParams
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks.layer import gravity_free, landmark_layer
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import object_layer
-from gsmap.describe.objects.lift import visible
-from gsmap.describe.objects.things import find_things
+from gsmap.describe.objects.lift import find_visible
+from gsmap.describe.objects.segments import find_segments
 from gsmap.describe.objects.views import render_views
 from gsmap.describe.segmenters import builtin as segmenter
 from gsmap.describe.unit import estimate_unit_m
@@ -42,11 +42,11 @@ def _context() -> SceneContext:
 def _describe() -> dict[str, np.ndarray]:
     """The whole, and the vertical and the metre with and without cameras."""
     gaussians, cameras = room(n=4000)
-    few = GravityParams(max_normals=500)
-    graph = describe("room", gaussians, cameras, Params(gravity=few, object=_FEW), scale_policy="unknown")
-    assert graph.up is not None
     points = surface_cloud(gaussians).points
-    blind = estimate_up(points, None, few)
+    with mock.patch.object(gravity, "_MAX_NORMALS", 500):
+        graph = describe("room", gaussians, cameras, Params(object=_FEW), scale_policy="unknown")
+        blind = estimate_up(points, None)
+    assert graph.up is not None
     out = {
         "up": graph.up,
         "up_without_cameras": np.zeros(3) if blind is None else blind,
@@ -69,7 +69,7 @@ def _objects() -> dict[str, np.ndarray]:
 
 def _things() -> dict[str, np.ndarray]:
     gaussians, _ = room(n=4000)
-    found = find_things(gaussians, surface_cloud(gaussians), _UP, 1.0)
+    found = find_segments(gaussians, surface_cloud(gaussians), _UP, 1.0)
     return {
         name: getattr(found, name)
         for name in ("members", "positions", "extents", "colours", "samples", "sample_colours")
@@ -93,7 +93,7 @@ def _embedder() -> dict[str, np.ndarray]:
     context = _context()
     view = next(render_views(gaussians, cameras[[0]], 96, "native"))
     masks = segmenter.make(context, segmenter.Params()).segment(view)
-    rows, pixel = visible(context.cloud.points, view)
+    rows, pixel = find_visible(context.cloud.points, view)
     shown = [context.cloud.points[rows[mask.pixels[pixel[:, 1], pixel[:, 0]]]] for mask in masks]
     some = [i for i, points in enumerate(shown) if len(points) >= 4]
     words = embedder.make(context, embedder.Params())

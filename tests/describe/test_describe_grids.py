@@ -12,9 +12,8 @@ from gsmap._native import landmark_surroundings
 from gsmap.describe import Params, describe
 from gsmap.describe.cloud import downsample, surface_cloud
 from gsmap.describe.landmarks import detect
-from gsmap.describe.landmarks.context import Params as ContextParams
-from gsmap.describe.landmarks.context import cylinder_context, shell_context
-from gsmap.describe.landmarks.detect import find_blobs, thinned
+from gsmap.describe.landmarks.context import CELL_M, HEIGHTS_M, RADII_M, SHELLS_M, cylinder_context, shell_context
+from gsmap.describe.landmarks.detect import find_blobs, thin_cloud
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +96,7 @@ def test_blocks_find_what_one_grid_finds(cloud, monkeypatch):
 
 def test_a_thinned_cloud_has_its_surface_and_its_landmarks(cloud, monkeypatch):
     monkeypatch.setattr(detect, "_MANY", 1000)
-    points, lab, areas = thinned(cloud.points, cloud.lab, cloud.areas, 0.5)
+    points, lab, areas = thin_cloud(cloud.points, cloud.lab, cloud.areas, 0.5)
     assert len(points) < 0.7 * len(cloud)
     assert areas.sum() == pytest.approx(cloud.areas.sum())
     np.testing.assert_allclose((areas[:, None] * lab).sum(0), (cloud.areas[:, None] * cloud.lab).sum(0), rtol=1e-6)
@@ -109,28 +108,27 @@ def test_a_thinned_cloud_has_its_surface_and_its_landmarks(cloud, monkeypatch):
 
 
 def test_surroundings_are_the_means_of_what_lies_in_each_ring(cloud):
-    params = ContextParams()
     rng = np.random.default_rng(0)
     positions = cloud.points[rng.integers(len(cloud), size=7)] + rng.normal(size=(7, 3)) * 0.05
-    thin, colour = downsample(cloud.points, cloud.lab, params.cell_m)
+    thin, colour = downsample(cloud.points, cloud.lab, CELL_M)
     values = (colour - [55.0, 3.0, 8.0]) / [20.0, 10.0, 14.0]
-    cylinders = cylinder_context(positions, cloud.points, cloud.lab, params)
-    shells = shell_context(positions, cloud.points, cloud.lab, params)
-    levels = len(params.heights_m) - 1
+    cylinders = cylinder_context(positions, cloud.points, cloud.lab)
+    shells = shell_context(positions, cloud.points, cloud.lab)
+    levels = len(HEIGHTS_M) - 1
     for row, position in enumerate(positions):
         step = thin - position
         ring, level = (
-            np.searchsorted(params.radii_m, np.hypot(*step[:, :2].T)),
-            np.searchsorted(params.heights_m, step[:, 2]) - 1,
+            np.searchsorted(RADII_M, np.hypot(*step[:, :2].T)),
+            np.searchsorted(HEIGHTS_M, step[:, 2]) - 1,
         )
-        shell = np.searchsorted(params.shells_m, np.linalg.norm(step, axis=1))
-        for i in range(len(params.radii_m)):
+        shell = np.searchsorted(SHELLS_M, np.linalg.norm(step, axis=1))
+        for i in range(len(RADII_M)):
             for j in range(levels):
                 inside = (ring == i) & (level == j)
                 expected = values[inside].mean(0) if inside.any() else np.zeros(3)
                 np.testing.assert_allclose(cylinders[row, i * levels + j, :3], expected, atol=1e-9)
                 assert (cylinders[row, i * levels + j, 3] > 0) == inside.any()
-        for i in range(len(params.shells_m)):
+        for i in range(len(SHELLS_M)):
             inside = shell == i
             expected = values[inside].mean(0) if inside.any() else np.zeros(3)
             np.testing.assert_allclose(shells[row, i, :3], expected, atol=1e-9)

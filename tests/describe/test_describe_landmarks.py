@@ -13,11 +13,9 @@ from gsmap.describe import Params, describe, recipe_key
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks import layer as landmarks
-from gsmap.describe.landmarks.context import METRICS, embed, metric, metric_digest
-from gsmap.describe.landmarks.context import Params as ContextParams
+from gsmap.describe.landmarks.context import METRICS, NUM_RINGS, NUM_SHELLS, embed, metric, metric_digest
 from gsmap.describe.landmarks.layer import landmark_layer
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
-from gsmap.errors import ConfigError
 from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.register.correspondences import correspondences
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
@@ -217,26 +215,23 @@ def test_house_landmarks_repeat(shared_data):
     assert counterparts(layers["c0"], layers["c1"], S, 0.1) > 0.25
 
 
-def test_the_fitted_metric_maps_embeddings_and_holds_for_the_bins_it_was_fitted_for_alone():
-    params = ContextParams()
-    for bins in (params.num_rings, params.num_shells):
+def test_the_fitted_metric_maps_embeddings():
+    for bins in (NUM_RINGS, NUM_SHELLS):
         found = metric(4 * bins)
         assert found.shape == (4 * bins, 4 * bins)
         np.testing.assert_allclose(found, found.T, atol=1e-3)
         values = np.linalg.eigvalsh(found)
         assert 0.02 < values.min() < 0.6 * values.max()  # it tells directions apart, and forgets none
         around = np.random.default_rng(0).uniform(0, 1, (30, bins, 4))
-        plain, fitted = (embed(around, ContextParams(fitted=on)) for on in (False, True))
+        plain, fitted = (embed(around, on) for on in (False, True))
         moved = plain @ found
         np.testing.assert_allclose(fitted, moved / np.linalg.norm(moved, axis=1, keepdims=True), atol=1e-9)
-    with pytest.raises(ConfigError, match="default of colour_weight alone"):
-        ContextParams(colour_weight=0.71, fitted=True)
 
 
 def test_a_metric_that_is_fitted_anew_makes_other_graphs_that_compare_with_no_older_ones(monkeypatch):
     keys = {}
     for fitted in (False, True):
-        params = landmarks.Params(context=ContextParams(fitted=fitted))
+        params = landmarks.Params(use_fitted_metric=fitted)
         for digest in ("as shipped", "anew"):
             monkeypatch.setattr(landmarks, "metric_digest", lambda digest=digest: digest)
             keys[fitted, digest] = recipe_key(Params(landmark=params)).digest, landmarks.descriptor_id(params)

@@ -6,7 +6,7 @@ from describe_places import moved, room
 
 from gsmap.describe import Params, describe
 from gsmap.describe.cloud import surface_cloud
-from gsmap.describe.landmarks.detect import Octaves
+from gsmap.describe.landmarks.detect import OctaveCache
 from gsmap.describe.landmarks.layer import landmark_layer
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.unit import landmark_units, working_unit_m
@@ -69,7 +69,7 @@ def test_without_cameras_nobody_knows_from_where_it_was_seen():
 
 def test_octaves_that_layers_share_are_those_that_each_finds():
     cloud = surface_cloud(room(n=12_000)[0])
-    octaves = Octaves()
+    octaves = OctaveCache()
     for unit_m in (1.0, 0.5, 0.6):
         shared, alone = (landmark_layer(cloud, UP, unit_m, octaves=given) for given in (octaves, None))
         assert len(alone) > 20

@@ -9,10 +9,11 @@ from gsmap.describe import Params, describe, embedders, recipe_key
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.landmarks import layer as landmarks
 from gsmap.describe.landmarks.layer import Params as LandmarkParams
-from gsmap.describe.objects.associate import associate, giou, region
+from gsmap.describe.objects import layer as object_layers
+from gsmap.describe.objects.associate import associate, giou, make_region
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import descriptor_id
-from gsmap.describe.objects.lift import visible
+from gsmap.describe.objects.lift import find_visible
 from gsmap.describe.objects.views import render_views
 from gsmap.describe.onnx.check import check_model
 from gsmap.describe.segmenters import builtin, per_view
@@ -47,11 +48,11 @@ def test_two_views_of_two_things_become_two_nodes():
     feature = np.eye(4, dtype=np.float32)
     cup, chair = rng.uniform(0, 0.1, (200, 3)), rng.uniform(2, 3, (200, 3))
     nodes = []
-    associate(nodes, region(cup[:150], feature[0], 0.9, 0, 0.01), 1.1, 0.01)
-    associate(nodes, region(chair[:150], feature[1], 0.8, 0, 0.01), 1.1, 0.01)
+    associate(nodes, make_region(cup[:150], feature[0], 0.9, 0, 0.01), 1.1, 0.01)
+    associate(nodes, make_region(chair[:150], feature[1], 0.8, 0, 0.01), 1.1, 0.01)
     seen_again = feature[0] + 0.3 * feature[2]
     seen_again /= np.linalg.norm(seen_again)
-    joined = associate(nodes, region(cup[50:], seen_again, 0.7, 1, 0.01), 1.1, 0.01)
+    joined = associate(nodes, make_region(cup[50:], seen_again, 0.7, 1, 0.01), 1.1, 0.01)
     assert joined is nodes[0]
     assert len(nodes) == 2
     assert joined.views == {0, 1}
@@ -62,12 +63,12 @@ def test_two_views_of_two_things_become_two_nodes():
     assert len(joined.points) <= len(cup)
     assert len(np.unique(np.floor((joined.points - joined.points.min(0)) / 0.01), axis=0)) >= 0.9 * len(joined.points)
     # The same place with another look, and the same look elsewhere, are other things.
-    associate(nodes, region(cup, feature[3], 0.9, 2, 0.01), 1.1, 0.01)
-    associate(nodes, region(cup + 5, feature[0], 0.9, 2, 0.01), 1.1, 0.01)
+    associate(nodes, make_region(cup, feature[3], 0.9, 2, 0.01), 1.1, 0.01)
+    associate(nodes, make_region(cup + 5, feature[0], 0.9, 2, 0.01), 1.1, 0.01)
     assert len(nodes) == 4
     # Where the segmenter knows two masks to be one part, looks and place do not matter.
-    one = associate(nodes, region(cup + 9, feature[0], 0.9, 3, 0.01, part=7), 1.1, 0.01)
-    assert associate(nodes, region(cup + 12, feature[1], 0.9, 4, 0.01, part=7), 1.1, 0.01) is one
+    one = associate(nodes, make_region(cup + 9, feature[0], 0.9, 3, 0.01, part=7), 1.1, 0.01)
+    assert associate(nodes, make_region(cup + 12, feature[1], 0.9, 4, 0.01, part=7), 1.1, 0.01) is one
 
 
 def test_lifting_takes_the_visible_surface_only():
@@ -75,17 +76,17 @@ def test_lifting_takes_the_visible_surface_only():
     depth = np.full((80, 100), 2.0, np.float32)
     view = View(np.zeros((80, 100, 3), np.uint8), depth, np.ones_like(depth), np.zeros((80, 100), np.int32), camera)
     points = np.array([[0, 0, 2.0], [0.1, 0.2, 2.03], [0, 0, 3], [0, 0, 1], [0, 0, -2], [5, 0, 2]])
-    rows, pixel = visible(points, view)
+    rows, pixel = find_visible(points, view)
     assert rows.tolist() == [0, 1]
     assert pixel[0].tolist() == [50, 40]
     # As published: all that projects into the picture, behind the surface and before it, where something is shown.
-    assert visible(points, view, np.inf)[0].tolist() == [0, 1, 2, 3]
+    assert find_visible(points, view, np.inf)[0].tolist() == [0, 1, 2, 3]
     depth[40:60, :60] = 0
     with np.errstate(invalid="raise"):
-        assert visible(points, view, np.inf)[0].tolist() == []
+        assert find_visible(points, view, np.inf)[0].tolist() == []
 
 
-def test_masks_of_one_view_each_are_those_of_the_parts_and_name_none():
+def test_masks_of_one_view_each_are_those_of_the_parts_and_name_none(monkeypatch):
     gaussians, cameras = room(n=6000)
     cloud = surface_cloud(gaussians)
     context = SceneContext(cloud, len(gaussians), None, 1.0)
@@ -95,11 +96,11 @@ def test_masks_of_one_view_each_are_those_of_the_parts_and_name_none():
     assert [(m.pixels.tobytes(), m.confidence) for m in masks] == [(m.pixels.tobytes(), m.confidence) for m in parts]
     assert {m.part for m in masks} == {None}
     # So what becomes one object is decided by looks and place: nothing resembles itself more than 2.
-    split, joined = (
-        describe("room", gaussians, cameras, small(segmenter="per_view", tau_asso=tau, min_views=1)).layers["objects"]
-        for tau in (2.1, 0.5)
-    )
-    assert len(split) > 2 * len(joined)
+    params, counts = small(segmenter="per_view", min_views=1), []
+    for least in (2.1, 0.5):
+        monkeypatch.setattr(object_layers, "_MIN_SIMILARITY", least)
+        counts.append(len(describe("room", gaussians, cameras, params).layers["objects"]))
+    assert counts[0] > 2 * counts[1]
 
 
 def test_felzenszwalb_cuts_at_the_heavy_edge():
@@ -118,8 +119,9 @@ def small(**changed) -> Params:
 def test_masks_of_low_confidence_make_no_objects():
     gaussians, cameras = room(n=6000)
 
-    def layer(c_mask: float):
-        return describe("room", gaussians, cameras, small(c_mask=c_mask), scale_policy="known").layers["objects"]
+    def layer(least: float):
+        params = small(min_confidence=least)
+        return describe("room", gaussians, cameras, params, scale_policy="known").layers["objects"]
 
     every, sure = layer(0.0), layer(0.9)
     assert every.weights.min() < 0.8
@@ -191,20 +193,14 @@ def test_every_parameter_is_explained_and_in_the_key_of_what_it_changes():
 
 
 def test_how_much_is_kept_does_not_keep_layers_from_being_compared():
-    base, more = ObjectParams(), ObjectParams(num_cameras=96, c_mask=0.4)
+    base, more = ObjectParams(), ObjectParams(num_cameras=96, min_confidence=0.4)
     assert descriptor_id(base, {}) == descriptor_id(more, {})
     assert descriptor_id(base, {}) != descriptor_id(
-        changed(base, {"embedder": "builtin", "embedders.builtin.hue": 0.9}), {}
+        changed(base, {"segmenter": "builtin", "segmenters.builtin.scale": 5.0}), {}
     )
-    many = changed(LandmarkParams(), {"detect.max_per_octave": 9})
-    wide = changed(LandmarkParams(), {"context.radii_m": [0.5, 1.0]})
-    ids = [landmarks.descriptor_id(p) for p in (LandmarkParams(), many, wide)]
+    many, fitted = LandmarkParams(max_per_octave=9), LandmarkParams(use_fitted_metric=True)
+    ids = [landmarks.descriptor_id(p) for p in (LandmarkParams(), many, fitted)]
     assert ids[0] == ids[1] != ids[2]
-
-
-def test_rings_that_do_not_rise_are_refused():
-    with pytest.raises(ConfigError, match="radii_m must rise"):
-        changed(LandmarkParams(), {"context.radii_m": [1.0, 0.5]})
 
 
 def test_objects_sit_on_the_furniture_and_follow_the_scene():
@@ -265,7 +261,7 @@ def test_recipes_change_with_parameters_and_name_what_is_comparable():
     assert (base.stage, base.method) == ("describe", "graph")
     assert set(base.settings["layers"]) == {"landmarks", "objects", "things"}
     assert recipe_key().digest == base.digest
-    other = recipe_key(Params(object=ObjectParams(tau_asso=1.2)))
+    other = recipe_key(Params(object=ObjectParams(min_views=3)))
     assert other.settings["landmark"] == base.settings["landmark"]
     assert other.settings["object"] != base.settings["object"]
     assert other.digest != base.digest

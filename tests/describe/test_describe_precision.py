@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsmap.describe.precision import Params, rounded
+from gsmap.describe.precision import round_graph
 from gsmap.types import NodeLayer, SceneGraph, Segments
 
 RNG = np.random.default_rng(3)
@@ -29,7 +29,7 @@ def graph(unit: float = 1.0) -> SceneGraph:
 
 @pytest.mark.parametrize("unit", [1.0, 0.01, 3.7])
 def test_numbers_stay_near_what_was_found(unit: float) -> None:
-    found, told = graph(unit), rounded(graph(unit))
+    found, told = graph(unit), round_graph(graph(unit))
     a, b = found.layers["landmarks"], told.layers["landmarks"]
     half_step = 0.5 * 0.001 * unit * np.sqrt(2)  # the step is a power of two near a millimetre
     for before, after in ((a.positions, b.positions), (found.things.samples, told.things.samples)):
@@ -44,28 +44,28 @@ def test_numbers_stay_near_what_was_found(unit: float) -> None:
 
 
 def test_a_landmark_reaches_as_far_to_all_sides() -> None:
-    layer = rounded(graph()).layers["landmarks"]
+    layer = round_graph(graph()).layers["landmarks"]
     around = layer.extents - layer.positions[:, None]
     assert (around[:, 1] == -around[:, 0]).all()
     assert np.ptp(around[:, 1], axis=1).max() == 0
 
 
 def test_rounding_again_changes_nothing() -> None:
-    once = rounded(graph())
-    again = rounded(once)
+    once = round_graph(graph())
+    again = round_graph(once)
     for name in ("positions", "embeddings", "weights", "extents", "features"):
         assert np.array_equal(getattr(once.layers["landmarks"], name), getattr(again.layers["landmarks"], name))
 
 
 def test_every_component_fits_a_byte() -> None:
     layer = NodeLayer(np.zeros((1, 3)), [[0.7, -0.7, 0.1]], [0], [1], np.zeros((1, 2, 3)), np.ones((1, 2)), [0], "d")
-    (one,) = rounded(SceneGraph("a", {"landmarks": layer})).layers.values()
+    (one,) = round_graph(SceneGraph("a", {"landmarks": layer})).layers.values()
     assert one.embeddings.tolist() == [[127 / 256, -0.5, 26 / 256]]
 
 
 def test_an_object_is_still_told_by_its_feature() -> None:
     feature = RNG.normal(size=(5, 512)).astype(np.float32)
     layer = NodeLayer(np.zeros((5, 3)), feature, [0] * 5, [1] * 5, np.zeros((5, 2, 3)), feature, [1] * 5, "d")
-    (told,) = rounded(SceneGraph("a", {"objects": layer}), Params()).layers.values()
+    (told,) = round_graph(SceneGraph("a", {"objects": layer})).layers.values()
     assert np.array_equal(told.embeddings, told.features)
     assert np.allclose(told.features, feature, rtol=2.0**-11)

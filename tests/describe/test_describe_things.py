@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.describe import Params, describe, recipe_key
 from gsmap.describe.cloud import surface_cloud
-from gsmap.describe.gravity import Params as GravityParams
-from gsmap.describe.objects.things import find_things
+from gsmap.describe.objects.segments import find_segments
 from gsmap.errors import InputError
 from gsmap.geometry.rotations import matrices_to_quats
 from gsmap.types import Gaussians, SceneGraph, Segments, Sim3
@@ -35,7 +34,7 @@ def place() -> tuple[Gaussians, np.ndarray]:
 
 def test_each_piece_is_one_thing_and_the_building_is_none(place):
     gaussians, owners = place
-    found = find_things(gaussians, surface_cloud(gaussians), UP, 1.0)
+    found = find_segments(gaussians, surface_cloud(gaussians), UP, 1.0)
     assert min(ious(found.members, owners)) > 0.75
     assert len(found) == 4
     assert (found.members[owners == SHELL] >= 0).mean() < 0.01
@@ -54,7 +53,7 @@ def test_things_do_not_depend_on_frame_or_unit(place):
     there = Gaussians(
         S.apply(gaussians.means), quats, gaussians.log_scales + np.log(2.5), gaussians.logit_opacities, gaussians.sh
     )
-    found = find_things(there, surface_cloud(there), S.rotation @ UP, 1 / 2.5)
+    found = find_segments(there, surface_cloud(there), S.rotation @ UP, 1 / 2.5)
     assert min(ious(found.members, owners)) > 0.75
     assert (found.members[owners == SHELL] >= 0).mean() < 0.01
 
@@ -65,24 +64,24 @@ def test_faint_gaussians_belong_to_the_thing_they_lie_on(place):
     rows = np.flatnonzero(owners == 0)[::3]
     faint[rows] = -4.0
     dimmed = Gaussians(gaussians.means, gaussians.quats, gaussians.log_scales, faint, gaussians.sh)
-    found = find_things(dimmed, surface_cloud(dimmed), UP, 1.0)
+    found = find_segments(dimmed, surface_cloud(dimmed), UP, 1.0)
     cupboard = found.members[np.setdiff1d(np.flatnonzero(owners == 0), rows)]
     assert (found.members[rows] == np.bincount(cupboard[cupboard >= 0]).argmax()).mean() > 0.8
 
 
 def test_nothing_is_told_apart_where_up_is_unknown_or_nothing_is_there(place):
     gaussians, _ = place
-    assert (find_things(gaussians, surface_cloud(gaussians), None, 1.0).members == -1).all()
-    assert len(find_things(gaussians, surface_cloud(gaussians), UP, 1e4)) == 0
+    assert (find_segments(gaussians, surface_cloud(gaussians), None, 1.0).members == -1).all()
+    assert len(find_segments(gaussians, surface_cloud(gaussians), UP, 1e4)) == 0
     none = gaussians[:3]
-    found = find_things(none, surface_cloud(none), UP, 1.0)
+    found = find_segments(none, surface_cloud(none), UP, 1.0)
     assert len(found) == 0
     assert found.members.shape == (3,)
 
 
 def test_graphs_name_the_thing_of_every_gaussian(place):
     gaussians, owners = place
-    params = Params(landmarks=False, objects=False, gravity=GravityParams(max_normals=500))
+    params = Params(landmarks=False, objects=False)
     graph = describe("a", gaussians, None, params)
     assert graph.things is not None
     assert graph.layers == {}

@@ -8,9 +8,9 @@ from describe_places import room
 from made_room import furnished
 from scipy.spatial.transform import Rotation
 
+from gsmap.describe.camera_orientations import CameraOrientations
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import _confirmed, estimate_up
-from gsmap.describe.heading import Held
 from gsmap.types import Cameras
 
 FRAME = Rotation.random(random_state=3).as_matrix()
@@ -88,7 +88,7 @@ def test_upside_down_or_looking_up_is_not_believed():
 
 def test_what_bears_no_witness_on_one_heading():
     def told(cameras, room=None):
-        return _confirmed(Held.of(cameras), surface("open"), [*FRAME.T], room)
+        return _confirmed(CameraOrientations.of(cameras), surface("open"), [*FRAME.T], room)
 
     x, y, z = FRAME.T
     assert told(held(30, 0)) @ z > 0.99  # a level walk does

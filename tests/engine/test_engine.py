@@ -133,10 +133,10 @@ def test_workers_are_kept_while_a_map_is_open() -> None:
     def processes() -> set[int]:
         return {process for _, (_, process) in engine.run_jobs(square, [(i,) for i in range(6)], params)}
 
-    with engine.Kept():
+    with engine.WorkerSession():
         first = processes()
         assert processes() <= first
-        with engine.Kept():
+        with engine.WorkerSession():
             assert processes() <= first
         assert processes() <= first
     for process in first:

@@ -22,7 +22,7 @@ FRAMES = {
 DATES = {"may": "2026-05-31", "june": "2026-06-30"}
 YELLOW = [(0.8, 2.3), (2.3, 2.4), (3.4, 1.2)]
 RED, TABLE, CUPBOARD = (1.3, 0.5), (2.6, 0.35), (0.25, 1.0)
-SETTINGS = {"describe.landmarks": False, "describe.gravity.max_normals": 500, "describe.object.num_cameras": 12}
+SETTINGS = {"describe.landmarks": False, "describe.object.num_cameras": 12}
 
 
 def capture(seed: int):

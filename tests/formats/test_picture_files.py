@@ -17,7 +17,7 @@ from PIL import EpsImagePlugin, Image
 
 import gsmap
 from gsmap import formats
-from gsmap.describe import seeing
+from gsmap.describe import query_embedding
 from gsmap.errors import InputError, MissingDependencyError, NotFoundError
 from gsmap.evaluate.renders import read_image
 from gsmap.formats.pictures import MAX_PIXELS, open_picture
@@ -55,7 +55,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "depth": lambda path: read_depth(path, (100.0, 100.0, 4.0, 4.0)),
     "nerfstudio": frames,
     "placed photos": placed_photos._size,
-    "find": seeing._picture,
+    "find": query_embedding._picture,
 }
 QUIET: dict[str, Callable[[Path], object]] = {"exif": exif.read, "dates": dates._exif_date}
 

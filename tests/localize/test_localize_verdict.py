@@ -14,7 +14,7 @@ from gsmap.localize.covariance import with_scene
 from gsmap.localize.features import sound_depth
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.probability import model
-from gsmap.render import Rendered
+from gsmap.render import Rendering
 from gsmap.types import Sim3
 
 GOOD = {
@@ -140,7 +140,7 @@ def test_depth_at_an_edge_is_not_sound() -> None:
     depth[:, :, 10:] = 3.0
     alpha = np.ones_like(depth)
     alpha[:, 15:] = 0.5
-    sound = sound_depth(Rendered(np.zeros((1, 20, 20, 3), np.float32), alpha, depth)) > 0
+    sound = sound_depth(Rendering(np.zeros((1, 20, 20, 3), np.float32), alpha, depth)) > 0
     assert sound[5, 2]
     assert sound[5, 17]
     assert not sound[5, 8:12].any()

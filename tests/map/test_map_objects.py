@@ -71,7 +71,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
                 captured_at=DATES[name],
                 scale="known",
             )
-        m.with_settings({"describe.landmarks": False, "describe.objects": False, "describe.gravity.max_normals": 500})
+        m.with_settings({"describe.landmarks": False, "describe.objects": False})
         m.describe()
         poses = {s.id: ScenePose(s.id, FRAMES[s.name].inverse(), 0, "placed") for s in m.scenes()}
         m.store.revisions.save(PoseGraph(poses))

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from made_worlds import PLACING, city, twin_wings
 
 from gsmap.optimize import Params, gravity_align, optimize
-from gsmap.optimize.cycles import vote
+from gsmap.optimize.cycles import count_cycle_support
 from gsmap.optimize.measurements import measurements
 from gsmap.optimize.perceptual_aliasing import resolve_aliased_loops
 from gsmap.types import PoseGraph
@@ -62,8 +62,8 @@ def _aliasing() -> dict[str, np.ndarray]:
     accepted = ~((low < first) & (high >= second))
     poses = world.truth.replaced(np.arange(second, 80), world.truth[np.arange(first, first + wing)])
     params = Params()
-    votes = vote(m, params.gate_probability)
-    found = resolve_aliased_loops(m, accepted, np.zeros(len(m), dtype=bool), poses, votes, params)
+    cycles = count_cycle_support(m, params.gate_probability)
+    found = resolve_aliased_loops(m, accepted, np.zeros(len(m), dtype=bool), poses, cycles, params)
     return {"wrong": found.wrong, "right": found.right, "undecided": found.undecided}
 
 

@@ -8,7 +8,7 @@ import pytest
 from made_worlds import PLACING, poses_at, true_edges
 
 from gsmap.optimize import Params, log_odds_wrong, optimize
-from gsmap.optimize.contradictions import contradicting
+from gsmap.optimize.contradictions import find_contradicting_edges
 from gsmap.optimize.measurements import measurements
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.state import State
@@ -127,7 +127,7 @@ def test_a_misfit_of_some_sigma_is_no_contradiction(off_m, expected):
     poses = poses_at(np.c_[[0.0, 10, 30, 40], np.zeros((4, 2))])
     poses.rotations[:] = np.eye(3)
     state = State.fresh(m, poses, np.array([True, True, True, False]), PriorTerms.stack((), ()))
-    assert contradicting(m, state, QUICK).tolist() == expected
+    assert find_contradicting_edges(m, state, QUICK).tolist() == expected
 
 
 @pytest.mark.parametrize("separable", [True, False])

@@ -6,7 +6,7 @@ from made_worlds import poses_at
 
 from gsmap.geometry import similarities
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.cycles import cycle_chi2, list_triangles, vote
+from gsmap.optimize.cycles import count_cycle_support, cycle_chi2, list_triangles
 from gsmap.optimize.measurements import measurements
 from gsmap.types import Edge
 
@@ -54,10 +54,10 @@ def test_covariances_are_carried_round_a_triangle(seed, pairs):
 
 def test_a_triangle_that_does_not_close_supports_nothing():
     m = triangle(0, [(0, 1), (1, 2), (0, 2)])
-    assert vote(m, 0.999).agree.tolist() == [1, 1, 1]
+    assert count_cycle_support(m, 0.999).agree.tolist() == [1, 1, 1]
     off = m.measured.replaced(np.array([2]), poses_at(np.array([[20.0, 0, 0]]), 9))
     broken = measurements(IDS, [Edge(*m.keys[k], off.item(k), full(m.information[k])) for k in range(3)], rigid=True)
-    assert vote(broken, 0.999).agree.tolist() == [0, 0, 0]
+    assert count_cycle_support(broken, 0.999).agree.tolist() == [0, 0, 0]
 
 
 def full(information):

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize import Params, optimize
-from gsmap.optimize.joining import Join, join_decision, spanning_joins
+from gsmap.optimize.component_joins import Join, join_decision, spanning_joins
 from gsmap.optimize.measurements import measurements
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import chi_squares

@@ -9,7 +9,7 @@ import pytest
 
 from gsmap.errors import CorruptError
 from gsmap.optimize import optimize
-from gsmap.optimize.survey_places import Places
+from gsmap.optimize.survey_common_points import CommonPoints
 from gsmap.store.ties import tie_value, ties_of
 from gsmap.types import Sim3
 from gsmap.types.world import CAUSES, Contradiction, Survey, WorldFrame, WorldTie
@@ -160,12 +160,12 @@ def test_a_capture_counts_once_however_many_photos_it_has() -> None:
     assert tie.S_world_map is None or off < 0.2
 
 
-def places(own_m: list[float], in_world: np.ndarray) -> Places:
+def places(own_m: list[float], in_world: np.ndarray) -> CommonPoints:
     n = len(own_m)
     own = np.repeat(np.array(own_m)[:, None], 3, axis=1)
     rows = np.arange(n)
     kinds = np.array(["points"] * n)
-    return Places(
+    return CommonPoints(
         tuple(f"P{k}" for k in range(n)), in_world, in_world, own, np.zeros((n, 3)), np.zeros(n), kinds, rows, rows,
         rows,
     )  # fmt: skip

@@ -263,7 +263,7 @@ def test_a_fit_that_the_gpu_cannot_hold_runs_on_the_cpu(device, monkeypatch, cap
 
 def test_a_scene_is_moved_once_and_forgotten_with_the_object(device):
     gaussians, cameras = scene(views=2, size=(48, 33))
-    gsplat._kept.clear()
+    gsplat._device_cache.clear()
     render(gaussians, cameras[0], backend="gsplat")
     moved = gsplat._kept.get(gaussians)
     render(gaussians, cameras[1], backend="gsplat")

@@ -5,7 +5,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from gsmap.describe.precision import rounded
+from gsmap.describe.precision import round_graph
 from gsmap.errors import CorruptError
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
 from gsmap.store.narrow import narrow, shape_of, widen
@@ -96,7 +96,7 @@ def bits(graph):
 
 @pytest.mark.parametrize("round_it", [False, True])
 def test_a_graph_comes_back_to_the_bit(round_it):
-    made = rounded(graph()) if round_it else graph()
+    made = round_graph(graph()) if round_it else graph()
     arrays, about = to_arrays(made)
     assert {name: array.shape for name, array in arrays.items()} == shapes_of(about)
     back = from_arrays(made.scene_id, about, arrays)
@@ -107,7 +107,7 @@ def test_a_graph_comes_back_to_the_bit(round_it):
 
 
 def test_a_rounded_graph_takes_a_fraction_of_the_bytes():
-    whole, less = (sum(array.nbytes for array in to_arrays(g)[0].values()) for g in (graph(), rounded(graph())))
+    whole, less = (sum(array.nbytes for array in to_arrays(g)[0].values()) for g in (graph(), round_graph(graph())))
     assert less < 0.4 * whole
 
 

@@ -2,14 +2,14 @@
 """What a repeating street front with a gap does to a map: edges that are wrong and used, right and not used.
 
     python -m tools.bench.front --cache /tmp/fronts --seeds 101 102 103       # seeds from 100 on had no part in any fit
-    python -m tools.bench.front --cache /tmp/fronts --seeds 11 12 13 14 --fit # weights of gsmap.optimize.likelihood
+    python -m tools.bench.front --cache /tmp/fronts --seeds 11 12 13 14 --fit # fit `edge_likelihood`
 
 Makes fronts (`gsmap_synthetic.facade`): the facade repeats after every window, the road does not. Captures five times
 20 m of each in steps of 10 m, each capture with its own exposure, noise and floaters, and registers all pairs. Solves
 the poses of all five and of every four of them (a gap) from the same edges, by gsmap and by disagreement alone. An edge
 is right if it puts the source's middle within 0.5 m of the truth. Prints, over all solves, wrong edges by use, right
 edges by use, and pairs of scenes in one component that lie more than 1 m off (folded); a wrong edge is contradicted
-where right edges alone would tie its scenes. ``--fit`` prints the weights of `gsmap.optimize.likelihood` fitted on all
+where right edges alone would tie its scenes. ``--fit`` prints the weights of `edge_likelihood` fitted on all
 judged poses, and their errors on fronts left out.
 """
 
@@ -33,7 +33,7 @@ import gsmap.map
 import gsmap.register.pair as pair_module
 from gsmap.evaluate.registration import pose_error
 from gsmap.map.stages.optimize import pose_inputs
-from gsmap.optimize import likelihood, optimize
+from gsmap.optimize import edge_likelihood, optimize
 from gsmap.register.conclusion import Judged
 from gsmap.types import Edge, Sim3
 from gsmap_synthetic.facade import front_captures, make_front
@@ -52,7 +52,7 @@ class Front:
         truth: by id, where a capture lies along the front.
         middles: (3,) of each capture's content.
         edges: that registration accepted.
-        judged: (K, 5) of every pose that it judged: whether it is right, and `likelihood.features`.
+        judged: (K, 5) of every pose that it judged: whether it is right, and `edge_likelihood.features`.
     """
 
     ids: list[str]
@@ -97,7 +97,7 @@ def read(folder: Path, seed: int) -> Front:
     rows = []
     for target, source, S, evidence, overlap in stored["judged"]:
         error_m = front.error_m(target, source, Sim3.from_matrix(np.array(S)))
-        rows.append(np.r_[error_m < RIGHT_M, likelihood.features(evidence, overlap)])
+        rows.append(np.r_[error_m < RIGHT_M, edge_likelihood.features(evidence, overlap)])
     return replace(front, judged=np.array(rows).reshape(-1, 5))
 
 
@@ -198,7 +198,7 @@ def fit(judged: list[np.ndarray]) -> None:
 
 
 def weights_now() -> list[float]:
-    return [likelihood.COLOUR, likelihood.DISAGREEMENT, likelihood.FREE_SPACE, likelihood.OVERLAP]
+    return [edge_likelihood.COLOUR, edge_likelihood.DISAGREEMENT, edge_likelihood.FREE_SPACE, edge_likelihood.OVERLAP]
 
 
 def differences(judged: np.ndarray) -> np.ndarray:

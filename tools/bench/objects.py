@@ -29,7 +29,7 @@ from gsmap import formats
 from gsmap.change import compare
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
-from gsmap.describe.objects.things import find_things
+from gsmap.describe.objects.segments import find_segments
 from gsmap.objects import Capture, Eyes, changed_thing, make_objects, open_eyes
 from gsmap.types import MapObject, PlacedScene, Segments
 from tools.make.change_truth import Truth, owners
@@ -63,7 +63,7 @@ def score(truth: Truth, with_changes: bool) -> Counter[str]:
         cloud = surface_cloud(gaussians)
         up = estimate_up(cloud.points, cameras)
         between = time.process_time()
-        things = find_things(gaussians, cloud, up, 1.0)
+        things = find_segments(gaussians, cloud, up, 1.0)
         counts["things ms"] += round(1000 * (time.process_time() - between))
         counts["surface ms"] += round(1000 * (between - started))
         counts["captures"] += 1

@@ -147,7 +147,7 @@ def peer(method: str, world):
     import gtsam
 
     from gsmap.geometry.similarities import Similarities
-    from gsmap.optimize.cycles import vote
+    from gsmap.optimize.cycles import count_cycle_support
     from gsmap.optimize.gtsam_solve import GAUGE_SIGMAS, from_gtsam, to_gtsam
     from gsmap.optimize.measurements import measurements
     from gsmap.optimize.robust import spanning_tree_init
@@ -159,7 +159,7 @@ def peer(method: str, world):
     if method == "oracle":
         used = ~np.array([key in world.wrong_keys for key in m.keys])
     if method == "pcm":
-        used = vote(m, 0.999).agree >= 2
+        used = count_cycle_support(m, 0.999).agree >= 2
     labels = component_labels(m, np.flatnonzero(used))
     lead = labels == np.argmax(np.bincount(labels))
     used &= lead[m.targets]

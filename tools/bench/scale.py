@@ -169,7 +169,7 @@ def parts() -> AbstractContextManager[Spent]:
         ("poses: edges", optimize, "_edges"),
         ("poses: solve", optimize.solver, "optimize"),
         ("poses: place", optimize.solver, "grow"),
-        ("poses: keep still", optimize.solver, "kept_still"),
+        ("poses: keep still", optimize.solver, "keep_unchanged_poses"),
         ("poses: load", optimize, "_inputs"),
         ("poses: save", optimize, "_optimize"),
         ("poses: save", optimize, "_grow"),

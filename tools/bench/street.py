@@ -180,7 +180,7 @@ PARTS = [
     ("pairs", register, "register_scenes"),
     ("looking up", register, "ask"),
     ("solving", optimize.solver, "optimize"),
-    ("keeping still", optimize.solver, "kept_still"),
+    ("keeping still", optimize.solver, "keep_unchanged_poses"),
     ("naming poses", optimize, "pose_basis"),
     ("reading edges", optimize, "_edges"),
     ("report", reports, "update_report"),
@@ -264,7 +264,7 @@ def print_solves(args: argparse.Namespace) -> None:
         edges = [edge for edge in given.edges if {edge.target, edge.source} <= some]
         start = time.process_time()
         found = optimize.solver.optimize(given.scenes[:count], edges, (), answer, params)
-        answer = optimize.solver.kept_still(found, answer, edges, params)
+        answer = optimize.solver.keep_unchanged_poses(found, answer, edges, params)
         seconds.append(time.process_time() - start)
         methods[answer.provenance.method] += 1
     assert answer is not None

@@ -1,1 +1,1 @@
-"""Embedders, one file each: from masks to features. The contract is in `gsmap.methods.embedder`."""
+"""Embedders, one file each: features of masks. The contract is in `gsmap.methods.embedder`."""

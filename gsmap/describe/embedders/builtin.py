@@ -1,14 +1,14 @@
-"""The embedder that needs no weights: colour, texture and shape of what a mask shows.
+"""Embedder without a network: histograms of colour, texture and shape of a mask.
 
 Four histograms, each the root of a distribution (so that a dot product is a Bhattacharyya coefficient), side by side:
 
-- *hue*: a*b* direction in 12 soft bins where there is colour, one bin for grey. Gain and gamma leave it nearly alone.
+- *hue*: a*b* direction in 12 soft bins where there is colour, one bin for grey. Gain and gamma hardly change it.
 - *lightness*: L* relative to the median of the view, in 7 soft bins: exposure moves both.
 - *texture*: strength of the L* gradient relative to L*, in 6 soft bins; without direction, so the camera may roll.
-- *shape*: of the surface points in 3D: logarithm of the size (metres by the unit assumed), flatness and elongation
-  from the principal axes, and how the flattest axis stands to gravity; soft bins each.
+- *shape*: of the surface points in 3D: logarithm of the size (metres by the assumed unit), flatness and elongation
+  from the principal axes, and the angle of the flattest axis with gravity; soft bins each.
 
-All are free of the camera's place and roll, so the features of one thing agree over views and captures.
+All are invariant to the camera's position and roll, so that the features of one object agree over views and captures.
 """
 
 from __future__ import annotations
@@ -28,43 +28,30 @@ _LIGHTNESS = np.linspace(-45, 45, 7)
 _TEXTURE = np.linspace(-5, 0, 6)  # natural log of |grad L| / L per pixel
 _SIZE = np.log(np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4]))
 _RATIO = np.linspace(0, 1, 5)
+_WEIGHTS = np.array([1.0, 0.7, 0.5, 0.9])  # of hue, lightness, texture and shape; squares are shares of the cosine
+_GREY_CHROMA = 8.0  # a pixel of this chroma, L*a*b* units, counts half as coloured and half as grey
 _PARTS = (_HUES + 1, len(_LIGHTNESS), len(_TEXTURE), len(_SIZE) + 3 * len(_RATIO))
 
 
 @dataclass(frozen=True)
 class Params:
-    """How much each part of the vector weighs (their squares are shares of the cosine).
-
-    Args:
-        hue: of the direction in the a*b* plane.
-        lightness: of L* relative to the view's median.
-        texture: of the strength of the L* gradient.
-        shape: of size, flatness, elongation and tilt in 3D.
-        grey_chroma: a pixel of this chroma, L*a*b* units, counts half as coloured and half as grey.
-    """
-
-    hue: float = 1.0
-    lightness: float = 0.7
-    texture: float = 0.5
-    shape: float = 0.9
-    grey_chroma: float = 8.0
+    """No settings: layers compare only under the same weights."""
 
 
 def make(context: SceneContext, params: Params) -> BuiltinEmbedder:
-    """An embedder that knows the scene's vertical and metre; see `gsmap.methods.embedder`."""
-    return BuiltinEmbedder(params, context.up, context.unit_m)
+    """Create an embedder with the scene's vertical and unit; see `gsmap.methods.embedder`."""
+    return BuiltinEmbedder(context.up, context.unit_m)
 
 
 class BuiltinEmbedder:
-    """Appearance and shape, hand-made."""
+    """Histograms of appearance and shape."""
 
-    def __init__(self, params: Params, up: np.ndarray | None, unit_m: float) -> None:
-        weights = np.array([params.hue, params.lightness, params.texture, params.shape])
-        self.weights = np.repeat(weights / np.linalg.norm(weights), _PARTS).astype(np.float32)
-        self.up, self.unit_m, self.grey_chroma = up, unit_m, params.grey_chroma
+    def __init__(self, up: np.ndarray | None, unit_m: float) -> None:
+        self.weights = np.repeat(_WEIGHTS / np.linalg.norm(_WEIGHTS), _PARTS).astype(np.float32)
+        self.up, self.unit_m = up, unit_m
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
-        """(R, F) features of the masks; see `gsmap.methods.embedder`."""
+        """Compute features (R, F) of the masks; see `gsmap.methods.embedder`."""
         if not masks:
             return np.zeros((0, sum(_PARTS)), np.float32)
         lab = srgb_to_lab(view.rgb / 255.0)
@@ -72,10 +59,10 @@ class BuiltinEmbedder:
         middle = np.median(lab[seen, 0]) if seen.any() else 50.0
         slope = np.hypot(*np.gradient(lab[..., 0])) / np.maximum(lab[..., 0], 5.0)
         rows = []
-        # What every pixel says, once: masks overlap, and there are many.
-        hues = _hues(lab, self.grey_chroma)
-        lightness = _shared(lab[..., 0] - middle, _LIGHTNESS)
-        texture = _shared(np.log(np.maximum(slope, 1e-4)), _TEXTURE)
+        # Bins of every pixel, once: masks overlap, and there are many.
+        hues = _hues(lab)
+        lightness = _soft_bins(lab[..., 0] - middle, _LIGHTNESS)
+        texture = _soft_bins(np.log(np.maximum(slope, 1e-4)), _TEXTURE)
         for mask, shown in zip(masks, points, strict=True):
             at = np.flatnonzero(mask.pixels)
             parts = [
@@ -88,20 +75,21 @@ class BuiltinEmbedder:
         return np.stack(rows).astype(np.float32)
 
     def embed_picture(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours alone: a picture by itself has no size in metres, no shape in space, and no known resolution.
+        """Compute features of a picture by its colours alone: it has no size in metres, no 3D shape, no known
+        resolution.
 
         Args:
             rgb: (H, W, 3) uint8.
 
         Returns:
-            (F,) features, and (F,) bool which of them are told.
+            (F,) features, and (F,) bool, those of them that are valid.
         """
         lab = srgb_to_lab(rgb / 255.0)
-        told = np.repeat([True, False, False, False], _PARTS)
-        hue = _hues(lab, self.grey_chroma).of(slice(None))
+        valid = np.repeat([True, False, False, False], _PARTS)
+        hue = _hues(lab).of(slice(None))
         out = np.zeros(sum(_PARTS))
         out[: _PARTS[0]] = np.sqrt(hue / max(hue.sum(), 1e-12))
-        return (out * self.weights).astype(np.float32), told
+        return (out * self.weights).astype(np.float32), valid
 
     def _shape(self, points: np.ndarray) -> np.ndarray:
         values, axes = np.linalg.eigh(np.cov((points * self.unit_m).T) + 1e-8 * np.eye(3))
@@ -113,14 +101,14 @@ class BuiltinEmbedder:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shares:
-    """Bins that values fall into, each shared between two, by the values' flat index.
+class _SoftBins:
+    """Soft histogram bins of N values, each shared between two bins.
 
     Args:
         low, high: (N,) the two bins.
-        low_share, high_share: (N,) how much falls into each.
+        low_share, high_share: (N,) weight in each bin.
         size: number of bins.
-        rest: (N,) what falls into one more bin than these; None where there is none.
+        rest: (N,) weight in one additional bin; None without such a bin.
     """
 
     low: np.ndarray
@@ -131,31 +119,31 @@ class _Shares:
     rest: np.ndarray | None = None
 
     def of(self, rows: np.ndarray | slice) -> np.ndarray:
-        """The histogram of some of the values."""
+        """Return the histogram of some of the values."""
         out = np.bincount(self.low[rows], self.low_share[rows], self.size)
         out = out + np.bincount(self.high[rows], self.high_share[rows], self.size)
         return out if self.rest is None else np.concatenate([out, [self.rest[rows].sum()]])
 
 
-def _shared(values: np.ndarray, centres: np.ndarray) -> _Shares:
-    """Values over evenly spaced centres, each shared linearly between its two neighbours."""
+def _soft_bins(values: np.ndarray, centres: np.ndarray) -> _SoftBins:
+    """Distribute values over evenly spaced centres, each linearly between its two neighbours."""
     at = np.clip((values.ravel() - centres[0]) / (centres[1] - centres[0]), 0, len(centres) - 1)
     low = np.minimum(at.astype(int), len(centres) - 2)
     share = at - low
-    return _Shares(low, low + 1, 1 - share, share, len(centres))
+    return _SoftBins(low, low + 1, 1 - share, share, len(centres))
 
 
 def _soft(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Histogram of values over evenly spaced centres."""
-    return _shared(values, centres).of(slice(None))
+    """Compute the histogram of values over evenly spaced centres."""
+    return _soft_bins(values, centres).of(slice(None))
 
 
-def _hues(lab: np.ndarray, grey_chroma: float) -> _Shares:
-    """Hue circle and grey: a pixel is coloured as far as its chroma exceeds that of grey things."""
+def _hues(lab: np.ndarray) -> _SoftBins:
+    """Distribute pixels over the hue circle and grey, by how far their chroma exceeds `_GREY_CHROMA`."""
     a, b = lab[..., 1].ravel(), lab[..., 2].ravel()
     chroma = np.hypot(a, b)
-    coloured = chroma / (chroma + grey_chroma)
+    coloured = chroma / (chroma + _GREY_CHROMA)
     at = np.arctan2(b, a) / (2 * np.pi) * _HUES % _HUES
     low = at.astype(int) % _HUES
     share = at - at.astype(int)
-    return _Shares(low, (low + 1) % _HUES, coloured * (1 - share), coloured * share, _HUES, 1 - coloured)
+    return _SoftBins(low, (low + 1) % _HUES, coloured * (1 - share), coloured * share, _HUES, 1 - coloured)

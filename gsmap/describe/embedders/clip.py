@@ -1,9 +1,9 @@
-"""Features from an image encoder the user gives: CLIP's visual tower, DINO, MobileNet, any ONNX file of that shape."""
+"""Embedder that runs an image encoder from the user: CLIP's visual tower, DINO, MobileNet or any similar ONNX file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,39 +14,31 @@ from gsmap.types.views import Mask, SceneContext, View
 
 VERSION = 1
 MODELS = ("clip",)
+_MARGIN = 0.1  # the crop is the mask's box and this share of it around, made square
+_BACKGROUND = 0.5  # weight of the pixels outside the mask; the rest is the view's mean
+_SIDE_PX = 224  # where the model leaves its input size free
+_BATCH = 16  # crops per run, where the model takes several
 
 
 @dataclass(frozen=True)
 class Params:
-    """How a mask becomes a picture.
-
-    Args:
-        margin: the crop is the mask's box and this share of it around, made square.
-        background: how much of the pixels outside the mask is kept; the rest is the picture's mean.
-        side_px: where the model leaves its input size free.
-        batch: crops per run, where the model takes several.
-    """
-
-    margin: float = 0.1
-    background: float = 0.5
-    side_px: int = 224
-    batch: int = 16
+    """No settings: crops are made as the constants of this module have it."""
 
 
 def make(context: SceneContext, params: Params) -> ClipEmbedder:
     """Open the encoder; see `gsmap.methods.embedder`."""
-    return ClipEmbedder(params, context.models["clip"])
+    return ClipEmbedder(context.models["clip"])
 
 
 def embed_text(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
-    """The vector (F,) of words, by the text tower of the same pack; see `gsmap.describe.onnx.text`."""
+    """Compute the vector (F,) of a text, by the text tower of the same pack; see `gsmap.describe.onnx.text`."""
     from gsmap.describe.onnx import text as tower
 
     return tower.embed(text, models)
 
 
 def probe(spec: ModelSpec) -> None:
-    """Refuse a model that is no image encoder. It is run once: declared shapes do not tell all that can go wrong.
+    """Refuse a model that is not an image encoder; it is run once, for declared shapes are not sufficient.
 
     Raises:
         InputError: its inputs and outputs do not fit, or it does not run.
@@ -55,45 +47,45 @@ def probe(spec: ModelSpec) -> None:
         raise misfit(spec, "an image encoder takes one input of shape (N, 3, H, W) or (N, H, W, 3)")
     if not spec.outputs:
         raise misfit(spec, "it gives nothing")
-    ClipEmbedder(Params(), spec)
+    ClipEmbedder(spec)
 
 
 class ClipEmbedder:
-    """Runs the encoder on one crop per mask. Size, layout and names are read from the model."""
+    """Image encoder run on one crop per mask. Size, layout and names are read from the model."""
 
-    def __init__(self, params: Params, spec: ModelSpec) -> None:
-        self.params, self.spec = params, spec
+    def __init__(self, spec: ModelSpec) -> None:
+        self.spec = spec
         self.session = open_session(spec)
         self.input = spec.inputs[0]
         n, *rest = self.input.shape
         self.channels_last = rest[-1] == 3 and rest[0] != 3
         sides = rest[:2] if self.channels_last else rest[1:]
-        self.size = (sides[0] or params.side_px, sides[1] or params.side_px)  # height, width
-        self.batch = params.batch if n is None else n
+        self.size = (sides[0] or _SIDE_PX, sides[1] or _SIDE_PX)  # height, width
+        self.batch = _BATCH if n is None else n
         self.fixed = n is not None
-        # The embedding is what the model names so, else its first output with one vector per picture.
+        # The output that the model names as embedding, or its first output with one vector per picture.
         named = [o.name for o in spec.outputs if o.name in ("image_embeds", "embedding", "embeddings", "pooler_output")]
         flat = [o.name for o in spec.outputs if len(o.shape) == 2]
         self.output = (named or flat or [spec.outputs[0].name])[0]
         self.dim = self._run(np.zeros((1, *self.size, 3), np.float32)).shape[1]
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
-        """(R, F) features of the masks; see `gsmap.methods.embedder`."""
+        """Compute features (R, F) of the masks; see `gsmap.methods.embedder`."""
         if not masks:
             return np.zeros((0, self.dim), np.float32)
-        crops = np.stack([crop(view.rgb, m.pixels, self.size, self.params) for m in masks])
+        crops = np.stack([crop(view.rgb, m.pixels, self.size) for m in masks])
         features = self._run(normalise(crops, self.spec))
         return (features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
     def embed_picture(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `embed`, of one whole picture (H, W, 3) uint8; and (F,) bool: all of it is told."""
-        crops = crop(rgb, np.ones(rgb.shape[:2], bool), self.size, replace(self.params, margin=0.0))[None]
+        """Compute features of one whole picture (H, W, 3) uint8, and (F,) bool: all of them are valid."""
+        crops = crop(rgb, np.ones(rgb.shape[:2], bool), self.size, margin=0.0)[None]
         feature = self._run(normalise(crops, self.spec))[0]
         unit = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
         return unit, np.ones(len(unit), bool)
 
     def _run(self, pictures: np.ndarray) -> np.ndarray:
-        """(R, F) features of normalised pictures (R, H, W, 3)."""
+        """Compute features (R, F) of normalised pictures (R, H, W, 3)."""
         out = []
         for start in range(0, len(pictures), self.batch):
             part = pictures[start : start + self.batch]
@@ -117,11 +109,17 @@ class ClipEmbedder:
         return np.concatenate(out)
 
 
-def crop(rgb: np.ndarray, pixels: np.ndarray, size: tuple[int, int], params: Params) -> np.ndarray:
-    """The square around a mask as (height, width, 3) float32 in [0, 1]; what is off the picture is its mean."""
+def crop(
+    rgb: np.ndarray,
+    pixels: np.ndarray,
+    size: tuple[int, int],
+    margin: float = _MARGIN,
+    background: float = _BACKGROUND,
+) -> np.ndarray:
+    """Crop the square around a mask, (height, width, 3) float32 in [0, 1], padded with the view's mean."""
     rows, columns = np.flatnonzero(pixels.any(1)), np.flatnonzero(pixels.any(0))
     centre = np.array([rows[0] + rows[-1] + 1, columns[0] + columns[-1] + 1]) / 2
-    side = max(rows[-1] + 1 - rows[0], columns[-1] + 1 - columns[0]) * (1 + 2 * params.margin)
+    side = max(rows[-1] + 1 - rows[0], columns[-1] + 1 - columns[0]) * (1 + 2 * margin)
     low = np.floor(centre - side / 2).astype(int)
     side = max(2, int(np.ceil(side)))
     mean = rgb.reshape(-1, 3).mean(0)
@@ -130,7 +128,7 @@ def crop(rgb: np.ndarray, pixels: np.ndarray, size: tuple[int, int], params: Par
     column = slice(max(low[1], 0), min(low[1] + side, rgb.shape[1]))
     part = rgb[row, column].astype(np.float64)
     outside = ~pixels[row, column, None]
-    part = np.where(outside, params.background * part + (1 - params.background) * mean, part)
+    part = np.where(outside, background * part + (1 - background) * mean, part)
     at_row, at_column = row.start - low[0], column.start - low[1]
     square[at_row : at_row + part.shape[0], at_column : at_column + part.shape[1]] = part
     from PIL import Image  # naming a recipe does without
@@ -141,5 +139,5 @@ def crop(rgb: np.ndarray, pixels: np.ndarray, size: tuple[int, int], params: Par
 
 
 def normalise(pictures: np.ndarray, spec: ModelSpec) -> np.ndarray:
-    """Pictures (..., 3) in [0, 1] scaled as the model expects: ``(rgb - mean) / std``."""
+    """Scale pictures (..., 3) in [0, 1] as the model expects: ``(rgb - mean) / std``."""
     return ((pictures - np.asarray(spec.mean, np.float32)) / np.asarray(spec.std, np.float32)).astype(np.float32)

@@ -1,1 +1,1 @@
-"""Landmarks: typed blobs of colour and density, with what surrounds them; needs neither renders nor models."""
+"""Landmarks: typed blobs of colour and density with a descriptor of their surroundings; no renders, no networks."""

@@ -1,7 +1,7 @@
-"""Landmark nodes: typed colour and density blobs of the surface, found without rendering and without any model.
+"""Landmark detection: typed blobs of colour and density of the surface, without rendering and without networks.
 
-Works on a *levelled* cloud: metres (by the unit given) and z against gravity. Everything that follows is a function of
-that cloud alone, so the same place gives the same landmarks whatever frame and unit its capture came in.
+The input is a *levelled* cloud: metres (by the given unit) and z against gravity. Landmarks are a function of that
+cloud alone, so that they do not depend on the frame and unit of the capture.
 """
 
 from __future__ import annotations
@@ -15,36 +15,19 @@ from gsmap.geometry.cells import cell_means
 from gsmap.geometry.neighbours import spatial_order
 from gsmap.types.views import Cloud
 
+CELL_M = 0.025  # grid of the finest octave, metres under the layer's unit; its blobs have a scale of 1.6 cells
+NUM_OCTAVES = 4  # number of scales, doubling; those finer than the capture's Gaussians are skipped
+MAX_PER_OCTAVE = 1500  # default of the setting
+_MAX_SPACING_CELLS = 1.4  # an octave is skipped where points are typically farther from their 8th neighbour
+# Smallest contrast of the channels: 2 L*a*b* units in a and b, 1.3 times that in L, and surface in excess of a plane's.
+_THRESHOLDS = np.array([1.3 * 2.0, 2.0, 2.0, 0.6])
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
 _SURROUND = 1.8  # scale of the surround relative to the blob's
-_MANY = 400_000  # points; clouds of more are thinned to what each grid resolves
-_UNTOLD = 0.3  # cells within which points are not told apart: a fifth of a blob's scale
+_MANY = 400_000  # points; larger clouds are thinned to the resolution of each grid
+_THIN_CELLS = 0.3  # cells within which points are merged: a fifth of a blob's scale
 _ORDER_ACROSS = 256  # cells of the order in which points are spread over grids
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
 _BLOCK_CELLS = 192  # grids larger than this are worked through in blocks: memory stays bounded
-
-
-@dataclass(frozen=True)
-class Params:
-    """How landmarks are found; lengths are metres under the layer's unit.
-
-    Args:
-        cell_m: grid of the finest octave; its blobs have a scale of 1.6 cells.
-        octaves: number of scales, doubling; those finer than the capture's Gaussians are skipped.
-        max_spacing_cells: an octave is skipped where points are typically farther from their 8th neighbour than this.
-        lab_threshold: smallest colour contrast in a and b, L*a*b* units.
-        lightness_factor: the threshold in L is this many times as much.
-        density_threshold: smallest excess of surface over a plane's.
-        max_per_octave: the strongest are kept.
-    """
-
-    cell_m: float = 0.025
-    octaves: int = 4
-    max_spacing_cells: float = 1.4
-    lab_threshold: float = 2.0
-    lightness_factor: float = 1.3
-    density_threshold: float = 0.6
-    max_per_octave: int = 1500
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +50,10 @@ class Blobs:
         return len(self.positions)
 
 
-class Octaves:
-    """One levelled cloud in its own unit, and its extrema by the size of the grid's cells, for layers that share both.
+class OctaveCache:
+    """Cache of one levelled cloud and its extrema by grid cell size, for layers that share both.
 
-    Layers whose units differ by a power of two look at the same grids, bit by bit.
+    Layers whose units differ by a power of two use the same grids, bit by bit.
     """
 
     def __init__(self) -> None:
@@ -78,8 +61,9 @@ class Octaves:
         self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
 
     def levelled(self, cloud: Cloud, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points, L*a*b* and areas of the cloud, always the same one, turned by ``level`` (3, 3), neighbours together:
-        spread over a grid so, or thinned, they stay in the processor's cache."""
+        """Return points, L*a*b* and areas of the cloud, rotated by ``level`` (3, 3) and in spatial order, which is
+        cache-friendly. Every call must pass the same cloud.
+        """
         if self._levelled is None:
             points = cloud.points @ level.T
             order = spatial_order(points, _ORDER_ACROSS)
@@ -96,65 +80,61 @@ class Octaves:
         size_m: float,
         unit_m: float,
     ) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
-        """As `_extrema` of a grid of ``size_m``; ``unit_m`` is that of the points."""
+        """Compute `_extrema` of a grid of ``size_m``; ``unit_m`` is that of the points."""
         key = size_m / unit_m, thresholds.tobytes()
         if key not in self._found:
             self._found[key] = list(_extrema(points, lab, areas, thresholds, size_m))
         return self._found[key]
 
 
-def thinned(
+def thin_cloud(
     points: np.ndarray, lab: np.ndarray, areas: np.ndarray, size_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A cloud of very many points as the means of those that a grid of ``size_m`` does not tell apart, with all of
-    their surface; one of fewer as it is."""
+    """Thin a very large cloud to the means of grid cells finer than a grid of ``size_m`` resolves, keeping its area."""
     if len(points) <= _MANY:
         return points, lab, areas
-    return cell_means(points, lab, size_m * _UNTOLD, areas)
+    return cell_means(points, lab, size_m * _THIN_CELLS, areas)
 
 
 def find_blobs(
     points: np.ndarray,
     lab: np.ndarray,
     areas: np.ndarray,
-    params: Params | None = None,
-    octaves: Octaves | None = None,
+    max_per_octave: int = MAX_PER_OCTAVE,
+    octaves: OctaveCache | None = None,
     unit_m: float = 1.0,
     median_area_m2: float | None = None,
     thinned_m: float = 0.0,
 ) -> Blobs:
-    """Extrema of colour and density against their surround, at 1.6 cells and one scale per octave above.
+    """Detect extrema of colour and density against their surround, at 1.6 cells and one scale per octave.
 
-    Points are spread over the grid with the surface they stand for as weight, so that neither the grid's place nor how
-    densely a trainer put its Gaussians matters. Colour at a scale is the normalised Gaussian convolution; the response
+    Points are spread over the grid weighted by their area, so that neither the grid's origin nor the density of the
+    Gaussians matters. Colour at a scale is the normalised Gaussian convolution; the response
     is its difference between scale s and 1.8 s. Density is the surface near a point relative to that of a plane
-    (``m sqrt(2 pi) s``): corners, clutter and thin things stand out. A blob's position is the mean of the cells around
-    the extremum whose response exceeds 0.6 of the peak's, weighted by it. Octaves finer than the points are skipped.
+    (``m sqrt(2 pi) s``): corners, clutter and thin objects stand out. A blob's position is the mean of the cells around
+    the extremum whose response exceeds 0.6 of the peak's, weighted by it. Octaves finer than the points
+    are skipped.
 
     Args:
         points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
         octaves: of this cloud in its own unit, which is ``unit_m`` metres.
-        median_area_m2: of the points before they were thinned ...
-        thinned_m: ... to what a grid of this size resolves.
+        median_area_m2: of the points before thinning.
+        thinned_m: cell size of the grid for which the points were thinned.
     """
-    params, known = params or Params(), octaves or Octaves()
-    lab_threshold, count = params.lab_threshold, params.octaves
+    known = octaves or OctaveCache()
     spacing_m = np.sqrt(8 / np.pi * (np.median(areas) if median_area_m2 is None else median_area_m2))
-    thresholds = np.array(
-        [params.lightness_factor * lab_threshold, lab_threshold, lab_threshold, params.density_threshold]
-    )
     found = [_empty()]
-    for octave in range(count):
-        size_m = params.cell_m * 2**octave
-        if spacing_m > params.max_spacing_cells * size_m:
+    for octave in range(NUM_OCTAVES):
+        size_m = CELL_M * 2**octave
+        if spacing_m > _MAX_SPACING_CELLS * size_m:
             continue
         if size_m > thinned_m:
-            points, lab, areas = thinned(points, lab, areas, size_m)
+            points, lab, areas = thin_cloud(points, lab, areas, size_m)
         parts = [_empty()]
-        for channel, negative, cells, ratio in known.extrema(points, lab, areas, thresholds, size_m, unit_m):
-            kind = np.full(len(cells), (channel * 2 + negative) * count + octave, np.int32)
+        for channel, negative, cells, ratio in known.extrema(points, lab, areas, _THRESHOLDS, size_m, unit_m):
+            kind = np.full(len(cells), (channel * 2 + negative) * NUM_OCTAVES + octave, np.int32)
             parts.append(Blobs(cells * size_m, kind, ratio, np.full(len(cells), _SIGMA_CELLS * size_m)))
-        found.append(_strongest(parts, params.max_per_octave))
+        found.append(_strongest(parts, max_per_octave))
     return _strongest(found)
 
 

@@ -1,16 +1,21 @@
-"""The landmark layer: blobs of the surface with what surrounds them."""
+"""Landmark layer: blobs of the surface with their descriptors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from gsmap.describe.landmarks.context import Params as ContextParams
-from gsmap.describe.landmarks.context import cylinder_context, embed, metric_digest, shell_context
-from gsmap.describe.landmarks.detect import Octaves, find_blobs, thinned
-from gsmap.describe.landmarks.detect import Params as DetectParams
+from gsmap.describe.landmarks.context import (
+    NUM_RINGS,
+    NUM_SHELLS,
+    cylinder_context,
+    embed,
+    metric_digest,
+    shell_context,
+)
+from gsmap.describe.landmarks.detect import CELL_M, MAX_PER_OCTAVE, OctaveCache, find_blobs, thin_cloud
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey
 from gsmap.types import NodeLayer
@@ -22,44 +27,46 @@ VERSION = 7
 
 @dataclass(frozen=True)
 class Params:
-    """Landmarks: where they are, and what is told of what surrounds them.
+    """Settings of the landmark layers.
 
     Args:
-        detect: how they are found.
-        context: what is told of their surroundings.
+        max_per_octave: Number of landmarks, at least 1, that are kept per octave of size, the strongest first; larger
+            finds more overlap in large scenes, and takes more time and space.
+        use_fitted_metric: Transform embeddings by the metric fitted on synthetic places; layers with and without it do
+            not compare.
     """
 
-    detect: DetectParams = field(default_factory=DetectParams)
-    context: ContextParams = field(default_factory=ContextParams)
+    max_per_octave: int = MAX_PER_OCTAVE
+    use_fitted_metric: bool = False
 
 
 def settings(params: Params) -> dict[str, Any]:
-    """The parameters as plain values, and the digest of the fitted metric where it is used."""
+    """Return the parameters as plain values, and the digest of the fitted metric where it is used."""
     out: dict[str, Any] = plain(params)
-    if params.context.fitted:
-        out["context"]["metric"] = metric_digest()
-    return out
+    return out | _metric(params)
+
+
+def _metric(params: Params) -> dict[str, str]:
+    return {"metric": metric_digest()} if params.use_fitted_metric else {}
 
 
 def descriptor_id(params: Params, *, upright: bool = True) -> str:
-    """What two comparable landmark layers share; contexts with and without a vertical do not compare.
+    """Return the id that two comparable landmark layers share; contexts with and without a vertical do not compare.
 
-    How many landmarks are kept, and how strong they must be, does not keep layers from being compared.
+    Layers with different numbers of landmarks compare.
     """
-    decides = {"cell_m": params.detect.cell_m, "octaves": params.detect.octaves, "context": settings(params)["context"]}
     name = "landmarks" if upright else "landmarks_gravity_free"
-    return RecipeKey("describe", name, {"landmarks": VERSION}, decides).recipe
+    return RecipeKey("describe", name, {"landmarks": VERSION}, _metric(params)).recipe
 
 
 def landmark_layer(
-    cloud: Cloud, up: np.ndarray | None, unit_m: float, params: Params | None = None, octaves: Octaves | None = None
+    cloud: Cloud, up: np.ndarray | None, unit_m: float, params: Params | None = None, octaves: OctaveCache | None = None
 ) -> NodeLayer:
-    """Landmarks of a surface cloud.
+    """Compute the landmarks of a surface cloud.
 
     Args:
         cloud: in the scene's frame and unit.
-        up: (3,) against gravity, scene frame, or None: contexts are then counted in shells, which tell places apart
-            less well.
+        up: (3,) against gravity, scene frame, or None: contexts are then in shells, which are less distinctive.
         unit_m: metres per scene unit to assume.
         octaves: of this cloud, shared by its layers.
 
@@ -69,26 +76,25 @@ def landmark_layer(
     """
     params = params or Params()
     descriptor = descriptor_id(params, upright=up is not None)
-    bins = params.context.num_shells if up is None else params.context.num_rings
+    bins = NUM_SHELLS if up is None else NUM_RINGS
     surroundings = shell_context if up is None else cylinder_context
     dim = 4 * bins
     if not cloud.areas.any():  # nothing, or only coincident points
         return NodeLayer.empty(descriptor, dim, unit_m)
     level = np.eye(3) if up is None else level_frame(up)
-    octaves = octaves or Octaves()
+    octaves = octaves or OctaveCache()
     points, lab, areas = octaves.levelled(cloud, level)
     spacing_m2 = float(np.median(areas)) * unit_m**2
-    finest_m = params.detect.cell_m
-    points, lab, areas = thinned(points * unit_m, lab, areas * unit_m**2, finest_m)
-    blobs = find_blobs(points, lab, areas, params.detect, octaves, unit_m, spacing_m2, finest_m)
+    points, lab, areas = thin_cloud(points * unit_m, lab, areas * unit_m**2, CELL_M)
+    blobs = find_blobs(points, lab, areas, params.max_per_octave, octaves, unit_m, spacing_m2, CELL_M)
     if len(blobs) == 0:
         return NodeLayer.empty(descriptor, dim, unit_m)
-    around = surroundings(blobs.positions, points, lab, params.context)
+    around = surroundings(blobs.positions, points, lab)
     positions = blobs.positions @ level / unit_m
     half = (1.5 * blobs.sigmas_m / unit_m)[:, None]
     return NodeLayer(
         positions=positions,
-        embeddings=embed(around, params.context),
+        embeddings=embed(around, params.use_fitted_metric),
         types=blobs.types,
         weights=blobs.responses,
         extents=np.stack([positions - half, positions + half], 1),
@@ -100,7 +106,7 @@ def landmark_layer(
 
 
 def gravity_free(layer: NodeLayer, cloud: Cloud, params: Params | None = None) -> NodeLayer:
-    """An upright scene's landmarks as scenes whose vertical is unknown see theirs: with contexts in shells.
+    """Recompute an upright scene's landmarks with shell contexts, comparable with scenes of unknown vertical.
 
     Args:
         layer: from `landmark_layer`, with the same cloud and parameters.
@@ -108,7 +114,7 @@ def gravity_free(layer: NodeLayer, cloud: Cloud, params: Params | None = None) -
     params = params or Params()
     descriptor = descriptor_id(params, upright=False)
     if len(layer) == 0:
-        return NodeLayer.empty(descriptor, 4 * params.context.num_shells, layer.unit_m)
+        return NodeLayer.empty(descriptor, 4 * NUM_SHELLS, layer.unit_m)
     points = cloud.points * layer.unit_m
-    around = shell_context(layer.positions * layer.unit_m, points, cloud.lab, params.context)
-    return replace(layer, embeddings=embed(around, params.context), descriptor_id=descriptor)
+    around = shell_context(layer.positions * layer.unit_m, points, cloud.lab)
+    return replace(layer, embeddings=embed(around, params.use_fitted_metric), descriptor_id=descriptor)

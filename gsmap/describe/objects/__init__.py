@@ -1,1 +1,1 @@
-"""Objects: parts found in renders, lifted to the surface, associated over views, with their context."""
+"""Objects: masks from renders, lifted to the surface and associated over views; and segments of the surface."""

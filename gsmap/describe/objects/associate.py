@@ -1,4 +1,4 @@
-"""Regions of many views become the nodes of one scene."""
+"""Association of masks over views to the object nodes of one scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmap.describe.cloud import downsample
 
 @dataclass(eq=False)
 class Node:
-    """An object under construction: points (n, 3), their box (2, 3), unit feature (F,), and what it was seen in."""
+    """An object under construction: points (n, 3), their box (2, 3), unit feature (F,), and the views that show it."""
 
     points: np.ndarray
     box: np.ndarray
@@ -22,11 +22,11 @@ class Node:
 
 
 def associate(nodes: list[Node], region: Node, tau: float, cell: float) -> Node:
-    """Merge a region (a node seen once) into the node it resembles most, or start a new one; returns the node.
+    """Merge a region (a node seen once) into the most similar node, or start a new one; return the node.
 
-    Resemblance is the cosine of the features plus the generalised IoU of the boxes (paper, tau_asso); regions whose
-    segmenter knows them to be one part are one node. Merging unites the points and thins them to one per cell of size
-    ``cell``, and averages the features over the regions seen so far.
+    Resemblance is the cosine of the features plus the generalised IoU of the boxes (paper, tau_asso); regions of one
+    part of the segmenter are one node. Merging unites the points and thins them to one per cell of size ``cell``, and
+    averages the features over the regions seen so far.
     """
     best = _counterpart(nodes, region, tau)
     if best is None:
@@ -43,10 +43,10 @@ def associate(nodes: list[Node], region: Node, tau: float, cell: float) -> Node:
     return best
 
 
-def region(
+def make_region(
     points: np.ndarray, feature: np.ndarray, confidence: float, view: int, cell: float, part: int | None = None
 ) -> Node:
-    """What one mask shows, as a node of its own."""
+    """Return one mask as a node of its own."""
     points = downsample(points, points, cell)[0]
     return Node(points, box_of(points), feature, [confidence], {view}, part)
 
@@ -62,7 +62,7 @@ def _counterpart(nodes: list[Node], region: Node, tau: float) -> Node | None:
 
 
 def giou(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Generalised IoU (M,) in (-1, 1] of axis-parallel boxes (M, 2, 3) with one box (2, 3).
+    """Compute the generalised IoU (M,) in (-1, 1] of axis-parallel boxes (M, 2, 3) with one box (2, 3).
 
     Rezatofighi et al. 2019, in 3D: IoU minus the share of the hull that neither covers. Flat boxes are given a
     thickness of a thousandth of the hull, so that two equal planes have IoU 1.
@@ -78,5 +78,5 @@ def giou(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def box_of(points: np.ndarray) -> np.ndarray:
-    """(2, 3) corners of the box that holds the points but for the outermost 2 percent on each side."""
+    """Compute the box (2, 3) of the points without the outermost 2 percent on each side."""
     return np.percentile(points, [2, 98] if len(points) > 20 else [0, 100], axis=0)

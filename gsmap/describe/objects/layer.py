@@ -1,4 +1,4 @@
-"""The object layer: what the segmenter finds in renders of the scene, lifted to 3D and associated over views."""
+"""Object layer: masks of the segmenter in renders of the scene, lifted to 3D and associated over views."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsmap.describe.objects.associate import Node, associate, region
-from gsmap.describe.objects.lift import visible
+from gsmap.describe.objects.associate import Node, associate, make_region
+from gsmap.describe.objects.lift import find_visible
 from gsmap.describe.objects.views import is_blocked, render_views
 from gsmap.errors import ConfigError
 from gsmap.geometry.directions import level_frame
@@ -22,41 +22,45 @@ from gsmap.types.progress import Progress, silent
 from gsmap.types.views import SceneContext
 
 VERSION = 3
+_NEAR_M = 0.1  # a view most of which is nearer than this looks out of the inside of an object, and is left out
+_MIN_POINTS = 12  # masks that show fewer Gaussians are dropped
+_MIN_SIMILARITY = 1.1  # cosine + GIoU above which a region joins a node (Graph-GSReg, tau_asso)
+_VOXEL_M = 0.03  # a node's points are thinned to one per cell of this size, metres under the layer's unit
 _MANY = 400_000  # points of the surface; of more, an even share is lifted
-# What decides which things are nodes and how often they are seen, not what a node and its embedding mean.
+# Settings that change the set of nodes, but not the meaning of a node and its embedding.
 _NOT_COMPARED = (
-    *("render_backend", "num_cameras", "longest_side_px", "near_m", "min_seen", "depth_tolerance"),
-    *("c_mask", "min_points", "tau_asso", "min_views", "voxel_m"),
+    *("render_backend", "num_cameras", "longest_side_px", "depth_tolerance", "min_confidence", "min_views"),
 )
 
-# What the layer is the same with: the backend is a part of the key by itself, a model beyond its limits makes none.
+# Settings without effect on the layer: the backend is in the key by itself, a model beyond its limits makes no layer.
 _NOT_NAMED = ("render_backend", "model_time_s", "model_memory_mb")
 
 
 @dataclass(frozen=True)
 class Params:
-    """How objects are found; lengths are metres under the layer's unit.
+    """Settings of the object layer.
 
     Args:
-        segmenter: finds masks; a method of that family, or ``auto``: the first that needs models and has them all, else
-            ``builtin``.
-        segmenters: the settings of each.
-        embedder: describes masks; a method of that family, or ``auto``, likewise.
-        embedders: the settings of each.
-        render_backend: ``native`` (CPU), ``gsplat`` (CUDA), or ``auto``: gsplat where there is a GPU for it.
-        num_cameras: views to render, evenly spread.
-        longest_side_px: of a render.
-        near_m: a view most of which is nearer than this looks out of the inside of something, and is left out.
-        min_seen: a view of which a smaller share shows anything is left out.
-        depth_tolerance: a Gaussian is visible where its depth is that of the render to within this share; inf takes
-            every one whose centre projects into a mask (paper).
-        c_mask: masks of lower confidence are dropped (paper).
-        min_points: masks that show fewer Gaussians are dropped.
-        tau_asso: cosine + GIoU above which a region joins a node (paper).
-        min_views: nodes seen in fewer views are dropped.
-        voxel_m: a node's points are thinned to one per cell of this size.
-        model_time_s: a model that loads, or runs once, for longer is ended, which is an error.
-        model_memory_mb: a model that takes more, beside what the libraries take, is ended likewise (on Linux).
+        segmenter: Segmenter that finds masks in renders: ``builtin``, ``per_view``, ``sam`` or one from another
+            package; ``auto`` takes the first that needs models and has them all, or ``builtin``.
+        segmenters: Settings of each segmenter.
+        embedder: Embedder that describes masks: ``builtin``, ``clip`` or one from another package; ``auto`` takes the
+            first that needs models and has them all, or ``builtin``.
+        embedders: Settings of each embedder.
+        render_backend: Renderer of the views: ``native`` (CPU), ``gsplat`` (CUDA), or ``auto`` for gsplat where there
+            is a GPU for it.
+        num_cameras: Number of views, at least 1, that are rendered of a scene, evenly spread over its cameras; larger
+            finds more objects and takes longer.
+        longest_side_px: Longer side of a rendered view in pixels, positive; larger resolves smaller objects and takes
+            longer.
+        depth_tolerance: Fraction, positive, of the rendered depth within which a Gaussian is visible; larger assigns
+            more hidden Gaussians to a mask, and inf all that project into it (as in Graph-GSReg).
+        min_confidence: Confidence in [0, 1] below which masks are dropped; larger keeps fewer, more certain masks.
+        min_views: Number of views, at least 1, that must show an object; larger drops more spurious objects.
+        model_time_s: Seconds, positive, that a model may take to load or for one run before it is ended with an error;
+            larger allows slower models.
+        model_memory_mb: Memory in MB, positive, that a model may take beside its libraries before it is ended with an
+            error (on Linux); larger allows larger models.
     """
 
     segmenter: str = "auto"
@@ -66,14 +70,9 @@ class Params:
     render_backend: Literal["auto", "native", "gsplat"] = "auto"
     num_cameras: int = 48
     longest_side_px: int = 320
-    near_m: float = 0.1
-    min_seen: float = 0.2
     depth_tolerance: float = 0.03
-    c_mask: float = 0.5
-    min_points: int = 12
-    tau_asso: float = 1.1
+    min_confidence: float = 0.5
     min_views: int = 2
-    voxel_m: float = 0.03
     model_time_s: float = ModelLimits.time_s
     model_memory_mb: int = ModelLimits.memory_mb
 
@@ -90,19 +89,19 @@ class Params:
 
     @property
     def limits(self) -> ModelLimits:
-        """Of every model that runs."""
+        """Time and memory limits of every model that runs."""
         return ModelLimits(self.model_time_s, self.model_memory_mb)
 
 
 @dataclass(frozen=True)
-class Resolved:
-    """Parameters with every ``auto`` replaced by what it stands for here.
+class MethodChoice:
+    """Parameters with every ``auto`` replaced by the chosen method.
 
     Args:
         params: with names of methods and a backend.
         versions: of the layer, the segmenter and the embedder.
         kinds: of the models that the two methods need.
-        fallbacks: what a person should know of the choices.
+        fallbacks: notes for the user on built-in methods.
     """
 
     params: Params
@@ -111,7 +110,7 @@ class Resolved:
     fallbacks: tuple[str, ...]
 
     def settings(self, models: Mapping[str, ModelSpec]) -> dict[str, Any]:
-        """Plain settings that can change the layer: those of the chosen methods only, and the models' digests."""
+        """Return the plain settings that can change the layer: those of the chosen methods, and the models' digests."""
         p = self.params
         out = {field.name: plain(getattr(p, field.name)) for field in fields(p) if field.name not in _NOT_NAMED}
         out["segmenters"] = {p.segmenter: plain(p.segmenters[p.segmenter])}
@@ -119,8 +118,8 @@ class Resolved:
         return out | {"models": [models[kind].digest if kind in models else kind for kind in self.kinds]}
 
 
-def resolved(params: Params, models: Mapping[str, ModelSpec]) -> Resolved:
-    """What the parameters stand for, given these models.
+def choose_methods(params: Params, models: Mapping[str, ModelSpec]) -> MethodChoice:
+    """Choose the methods for these parameters and models.
 
     Raises:
         ConfigError: a method that does not exist.
@@ -129,10 +128,10 @@ def resolved(params: Params, models: Mapping[str, ModelSpec]) -> Resolved:
     segmenter, embedder = _chosen(segmenters, params.segmenter, models), _chosen(embedders, params.embedder, models)
     fallbacks = [
         name
-        for name, asked, took in (("segmenter", params.segmenter, segmenter), ("embedder", params.embedder, embedder))
-        if asked == "auto" and took == "builtin"
+        for name, wanted, taken in (("segmenter", params.segmenter, segmenter), ("embedder", params.embedder, embedder))
+        if wanted == "auto" and taken == "builtin"
     ]
-    return Resolved(
+    return MethodChoice(
         replace(params, segmenter=segmenter, embedder=embedder, render_backend=backend(params.render_backend)),
         {"objects": VERSION, **segmenters.version(segmenter), **embedders.version(embedder)},
         (*segmenters.get(segmenter).MODELS, *embedders.get(embedder).MODELS),
@@ -141,8 +140,8 @@ def resolved(params: Params, models: Mapping[str, ModelSpec]) -> Resolved:
 
 
 def descriptor_id(params: Params, models: Mapping[str, ModelSpec]) -> str:
-    """What two comparable object layers share: what a node is, and what its feature means."""
-    chosen = resolved(params, models)
+    """Return the id that two comparable object layers share."""
+    chosen = choose_methods(params, models)
     decides = {name: value for name, value in chosen.settings(models).items() if name not in _NOT_COMPARED}
     return RecipeKey("describe", "objects", chosen.versions, decides).recipe
 
@@ -154,14 +153,14 @@ def object_layer(
     params: Params | None = None,
     progress: Progress = silent,
 ) -> tuple[NodeLayer, list[str]]:
-    """Objects of a scene and what a person should know of them.
+    """Compute the object layer of a scene, and notes for the user.
 
     Sample cameras, render, segment, keep confident masks, lift each to the Gaussians whose centres project into it on
     the visible surface, embed, associate over views. Contexts are counted when two layers are compared.
 
     Args:
         gaussians, cameras: the capture, scene frame and unit.
-        context: what the segmenter and embedder may know of it.
+        context: input of the segmenter and embedder.
 
     Returns:
         The layer, scene frame and unit; and notes.
@@ -170,15 +169,15 @@ def object_layer(
         ConfigError: a method that does not exist or lacks its model.
     """
     descriptor = descriptor_id(params or Params(), context.models)
-    chosen = resolved(params or Params(), context.models)
+    chosen = choose_methods(params or Params(), context.models)
     params = chosen.params
     limited = {kind: replace(model, limits=params.limits) for kind, model in context.models.items()}
     context = replace(context, models=limited)
-    segmenter = _made(family("segmenter"), params.segmenter, params.segmenters, context)
-    embedder = _made(family("embedder"), params.embedder, params.embedders, context)
+    segmenter = _make_method(family("segmenter"), params.segmenter, params.segmenters, context)
+    embedder = _make_method(family("embedder"), params.embedder, params.embedders, context)
     cloud, up, unit_m = context.cloud.evenly(_MANY), context.up, context.unit_m
     level = np.eye(3) if up is None else level_frame(up)
-    cell = params.voxel_m / unit_m
+    cell = _VOXEL_M / unit_m
     nodes: list[Node] = []
     blocked = 0
     if len(cloud) == 0 or cameras is None or len(cameras) == 0:
@@ -186,20 +185,20 @@ def object_layer(
     sampled = cameras.evenly(params.num_cameras)
     for i, view in enumerate(render_views(gaussians, sampled, params.longest_side_px, params.render_backend)):
         progress(i / len(sampled), f"objects, view {i + 1} of {len(sampled)}")
-        if is_blocked(view, params.near_m / unit_m, params.min_seen):
+        if is_blocked(view, _NEAR_M / unit_m):
             blocked += 1
             continue
-        rows, pixel = visible(cloud.points, view, params.depth_tolerance)
+        rows, pixel = find_visible(cloud.points, view, params.depth_tolerance)
         masks, points = [], []
         for mask in segmenter.segment(view):
             shown = cloud.points[rows[mask.pixels[pixel[:, 1], pixel[:, 0]]]]
-            if mask.confidence >= params.c_mask and len(shown) >= params.min_points:
+            if mask.confidence >= params.min_confidence and len(shown) >= _MIN_POINTS:
                 masks.append(mask)
                 points.append(shown)
         features = embedder.embed(view, masks, points)
         for mask, shown, feature in zip(masks, points, features, strict=True):
-            found = region(shown @ level.T, feature, mask.confidence, i, cell, mask.part)
-            associate(nodes, found, params.tau_asso, cell)
+            found = make_region(shown @ level.T, feature, mask.confidence, i, cell, mask.part)
+            associate(nodes, found, _MIN_SIMILARITY, cell)
     enough = min(params.min_views, len(sampled) - blocked)
     nodes = [n for n in nodes if len(n.views) >= enough]
     notes = list(chosen.fallbacks)
@@ -227,7 +226,7 @@ def _layer(nodes: list[Node], level: np.ndarray, unit_m: float, descriptor: str)
 
 
 def _chosen(methods: Family, name: str, models: Mapping[str, ModelSpec]) -> str:
-    """The name of the method that is meant."""
+    """Return the name of the chosen method."""
     if name != "auto":
         methods.get(name)
         return name
@@ -238,8 +237,8 @@ def _chosen(methods: Family, name: str, models: Mapping[str, ModelSpec]) -> str:
     return "builtin"
 
 
-def _made(methods: Family, name: str, params: MethodParams, context: SceneContext) -> Any:
-    """The method, ready for the scene."""
+def _make_method(methods: Family, name: str, params: MethodParams, context: SceneContext) -> Any:
+    """Create the method for the scene."""
     method = methods.get(name)
     missing = [kind for kind in method.MODELS if kind not in context.models]
     if missing:

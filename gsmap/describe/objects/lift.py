@@ -1,4 +1,4 @@
-"""From a mask in a view to the Gaussians it shows."""
+"""Lifting of masks to the Gaussians that they show."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from gsmap.geometry.projection import on_surface
 from gsmap.types.views import View
 
 
-def visible(points: np.ndarray, view: View, tolerance: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the points that lie on the surface the view sees, and their pixels (n, 2) int64 ``column row``.
+def find_visible(points: np.ndarray, view: View, tolerance: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
+    """Find the points on the surface that the view sees: their rows, and their pixels (n, 2) int64 ``column row``.
 
     A point is on it when its depth agrees with the rendered depth at its pixel to within ``tolerance`` of that depth:
-    the paper asks only that a centre projects into the mask, which also takes what lies behind the object, as a
-    tolerance of inf does.
+    Graph-GSReg only requires that a centre projects into the mask, which includes points behind the object; a tolerance
+    of inf does the same.
 
     Args:
         points: (N, 3) in the frame and unit that was rendered.

@@ -1,4 +1,4 @@
-"""The building itself: floor, ceiling and walls, told from what stands in them by geometry alone."""
+"""Structure of a building: floor, ceiling and walls, separated from its contents by geometry alone."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 _BIN_M = 0.02  # of a histogram of heights: finer than a floor is flat, coarser than a surface is noisy
 _STEP_M = 0.1  # of a histogram along a wall
 _CEILING_M = 1.9  # a horizontal plane lower than this above the floor is a table
-_PATCH_M2 = 0.3  # smaller upright patches say nothing of a wall
+_PATCH_M2 = 0.3  # smaller upright patches are no evidence of a wall
 _REACH_M = 0.3  # a wall ends nearer to the ceiling than this
-_HIDDEN_M = 2.5  # what a bookshelf hides of a wall: a plane that goes on behind so much is the same wall
+_HIDDEN_M = 2.5  # gap that furniture may hide of a wall: a plane that continues behind it is the same wall
 _FLAT_M = 0.02  # neighbours on one plane lie no farther off it
 _PARALLEL = 0.96  # cosine of neighbours' normals on one plane
 
@@ -21,8 +21,8 @@ class Wall:
     """A stretch of a vertical plane, level frame.
 
     Args:
-        normal: (2,) horizontal unit normal; which side it points to says nothing.
-        offset_m: of the plane along it.
+        normal: (2,) horizontal unit normal, of arbitrary sign.
+        offset_m: of the plane along the normal.
         span_m: (low, high) along `along`.
     """
 
@@ -36,19 +36,19 @@ class Wall:
         return np.array([-self.normal[1], self.normal[0]])
 
     def inside(self, points: np.ndarray, margin_m: float = _STEP_M) -> np.ndarray:
-        """(N,) which points lie before or behind the stretch."""
+        """Return (N,) bool: points before or behind the stretch."""
         along = points[:, :2] @ self.along
         return np.asarray((along > self.span_m[0] - margin_m) & (along < self.span_m[1] + margin_m))
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What was found of the building.
+    """Floor, ceiling and walls of a building.
 
     Args:
         heights_m: (N,) of the points above the floor.
         ceiling_m: height of the ceiling, or of the highest points where there is none.
-        has_ceiling: whether a ceiling was seen.
+        has_ceiling: True if a ceiling was found.
         walls: stretches of planes that reach up to the ceiling.
     """
 
@@ -59,7 +59,7 @@ class Structure:
 
 
 def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(count,) which nodes edges a-b join."""
+    """Label (count,) the connected components of nodes joined by edges a-b."""
     from scipy.sparse import coo_matrix  # naming a recipe does without
     from scipy.sparse.csgraph import connected_components
 
@@ -71,11 +71,11 @@ def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def find_structure(
     points: np.ndarray, normals: np.ndarray, planarity: np.ndarray, areas: np.ndarray, neighbours: np.ndarray
 ) -> Structure:
-    """Floor, ceiling and walls of a place.
+    """Find floor, ceiling and walls of a place.
 
-    The floor is the lowest large horizontal plane (fitted, for what is up is known to a fraction of a degree only), the
-    ceiling the highest. A wall is an upright patch, grown over neighbours on one plane, that reaches up to the ceiling;
-    its plane is followed along as far as it goes on.
+    The floor is the lowest large horizontal plane (fitted, for the vertical is known to a fraction of a degree only),
+    the ceiling the highest. A wall is an upright patch, grown over neighbours on one plane, that reaches up to the
+    ceiling; its plane is followed along as far as it goes on.
 
     Args:
         points: (N, 3) metres, z up.
@@ -113,7 +113,7 @@ def find_structure(
 
 
 def _heights(points: np.ndarray, flat: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, float, bool]:
-    """Heights above the fitted floor (N,), the ceiling's, and whether there is one."""
+    """Compute heights above the fitted floor (N,), the ceiling's, and whether there is one."""
     z = points[:, 2]
     low = float(z.min())
     if not flat.any():
@@ -141,7 +141,7 @@ def _is_of(wall: Wall, points: np.ndarray) -> bool:
 
 
 def _wall(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, rows: np.ndarray) -> Wall | None:
-    """The plane of a patch, fitted to all that lies on it, and how far it goes on; None where it is a pillar."""
+    """Fit the plane of a patch to all that lies on it, and its extent; None where it is a pillar."""
     patch = points[rows, :2]
     middle = patch.mean(0)
     normal = np.linalg.eigh((patch - middle).T @ (patch - middle))[1][:, 0]

@@ -1,4 +1,4 @@
-"""What the sampled cameras of a capture see."""
+"""Rendered views of a capture from its sampled cameras."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, b
 
 
 def is_blocked(view: View, nearest: float, min_seen: float = 0.2) -> bool:
-    """Whether the camera stands inside something: most of its picture is closer than ``nearest``, or empty.
+    """Return True if the camera is inside an object: most of its view is nearer than ``nearest``, or empty.
 
     Args:
         nearest: scene units.

@@ -1,1 +1,1 @@
-"""ONNX models that a user gives: their files, their sessions, and the check before one is taken in."""
+"""ONNX models from users: validation before a map accepts one, and text encoders."""

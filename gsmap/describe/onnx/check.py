@@ -1,4 +1,4 @@
-"""The check of a model before a map takes it in."""
+"""Validation of a model before a map accepts it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PRESETS = {  # mean and standard deviation of rgb in [0, 1]
 
 
 def kinds() -> dict[str, list[Any]]:
-    """Every kind of model that a segmenter, embedder or extractor names, with the methods that do; and of words.
+    """List every kind of model that a segmenter, embedder or extractor names, with these methods; and those of text.
 
     Raises:
         ConfigError: a method that names models and has no ``probe`` for them.
@@ -42,7 +42,7 @@ def kinds() -> dict[str, list[Any]]:
 
 
 def parse_preset(preset: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Mean and standard deviation of a preset's name or of ``mean=r,g,b;std=r,g,b``.
+    """Parse mean and standard deviation from a preset's name or ``mean=r,g,b;std=r,g,b``.
 
     Raises:
         ConfigError: neither, or a standard deviation that is not positive.
@@ -65,18 +65,18 @@ def parse_preset(preset: str) -> tuple[tuple[float, float, float], tuple[float, 
 def check_model(
     kind: str, path: str | os.PathLike[str], preset: str = "clip", limits: ModelLimits | None = None
 ) -> ModelSpec:
-    """Check that a file is an ONNX model of a kind, complete in itself, and that the methods that need one can use it.
+    """Validate an ONNX file of a kind: complete in itself, and usable by the methods that need it.
 
     Args:
         kind: one of `kinds`.
         preset: see `parse_preset`.
-        limits: what the model may take while it is checked, and wherever this spec goes.
+        limits: time and memory limits of the model, now and wherever this spec is used.
 
     Raises:
         ConfigError: an unknown kind or preset.
         NotFoundError: no such file.
-        InputError: not an ONNX model, weights in other files, one that takes too long or too much memory, or what a
-            method's ``probe`` refuses.
+        InputError: not an ONNX model, weights in other files, one that takes too long or too much memory, or one
+            that a method's ``probe`` refuses.
     """
     known = kinds()
     if kind not in known:

@@ -1,5 +1,6 @@
-"""Words as an embedder's vectors: a text tower (``clip-text``, ONNX) and its tokenizer (``clip-tokenizer``, the
-``tokenizer.json`` that is published beside it), both of the pack that the image encoder ``clip`` is of."""
+"""Text embedding by the text tower (``clip-text``, ONNX) and tokenizer (``clip-tokenizer``, ``tokenizer.json``) of the
+pack of the image encoder ``clip``.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +26,10 @@ _IMAGE_DIMS = 4
 
 
 def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
-    """The unit vector (F,) float32 of some words.
+    """Compute the unit vector (F,) float32 of a text.
 
     Raises:
-        ConfigError: the map lacks the tower or its tokenizer; what to add is said.
+        ConfigError: the map lacks the tower or its tokenizer.
         InputError: words that are too long, or a tower that does not run on them.
         MissingDependencyError: the package tokenizers is not installed.
     """
@@ -58,7 +59,7 @@ def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
 
 
 def probe_text(spec: ModelSpec) -> None:
-    """Refuse a model that is no text tower; it is run once.
+    """Refuse a model that is not a text tower; it is run once.
 
     Raises:
         InputError: its inputs and outputs do not fit, or it does not run.
@@ -73,7 +74,7 @@ def probe_text(spec: ModelSpec) -> None:
 
 
 def check_tokenizer(path: Path) -> ModelSpec:
-    """Check that a file is a ``tokenizer.json``; it is kept beside the models, and is none.
+    """Validate a ``tokenizer.json``, which is stored beside the models.
 
     Raises:
         InputError: it is not.
@@ -89,11 +90,11 @@ def check_tokenizer(path: Path) -> ModelSpec:
 
 
 def _tokens(text: str, spec: ModelSpec, length: int, *, pad: bool) -> tuple[np.ndarray, np.ndarray]:
-    """(1, L) ids of the tokens of a text, and (1, L) 1 where there is one.
+    """Tokenize a text: (1, L) ids, and (1, L) mask.
 
     Args:
         length: tokens at most.
-        pad: to that many: by the tokenizer's own token for it, else by the one that ends a text, as CLIP does.
+        pad: pad to that length with the tokenizer's padding token, or with the end token, as CLIP does.
     """
     path = Path(spec.path)
     if not path.is_file():
@@ -131,7 +132,7 @@ def _tokenizer(path: Path) -> Any:
 
 
 def _ids_of(spec: ModelSpec) -> Tensor:
-    """The input that takes the tokens."""
+    """Return the input that takes the tokens."""
     takes = [t for t in spec.inputs if len(t.shape) == 2 and not any(w in t.name for w in ("mask", "type", "position"))]
     if len(takes) != 1:
         raise misfit(spec, "a text tower takes tokens of shape (N, L), and perhaps a mask of that shape")
@@ -139,7 +140,7 @@ def _ids_of(spec: ModelSpec) -> Tensor:
 
 
 def _run(spec: ModelSpec, ids: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(F,) what the tower gives for the tokens of one text."""
+    """Run the tower on the tokens of one text, (F,)."""
     feed = {}
     for tensor in spec.inputs:
         value = ids

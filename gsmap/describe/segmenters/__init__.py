@@ -1,1 +1,1 @@
-"""Segmenters, one file each: from a view to masks. The contract is in `gsmap.methods.segmenter`."""
+"""Segmenters, one file each: masks of a view. The contract is in `gsmap.methods.segmenter`."""

@@ -1,4 +1,4 @@
-"""The segmenter that needs no weights: parts of the surface itself, seen through the renders.
+"""Segmenter without a network: parts of the surface, seen through the renders.
 
 The surface is cut into parts once, in 3D (Felzenszwalb and Huttenlocher 2004, "Efficient graph-based image
 segmentation", on a neighbour graph of the Gaussians with colour and normal differences as weights); a view's mask of a
@@ -18,30 +18,23 @@ from gsmap.types.views import Cloud, Mask, SceneContext, View
 
 VERSION = 1
 MODELS: tuple[str, ...] = ()
+_NUM_SAMPLES = 20000  # points that the surface is thinned to before it is cut, about
+_MIN_SHARE = 0.001  # parts of a smaller share of the samples join their most similar neighbour
+_MIN_AREA = 0.002  # masks of a smaller share of the image are dropped
+_LIGHTNESS_WEIGHT = 0.5  # of L* against a* and b*: shading separates surfaces less than hue
+_LAB_SCALE = 5.0  # L*a*b* difference that counts as an edge of weight 1
+_TURN_WEIGHT = 3.0  # of an edge between normals at a right angle
 
 
 @dataclass(frozen=True)
 class Params:
-    """How coarse the parts are.
+    """Settings of the built-in segmenter.
 
     Args:
-        num_samples: about how many points the surface is thinned to before it is cut.
-        scale: Felzenszwalb's k: larger makes larger parts.
-        min_share: parts of less than this share of the samples join their most similar neighbour.
-        min_area: masks of a smaller share of the image are dropped.
-        lightness_weight: of a difference in L*, against one in a* or b*: light and shade part a surface less than a
-            change of hue.
-        lab_scale: the difference of colour, L*a*b* units, that counts as much as an edge of weight 1.
-        turn_weight: of an edge between normals at a right angle.
+        scale: Felzenszwalb's k, positive: larger makes fewer, larger parts.
     """
 
-    num_samples: int = 20000
     scale: float = 6.0
-    min_share: float = 0.001
-    min_area: float = 0.002
-    lightness_weight: float = 0.5
-    lab_scale: float = 5.0
-    turn_weight: float = 3.0
 
 
 def make(context: SceneContext, params: Params) -> BuiltinSegmenter:
@@ -53,13 +46,12 @@ class BuiltinSegmenter:
     """Masks of the surface's parts."""
 
     def __init__(self, params: Params, cloud: Cloud, num_gaussians: int) -> None:
-        self.params = params
         self.part_of_gaussian = np.full(num_gaussians + 1, -1)  # the last row is for pixels where nothing was drawn
         if len(cloud):
             self.part_of_gaussian[cloud.index] = cut_surface(cloud, params)
 
     def segment(self, view: View) -> list[Mask]:
-        """Pixels dominated by each part's Gaussians; one mask per connected blob of them."""
+        """Return one mask per connected blob of pixels that a part's Gaussians dominate."""
         from scipy import ndimage  # naming a recipe does without
 
         parts = self.part_of_gaussian[view.dominant_id]
@@ -73,7 +65,7 @@ class BuiltinSegmenter:
             pixels = ndimage.binary_closing(np.pad(parts[window] == part, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
             labels, count = ndimage.label(pixels)
             sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-            for i in np.flatnonzero(sizes >= self.params.min_area * parts.size):
+            for i in np.flatnonzero(sizes >= _MIN_AREA * parts.size):
                 blob = np.zeros(parts.shape, bool)
                 blob[window] = labels == i + 1
                 masks.append(Mask(blob, float(view.alpha[blob].mean() * sizes[i] / sizes.sum()), part))
@@ -81,9 +73,9 @@ class BuiltinSegmenter:
 
 
 def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
-    """Part (N,) int of each point of the cloud, numbered from 0."""
-    # A cell so large that the surface covers about num_samples of them.
-    cell = float(np.sqrt(cloud.areas.sum() / params.num_samples)) or 1e-9
+    """Segment the cloud into parts (N,) int, numbered from 0."""
+    # A cell so large that the surface covers about _NUM_SAMPLES of them.
+    cell = float(np.sqrt(cloud.areas.sum() / _NUM_SAMPLES)) or 1e-9
     points, lab = downsample(cloud.points, cloud.lab, cell)
     if len(points) < 16:
         return np.zeros(len(cloud), np.int64)
@@ -95,17 +87,17 @@ def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
     near = distance[:, 1:].ravel() < 3 * cell
     a, b = a[once & near], b[once & near]
     lab = lab[neighbours].mean(1)  # a Gaussian's own colour is noisy
-    difference = (lab[a] - lab[b]) * [params.lightness_weight, 1.0, 1.0]
+    difference = (lab[a] - lab[b]) * [_LIGHTNESS_WEIGHT, 1.0, 1.0]
     turn = 1 - np.abs((normals[a] * normals[b]).sum(1))
-    weight = np.linalg.norm(difference, axis=1) / params.lab_scale + params.turn_weight * turn
-    parts = felzenszwalb(len(points), a, b, weight, params.scale, max(4, int(params.min_share * len(points))))
+    weight = np.linalg.norm(difference, axis=1) / _LAB_SCALE + _TURN_WEIGHT * turn
+    parts = felzenszwalb(len(points), a, b, weight, params.scale, max(4, int(_MIN_SHARE * len(points))))
     return parts[nearest_of(points, cloud.points)[1]]
 
 
 def felzenszwalb(
     count: int, a: np.ndarray, b: np.ndarray, weight: np.ndarray, scale: float, min_size: int
 ) -> np.ndarray:
-    """Component (count,) int of each node of a graph.
+    """Segment a graph (Felzenszwalb and Huttenlocher 2004): component (count,) int of each node.
 
     Edges in order of weight join components whose inner difference allows it; components smaller than ``min_size`` are
     then joined along their lightest edges.

@@ -1,7 +1,7 @@
-"""The built-in segmenter's masks as a network would give them: of one view each, the same thing in two views unknown.
+"""Built-in segmenter without association over views, as a network would segment each view.
 
-The built-in segmenter knows which masks of two views are one part of the surface, so nothing is associated. Here that
-is forgotten, and masks become objects by what they show and where it lies (``tau_asso``), as Graph-GSReg has it.
+The built-in segmenter numbers the parts of the surface, so that its masks need no association. Here the part numbers
+are dropped, and masks are associated by appearance and position, as in Graph-GSReg (``tau_asso``).
 """
 
 from __future__ import annotations
@@ -13,20 +13,24 @@ from gsmap.types.views import Mask, SceneContext, View
 
 VERSION = 1
 MODELS: tuple[str, ...] = ()
-Params = builtin.Params
 
 
-def make(context: SceneContext, params: builtin.Params) -> PerViewSegmenter:
+@dataclass(frozen=True)
+class Params:
+    """No settings: parts are cut as the built-in segmenter cuts them by default."""
+
+
+def make(context: SceneContext, params: Params) -> PerViewSegmenter:
     """Cut the surface of a scene; see `gsmap.methods.segmenter`."""
-    return PerViewSegmenter(builtin.make(context, params))
+    return PerViewSegmenter(builtin.make(context, builtin.Params()))
 
 
 @dataclass(frozen=True)
 class PerViewSegmenter:
-    """Masks of the surface's parts that do not say of which."""
+    """Masks of the surface's parts without their part numbers."""
 
     parts: builtin.BuiltinSegmenter
 
     def segment(self, view: View) -> list[Mask]:
-        """The built-in segmenter's masks of a view, without their parts."""
+        """Return the built-in segmenter's masks of a view, without their parts."""
         return [replace(mask, part=None) for mask in self.parts.segment(view)]

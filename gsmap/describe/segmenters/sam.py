@@ -1,4 +1,4 @@
-"""Segment Anything, run from its published ONNX exports: everything in the picture, prompted by a grid of points.
+"""Segment Anything from its published ONNX exports, prompted by a grid of points.
 
 Contract (segment-anything, ``scripts/export_onnx_model.py``; MobileSAM and others export the same): the encoder takes
 a picture whose longer side is 1024 and gives ``image_embeddings``; the decoder takes those with ``point_coords`` (1,
@@ -23,30 +23,26 @@ MODELS = ("sam-encoder", "sam-decoder")
 SAM_SIDE_PX = 1024
 # What the published SAM decoder export takes (segment-anything, scripts/export_onnx_model.py).
 DECODER_INPUTS = ("image_embeddings", "point_coords", "point_labels", "mask_input", "has_mask_input", "orig_im_size")
+_BATCH = 64  # prompts per run of the decoder, where it takes several
+_MIN_STABILITY = 0.9  # IoU between the mask cut one logit above and one below zero
+_MAX_BOX_IOU = 0.7  # of two masks whose boxes overlap more, the one of lower predicted IoU is dropped
+_MIN_AREA, _MAX_AREA = 0.002, 0.9  # fractions of the view
 _PIXEL_MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _PIXEL_STD = np.array([58.395, 57.12, 57.375], np.float32)
 
 
 @dataclass(frozen=True)
 class Params:
-    """The automatic mask generator's knobs.
+    """Settings of SAM's automatic mask generator.
 
     Args:
-        points_per_side: the prompts form a square grid.
-        batch: prompts per run of the decoder, where it takes several.
-        min_iou: least IoU the model predicts for its own mask.
-        min_stability: least IoU between the mask cut one logit above and one below zero.
-        max_box_iou: of two masks whose boxes overlap more, the one of lower predicted IoU goes.
-        min_area, max_area: share of the image.
+        points_per_side: Number of prompts, at least 1, along each side of a view; larger finds more small objects and
+            takes longer.
+        min_iou: Intersection over union in [0, 1] that SAM must predict for a mask; larger keeps fewer masks.
     """
 
     points_per_side: int = 16
-    batch: int = 64
     min_iou: float = 0.86
-    min_stability: float = 0.9
-    max_box_iou: float = 0.7
-    min_area: float = 0.002
-    max_area: float = 0.9
 
 
 def make(context: SceneContext, params: Params) -> SamSegmenter:
@@ -55,7 +51,7 @@ def make(context: SceneContext, params: Params) -> SamSegmenter:
 
 
 def probe(spec: ModelSpec) -> None:
-    """Refuse a model that is no SAM encoder, or no SAM decoder, by its inputs and outputs.
+    """Refuse a model that is not a SAM encoder or decoder, by its inputs and outputs.
 
     Raises:
         InputError: what does not fit.
@@ -89,11 +85,11 @@ class SamSegmenter:
         self.encoder, self.decoder = open_session(encoder), open_session(decoder)
         self.encoder_spec, self.decoder_spec = encoder, decoder
         shapes = {t.name: t.shape for t in decoder.inputs}
-        self.batch = params.batch if shapes["point_coords"][0] is None and shapes["point_labels"][0] is None else 1
+        self.batch = _BATCH if shapes["point_coords"][0] is None and shapes["point_labels"][0] is None else 1
         self.types = {t.name: np.float64 if t.dtype == "double" else np.float32 for t in decoder.inputs}
 
     def segment(self, view: View) -> list[Mask]:
-        """Everything that a grid of points finds, without what is unstable, too small, too large, or found twice."""
+        """Segment a view by a grid of prompts, without unstable, too small, too large or duplicate masks."""
         height, width = view.rgb.shape[:2]
         embeddings = self._encode(view.rgb)
         side = (np.arange(self.params.points_per_side) + 0.5) / self.params.points_per_side
@@ -106,18 +102,18 @@ class SamSegmenter:
                 share = pixels.mean()
                 if (
                     iou >= self.params.min_iou
-                    and inner >= self.params.min_stability * max(outer, 1)
-                    and self.params.min_area <= share <= self.params.max_area
+                    and inner >= _MIN_STABILITY * max(outer, 1)
+                    and _MIN_AREA <= share <= _MAX_AREA
                 ):
                     rows, columns = np.flatnonzero(pixels.any(1)), np.flatnonzero(pixels.any(0))
                     boxes.append([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1])
                     scores.append(float(iou))
                     masks.append(pixels)
-        keep = suppress(np.array(boxes, float).reshape(-1, 4), np.array(scores), self.params.max_box_iou)
+        keep = suppress(np.array(boxes, float).reshape(-1, 4), np.array(scores), _MAX_BOX_IOU)
         return [Mask(masks[i], min(1.0, scores[i])) for i in keep]
 
     def _encode(self, rgb: np.ndarray) -> np.ndarray:
-        """Embeddings (1, C, h, w) of a picture."""
+        """Compute the embeddings (1, C, h, w) of a picture."""
         height, width = rgb.shape[:2]
         scale = SAM_SIDE_PX / max(height, width)
         size = (round(width * scale), round(height * scale))
@@ -165,7 +161,7 @@ class SamSegmenter:
 
 
 def suppress(boxes: np.ndarray, scores: np.ndarray, max_iou: float) -> list[int]:
-    """Non-maximum suppression: rows of the boxes (M, 4) ``x0 y0 x1 y1`` to keep, the best first."""
+    """Apply non-maximum suppression: rows of the boxes (M, 4) ``x0 y0 x1 y1`` to keep, the best first."""
     areas = (boxes[:, 2:] - boxes[:, :2]).prod(1)
     left = np.argsort(-scores, kind="stable")
     keep = []

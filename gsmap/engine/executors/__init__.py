@@ -1,1 +1,1 @@
-"""Executors: one file each; contract in `gsmap.methods.executor`."""
+"""Executors, one file each; contract in `gsmap.methods.executor`."""

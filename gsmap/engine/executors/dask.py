@@ -1,7 +1,7 @@
-"""Jobs on a cluster that runs: Dask's, by the address of its scheduler; on how many machines is Dask's matter.
+"""Executor for a running Dask cluster, by the address of its scheduler.
 
-The scheduler holds no work and no results to speak of: jobs are submitted as there is room, each result is taken,
-compressed, as soon as it is there, and what is done stands in the map's catalog. So any part of the cluster may end.
+The scheduler holds little work and few results: jobs are submitted as workers are free, and each compressed result is
+fetched at once and committed to the map's catalog. So any part of the cluster may end.
 """
 
 from __future__ import annotations
@@ -24,38 +24,33 @@ from gsmap.methods.executor import SetAside
 VERSION = 1
 
 _ATTEMPTS = 2
-"""A job that was begun so often and never ended took its workers with it: it is set aside."""
+"""A job that was begun so often without an end killed its workers: it is quarantined."""
 
-_BEGUN = "gsmap-begun"  # where the scheduler keeps how often a job was begun
-_LOOK_S = 1.0  # how often it is looked whether there are more workers now
+_BEGUN = "gsmap-begun"  # metadata key of the number of attempts
+_POLL_S = 1.0  # interval at which the number of workers is read
+_AHEAD = 0.25  # jobs submitted beyond one for each thread of the workers, as a fraction of these
+_MIN_SUBMITTED = 4  # jobs submitted however few workers there are, so that a cluster that grows on demand sees some
 
 
 @dataclass(frozen=True)
 class Params:
-    """Args:
-    scheduler: its address, such as ``tcp://host:8786``; empty takes what ``GSMAP_SCHEDULER`` says.
-    ahead: jobs submitted beyond one for each thread of the workers, as a share of these.
-    at_least: jobs submitted however few workers there are, so that a cluster that grows on demand sees some.
-    timeout_s: how long the scheduler is waited for.
+    """Settings of the Dask executor.
+
+    Args:
+        scheduler: Address of the scheduler, such as ``tcp://host:8786``; empty takes ``GSMAP_SCHEDULER``.
+        timeout_s: Seconds, positive, to wait for the scheduler before a run fails; larger tolerates slower networks.
     """
 
     scheduler: str = ""
-    ahead: float = 0.25
-    at_least: int = 4
     timeout_s: float = 30.0
 
     def __post_init__(self) -> None:
-        if not self.ahead >= 0:
-            raise ConfigError(f"ahead must not be negative, got {self.ahead}", code="out_of_range")
-        if self.at_least < 1 or not self.timeout_s > 0:
-            raise ConfigError(
-                f"at_least and timeout_s must be positive, got {self.at_least} and {self.timeout_s}",
-                code="out_of_range",
-            )
+        if not self.timeout_s > 0:
+            raise ConfigError(f"timeout_s must be positive, got {self.timeout_s}", code="out_of_range")
 
 
 class DaskWorkers:
-    """See `gsmap.methods.executor.Workers`."""
+    """Workers of a Dask cluster; see `gsmap.methods.executor.Workers`."""
 
     def __init__(self, address: str, params: Params) -> None:
         self._address, self._params = address, params
@@ -85,10 +80,10 @@ class DaskWorkers:
                     submit(taken[0], pickle.dumps((job, taken[1]), pickle.HIGHEST_PROTOCOL))
                     taken = next(todo, None)
                 try:
-                    future = done.get(timeout=_LOOK_S)
+                    future = done.get(timeout=_POLL_S)
                 except queue.Empty:
                     future = None
-                if time.monotonic() - looked > _LOOK_S:
+                if time.monotonic() - looked > _POLL_S:
                     room, looked = self._room(), time.monotonic()
                 if future is None:
                     continue
@@ -127,15 +122,15 @@ class DaskWorkers:
         return self._client
 
     def _room(self) -> int:
-        """How many jobs may be submitted at once."""
+        """Return the number of jobs that may be submitted at once."""
         try:
             threads = sum(self._client.nthreads().values())
-        except Exception as error:  # whatever a connection that is lost raises
+        except Exception as error:  # a lost connection may raise anything
             raise self._lost() from error
-        return max(threads + math.ceil(self._params.ahead * threads), self._params.at_least)
+        return max(threads + math.ceil(_AHEAD * threads), _MIN_SUBMITTED)
 
     def _result(self, future: Any) -> tuple[bool, Any] | None:
-        """Whether a job returned, and what it returned or raised; None where it must be submitted again.
+        """Return (returned, value or error) of a job; None where it must be submitted again.
 
         Raises:
             GsmapError: the scheduler is gone.
@@ -185,14 +180,14 @@ def start(params: Params) -> DaskWorkers:
 
 
 def do(run: str, key: str, message: bytes) -> bytes:
-    """Do a job on a worker: the answer, compressed. What was begun twice and never ended is not begun again."""
+    """Run a job on a worker and return its compressed answer; a job that killed its workers twice is not run again."""
     from distributed import get_worker
     from distributed.utils import sync
 
     worker = get_worker()
 
     def begun(times: int | None = None) -> int:
-        """How often the job was begun, as the scheduler knows; or tell it."""
+        """Get the number of attempts of the job from the scheduler, or set it."""
         keys = [_BEGUN, run, key]
         if times is None:
             found: int = sync(worker.loop, worker.scheduler.get_metadata, keys=keys, default=0)
@@ -206,5 +201,5 @@ def do(run: str, key: str, message: bytes) -> bytes:
         return zlib.compress(pickle.dumps((True, SetAside(reason))), 1)
     begun(before + 1)
     packed = zlib.compress(answer(message), 1)
-    begun(0)  # what is lost from now on is not its fault
+    begun(0)  # losses from now on do not count as attempts
     return packed

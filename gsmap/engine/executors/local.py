@@ -1,4 +1,4 @@
-"""Jobs in a pool of processes on this machine; in this process where that is as fast."""
+"""Executor for a pool of processes on this machine, or this process where that is as fast."""
 
 from __future__ import annotations
 
@@ -15,29 +15,32 @@ from gsmap.errors import ConfigError
 
 VERSION = 2
 
+_MANY = 1_000_000  # assumed number of jobs where it is unknown
+_START_S = 0.9  # CPU seconds to start a process; quick jobs are spread only where more is gained
+
 
 @dataclass(frozen=True)
 class Params:
-    """Args:
-    workers: processes that compute at once; 0 takes every processor this process may use, or ``GSMAP_WORKERS``.
-    start_s: CPU seconds that it takes to start one: quick jobs are spread only where more than that is gained.
+    """Settings of the local executor.
+
+    Args:
+        workers: Number of processes, at least 0, that compute at once; larger is faster and takes more memory, and 0
+            takes ``GSMAP_WORKERS``, or every processor that this process may use.
     """
 
     workers: int = 0
-    start_s: float = 0.9
 
     def __post_init__(self) -> None:
         if self.workers < 0:
             raise ConfigError(f"the number of workers must not be negative, got {self.workers}", code="out_of_range")
-        if not self.start_s >= 0:
-            raise ConfigError(f"start_s must not be negative, got {self.start_s}", code="out_of_range")
 
 
 class LocalWorkers:
-    """See `gsmap.methods.executor.Workers`; in the order of the arguments where there is one worker or one job."""
+    """Worker processes of this machine; see `gsmap.methods.executor.Workers`. One worker, or one job, keeps the
+    order.
+    """
 
     def __init__(self, params: Params) -> None:
-        self._start_s = params.start_s
         self._pool = Pool(params.workers or default_workers())
 
     def run(
@@ -62,18 +65,15 @@ class LocalWorkers:
         yield from self._pool.run(job, chain(first, todo))
 
     def _is_worth_it(self, count: int, took_s: list[float]) -> bool:
-        """Whether workers would do what is left of so many jobs sooner than this process, their start included."""
+        """Return True if workers would finish the remaining jobs sooner than this process, their start included."""
         if self._pool.num_idle:
             return True
         # The first job also pays for what it imports.
         saved_s = (count - len(took_s)) * min(took_s, default=0.0) * (1 - 1 / self._pool.size)
-        return len(took_s) > 1 and saved_s > self._start_s
+        return len(took_s) > 1 and saved_s > _START_S
 
     def close(self) -> None:
         self._pool.close()
-
-
-_MANY = 1_000_000  # jobs of which nobody told how many there are
 
 
 def start(params: Params) -> LocalWorkers:
@@ -81,7 +81,7 @@ def start(params: Params) -> LocalWorkers:
 
 
 def default_workers() -> int:
-    """Processors this process may use; GSMAP_WORKERS says otherwise."""
+    """Return the number of processors that this process may use, or GSMAP_WORKERS."""
     named = os.environ.get("GSMAP_WORKERS", "")
     if named.isdigit() and int(named) > 0:
         return int(named)

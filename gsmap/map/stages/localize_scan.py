@@ -173,7 +173,7 @@ def _read(request: Request, settings: Settings) -> _Sought:
 
 def _of_scan(scan: Scan, policy: str, settings: Settings) -> _Sought:
     few = scan.points[:: max(1, len(scan) // 20_000)]
-    unit_m = 1.0 if policy == "known" else estimate_unit_m(few, None, None, settings.describe.unit)
+    unit_m = 1.0 if policy == "known" else estimate_unit_m(few, None, None, settings.describe.view_distance_m)
     gaussians = as_gaussians(scan, settings.scan.cell_m / unit_m)
     cameras = synthesise_cameras(gaussians) if scan.camera is None else scan.camera
     notes = list(scan.notes)

@@ -192,7 +192,7 @@ def _optimize(store: Store, given: PoseInputs, settings: Settings, progress: Sta
 def _answer(given: PoseInputs, previous: PoseGraph | None, settings: Settings) -> PoseGraph:
     params = settings.optimize
     answer = solver.optimize(given.scenes, given.edges, given.priors, previous, params, survey=given.survey)
-    return solver.kept_still(_upright(answer, given, params), previous, given.edges, params)
+    return solver.keep_unchanged_poses(_upright(answer, given, params), previous, given.edges, params)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +232,7 @@ def _grow(store: Store, given: _Growth, settings: Settings, progress: StageProgr
     answer = solver.grow(basis.scenes, given.edges, given.previous, params)
     if answer is None:
         return False
-    answer = solver.kept_still(_upright(answer, basis, params), given.previous, given.edges, params)
+    answer = solver.keep_unchanged_poses(_upright(answer, basis, params), given.previous, given.edges, params)
     if any(pose is not given.previous.poses.get(s) for s, pose in answer.poses.items() if s not in given.inside):
         return False  # more gave way, or all were turned upright: that asks more edges
     number = store.revisions.save(answer, basis.key, after=(given.revision, given.previous))

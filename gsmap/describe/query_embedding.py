@@ -1,4 +1,4 @@
-"""What a person shows or says, as the vectors that nodes have."""
+"""Embedding of a user's picture or text, comparable with node features."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.describe.objects.layer import Params, resolved
+from gsmap.describe.objects.layer import Params, choose_methods
 from gsmap.errors import ConfigError, InputError
 from gsmap.formats.pictures import open_picture
 from gsmap.methods import family
 from gsmap.types.model import ModelSpec
 from gsmap.types.views import Cloud, SceneContext
 
-_LEAST_PX, _MOST_PX = 8, 512  # sides: fewer show nothing, more say no more
+_MIN_PX, _MAX_PX = 8, 512  # sides: smaller pictures show too little, larger ones are reduced
 
 
-def embedded_picture(
+def embed_query_picture(
     path: str | os.PathLike[str], params: Params, models: Mapping[str, ModelSpec]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the embedder of nodes makes of a picture of one thing: features (F,), and (F,) bool which it can tell.
+    """Embed a picture of one object with the nodes' embedder: features (F,), and (F,) bool, those that are valid.
 
     Raises:
         NotFoundError: no such file.
@@ -30,7 +30,7 @@ def embedded_picture(
         ConfigError: the embedder reads no pictures by themselves, or its model is missing.
     """
     rgb = _picture(Path(path))
-    chosen = resolved(params, models)
+    chosen = choose_methods(params, models)
     name = chosen.params.embedder
     method = family("embedder").get(name)
     lacking = [kind for kind in method.MODELS if kind not in models]
@@ -46,18 +46,18 @@ def embedded_picture(
             f"embedder {name} describes parts of captures alone: show one with --like SCENE:NODE",
             code="option_not_applicable",
         )
-    vector, told = embedder.embed_picture(rgb)
-    return np.asarray(vector, np.float32), np.asarray(told, bool)
+    vector, valid = embedder.embed_picture(rgb)
+    return np.asarray(vector, np.float32), np.asarray(valid, bool)
 
 
-def embedded_text(text: str, params: Params, models: Mapping[str, ModelSpec]) -> np.ndarray:
-    """What the text tower beside the embedder of nodes makes of words: a unit vector (F,).
+def embed_query_text(text: str, params: Params, models: Mapping[str, ModelSpec]) -> np.ndarray:
+    """Embed a text with the text tower of the nodes' embedder: a unit vector (F,).
 
     Raises:
-        ConfigError: the embedder has none, or the map lacks it; what to add is said.
+        ConfigError: the embedder has no text tower, or the map lacks its model.
         InputError, MissingDependencyError: see `gsmap.describe.onnx.text`.
     """
-    name = resolved(params, models).params.embedder
+    name = choose_methods(params, models).params.embedder
     method = family("embedder").get(name)
     if not hasattr(method, "embed_text"):
         raise ConfigError(
@@ -72,12 +72,12 @@ def embedded_text(text: str, params: Params, models: Mapping[str, ModelSpec]) ->
 
 
 def _picture(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8, no larger than is of use."""
+    """Read a picture (H, W, 3) uint8, at most `_MAX_PX` on each side."""
     with open_picture(path) as image:
         picture = image.convert("RGB")
-        picture.thumbnail((_MOST_PX, _MOST_PX))
+        picture.thumbnail((_MAX_PX, _MAX_PX))
         rgb = np.asarray(picture)
-    if min(rgb.shape[:2]) < _LEAST_PX:
+    if min(rgb.shape[:2]) < _MIN_PX:
         raise InputError(
             f"{path} has {rgb.shape[1]} x {rgb.shape[0]} pixels: too few to show a thing", code="picture_too_small"
         )

@@ -1,4 +1,4 @@
-"""The last solve: each component by itself, in its own frame, with the covariances of its scenes."""
+"""Final solve: poses and covariances of each component in its own frame."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.gauge import anchor_of, onto_anchor, onto_priors, open_gauge
-from gsmap.optimize.gtsam_solve import held_directions, solve
+from gsmap.optimize.gauge import choose_anchor, free_gauge_directions, move_onto_anchor, move_onto_priors
+from gsmap.optimize.gtsam_solve import anchor_directions, solve
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.state import State
@@ -21,15 +21,15 @@ from gsmap.types.world import Survey, WorldTie
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """All scenes in their final frames.
+class FinalPoses:
+    """Final poses of all scenes.
 
     Args:
         poses: N.
-        component: (N,) largest first; those that priors fix completely share the outside world's frame, as one.
+        component: (N,) largest first; components that priors fix completely share one frame, that of the priors.
         covariances: (N, 7, 7), zero where there is none.
-        notes: on covariances that there are not.
-        world: where components lie in the world, of those of which anything was observed.
+        notes: missing covariances.
+        world: ties to the world of the components with observations.
     """
 
     poses: Similarities
@@ -47,11 +47,11 @@ def solve_components(
     params: Params,
     progress: Progress,
     survey: Survey,
-) -> Solved:
-    """Exact poses and covariances of every component from the edges that are taken in.
+) -> FinalPoses:
+    """Compute exact poses and covariances of every component from the accepted edges.
 
     Args:
-        ages: (N,) the place of each scene among all, oldest first: the oldest of a component holds its frame.
+        ages: (N,) rank of each scene, oldest first: the oldest scene of a component is its anchor.
     """
     rows = np.flatnonzero(state.accepted)
     labels = component_labels(m, rows)
@@ -61,7 +61,7 @@ def solve_components(
     edge_order = rows[np.argsort(labels[m.targets[rows]], kind="stable")]
     edge_members = np.split(edge_order, np.cumsum(np.bincount(labels[m.targets[rows]], minlength=len(sizes)))[:-1])
     prior_labels = labels[state.terms.scenes]
-    tied = set(prior_labels.tolist())
+    with_priors = set(prior_labels.tolist())
 
     poses = state.poses
     covariances = np.zeros((m.num_scenes, 7, 7))
@@ -69,32 +69,32 @@ def solve_components(
     missing: list[tuple[int, int, str]] = []
     ties: list[tuple[int, WorldTie]] = []
     world: int | None = None
-    most = params.max_marginal_scenes if params.marginals else 0
+    max_scenes = params.max_marginal_scenes if params.marginals else 0
     for index, label in enumerate(order):
         progress(index / len(order), "final solve")
         scenes, mine = members[label], edge_members[label]
-        own = state.terms[np.flatnonzero(prior_labels == label)] if label in tied else state.terms[:0]
-        anchor = anchor_of(scenes, m.scene_ids, previous)
+        own = state.terms[np.flatnonzero(prior_labels == label)] if label in with_priors else state.terms[:0]
+        anchor = choose_anchor(scenes, m.scene_ids, previous)
         component[scenes] = index
         old = previous.poses.get(m.scene_ids[anchor]) if previous else None
-        poses = onto_anchor(poses, scenes, anchor, old.S_map_scene if old else Sim3.identity())
+        poses = move_onto_anchor(poses, scenes, anchor, old.S_map_scene if old else Sim3.identity())
         if len(own):
-            poses = onto_priors(poses, scenes, anchor, own, m.dim)
-            if not len(open_gauge(poses, scenes, anchor, own, m.dim)):
-                # Fully known to the outside: it shares the world's frame with every other such component.
+            poses = move_onto_priors(poses, scenes, anchor, own, m.dim)
+            if not len(free_gauge_directions(poses, scenes, anchor, own, m.dim)):
+                # Its priors leave nothing open: it shares their frame with every other such component.
                 component[scenes] = world = index if world is None else world
         if len(mine) or len(own):
-            solution = solve(m[mine], poses, anchor, own, most)
+            solution = solve(m[mine], poses, anchor, own, max_scenes)
             poses = solution.poses
             if solution.covariances is not None:
                 covariances[scenes] = solution.covariances[scenes]
             elif params.marginals:
-                why = solution.problem or f"more than max_marginal_scenes, {most}"
-                missing.append((int(scenes[0]), len(scenes), why))
+                reason = solution.problem or f"more than max_marginal_scenes, {max_scenes}"
+                missing.append((int(scenes[0]), len(scenes), reason))
         if survey:
-            held = held_directions(m[mine], poses, scenes, anchor, own)
+            held = anchor_directions(m[mine], poses, scenes, anchor, own)
             whole = Component(scenes, m[mine], own, anchor, held)
-            surveyed = tie_component(whole, poses, survey, index, most)
+            surveyed = tie_component(whole, poses, survey, index, max_scenes)
             if surveyed is not None:
                 poses = surveyed.poses
                 ties.append((int(scenes[0]), surveyed.tie))
@@ -102,9 +102,9 @@ def solve_components(
                     covariances[scenes] = surveyed.covariances
     _, component = np.unique(component, return_inverse=True)
     notes = tuple(
-        f"no covariances in component {component[scene]} ({size} scenes): {why}" for scene, size, why in missing
+        f"no covariances in component {component[scene]} ({size} scenes): {reason}" for scene, size, reason in missing
     )
     placed: dict[int, WorldTie] = {}
-    for scene, tie in ties:  # of components that priors put into one frame, the largest says where that is
+    for scene, tie in ties:  # of components in one frame of priors, the largest gives the tie
         placed.setdefault(int(component[scene]), replace(tie, component=int(component[scene])))
-    return Solved(poses, component, covariances, notes, tuple(placed.values()))
+    return FinalPoses(poses, component, covariances, notes, tuple(placed.values()))

@@ -1,12 +1,10 @@
-"""Which Gaussians are one thing: furniture, lamps, pictures; what is left is the building.
+"""Segments of a surface: furniture, lamps, pictures; the remaining surface is the building.
 
-Floor, ceiling and walls are taken away (`structure`); what hangs on a wall is told from it by depth or colour, and from
-what stands before it by where its rim leads; the rest falls apart into what touches.
+Floor, ceiling and walls are removed (`structure`); an object on a wall is separated from it by depth or colour, and
+from objects before it by the neighbours of its rim; the remaining surface is split into connected components.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,58 +22,35 @@ from gsmap.types.views import Cloud
 VERSION = 1
 
 _NEIGHBOURS = 12
-_SAMPLE_M = 0.08  # edge of the cells of a thing's samples: finer than what they are compared by
-_WIDEST_M = 10_000.0  # a place so wide, or so far from metric, has no furniture to tell
-_BAND_M = 0.25  # the colour of a wall is told for squares of this side,
+_SAMPLE_M = 0.08  # edge of the cells of a segment's samples: finer than the cells of comparison
+_MAX_EXTENT_M = 10_000.0  # a scene so large, or so far from metric, has no furniture to segment
+_BAND_M = 0.25  # the colour of a wall is estimated for squares of this side,
 _AROUND_M = 1.5  # from all of the wall so far to either side at that height: pictures are narrower
-_LAYER_M = 0.02  # what differs by more in its distance from a wall is another surface
+_LAYER_M = 0.02  # points whose distances from a wall differ by more are of different surfaces
 _SOLE_M = 0.14  # what hangs on a wall does not reach so low: trims and the frames of doors do
 _LINKED = 8  # of these, those that may be one thing
 
 
-@dataclass(frozen=True)
-class Params:
-    """How things are told apart; lengths in metres.
-
-    Args:
-        max_points: the surface is thinned to about this many points.
-        link: neighbours up to so many times their spacing apart may be of one thing,
-        link_min_m: up to this in any case,
-        link_max_m: and never farther than this.
-        floor_m: what lies lower is the floor.
-        ceiling_m: what lies so near to the ceiling is the ceiling.
-        wall_m: what lies so near to a wall's plane is the wall, unless its colour is another's.
-        hang_m: what lies farther before a wall does not hang on it.
-        wall_lab: a colour so far from that of the wall at its height, L*a*b* units, is not the wall's.
-        core: a patch on a wall is held together by points whose neighbours on the wall are of it, this share of them.
-        stands_free: the share of a patch's rim that may lead to what stands before the wall, if the patch hangs on it.
-        min_points: things of fewer points of the surface are none.
-        min_area_m2: what hangs on a wall is no smaller.
-        assign_m: Gaussians off the surface belong to the thing whose surface lies nearest, but no farther than this.
-    """
-
-    max_points: int = 150_000
-    link: float = 2.2
-    link_min_m: float = 0.04
-    link_max_m: float = 0.12
-    floor_m: float = 0.03
-    ceiling_m: float = 0.15
-    wall_m: float = 0.03
-    hang_m: float = 0.12
-    wall_lab: float = 17.0
-    core: float = 0.65
-    stands_free: float = 0.2
-    min_points: int = 20
-    min_area_m2: float = 0.03
-    assign_m: float = 0.06
+_MAX_POINTS = 150_000  # the surface is thinned to about so many points
+_LINK = 2.2  # neighbours up to so many times their spacing apart may be of one segment,
+_LINK_MIN_M = 0.04  # up to this in any case,
+_LINK_MAX_M = 0.12  # and never farther than this
+_FLOOR_M = 0.03  # points lower than this are the floor
+_CEILING_M = 0.15  # points so near to the ceiling are the ceiling
+_WALL_M = 0.03  # points so near to a wall's plane are the wall, unless their colour differs
+_HANG_M = 0.12  # an object farther before a wall does not hang on it
+_WALL_LAB = 17.0  # a colour so far (L*a*b*) from that of the wall at its height is not the wall's
+_CORE = 0.65  # core points of a patch on a wall have this share of their neighbours on the wall in it
+_STANDS_FREE = 0.2  # share of a hanging patch's rim that may lead to objects before the wall
+_MIN_POINTS = 20  # segments of fewer surface points are dropped
+_MIN_AREA_M2 = 0.03  # hanging segments that are smaller are dropped
+_ASSIGN_M = 0.06  # Gaussians off the surface belong to the segment of the nearest surface within this distance
 
 
-def find_things(
-    gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: float, params: Params | None = None
-) -> Segments:
-    """The things of a capture, the largest first; none where up is unknown.
+def find_segments(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: float) -> Segments:
+    """Segment a capture into physical objects, the largest first; none where up is unknown.
 
-    Deterministic: the same Gaussians in the same order give the same things. Takes half a CPU second for 50,000.
+    Deterministic for Gaussians in the same order. Takes half a CPU second for 50,000.
 
     Args:
         gaussians: any frame and unit.
@@ -83,7 +58,7 @@ def find_things(
         up: (3,) against gravity, their frame.
         unit_m: metres per unit of the frame.
     """
-    members = _members(gaussians, cloud, up, unit_m, params or Params())
+    members = _members(gaussians, cloud, up, unit_m)
     count = int(members.max(initial=-1)) + 1
     rows = np.flatnonzero(members >= 0)
     of = members[rows]
@@ -91,7 +66,7 @@ def find_things(
     colours = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[rows, 0]), 0.0, 1.0))
     order = np.argsort(of, kind="stable")
     parts = np.split(order, np.searchsorted(of[order], np.arange(1, count))) if count else []
-    # One sample a cell: as many as it takes to show where a thing is, whatever its detail.
+    # One sample per cell: enough for the shape of a segment, whatever its detail.
     cells = np.floor(means * unit_m / _SAMPLE_M).astype(np.int64)
     labels, counts = cell_labels(np.column_stack([of, cell_labels(cells)[0], np.zeros(len(rows), np.int64)]))
     of_cell = np.empty(len(counts), np.int64)
@@ -108,41 +83,41 @@ def find_things(
     )
 
 
-def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: float, params: Params) -> np.ndarray:
-    """Thing (N,) int32 of each Gaussian, -1 for none."""
+def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: float) -> np.ndarray:
+    """Return the segment (N,) int32 of each Gaussian, -1 for none."""
     out = np.full(len(gaussians), -1, np.int32)
     if up is None or len(cloud) < 4 * _NEIGHBOURS:
         return out
     level = level_frame(up)
-    rows = _thinned(cloud, params.max_points)
+    rows = _thinned(cloud)
     points = cloud.points[rows] @ level.T * unit_m
     low, high = box_around(points)
-    if (high - low).max() > _WIDEST_M:
+    if (high - low).max() > _MAX_EXTENT_M:
         return out
     areas = cloud.areas[rows] * unit_m**2 * (len(cloud) / len(rows))
     distances, neighbours = nearest_neighbours(points, _NEIGHBOURS + 1)
     normals, planarity = _normals(gaussians, cloud.index[rows], points, neighbours, level)
     structure = find_structure(points, normals, planarity, areas, neighbours)
     lab = cloud.lab[rows].astype(np.float64)
-    surface = _Surface(points, lab, areas, distances, neighbours, structure, params)
-    things = _numbered(surface.things(), params.min_points)
+    surface = _Surface(points, lab, areas, distances, neighbours, structure)
+    things = _numbered(surface.things())
     out[cloud.index[rows]] = things
-    # The others, opaque or not: the thing (or the building) whose surface is nearest.
+    # Remaining Gaussians, opaque or not: the segment (or the building) whose surface is nearest.
     others = are_finite(gaussians.means)
     others[cloud.index[rows]] = False
     rest = np.flatnonzero(others)
     at = gaussians.means.take(rest, axis=0).astype(np.float64) @ level.T * unit_m
-    distance, nearest = nearest_of(points, at, params.assign_m)
+    distance, nearest = nearest_of(points, at, _ASSIGN_M)
     near = np.isfinite(distance)
     out[rest[near]] = things[nearest[near]]
     return out
 
 
-def _thinned(cloud: Cloud, max_points: int) -> np.ndarray:
-    """Rows of the cloud, one per cell of a grid so coarse that about ``max_points`` are left; all where it is small."""
-    if len(cloud) <= max_points:
+def _thinned(cloud: Cloud) -> np.ndarray:
+    """Select rows of the cloud, one per grid cell so that about `_MAX_POINTS` are left; all where it is small."""
+    if len(cloud) <= _MAX_POINTS:
         return np.arange(len(cloud))
-    cell = float(np.sqrt(cloud.areas.sum() / max_points))
+    cell = float(np.sqrt(cloud.areas.sum() / _MAX_POINTS))
     labels, counts = cell_labels(np.floor((cloud.points - box_around(cloud.points)[0]) / cell))
     first = np.empty(len(counts), np.int64)
     first[labels[::-1]] = np.arange(len(cloud))[::-1]
@@ -152,10 +127,10 @@ def _thinned(cloud: Cloud, max_points: int) -> np.ndarray:
 def _normals(
     gaussians: Gaussians, index: np.ndarray, points: np.ndarray, neighbours: np.ndarray, level: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (N, 3), level frame, and planarity (N,) of a surface.
+    """Estimate normals (N, 3), level frame, and planarity (N,) of a surface.
 
-    The principal axes of a neighbourhood mix the two sides of a thin wall. A flat Gaussian knows its own normal, if
-    noisily: neighbours count by how near they lie to its plane.
+    The principal axes of a neighbourhood mix both sides of a thin wall, so neighbours are weighted by their distance to
+    the plane of the flat Gaussian itself.
     """
     scales = gaussians.scales[index]
     shortest = np.argmin(scales, axis=1)
@@ -176,7 +151,7 @@ def _normals(
 
 
 class _Surface:
-    """A surface with its building, to be told apart into things; points in metres, z up."""
+    """A surface with its building structure, to be segmented; points in metres, z up."""
 
     def __init__(
         self,
@@ -186,53 +161,52 @@ class _Surface:
         distances: np.ndarray,
         neighbours: np.ndarray,
         structure: Structure,
-        params: Params,
     ) -> None:
-        self.points, self.lab, self.areas, self.structure, self.params = points, lab, areas, structure, params
+        self.points, self.lab, self.areas, self.structure = points, lab, areas, structure
         self.count = len(points)
         self.neighbours = neighbours
         self.a = np.repeat(np.arange(self.count), neighbours.shape[1] - 1)
         self.b = neighbours[:, 1:].ravel()
         self.length = distances[:, 1:].ravel()
         spacing = distances[:, 8] / 1.6  # the eighth neighbour of points that lie evenly on a plane
-        reach = params.link * np.minimum(spacing[self.a], spacing[self.b])
-        near = self.length < np.clip(reach, params.link_min_m, params.link_max_m)
+        reach = _LINK * np.minimum(spacing[self.a], spacing[self.b])
+        near = self.length < np.clip(reach, _LINK_MIN_M, _LINK_MAX_M)
         rank = np.tile(np.arange(neighbours.shape[1] - 1), self.count)
         self.linked = near & (rank < _LINKED)
         self.near = near
 
     def things(self) -> np.ndarray:
-        """(N,) label of each point, -1 for the building."""
+        """Label (N,) the segment of each point, -1 for the building."""
         heights, building = self.structure.heights_m, self.structure
-        shell = heights < self.params.floor_m
+        shell = heights < _FLOOR_M
         if building.has_ceiling:
-            shell |= heights > building.ceiling_m - self.params.ceiling_m
+            shell |= heights > building.ceiling_m - _CEILING_M
         wall, off = self._nearest_walls(~shell)
         by_wall = ~shell & (wall >= 0)
-        distinct = by_wall & ((np.abs(off) > self.params.wall_m) | self._foreign_colour(wall, off, by_wall))
+        distinct = by_wall & ((np.abs(off) > _WALL_M) | self._foreign_colour(wall, off, by_wall))
         hanging, patches = self._hanging(~shell & ~by_wall, distinct, wall)
-        # What is near a wall and no thing hanging on it is the wall, or the back of what stands before it.
-        free = ~shell & (~by_wall | (distinct & (patches < 0) & (np.abs(off) > self.params.wall_m)))
+        # Points near a wall that hang on it no more are the wall, or the back of an object before it.
+        free = ~shell & (~by_wall | (distinct & (patches < 0) & (np.abs(off) > _WALL_M)))
         ok = self.linked & free[self.a] & free[self.b]
         labels = np.where(free, components(self.count, self.a[ok], self.b[ok]), -1)
         labels = self._with_floating(labels)
         return np.where(hanging >= 0, hanging + self.count, labels)
 
     def _nearest_walls(self, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Index (N,) of the wall that each point lies close to, -1 for none, and how far before or behind it."""
+        """Find the wall (N,) that each point lies close to, -1 for none, and its signed distance."""
         wall, off = np.full(self.count, -1), np.full(self.count, np.inf)
         for i, plane in enumerate(self.structure.walls):
             distance = self.points[:, :2] @ plane.normal - plane.offset_m
-            nearer = inside & (np.abs(distance) < np.minimum(np.abs(off), self.params.hang_m))
+            nearer = inside & (np.abs(distance) < np.minimum(np.abs(off), _HANG_M))
             nearer &= plane.inside(self.points)
             wall[nearer], off[nearer] = i, distance[nearer]
         return wall, off
 
     def _foreign_colour(self, wall: np.ndarray, off: np.ndarray, by_wall: np.ndarray) -> np.ndarray:
-        """(N,) which points of walls differ in colour from what most of the wall has at their height."""
+        """Find points (N,) of walls whose colour differs from most of the wall at their height."""
         foreign = np.zeros(self.count, bool)
-        rows = np.flatnonzero(by_wall & (np.abs(off) < self.params.wall_m))
-        # A Gaussian's own colour is noisy; the neighbours' that lie as far before the wall are of the same surface.
+        rows = np.flatnonzero(by_wall & (np.abs(off) < _WALL_M))
+        # A Gaussian's own colour is noisy: average neighbours at the same distance from the wall.
         beside = self.neighbours[rows]
         level = (np.abs(off[beside] - off[rows, None]) < _LAYER_M)[..., None]
         mean = np.zeros((self.count, 3))
@@ -247,22 +221,22 @@ class _Surface:
                 for step in np.unique(place):
                     here = at[place == step]
                     around = at[np.abs(along[at] - (step + 0.5) * _BAND_M) < _AROUND_M]
-                    usual = np.median(mean[on[around]], axis=0)
-                    foreign[on[here]] = np.linalg.norm(mean[on[here]] - usual, axis=1) > self.params.wall_lab
+                    expected = np.median(mean[on[around]], axis=0)
+                    foreign[on[here]] = np.linalg.norm(mean[on[here]] - expected, axis=1) > _WALL_LAB
         return foreign
 
     def _hanging(self, free: np.ndarray, distinct: np.ndarray, wall: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Patches on walls, label (N,) of each point, -1 for none: those that hang, and all that are of a wall."""
-        # A trim is thin: by its core a patch is told from it, then the core is given its rim back.
+        """Label (N,) patches on walls, -1 for none: those that hang, and all that belong to a wall."""
+        # Trims are thin: find patches by their core points, then add the rim back to each core.
         same = self.near & (wall[self.a] == wall[self.b]) & (wall[self.a] >= 0)
         others = np.bincount(self.a[same], distinct[self.b[same]], minlength=self.count)
-        core = distinct & (others > self.params.core * np.bincount(self.a[same], minlength=self.count))
+        core = distinct & (others > _CORE * np.bincount(self.a[same], minlength=self.count))
         ok = same & core[self.a] & core[self.b]
         patch = np.where(core, components(self.count, self.a[ok], self.b[ok]), -1)
         rim = same & (patch[self.a] >= 0) & distinct[self.b] & ~core[self.b]
         patch[self.b[rim][::-1]] = patch[self.a[rim][::-1]]
-        # Where the rims lead: a picture's to the wall, a bookshelf's back to the bookshelf.
-        rim = (patch[self.a] >= 0) & (patch[self.a] != patch[self.b]) & (self.length < 1.25 * self.params.link_max_m)
+        # Neighbours of the rims: a picture's are the wall, those of a bookshelf's back are the bookshelf.
+        rim = (patch[self.a] >= 0) & (patch[self.a] != patch[self.b]) & (self.length < 1.25 * _LINK_MAX_M)
         leaving = np.bincount(patch[self.a[rim]], minlength=self.count)
         to_free = np.bincount(patch[self.a[rim]], free[self.b[rim]], minlength=self.count)
         mine = patch >= 0
@@ -270,13 +244,13 @@ class _Surface:
         number = np.bincount(patch[mine], minlength=self.count)
         lowest = np.full(self.count, np.inf)
         np.minimum.at(lowest, patch[mine], self.structure.heights_m[mine])
-        hangs = (to_free < self.params.stands_free * np.maximum(leaving, 1)) & (number >= 8)
+        hangs = (to_free < _STANDS_FREE * np.maximum(leaving, 1)) & (number >= 8)
         patch = np.where(mine & hangs[patch], patch, -1)
-        keep = (size > self.params.min_area_m2) & (lowest > _SOLE_M)
+        keep = (size > _MIN_AREA_M2) & (lowest > _SOLE_M)
         return np.where((patch >= 0) & keep[patch], patch, -1), patch
 
     def _with_floating(self, labels: np.ndarray) -> np.ndarray:
-        """Labels with what nothing carries given to what stands below it: a shade to its lamp."""
+        """Assign unsupported segments to the segment below them: a shade to its lamp."""
         heights = self.structure.heights_m
         used, compact = np.unique(labels[labels >= 0], return_inverse=True)
         if not len(used):
@@ -291,7 +265,7 @@ class _Surface:
         carrier = np.arange(len(parts))
         top = self.structure.ceiling_m
         for i in np.argsort(low, kind="stable"):
-            if low[i] < 0.15 or high[i] > top - 2 * self.params.ceiling_m - 0.05:
+            if low[i] < 0.15 or high[i] > top - 2 * _CEILING_M - 0.05:
                 continue
             below = (low < low[i] - 0.05) & (high > low[i] - 1.4) & (np.arange(len(parts)) != i)
             below &= ((boxes[:, 0] - 0.03 < middle[i]) & (boxes[:, 1] + 0.03 > middle[i])).all(1)
@@ -305,10 +279,10 @@ class _Surface:
         return out
 
 
-def _numbered(labels: np.ndarray, min_points: int) -> np.ndarray:
-    """Labels by size from 0, the largest first; -1 for those of too few points."""
+def _numbered(labels: np.ndarray) -> np.ndarray:
+    """Number labels by size from 0, the largest first; -1 for those of too few points."""
     used, compact, counts = np.unique(labels, return_inverse=True, return_counts=True)
-    counts = np.where((used < 0) | (counts < min_points), 0, counts)
+    counts = np.where((used < 0) | (counts < _MIN_POINTS), 0, counts)
     rank = np.empty(len(used), np.int32)
     rank[np.argsort(-counts, kind="stable")] = np.arange(len(used))
     return np.where(counts[compact] > 0, rank[compact], -1).astype(np.int32)

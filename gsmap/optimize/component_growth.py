@@ -1,43 +1,43 @@
-"""Components grow: by edges that close loops in them, by joining, and by single edges; and are cut again."""
+"""Growth of components: by loop closures, joins and single edges; and cuts of weak bridges."""
 
 from __future__ import annotations
 
 import networkx
 import numpy as np
 
+from gsmap.optimize.component_joins import attaching_joins, find_joins, join_decision, merge_components, spanning_joins
 from gsmap.optimize.consistency import consistent_with_component
-from gsmap.optimize.joining import attaching_joins, find_joins, join_decision, merge_components, spanning_joins
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.state import State
 from gsmap.optimize.structure import bridges, component_labels
 
 
-def take_in_agreeing(m: Measurements, state: State, params: Params) -> bool:
-    """Take in edges and join components as long as edges agree; poses are moved, not yet refined."""
+def accept_agreeing_edges(m: Measurements, state: State, params: Params) -> bool:
+    """Accept edges and join components while edges agree; poses are moved, not yet refined."""
     any_taken = False
     while close_loops(m, state, params) or join_components(m, state, params, single=False):
         any_taken = True
     return any_taken
 
 
-def take_in(m: Measurements, state: State, params: Params) -> None:
-    """Take in what agrees, and then what single edges attach."""
-    while take_in_agreeing(m, state, params) or join_components(m, state, params, single=True):
+def accept_edges(m: Measurements, state: State, params: Params) -> None:
+    """Accept agreeing edges, then attach small components by single edges."""
+    while accept_agreeing_edges(m, state, params) or join_components(m, state, params, single=True):
         pass
 
 
-def attach_singles(m: Measurements, state: State, params: Params) -> None:
-    """Attach small components by single edges, as long as there are any."""
+def attach_by_single_edges(m: Measurements, state: State, params: Params) -> None:
+    """Attach small components by single edges until there are none left."""
     while join_components(m, state, params, single=True):
         pass
 
 
-def close_through_singles(m: Measurements, state: State, params: Params) -> bool:
-    """Take in the cycles that close once single edges attach small components.
+def close_loops_through_single_edges(m: Measurements, state: State, params: Params) -> bool:
+    """Accept the cycles that close once single edges attach small components.
 
-    The single edges that no cycle confirms are let go again, for a scene that rests on one edge is no evidence
-    for others; they come back when nothing else does.
+    Single edges that no cycle confirms are excluded again, for a scene with one edge is no evidence for others; they
+    are accepted again at the end.
     """
     accepted, poses = state.accepted.copy(), state.poses
     while join_components(m, state, params, single=True):
@@ -50,7 +50,7 @@ def close_through_singles(m: Measurements, state: State, params: Params) -> bool
 
 
 def close_loops(m: Measurements, state: State, params: Params) -> bool:
-    """Take in the edges inside a component that agree with what the component predicts for them."""
+    """Accept the edges inside a component that agree with its prediction."""
     rows = state.open()
     if not len(rows):
         return False
@@ -89,10 +89,10 @@ def join_components(m: Measurements, state: State, params: Params, *, single: bo
 
 
 def cut_weak_bridges(m: Measurements, state: State, params: Params) -> None:
-    """Let go of single edges that have come to hold two firm components together.
+    """Exclude single edges that have come to connect two large components.
 
-    A scene attached by one edge may turn out to belong to a component of its own; then that edge alone would join
-    two components, which it may not.
+    A scene attached by one edge may become part of a large component; then that edge alone would join two large
+    components, which it may not.
     """
     single = bridges(m, state.accepted) & ~m.confirmed
     blocks = component_labels(m, np.flatnonzero(state.accepted & ~single))

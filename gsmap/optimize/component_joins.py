@@ -1,4 +1,4 @@
-"""When two components may join, and how they are moved together."""
+"""Joins of components: the evidence that they need, and the motion that they cause."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _RIVAL_FACTOR = 3  # such a rival must be outnumbered so many times before large
 
 @dataclass(frozen=True, eq=False)
 class Join:
-    """Edges that agree on how component ``source`` lies in the frame of component ``target``.
+    """Edges that agree on the pose of component ``source`` in the frame of component ``target``.
 
     Args:
         target, source: components by label.
         edges: rows of the edges that agree, the one that most others agree with first.
-        rival: how many edges the largest group has that contradicts them.
-        offered: rows of all edges between the two.
-        log_odds_wrong: of the least likely of the edges that agree (`Measurements.log_odds_wrong`); 0 where unknown.
-        log_odds: natural log-odds that the likeliest edge that contradicts them is wrong, against the least likely of
-            them; 0 where that is not known or nothing contradicts them.
+        rival: number of edges in the largest group that contradicts them.
+        offered: rows of all edges between the two components.
+        log_odds_wrong: of the least likely of the agreeing edges (`Measurements.log_odds_wrong`); 0 where unknown.
+        log_odds: natural log-odds that the likeliest contradicting edge is wrong, against the least likely agreeing
+            one; 0 where unknown or without contradiction.
     """
 
     target: int
@@ -44,7 +44,7 @@ class Join:
 
 
 def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probability: float) -> list[Join]:
-    """For every pair of components with edges between them, the largest group of edges that agree."""
+    """Find, for every pair of components with edges between them, the largest group of edges that agree."""
     labels = drift.labels
     rows = rows[labels[edges.targets[rows]] != labels[edges.sources[rows]]]
     if not len(rows):
@@ -84,7 +84,7 @@ def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probabi
 
 
 def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Params) -> str:
-    """``agreed``, ``single`` or, where the evidence does not suffice, the reason in words.
+    """Decide on a join: ``agreed``, ``single`` or, where the evidence does not suffice, the reason in words.
 
     Modelling assumption: independent mistakes do not agree with each other, so agreeing edges are either right or come
     from a place that looks like another. It fails where one mistake is made several times over: scenes cut from one
@@ -118,10 +118,10 @@ def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Pa
 def merge_components(
     edges: Measurements, chosen: list[Join], labels: np.ndarray, poses: Similarities
 ) -> tuple[np.ndarray, Similarities]:
-    """Move whole components so that the first edge of each chosen join is met. Joins must form no cycle.
+    """Move whole components so that the first edge of each chosen join is satisfied. Joins must form no cycle.
 
     Returns:
-        Rows of the edges taken in, and the moved poses.
+        Rows of the accepted edges, and the moved poses.
     """
     ties: dict[int, list[tuple[int, int]]] = {}
     for k, join in enumerate(chosen):
@@ -155,7 +155,7 @@ def merge_components(
 
 
 def spanning_joins(offers: list[Join], count: int) -> list[Join]:
-    """The joins of most edges that form no cycle between ``count`` components."""
+    """Select the joins with most edges that form no cycle between ``count`` components."""
     order = sorted(offers, key=lambda join: (-len(join.edges), join.target, join.source))
     # Distinct weights: the minimum spanning forest is the one that taking them in order would give.
     rank = np.arange(1.0, len(order) + 1)
@@ -165,8 +165,9 @@ def spanning_joins(offers: list[Join], count: int) -> list[Join]:
 
 
 def attaching_joins(offers: list[Join], sizes: np.ndarray, min_large: int) -> list[Join]:
-    """Joins by single edges: each takes in one small component, the likeliest join first (a minimum spanning forest as
-    Prim's); of equals those of the largest component, from it outwards."""
+    """Select joins by single edges, each of which attaches one small component, the likeliest first (a minimum spanning
+    forest, as Prim's); equals from the largest component outwards.
+    """
     ties: dict[int, list[tuple[int, Join]]] = {}
     for join in offers:
         ties.setdefault(join.target, []).append((join.source, join))

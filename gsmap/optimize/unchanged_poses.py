@@ -1,4 +1,4 @@
-"""Leaving alone what an answer did not change: solved anew, every pose differs from the last one by rounding."""
+"""Unchanged poses: keep previous poses where the new ones differ by less than their uncertainty."""
 
 from __future__ import annotations
 
@@ -12,33 +12,35 @@ from gsmap.optimize.params import Params
 from gsmap.types import Edge, EdgeOutcome, PoseGraph, ScenePose, Sim3
 
 _MAX_VARIANCE_CHANGE = 1e-2  # of covariances as a fraction of the variances, and of chi-squares of edges
-_ROUNDING = 1e-9  # rad, scene units, log scale: a step that no pose was ever known to
-_ROUNDS = 20  # of letting go what a group of scenes that moved tears at; then none of the component stays
-_SEAM = 10.0  # times what an edge may be off inside: around a group of scenes that moved, the small steps add up
+_ROUNDING = 1e-9  # rad, scene units, log scale: below the precision of any pose
+_ROUNDS = 20  # of moving scenes at the rim of a group that moved; then no scene of the component stays
+_SEAM = 10.0  # factor on the tolerance of edges at the rim of a group that moved, where small steps add up
 
 
-def kept_still(answer: PoseGraph, previous: PoseGraph | None, edges: Sequence[Edge], params: Params) -> PoseGraph:
-    """The answer, with poses, covariances and chi-squares of the previous one where they are the same for all purposes.
+def keep_unchanged_poses(
+    answer: PoseGraph, previous: PoseGraph | None, edges: Sequence[Edge], params: Params
+) -> PoseGraph:
+    """Return the answer with the poses, covariances and chi-squares of the previous one where both are equivalent.
 
-    A scene keeps its pose where the new one is within ``params.max_unchanged_sigmas`` of its standard deviations, and
-    where that holds of its place beside each neighbour, too, by what the edge between them leaves open: far from the
-    anchor a rounding turns all scenes together, which moves each by more than neighbours are known to each other, and
-    none beside another. Scenes that did move are put to those that stay as the answer has them beside each other.
+    A scene keeps its pose if the new one is within ``params.max_unchanged_sigmas`` of its standard deviations, and if
+    its relative pose to each neighbour is within as many standard deviations of their edge: far from the anchor,
+    rounding turns all scenes together, which moves each by more than the uncertainty of its edges, but none against
+    another. Scenes that moved are placed beside unchanged ones as in the answer.
 
-    What is kept is compared with an answer from all edges every time, so that small steps do not add up.
+    Every comparison is with an answer from all edges, so that small steps do not add up.
 
     Args:
-        previous: the last answer; None keeps nothing.
-        edges: those that the answer rests on; at least those of all scenes whose pose is not the very object of before,
-            and of those beside them that give way.
+        previous: the previous answer; None keeps nothing.
+        edges: the edges of the answer; at least those of all scenes whose pose is not the same object as before, and of
+            their neighbours.
         params: ``max_unchanged_sigmas`` is used.
     """
     if previous is None or not answer.poses:
         return answer
     used = [e for e in edges if answer.use(e.target, e.source) != "unused"]
-    # Where new scenes were placed one by one, all but a few poses are the very ones of before.
+    # Where new scenes were placed one by one, most pose objects are the previous ones.
     changed = {scene for scene, pose in answer.poses.items() if previous.poses.get(scene) is not pose}
-    graph = _Both.of(answer, previous, changed.union(*((e.target, e.source) for e in used)), used)
+    graph = _PosePairs.of(answer, previous, changed.union(*((e.target, e.source) for e in used)), used)
     still = graph.still(answer, params.max_unchanged_sigmas)
     poses = dict(answer.poses)
     for row, S_map_scene in graph.beside(still, params.max_unchanged_sigmas).items():
@@ -55,11 +57,11 @@ def kept_still(answer: PoseGraph, previous: PoseGraph | None, edges: Sequence[Ed
 
 
 @dataclass(frozen=True, eq=False)
-class _Both:
-    """N scenes by id as they lie now and lay before, and the E edges in use between them.
+class _PosePairs:
+    """N scenes by id with their new and previous poses, and the E edges in use between them.
 
     Args:
-        known: (N,) bool, scenes that had a pose before; ``before`` has the new one for the others.
+        known: (N,) bool, scenes with a previous pose; ``before`` has the new one for the others.
         targets, sources: (E,) rows of ``scenes``.
         information: (E, 7, 7).
         component: (N,).
@@ -75,7 +77,7 @@ class _Both:
     component: np.ndarray
 
     @classmethod
-    def of(cls, answer: PoseGraph, previous: PoseGraph, among: Collection[str], edges: Sequence[Edge]) -> _Both:
+    def of(cls, answer: PoseGraph, previous: PoseGraph, among: Collection[str], edges: Sequence[Edge]) -> _PosePairs:
         scenes = sorted(s for s in among if s in answer.poses and answer.poses[s].S_map_scene is not None)
         row = {scene: k for k, scene in enumerate(scenes)}
         now = [answer.poses[scene].S_map_scene for scene in scenes]
@@ -98,7 +100,7 @@ class _Both:
         )
 
     def still(self, answer: PoseGraph, sigmas: float) -> np.ndarray:
-        """(N,) bool: scenes that need not move."""
+        """Find scenes (N,) whose poses are unchanged."""
         steps = (self.before.inverse() @ self.now).log()
         covariances = [answer.poses[scene].covariance for scene in self.scenes]
         sigma = np.array([np.zeros(7) if c is None else np.sqrt(np.maximum(np.diag(c), 0)) for c in covariances])
@@ -112,9 +114,9 @@ class _Both:
         return still
 
     def beside(self, still: np.ndarray, sigmas: float) -> dict[int, Sim3]:
-        """Poses, by row, of the scenes that moved: each group of them put to a scene beside it that stays.
+        """Align each group of scenes that moved with an unchanged scene beside it; return their poses by row.
 
-        Where that leaves a gap to another one that stays, that one moves, too; ``still`` says so then.
+        Where that leaves a gap to another unchanged scene, that one moves as well, and ``still`` is updated.
         """
         ends = np.stack([self.targets, self.sources])
         for _ in range(_ROUNDS):
@@ -130,7 +132,7 @@ class _Both:
         return {row: poses.item(row) for row in rows.tolist()}
 
     def _put_beside(self, still: np.ndarray) -> tuple[Similarities, np.ndarray]:
-        """All poses then, and the rows of those that are neither as they were nor as the answer has them."""
+        """Align the groups that moved: all poses, and the rows of those that are neither previous nor new poses."""
         ends, n = np.stack([self.targets, self.sources]), len(self.scenes)
         moved = ~still[ends].any(0)
         import scipy.sparse as sp  # naming a recipe does without
@@ -151,7 +153,7 @@ class _Both:
         return poses.replaced(rows, (back @ self.now[rows]).orthonormalised()), rows
 
     def _off(self, poses: Similarities, which: np.ndarray) -> np.ndarray:
-        """(K,) how far some edges are from where the answer has them, in standard deviations."""
+        """Compute the distance (K,) of some edges from the answer's relative poses, in standard deviations."""
         a, b = self.targets[which], self.sources[which]
         xi = ((poses[a].inverse() @ poses[b]).inverse() @ (self.now[a].inverse() @ self.now[b])).log()
         chi2: np.ndarray = np.einsum("ei,eij,ej->e", xi, self.information[which], xi)
@@ -165,7 +167,7 @@ def _kept(pose: ScenePose, before: ScenePose, variance: float) -> ScenePose:
         if (np.abs(covariance - before.covariance) <= variance * root[:, None] * root[None]).all():
             covariance = before.covariance
     if covariance is before.covariance and (pose.component, pose.status) == (before.component, before.status):
-        return before  # itself: who compares the two answers need not look at its numbers
+        return before  # the same object, so that comparing both answers is quick
     return replace(pose, S_map_scene=before.S_map_scene, covariance=covariance)
 
 

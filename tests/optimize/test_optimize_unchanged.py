@@ -5,7 +5,7 @@ import pytest
 
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities, exp
-from gsmap.optimize import Params, kept_still, optimize
+from gsmap.optimize import Params, keep_unchanged_poses, optimize
 from gsmap.types import Edge, Sim3
 
 SIGMAS = np.array([2e-4] * 3 + [1e-3] * 3 + [1e-3])
@@ -65,7 +65,7 @@ def test_a_new_scene_moves_only_its_surroundings(street):
     ids = set(street.ids)
     street.grow()
     answer = street.solved(before)
-    kept = kept_still(answer, before, street.edges, PARAMS)
+    kept = keep_unchanged_poses(answer, before, street.edges, PARAMS)
     assert len(moved(before, answer)) == len(street.ids)
     far = moved(before, kept)
     assert set(street.ids) - ids <= far
@@ -84,7 +84,7 @@ def test_keeping_again_and_again_does_not_drift():
     for _ in range(25):
         street.grow()
         answer = street.solved(kept)
-        kept = kept_still(answer, kept, street.edges, PARAMS)
+        kept = keep_unchanged_poses(answer, kept, street.edges, PARAMS)
         assert apart(answer, kept, street.edges) < 10 * PARAMS.max_unchanged_sigmas
     fresh = street.solved()
     steps = [fresh.poses[s].S_map_scene.inverse() @ kept.poses[s].S_map_scene for s in street.ids]
@@ -97,11 +97,11 @@ def test_a_loop_that_closes_moves_what_it_holds(street):
     before = street.solved()
     street.grow(2)
     answer = street.solved(before)
-    kept = kept_still(answer, before, street.edges, PARAMS)
+    kept = keep_unchanged_poses(answer, before, street.edges, PARAMS)
     assert len(moved(before, kept)) > len(street.ids) // 2
     assert apart(answer, kept, street.edges) < 10 * PARAMS.max_unchanged_sigmas
 
 
 def test_without_an_answer_before_nothing_is_kept(street):
     answer = street.solved()
-    assert kept_still(answer, None, street.edges, PARAMS) is answer
+    assert keep_unchanged_poses(answer, None, street.edges, PARAMS) is answer

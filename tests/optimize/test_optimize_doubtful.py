@@ -7,7 +7,7 @@ import pytest
 from made_worlds import poses_at, true_edges
 
 from gsmap.optimize import Params, optimize
-from gsmap.optimize.doubt import chance_alike, dividing_bar
+from gsmap.optimize.aliasing_evidence import aliasing_probability, separating_threshold
 from gsmap.types import Sim3
 
 QUICK = Params(marginals=False)
@@ -145,9 +145,9 @@ def test_a_confirmed_edge_is_in_no_doubt():
 
 
 def test_the_rule_of_succession():
-    assert chance_alike(0, 0) == 0.5
-    assert chance_alike(0, 1) == pytest.approx(2 / 3)
-    assert chance_alike(8, 1) == pytest.approx(2 / 11)
+    assert aliasing_probability(0, 0) == 0.5
+    assert aliasing_probability(0, 1) == pytest.approx(2 / 3)
+    assert aliasing_probability(8, 1) == pytest.approx(2 / 11)
 
 
 def test_where_doubt_begins_is_told_by_the_map():
@@ -167,8 +167,8 @@ def test_where_doubt_begins_is_told_by_the_map():
 def test_the_bar_divides_what_agrees_from_what_is_contradicted():
     rng = np.random.default_rng(0)
     low, high = (middle * np.exp(rng.normal(0, 0.2, 4000)) for middle in (0.05, 0.15))
-    bar = dividing_bar(low, high)
+    bar = separating_threshold(low, high)
     # Bayes: log-normal densities of equal width meet at ten to one, for a wrong edge is as bad as ten right ones.
     expected = np.exp(np.log(0.05 * 0.15) / 2 - 0.2**2 * np.log(10) / np.log(3))
     assert bar == pytest.approx(expected, rel=0.02)
-    assert dividing_bar(high, low) == np.inf
+    assert separating_threshold(high, low) == np.inf

@@ -1,4 +1,4 @@
-"""Places known both in the map and in the world before anything is bent, and whether they determine where it lies."""
+"""Points common to the map and the world before the georeferenced solve, and what they determine."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ SURVEYED = "survey"  # the name of a fix of a scene's origin; other fixes are ph
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
-    """P places known in the map and in the world.
+class CommonPoints:
+    """P points known in the map and in the world.
 
     Args:
-        names: for people. in_map, in_world: (P, 3).
+        names: for messages. in_map, in_world: (P, 3).
         own_m: (P, 3) standard deviations of each by itself. common_m: (P, 3) of what it shares with its unit.
         sea_m: (P,) of the sea level, which all places that count from it share.
         kinds: (P,) ``points``, ``photos`` or ``scenes``. rows: (P,) row among the control points or fixes.
@@ -53,23 +53,23 @@ class Places:
     def __len__(self) -> int:
         return len(self.names)
 
-    def __getitem__(self, keep: np.ndarray) -> Places:
+    def __getitem__(self, keep: np.ndarray) -> CommonPoints:
         rows = np.flatnonzero(keep) if keep.dtype == bool else keep
         arrays = (self.in_map, self.in_world, self.own_m, self.common_m, self.sea_m)
         labels = (self.kinds, self.rows, self.units, self.sources)
-        return Places(tuple(self.names[k] for k in rows.tolist()), *(one[rows] for one in (*arrays, *labels)))
+        return CommonPoints(tuple(self.names[k] for k in rows.tolist()), *(one[rows] for one in (*arrays, *labels)))
 
     def reach_m(self) -> np.ndarray:
-        """(P, 3) standard deviations with all errors that a place shares."""
+        """Compute standard deviations (P, 3) with all errors that a place shares."""
         out = np.hypot(self.own_m, self.common_m)
         out[:, 2] = np.hypot(out[:, 2], self.sea_m)
         return out
 
     def missing(self, S: Sim3 | None = None) -> str | None:
-        """What they do not determine, and what would; None where they determine everything.
+        """Explain what the points leave undetermined, and what would determine it; None where nothing is.
 
         Args:
-            S: ``S_world_map`` near the answer; without it only the number of places is looked at.
+            S: ``S_world_map`` near the answer; without it only the number of points is checked.
         """
         n = len(self)
         if not n:
@@ -96,9 +96,10 @@ class Places:
         return None
 
     def _sigmas(self, S: Sim3) -> tuple[np.ndarray, float]:
-        """(3,) standard deviations of the rotation about its principal axes, smallest first, and of the log scale.
+        """Compute standard deviations of the rotation about its principal axes (3,), smallest first, and of the log
+        scale.
 
-        Information adds up: each place brings its own, with what it shares with others taken as unknown.
+        Sums the information of each point, with its common errors as unknowns.
         """
         q = S.apply(self.in_map)
         q = q - q.mean(0)
@@ -121,10 +122,10 @@ class Places:
         return turns, float(np.sqrt(max(0.0, covariance[6, 6]))) / size
 
     def robust_fit(self) -> tuple[Sim3, np.ndarray]:
-        """``S_world_map`` that most of them agree with, and (P,) bool which do.
+        """Fit the ``S_world_map`` that most points agree with; also return (P,) bool, the points that agree.
 
-        Every triple is tried, or so many of them; what agrees is what lies within its error and the drift of a map.
-        What all places share moves all of them alike, and is no part of an error here.
+        Tries every triple, or `_DRAWS` of them; a point agrees within its error and the drift of the map. Errors common
+        to all points do not count.
 
         Raises:
             InputError: no similarity fits, for all places coincide.
@@ -170,32 +171,33 @@ class Places:
         return out
 
     def misfit_m(self) -> float:
-        """RMS of the best similarity."""
+        """Compute the RMS residual of the best similarity."""
         off = umeyama(self.in_world, self.in_map, with_scale=True).apply(self.in_map) - self.in_world
         return float(np.sqrt((off**2).sum(1).mean()))
 
     def noise_m(self, *, sea: bool = True) -> float:
-        """Misfit that stated errors and the drift of a map may have: three standard deviations, 0.2 % of the extent.
+        """Compute the residual allowed by stated errors and drift of the map: three standard deviations and 0.2 % of
+        the extent.
 
         Args:
-            sea: count that of the sea level, which moves some places beside others but not all of them.
+            sea: include the error of the sea level, which is common to some of the points.
         """
         reach = self.reach_m() if sea else np.hypot(self.own_m, self.common_m)
         extent = float(np.linalg.norm(np.ptp(self.in_world[:, :2], axis=0)))
         return 3 * float(np.sqrt((reach**2).sum(1).mean())) + 0.002 * extent
 
-    def moved(self, rows: np.ndarray, by_m: np.ndarray) -> Places:
-        """With some places elsewhere in the world, by (n, 3) or (3,)."""
+    def moved(self, rows: np.ndarray, by_m: np.ndarray) -> CommonPoints:
+        """Return the points with some of them moved in the world, by (n, 3) or (3,)."""
         in_world = self.in_world.copy()
         in_world[rows] += by_m
         return replace(self, in_world=in_world)
 
 
-def known_places(system: System) -> Places:
-    """All places of a component, as the map lies before anything is bent."""
+def collect_common_points(system: System) -> CommonPoints:
+    """Collect all common points of a component, before the map is bent."""
     terms, x = system.terms, system.terms.start(system.scenes, Sim3.identity())
-    in_map, _, told = terms.triangulated(x, system.usable[1])
-    chosen = np.flatnonzero(told & ~system.is_check)
+    in_map, _, determined = terms.triangulate(x, system.usable[1])
+    chosen = np.flatnonzero(determined & ~system.is_check)
     points, fixes = [terms.points[k] for k in chosen.tolist()], terms.fixes
     kinds = ["points"] * len(points) + [fix_kind(fix) for fix in fixes]
     captures = {group: k for k, group in enumerate(sorted(set(terms.fix_groups)))}
@@ -210,7 +212,7 @@ def known_places(system: System) -> Places:
     sources = sorted(set(zip(kinds, corrected, strict=True)))
     zeros = [(0.0, 0.0)] * len(points)
     positions = [point.position for point in points] + [fix.position for fix in fixes]
-    return Places(
+    return CommonPoints(
         tuple([f"control point {p.name}" for p in points] + [f"{fix.name} of a scene" for fix in fixes]),
         np.concatenate([in_map[chosen], terms.fix_points(system.scenes)]),
         np.array(positions, dtype=np.float64).reshape(-1, 3),
@@ -225,17 +227,17 @@ def known_places(system: System) -> Places:
 
 
 def fix_kind(fix: Fix) -> str:
-    """The group of observations that a fix belongs to."""
+    """Return the group of observations that a fix belongs to."""
     return "scenes" if fix.name == SURVEYED else "photos"
 
 
 def _axes(sigmas_m: Sequence[tuple[float, float]]) -> np.ndarray:
-    """(P, 3) of horizontal and vertical ones."""
+    """Expand horizontal and vertical standard deviations to (P, 3)."""
     return np.array(sigmas_m, dtype=np.float64).reshape(-1, 2)[:, [0, 0, 1]]
 
 
 def _spread(points: np.ndarray) -> np.ndarray:
-    """(3,) root of the sum of squares along the principal axes, largest first."""
+    """Compute the root of the sum of squares (3,) along the principal axes, largest first."""
     found = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return np.r_[found, np.zeros(3)][:3]
 

@@ -1,4 +1,4 @@
-"""How cameras are held, and what that says of the vertical."""
+"""Camera orientations of a capture, as evidence of the vertical."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import numpy as np
 
 from gsmap.types import Cameras
 
-_STEEP = 0.85  # cosine: cameras within 32 degrees of straight down or up, in which image up says little
-_UPWARD = np.sin(np.radians(20))  # who looks up by more than this on average is as likely held upside down
+_STEEP = 0.85  # cosine: cameras within 32 degrees of straight down or up, where image up is unreliable
+_UPWARD = np.sin(np.radians(20))  # cameras that look up by more than this on average may be held upside down
 _ROLL = np.sin(np.radians(20))  # a camera held level has its rows, or its columns, this nearly level
-_SWAY = 0.2  # of the distance to the scene: a way narrower than this may be an arm's
-_THIN = 0.35  # a way that rises and falls by less than this share of its width is level
+_SWAY = 0.2  # of the distance to the scene: a narrower path may be the sway of an arm
+_THIN = 0.35  # a path that rises and falls by less than this share of its width is level
 
 
 @dataclass(frozen=True)
-class Turned:
-    """A vertical that cameras tell by turning about it.
+class VerticalEstimate:
+    """A vertical estimated from cameras that turn about it.
 
     Args:
         up: (3,) unit vector against gravity.
-        cone_deg: how far it may be off.
-        sure: whether its sign is known.
+        cone_deg: largest error.
+        sure: True if its sign is known.
     """
 
     up: np.ndarray
@@ -31,8 +31,8 @@ class Turned:
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """How the cameras of a capture are held.
+class CameraOrientations:
+    """Camera orientations of a capture.
 
     Args:
         rotation: (C, 3, 3) camera to frame, OpenCV axes.
@@ -43,40 +43,43 @@ class Held:
     centres: np.ndarray
 
     @classmethod
-    def of(cls, cameras: Cameras) -> Held:
+    def of(cls, cameras: Cameras) -> CameraOrientations:
         return cls(cameras.T_frame_camera[:, :3, :3], cameras.T_frame_camera[:, :3, 3])
 
     @property
     def mean(self) -> np.ndarray:
-        """(3, 3) whose columns are the mean right, down and forward."""
+        """Mean right, down and forward axes of the cameras, as columns (3, 3)."""
         mean: np.ndarray = self.rotation.mean(0)
         return mean
 
     @property
     def at_all_angles(self) -> bool:
-        """As around an object: no direction of the images is kept."""
+        """True where cameras look from all angles, as around an object: no image direction is constant."""
         return bool(np.linalg.norm(self.mean, axis=0).max() < 0.3)
 
     def is_allowed(self, up: np.ndarray) -> bool:
-        """Whether cameras on one heading may be held so: not upside down, not looking up, no edge askew."""
+        """Return True if cameras on one heading may have this vertical: not upside down, not looking up, no edge
+        tilted.
+        """
         right, down, forward = self.mean.T
         level = min(abs(right @ up), abs(down @ up)) < _ROLL
         # Held upright; or on its side or straight down, where the image's up is level itself.
         return bool(level and down @ up < _ROLL and forward @ up < _UPWARD)
 
     def is_upright(self, up: np.ndarray) -> bool:
-        """Whether the images' own up tells the sign of a vertical: not where they lie or look straight down."""
+        """Return True if the images' own up gives the sign of a vertical: not where they lie or look straight down."""
         return bool(-self.mean[:, 1] @ up > 0.25)
 
     def looks_along(self, axis: np.ndarray) -> bool:
-        """Whether an axis is what the cameras look along, up or down."""
+        """Return True if the cameras look along an axis, up or down."""
         return bool(abs(self.mean[:, 2] @ axis) > _STEEP)
 
-    def across_the_way(self, points: np.ndarray) -> np.ndarray | None:
-        """The axis (3,) along which the cameras hardly move while they do along both others; its sign means nothing.
+    def normal_of_path(self, points: np.ndarray) -> np.ndarray | None:
+        """Estimate the axis (3,) along which the cameras hardly move while they do along both others; its sign is
+        arbitrary.
 
         Args:
-            points: (N, 3) of the scene; who only sways beside its size has no way.
+            points: (N, 3) of the scene; cameras that move little against its distance have no path.
         """
         if len(self.centres) < 6:
             return None
@@ -85,25 +88,25 @@ class Held:
         wide = values[1] > max(0.1**2 * values[2], (_SWAY * away) ** 2) and values[0] < _THIN**2 * values[1]
         return vectors[:, 0] if wide else None
 
-    def across_the_rows(self) -> np.ndarray | None:
-        """The axis (3,) about which the cameras turn a little, and far more than they roll; its sign means nothing."""
+    def normal_of_rows(self) -> np.ndarray | None:
+        """Estimate the axis (3,) about which the cameras turn far more than they roll; its sign is arbitrary."""
         right = self.rotation[:, :, 0]
         values, vectors = np.linalg.eigh(right.T @ right / len(right))
         small = values[1] > np.sin(np.radians(5)) ** 2 and values[0] < 0.4**2 * values[1]
         return vectors[:, 0] if small else None
 
 
-def turned_about(held: Held) -> Turned | None:
-    """The axis about which cameras turn, or None where they do not: on one heading, or at all angles.
+def estimate_turn_axis(cameras: CameraOrientations) -> VerticalEstimate | None:
+    """Estimate the axis about which cameras turn; None where they do not: on one heading, or at all angles.
 
     The direction that stays where it is in all images is that axis, however they are held: with ``b`` in the camera,
     ``a`` in the frame and ``R`` from camera to frame, the pair of largest mean ``a . R b``, which are the first
     singular vectors of the mean rotation. Where the pitch varies too much for that, it is the axis most nearly
     perpendicular to the rows of all images. Up is where the image's up is; seen from straight above, against the view.
     """
-    axis, cone_deg, mean = _kept(held), 15.0, held.mean
+    axis, cone_deg, mean = _kept(cameras), 15.0, cameras.mean
     if axis is None:
-        axis = _level(held)
+        axis = _level(cameras)
     if axis is None and _spread(mean):
         axis, cone_deg = -mean[:, 1] / np.linalg.norm(mean[:, 1]), 25.0
     if axis is None:
@@ -111,22 +114,22 @@ def turned_about(held: Held) -> Turned | None:
     up, forward = -mean[:, 1] @ axis, mean[:, 2] @ axis
     if abs(up) > 0.25:
         sign = np.sign(up)
-        return Turned(axis * sign, cone_deg, sure=bool(forward * sign < _UPWARD))
+        return VerticalEstimate(axis * sign, cone_deg, sure=bool(forward * sign < _UPWARD))
     sign = -np.sign(forward) or 1.0
-    # On the side: which one, only a view that is steep enough tells.
-    return Turned(axis * sign, cone_deg, sure=bool(abs(forward) > _STEEP))
+    # Cameras on their side: only steep views determine which side.
+    return VerticalEstimate(axis * sign, cone_deg, sure=bool(abs(forward) > _STEEP))
 
 
-def _kept(held: Held) -> np.ndarray | None:
-    """The axis of a turn at a constant pitch and roll, where the turn is wide beside what they vary."""
-    axes, kept, _ = np.linalg.svd(held.mean)
+def _kept(cameras: CameraOrientations) -> np.ndarray | None:
+    """Estimate the axis of a turn at constant pitch and roll, where the turn is wide against their variation."""
+    axes, kept, _ = np.linalg.svd(cameras.mean)
     lost, turned = 1 - kept[:2]
     return axes[:, 0] if turned > 0.08 and lost < 0.15 * turned else None
 
 
-def _level(held: Held) -> np.ndarray | None:
-    """The axis perpendicular to all images' rows, where they turn far enough to have one."""
-    right = held.rotation[:, :, 0]
+def _level(cameras: CameraOrientations) -> np.ndarray | None:
+    """Estimate the axis perpendicular to all images' rows, where they turn far enough to have one."""
+    right = cameras.rotation[:, :, 0]
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     # Over less than half a turn, rows that are askew seem to turn about an axis that is askew as well.
     askew = 0.25 if values[1] > 0.3 else 0.05
@@ -134,7 +137,7 @@ def _level(held: Held) -> np.ndarray | None:
 
 
 def _spread(mean: np.ndarray) -> bool:
-    """Whether images are upright on the whole and look in all directions about that."""
+    """Return True if images are mostly upright and look in all directions about the vertical."""
     down = np.linalg.norm(mean[:, 1])
     if down < 0.3:
         return False

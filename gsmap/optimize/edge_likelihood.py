@@ -1,13 +1,13 @@
-"""Odds that an edge is wrong, against those of another edge that it contradicts, by the evidence of registration.
+"""Log-odds that an edge is wrong, against another edge that it contradicts, from the evidence of registration.
 
-A repeated facade agrees with itself wherever it is laid, so disagreement alone misleads: less disagrees of a front laid
-along itself than of a place that two captures see from afar and share a third of. But a right pose of much overlap
-leaves next to nothing in front of free space, and its colours agree closely. The log-odds are linear in the figures; a
-constant that all edges of a map share (how noisy its captures are) cancels where the edges of one loop are compared.
+A repeated facade agrees with itself under any shift by a period, so disagreement alone misleads: a shifted facade
+disagrees less than two captures that see one place from afar and overlap by a third. But a right pose of much overlap
+has nearly no surface in free space, and its colours agree closely. The log-odds are linear in the figures; a constant
+common to all edges of a map (the noise of its captures) cancels where the edges of one loop are compared.
 
 Weights: conditional logistic regression of wrong against right poses of the same map, on made street fronts with
-exposure, bent and noisy geometry and floaters (``tools/bench/front.py --fit``). The number of false alarms has no part
-in it: a repeated facade violates the independence that it assumes, and nothing corrects it for self-similarity.
+exposure, bent and noisy geometry and floaters (``tools/bench/front.py --fit``). The number of false alarms is not
+used: a repeated facade violates the independence that it assumes, and nothing corrects it for self-similarity.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LEAST, _LEAST_COLOUR = 0.003, 0.02  # shares below these are noise of rendering
 
 
 def features(evidence: Mapping[str, float], overlap: float) -> np.ndarray:
-    """(4,) figures that each rise with the odds that a pose is wrong; NaN where no cameras could judge.
+    """Compute 4 figures that each rise with the odds that a pose is wrong; NaN where no cameras could judge.
 
     Args:
         evidence: of the registration, by name (`gsmap.types.Registration`).
@@ -37,7 +37,8 @@ def features(evidence: Mapping[str, float], overlap: float) -> np.ndarray:
 
 
 def log_odds_wrong(evidence: Mapping[str, float], overlap: float) -> float:
-    """Natural log-odds that a pose is wrong, up to a constant that all edges share; NaN where no cameras could judge.
+    """Compute the log-odds that a pose is wrong, up to a constant common to all edges; NaN where no cameras could
+    judge.
 
     Args:
         evidence, overlap: as in `features`.

@@ -1,0 +1,180 @@
+"""Doubtful edges: captures that disagree on a surface both saw, of one place that changed or of two similar places.
+
+A pair by itself does not decide which; the map does: a doubtful edge that the other edges support is of one place that
+changed, and one that they contradict is not. A doubtful edge that alone connects two parts of the map is accepted as
+long as most doubtful edges of this map turned out right, and its scenes are tentative; otherwise the parts stay
+separate.
+
+Assumption: in one place captured twice without change nearly all of the common surface agrees, so undoubted edges are
+right as often as any. It fails where rooms are repeated entirely, their furniture included; see
+`gsmap.optimize.perceptual_aliasing` for those.
+
+The threshold depends on the map: noisy captures disagree more, and bare rooms less. So where edges contradict each
+other the likeliest are accepted first, and the first contradicted ones set the threshold of doubt. The likelihood is
+that of all evidence of registration (`gsmap.optimize.edge_likelihood`), for a repeated facade disagrees less than two
+captures that see one place from afar. Edges of unknown likelihood are ranked by disagreement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.component_growth import accept_edges, close_loops
+from gsmap.optimize.consistency import consistent_with_component
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.params import Params
+from gsmap.optimize.priors import PriorTerms
+from gsmap.optimize.state import State, refine
+from gsmap.optimize.structure import component_labels
+
+_MAX_ALIASING_PROBABILITY = 0.5  # doubtful edges join nothing where more of the map's decided ones were of two places
+_COST = 10.0  # a wrong edge that is accepted costs as much as so many right ones that are doubtful
+_LEAST_SPREAD = 0.15  # lower bound of the spread of log disagreements, for small samples
+_SCENE_STEPS, _FEWEST_STEPS = 2000, 8  # large maps accept more edges per step, for each step costs a solve
+_STEPS = 64  # maximum number of steps in which edges are accepted by likelihood
+
+
+def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
+    """Find doubtful edges (E,): at least the fraction ``bar`` of the common surface disagrees, and no person
+    confirmed.
+    """
+    with np.errstate(invalid="ignore"):  # NaN: not compared, hence not doubtful
+        found: np.ndarray = (m.disagreement >= bar) & ~m.confirmed
+    return found
+
+
+def find_doubtful_in_map(
+    m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params
+) -> np.ndarray:
+    """Find doubtful edges (E,) by ``max_disagreement`` and by the contradictions of this map.
+
+    Where the map contradicts more doubtful edges than it supports, it has places that look alike, and the threshold is
+    the one that best separates the disagreement of its accepted edges from that of the contradicted ones. Where
+    undoubted edges contradict each other, those from `find_first_contradicted` are doubtful as well.
+
+    Args:
+        state: state of the map from undoubted edges.
+    """
+    bar = params.max_disagreement
+    inside = _within(m, state.accepted)
+    fits = np.zeros(len(m), dtype=bool)
+    rows = np.flatnonzero(inside & doubtful)
+    if len(rows):
+        fits[rows] = consistent_with_component(m, rows, state.drift(m), params.gate_probability)
+    contradicted = inside & doubtful & ~fits
+    aliasing = aliasing_probability(int((inside & doubtful & fits).sum()), int(contradicted.sum()))
+    believed = state.accepted & (m.disagreement > 0)
+    if aliasing > _MAX_ALIASING_PROBABILITY and believed.any():
+        bar = min(bar, separating_threshold(m.disagreement[believed], m.disagreement[contradicted]))
+    found = find_doubtful(m, bar)
+    if not (state.accepted | state.ambiguous | doubtful).all():
+        found |= find_first_contradicted(m, ~(state.ambiguous | doubtful), state.terms, gate, params)
+    return found
+
+
+def separating_threshold(believed: np.ndarray, contradicted: np.ndarray) -> float:
+    """Compute the threshold that best separates two log-normal sets of disagreements (Bayes, a wrong edge costs `_COST`
+    right ones); infinity where they cannot be separated.
+    """
+    logs = [np.log(np.maximum(values, 1e-6)) for values in (believed, contradicted)]
+    low, high = (float(np.median(values)) for values in logs)
+    if high <= low:
+        return float("inf")
+    spread = np.concatenate([np.abs(values - middle) for values, middle in zip(logs, (low, high), strict=True)])
+    sigma = max(_LEAST_SPREAD, 1.4826 * float(np.median(spread)))
+    return float(np.exp((low + high) / 2 - sigma**2 * np.log(_COST) / (high - low)))
+
+
+def find_first_contradicted(
+    m: Measurements, eligible: np.ndarray, terms: PriorTerms, gate: float, params: Params
+) -> np.ndarray:
+    """Find the edges (E,) from the rank on at which most edges are contradicted; none where there is no such rank.
+
+    Edges are accepted in order of likelihood, each connecting its scenes; the scenes of late edges are connected
+    already.
+
+    Args:
+        eligible: (E,) bool, edges that may be accepted; the others decide nothing.
+    """
+    rank, known = _ranked(m)
+    tying = replace(params, min_large_component=m.num_scenes + 1)
+    state = State.fresh(m, Similarities.identity(m.num_scenes), np.zeros(len(m), dtype=bool), terms)
+    agrees, contradicted = np.zeros((2, len(m)), dtype=bool)
+    steps = np.unique(rank[eligible])
+    max_steps = min(len(steps), _STEPS, max(_FEWEST_STEPS, _SCENE_STEPS // m.num_scenes))
+    below = -1
+    for step in np.unique(np.quantile(steps, np.linspace(0, 1, max_steps), method="nearest")).tolist():
+        state.rejected = (rank > step) | ~eligible
+        new = (rank > below) & ~state.rejected
+        tied = _within(m, state.accepted)
+        accept_edges(m, state, tying)
+        refine(m, state, gate)
+        agrees |= new & tied & state.accepted
+        contradicted |= new & _within(m, state.accepted) & ~state.accepted
+        below = step
+    for bar in np.unique(rank[contradicted & known]).tolist():
+        above = rank >= bar
+        if (
+            aliasing_probability(int((agrees & above).sum()), int((contradicted & above).sum()))
+            > _MAX_ALIASING_PROBABILITY
+        ):
+            return above & known
+    return np.zeros(len(m), dtype=bool)
+
+
+def _ranked(m: Measurements) -> tuple[np.ndarray, np.ndarray]:
+    """Rank edges by likelihood: (E,) rank, the likeliest 0, and (E,) bool, True where the likelihood is known.
+    Confirmed edges and those of unknown likelihood come first.
+    """
+    known = np.isfinite(m.log_odds_wrong)
+    value = m.log_odds_wrong
+    if not known.any():
+        known, value = m.disagreement > 0, m.disagreement
+    known = known & ~m.confirmed
+    return np.unique(np.where(known, value, -np.inf), return_inverse=True)[1], known
+
+
+def accept_doubtful_edges(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> None:
+    """Accept the doubtful edges that the map supports, and others that connect components if most doubtful edges of
+    this map were right.
+    """
+    state.doubtful = doubtful
+    if close_loops(m, state, params):
+        refine(m, state, gate)
+    inside = doubtful & _within(m, state.accepted)
+    supported = int((inside & state.accepted).sum())
+    joining = doubtful & ~inside
+    one_visit = joining & m.same_visit
+    state.undecided |= one_visit
+    if aliasing_probability(supported, int((inside & ~state.accepted).sum())) <= _MAX_ALIASING_PROBABILITY:
+        before = replace(state, accepted=state.accepted.copy(), failures=state.failures.copy())
+        accept_edges(m, state, params)
+        refine(m, state, gate)
+        # Edges between places that look alike contradict each other sooner or later: then none of them is accepted.
+        contradicted = int((doubtful & _within(m, state.accepted) & ~state.accepted).sum())
+        if aliasing_probability(supported, contradicted) > _MAX_ALIASING_PROBABILITY:
+            state.accepted, state.failures, state.poses = before.accepted, before.failures, before.poses
+    apart = joining & ~_within(m, state.accepted)
+    state.undecided |= apart
+    for row in np.flatnonzero(apart).tolist():
+        others = "captured in one visit" if one_visit[row] else "so are others of this map, or they contradict it"
+        state.pending[row] = f"places that look alike? ({others})"
+
+
+def _within(m: Measurements, accepted: np.ndarray) -> np.ndarray:
+    """Return (E,) bool: both scenes of the edge are in one component."""
+    labels = component_labels(m, np.flatnonzero(accepted))
+    found: np.ndarray = labels[m.targets] == labels[m.sources]
+    return found
+
+
+def aliasing_probability(supported: int, contradicted: int) -> float:
+    """Estimate the probability that a further doubtful edge joins two different places, by the rule of succession.
+
+    Args:
+        supported, contradicted: numbers of doubtful edges of this map that the other edges support and contradict.
+    """
+    return (contradicted + 1) / (supported + contradicted + 2)
