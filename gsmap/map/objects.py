@@ -21,7 +21,7 @@ from gsmap.map.object_words import apart, with_words
 from gsmap.map.photos import with_photos
 from gsmap.map.settings import Settings
 from gsmap.map.stages.objects import Part, objects_of_components
-from gsmap.objects import graphml, object_graph, permanence, relations
+from gsmap.objects import estimate_persistence, graphml, object_graph, relations
 from gsmap.store import Store
 from gsmap.store.objects import Computed, ObjectFact, number_of
 from gsmap.texts import few
@@ -362,7 +362,7 @@ def _meets(box: np.ndarray | None, area: np.ndarray, near: float) -> bool:
 
 def object_row(thing: MapObject, known: Known) -> ObjectRow:
     """One object."""
-    stays = permanence(thing, known.dates)
+    stays = estimate_persistence(thing, known.dates)
     seen = [known.dates[sighting.scene] for sighting in thing.sightings if sighting.state == "seen"]
     return ObjectRow(
         id=thing.id,

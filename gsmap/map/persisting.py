@@ -125,7 +125,7 @@ def rows(store: Store, scene: str, passing: Passing) -> np.ndarray:
             code="changed_meanwhile",
         )
     if graph is not None and graph.things is not None and len(graph.things):
-        from gsmap.objects.changed import CHANGED  # naming what passes does without
+        from gsmap.objects.changed_segments import CHANGED  # naming what passes does without
 
         members = graph.things.members
         of = np.bincount(members[members >= 0], minlength=len(graph.things))

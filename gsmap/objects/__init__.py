@@ -1,35 +1,42 @@
-"""Things of captures become objects of the map: fused, looked for in every capture, related, and counted."""
+"""Objects of the map: segments of scenes fused over time, looked up in every scene, and related to each other."""
 
-from gsmap.objects.changed import changed_thing
-from gsmap.objects.fuse import Node, Placed, fuse
+from gsmap.objects.changed_segments import find_changed_segment
+from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse
 from gsmap.objects.graph import graphml, object_graph
-from gsmap.objects.looks import Eyes, Glance, glance, in_view, judge, open_eyes
-from gsmap.objects.make import VERSION, Capture, Params, make_objects, recipe_key
-from gsmap.objects.permanence import Permanence, permanence
+from gsmap.objects.make import VERSION, Params, SegmentedScene, make_objects, recipe_key
+from gsmap.objects.persistence import Persistence, estimate_persistence
 from gsmap.objects.relations import Relation, relations
 from gsmap.objects.rooms import find_rooms
+from gsmap.objects.visibility import (
+    PointObservations,
+    RenderedViews,
+    classify_observation,
+    is_in_view,
+    observe_points,
+    render_views,
+)
 
 __all__ = [
     "VERSION",
-    "Capture",
-    "Eyes",
-    "Glance",
-    "Node",
+    "SegmentedScene",
+    "RenderedViews",
+    "PointObservations",
+    "SegmentId",
     "Params",
-    "Permanence",
-    "Placed",
+    "Persistence",
+    "PlacedSegments",
     "Relation",
-    "changed_thing",
+    "find_changed_segment",
     "find_rooms",
     "fuse",
-    "glance",
+    "observe_points",
     "graphml",
-    "in_view",
-    "judge",
+    "is_in_view",
+    "classify_observation",
     "make_objects",
     "object_graph",
-    "open_eyes",
-    "permanence",
+    "render_views",
+    "estimate_persistence",
     "recipe_key",
     "relations",
 ]

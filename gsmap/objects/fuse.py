@@ -1,4 +1,4 @@
-"""Which things of several captures are one: those that fill the same cells of the map in the same colour."""
+"""Association of segments over scenes: segments that fill the same cells in the same colour are one object."""
 
 from __future__ import annotations
 
@@ -13,49 +13,49 @@ _CELL_M = 0.12  # edge of the cells that segments are compared by
 _MIN_OVERLAP_OF_LARGER = 0.2  # fraction of the larger segment's cells that two segments of one object share
 _MAX_LAB = 15.0  # median difference of their colours, after exposure balancing
 _MIN_IOU = 0.4  # from which on the colours may differ: the object was painted
-_AHEAD = 3  # a thing is compared with those of so many later captures at its place: linear in captures, few gaps
+_AHEAD = 3  # later scenes at the place of a segment that it is compared with, so that cost is linear in scenes
 
 
-Node = tuple[int, int]
-"""(capture, thing), both by index."""
+SegmentId = tuple[int, int]
+"""Indices (scene, segment)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """The things of one capture in the frame of the map.
+class PlacedSegments:
+    """The segments of one scene in the map frame.
 
     Args:
-        points: (K, 3) float64 metres, of members of things.
-        things: (K,) int which.
-        lab: (K, 3) their colours, L*a*b*.
-        count: M, how many things there are.
+        points: (K, 3) float64 metres, sample points of segments.
+        segments: (K,) int the segment of each point.
+        lab: (K, 3) colours of the points, L*a*b*.
+        count: M, number of segments.
     """
 
     points: np.ndarray
-    things: np.ndarray
+    segments: np.ndarray
     lab: np.ndarray
     count: int
 
 
 def fuse(
-    captures: Sequence[Placed],
-    moved: Sequence[tuple[Node, Node]] = (),
-    parted: Sequence[tuple[Node, int]] = (),
+    captures: Sequence[PlacedSegments],
+    moved: Sequence[tuple[SegmentId, SegmentId]] = (),
+    parted: Sequence[tuple[SegmentId, int]] = (),
     min_overlap: float = 0.45,
-) -> list[tuple[Node, ...]]:
-    """Groups of things that are one object, at most one of each capture; each thing is in one.
+) -> list[tuple[SegmentId, ...]]:
+    """Group segments into objects, at most one segment of each scene; each segment is in one group.
 
-    Two things are one where each is the other's best match by shared cells and they agree in size and colour; the
-    surest matches are taken first. The order of the captures matters only for which of those that are far apart in it
-    are compared at all.
+    Two segments are joined if each is the other's best match by shared cells and they agree in size and colour; the
+    best matches are joined first. Scenes far apart in the given order are not compared directly.
 
     Args:
         captures: in order of time, one frame.
-        moved: things that are known to be one though they stood elsewhere; these are taken first.
-        parted: things, each with a capture that is known not to show it where it stood.
+        moved: pairs of segments of one moved object; these are joined first.
+        parted: segments, each with the index of a scene that does not show it in place.
+        min_overlap: fraction in [0, 1] of the smaller segment's cells that lie in the larger one's.
 
     Returns:
-        Groups by their first node; nodes within by capture.
+        Groups sorted by their first segment; segments within by scene.
     """
     first, cells, lab = _cells(captures, _CELL_M)
     home = np.searchsorted(first, np.arange(first[-1]), "right") - 1
@@ -70,16 +70,16 @@ def fuse(
     order = np.argsort(-score[best], kind="stable")
     edges = [(first[p[0]] + p[1], first[q[0]] + q[1]) for p, q in moved]
     edges += list(zip(a[best][order].tolist(), b[best][order].tolist(), strict=True))
-    groups = _joined(edges, home, {(int(first[c] + t), other) for (c, t), other in parted}, len(moved))
+    groups = _join_groups(edges, home, {(int(first[c] + t), other) for (c, t), other in parted}, len(moved))
     return [tuple((int(home[n]), int(n - first[home[n]])) for n in group) for group in groups]
 
 
-def _cells(captures: Sequence[Placed], cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where each capture's nodes begin (C + 1,), rows (cell, node), each once, sorted; and the mean colour in each."""
+def _cells(captures: Sequence[PlacedSegments], cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (C + 1,) the first node of each scene, unique sorted rows (cell, node), and their mean colours."""
     first = np.concatenate([[0], np.cumsum([capture.count for capture in captures])]).astype(np.int64)
     points = np.concatenate([capture.points for capture in captures]).reshape(-1, 3)
     lab = np.concatenate([capture.lab for capture in captures]).reshape(-1, 3)
-    nodes = np.concatenate([first[i] + capture.things for i, capture in enumerate(captures)]).astype(np.int64)
+    nodes = np.concatenate([first[i] + capture.segments for i, capture in enumerate(captures)]).astype(np.int64)
     label, _ = cell_labels(np.floor(points / cell_m))
     cells, row, counts = np.unique(np.column_stack([label, nodes]), axis=0, return_inverse=True, return_counts=True)
     return first, cells, group_means(lab, row.reshape(-1), counts)
@@ -88,16 +88,16 @@ def _cells(captures: Sequence[Placed], cell_m: float) -> tuple[np.ndarray, np.nd
 def _overlaps(
     cells: np.ndarray, lab: np.ndarray, home: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of nodes of different captures that share cells, how many, and how much colours differ in most of these."""
+    """Return pairs of nodes of different scenes that share cells, their number, and the median colour difference."""
     parts, offs = [], []
-    for ahead in range(1, 2 * _AHEAD + 1):  # nodes come by capture; two of one capture may share a cell
+    for ahead in range(1, 2 * _AHEAD + 1):  # nodes are sorted by scene; two of one scene may share a cell
         same = np.flatnonzero(cells[:-ahead, 0] == cells[ahead:, 0])
         same = same[home[cells[same, 1]] != home[cells[same + ahead, 1]]]
         parts.append(np.column_stack([cells[same, 1], cells[same + ahead, 1]]))
         offs.append(lab[same] - lab[same + ahead])
     pairs, off = np.concatenate(parts), np.concatenate(offs)
     captures = home[pairs]
-    for i, j in np.unique(captures, axis=0):  # another exposure is not another thing
+    for i, j in np.unique(captures, axis=0):  # exposure balancing
         both = (captures == (i, j)).all(1)
         off[both] -= np.median(off[both], axis=0)
     found, label, shared = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
@@ -108,7 +108,7 @@ def _overlaps(
 
 
 def _mutual(a: np.ndarray, b: np.ndarray, score: np.ndarray, home: np.ndarray) -> np.ndarray:
-    """Rows of the pairs in which each is the other's best in its capture."""
+    """Return the rows of mutually best pairs."""
     best: dict[tuple[int, int], int] = {}
     for row in np.argsort(score, kind="stable"):
         best[int(a[row]), int(home[b[row]])] = int(row)
@@ -121,13 +121,13 @@ def _mutual(a: np.ndarray, b: np.ndarray, score: np.ndarray, home: np.ndarray) -
     return np.array(mutual, np.int64)
 
 
-def _joined(
+def _join_groups(
     edges: Sequence[tuple[int, int]], home: np.ndarray, parted: set[tuple[int, int]], moved: int
 ) -> list[list[int]]:
-    """Groups of nodes that edges join, in this order, the first of them of what moved.
+    """Join nodes to groups by edges in order, the first ``moved`` edges being of moved objects.
 
-    An edge is left that would give a group two of one capture, or, of what stayed, one of a capture that does not show
-    another.
+    An edge is skipped that would give a group two nodes of one scene, or, unless it is of a moved object, a node of a
+    scene that does not show another node of the group.
     """
     group = {n: [n] for n in range(len(home))}
     for i, (p, q) in enumerate(edges):

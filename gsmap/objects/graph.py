@@ -1,4 +1,4 @@
-"""The map-level scene graph for other programs."""
+"""Export of the map's objects, relations and rooms as a graph."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Any
 
-from gsmap.objects.permanence import permanence
+from gsmap.objects.persistence import estimate_persistence
 from gsmap.objects.relations import relations
 from gsmap.types import MapObject
 from gsmap.types.rows import RoomRow
@@ -18,16 +18,16 @@ def object_graph(
     metres: float | Mapping[int, float] = 1.0,
     rooms: Sequence[RoomRow] = (),
 ) -> Any:
-    """A `networkx.MultiDiGraph`: a node per object, an edge per relation, whose attributes GraphML can say.
+    """Build a `networkx.MultiDiGraph` of objects, relations and rooms, with attributes that GraphML supports.
 
     Nodes: ``kind`` (object), ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
-    ``seen``, ``looks``, ``half_life_days`` (absent where unknown), ``there`` (the newest look shows it), ``name`` and
-    ``label`` (absent where nobody gave any). Edges: ``kind`` (on, in, next to). Rooms are nodes, too: ``kind`` (room),
+    ``seen``, ``looks``, ``half_life_days`` (absent if unknown), ``there`` (seen in the newest observation), ``name`` and
+    ``label`` (absent if none was given). Edges: ``kind`` (on, in, next to). Rooms are nodes, too: ``kind`` (room),
     ``component``, ``x y z`` (the middle of the floor), ``area_m2``; an object has an edge ``in room`` to the one it
     stands in, and rooms have one ``door`` each way.
 
     Args:
-        dates: as for `permanence`.
+        dates: as for `estimate_persistence`.
         metres: per unit of the map; by component, or for all.
         rooms: the map's.
     """
@@ -35,7 +35,7 @@ def object_graph(
 
     graph = nx.MultiDiGraph()
     for thing in objects:
-        stays = permanence(thing, dates)
+        stays = estimate_persistence(thing, dates)
         facts: dict[str, Any] = {"kind": "object", "component": thing.component}
         facts |= {axis: float(value) for axis, value in zip("xyz", thing.position, strict=True)}
         facts |= {f"size_{axis}": float(v) for axis, v in zip("xyz", thing.box[1] - thing.box[0], strict=True)}
@@ -57,7 +57,7 @@ def object_graph(
 
 
 def graphml(graph: Any) -> str:
-    """The graph as GraphML."""
+    """Return the graph as GraphML text."""
     import networkx as nx
 
     text = BytesIO()

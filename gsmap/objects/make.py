@@ -1,4 +1,4 @@
-"""Objects of the map from its captures."""
+"""Construction of the objects of the map from the segments of its scenes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from gsmap import render
 from gsmap.methods import RecipeKey, text_digest
-from gsmap.objects.fuse import Node, Placed, fuse
-from gsmap.objects.looks import Eyes, glance, judge
+from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse
+from gsmap.objects.visibility import RenderedViews, classify_observation, observe_points
 from gsmap.types import MapObject, Segments, Sighting, SightingState, Sim3
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
@@ -42,52 +42,54 @@ class Params:
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
-    """What names the objects of a component; what they are made of is added by whoever knows it."""
+    """Return the recipe of the objects of a component, without its inputs."""
     return RecipeKey("objects", "fused", {"objects": VERSION}, plain(params or Params()), render.backend())
 
 
 @dataclass(frozen=True, eq=False)
-class Capture:
-    """A placed capture, as objects are made of it.
+class SegmentedScene:
+    """A scene with a pose and segments.
 
     Args:
-        scene: id.
-        S_map_scene: where it lies.
-        things: of its graph.
+        scene: its id.
+        S_map_scene: its pose.
+        segments: of its scene graph.
     """
 
     scene: str
     S_map_scene: Sim3
-    things: Segments
+    segments: Segments
 
 
 def make_objects(
-    captures: Sequence[Capture],
+    captures: Sequence[SegmentedScene],
     component: int,
-    eyes: Callable[[Capture], Eyes],
+    eyes: Callable[[SegmentedScene], RenderedViews],
     *,
     metres: float = 1.0,
-    moved: Sequence[tuple[Node, Node]] = (),
-    parted: Sequence[tuple[Node, int]] = (),
-    looked: Callable[[int, Node], tuple[SightingState, float] | None] = lambda capture, node: None,
-    could_see: Callable[[Capture, np.ndarray], bool] = lambda capture, points: True,
+    moved: Sequence[tuple[SegmentId, SegmentId]] = (),
+    parted: Sequence[tuple[SegmentId, int]] = (),
+    looked: Callable[[int, SegmentId], tuple[SightingState, float] | None] = lambda capture, node: None,
+    could_see: Callable[[SegmentedScene, np.ndarray], bool] = lambda capture, points: True,
     params: Params | None = None,
     progress: Progress = silent,
 ) -> list[MapObject]:
-    """The objects of one component of the map, the largest first.
+    """Make the objects of one component of the map, the largest first.
 
-    A capture is opened once, whatever the number of others, and only where it has to be asked for an object that others
-    show at a place that its cameras can see: its cost is that of its own things and of the objects at its place.
+    A scene is rendered at most once, and only if an object of other scenes lies in the frustum of its cameras: its cost
+    is that of its own segments and of the objects at its place.
 
     Args:
-        captures: of the component, oldest first.
-        eyes: what a capture sees; asked at most once for each.
+        captures: scenes of the component, oldest first.
+        eyes: renders the views of a scene; called at most once for each.
         metres: per unit of the map.
-        moved: things (capture and thing by index) that are one though they stood elsewhere.
-        parted: things, each with the index of a capture that is known not to show it where it stood.
-        looked: state and share of what a capture (by index) was found to show of a thing of another when it was asked
-            before; None where it has to be asked.
-        could_see: whether any camera of a capture can see some of these points, its frame and unit; without rendering.
+        moved: pairs of segments, by index, of one moved object.
+        parted: segments, each with the index of a scene that does not show it in place.
+        looked: state and observed fraction, from an earlier run, of a segment of another scene in a scene (by index);
+            None if it has to be observed now.
+        could_see: whether some camera of a scene has any of the points in its frustum, scene frame and unit.
+        params: see `Params`.
+        progress: called with the fraction done in [0, 1] and the current step.
     """
     params = params or Params()
     placed = [_placed(capture, metres) for capture in captures]
@@ -95,9 +97,9 @@ def make_objects(
     gone = set(parted)
     kept = []
     for group in groups:
-        rows = {c: np.flatnonzero(placed[c].things == t) for c, t in group}
+        rows = {c: np.flatnonzero(placed[c].segments == t) for c, t in group}
         places = {c: (placed[c].points[mine] / metres, placed[c].lab[mine]) for c, mine in rows.items()}
-        members = max(np.count_nonzero(captures[c].things.members == t) for c, t in group)
+        members = max(np.count_nonzero(captures[c].segments.members == t) for c, t in group)
         if members >= params.min_gaussians:
             kept.append((group, places))
     sightings: list[dict[int, Sighting]] = [
@@ -106,61 +108,65 @@ def make_objects(
     ]
     for c, capture in enumerate(captures):
         progress(c / max(len(captures), 1), f"looking for {len(kept)} objects in capture {c + 1} of {len(captures)}")
-        # Of which capture each is known where it stood when it is looked for: the nearest in time.
+        # Scene that provides the expected place of each object: the nearest in time.
         of = [min((o for o in at if o != c), key=lambda o: (abs(o - c), o), default=c) for _, at in kept]
         points = [places[o][0] for (_, places), o in zip(kept, of, strict=True)]
         S_scene_map, unit = capture.S_map_scene.inverse(), metres * capture.S_map_scene.scale
-        said: dict[int, tuple[SightingState, float]] = {}
-        asking = []
+        results: dict[int, tuple[SightingState, float]] = {}
+        to_observe = []
         for i, mine in enumerate(sightings):
             if c in mine:
                 continue
             before = looked(c, (of[i], sightings[i][of[i]].thing))
             if before is not None:
-                said[i] = before
+                results[i] = before
             elif could_see(capture, S_scene_map.apply(points[i])):
-                asking.append(i)
+                to_observe.append(i)
             else:
                 sightings[i][c] = Sighting(capture.scene, "unseen", -1, None, 0.0)
-        if asking:
+        if to_observe:
             seen = eyes(capture)
             own = [places[o][1] for (_, places), o in zip(kept, of, strict=True)]
-            # The exposure: by what is certainly there, else by all that has a surface where it should.
-            sure = [i for i, mine in enumerate(sightings) if c in mine] or asking
-            glances = {i: glance(seen, S_scene_map.apply(points[i]), unit) for i in dict.fromkeys([*sure, *asking])}
-            off = np.concatenate([(glances[i].colours - own[i])[glances[i].on] for i in sure])
+            # Exposure by objects that the scene certainly shows, or by all that have a surface in place.
+            sure = [i for i, mine in enumerate(sightings) if c in mine] or to_observe
+            observations = {
+                i: observe_points(seen, S_scene_map.apply(points[i]), unit) for i in dict.fromkeys([*sure, *to_observe])
+            }
+            off = np.concatenate([(observations[i].colours - own[i])[observations[i].on] for i in sure])
             shift = np.median(off, axis=0) if len(off) else np.zeros(3)
-            for i in asking:
-                said[i] = judge(glances[i], points[i] * metres, own[i], shift)
-        for i, (state, share) in said.items():
+            for i in to_observe:
+                results[i] = classify_observation(observations[i], points[i] * metres, own[i], shift)
+        for i, (state, share) in results.items():
             asked = captures[of[i]].scene
             if any((node, c) in gone for node in kept[i][0]):
-                state, asked = "absent", ""  # a person may take that back, so that it is not what was looked for
+                state, asked = "absent", ""  # a review may revert it, so it is not kept as an observation
             box = np.array([points[i].min(0), points[i].max(0)]) if state == "seen" else None
             sightings[i][c] = Sighting(capture.scene, state, -1, box, share, asked)
     objects = []
     for (group, _), mine in zip(kept, sightings, strict=True):
         first, last = group[0], group[-1]
-        own = captures[first[0]].things.positions[first[1]] * captures[first[0]].things.unit_m
+        own = captures[first[0]].segments.positions[first[1]] * captures[first[0]].segments.unit_m
         name = text_digest(f"{captures[first[0]].scene} {np.round(own, 1).tolist()}")[:8]
         box = mine[last[0]].box
         assert box is not None
-        middle = captures[last[0]].S_map_scene.apply(captures[last[0]].things.positions[last[1]][None])[0]
-        colour = captures[last[0]].things.colours[last[1]]
+        middle = captures[last[0]].S_map_scene.apply(captures[last[0]].segments.positions[last[1]][None])[0]
+        colour = captures[last[0]].segments.colours[last[1]]
         objects.append(MapObject(name, component, box, middle, colour, tuple(mine[c] for c in range(len(captures)))))
     objects.sort(key=lambda thing: (-float(np.prod(thing.box[1] - thing.box[0])), thing.id))
     return _distinct(objects)
 
 
-def _placed(capture: Capture, metres: float) -> Placed:
-    """Some points of every thing, in metres of the map."""
-    known = capture.things
-    points = capture.S_map_scene.apply(known.samples) * metres
-    return Placed(points, np.repeat(np.arange(len(known)), known.sample_counts), known.sample_colours, len(known))
+def _placed(capture: SegmentedScene, metres: float) -> PlacedSegments:
+    """Return sample points of every segment, in metres of the map."""
+    segments = capture.segments
+    points = capture.S_map_scene.apply(segments.samples) * metres
+    return PlacedSegments(
+        points, np.repeat(np.arange(len(segments)), segments.sample_counts), segments.sample_colours, len(segments)
+    )
 
 
 def _distinct(objects: list[MapObject]) -> list[MapObject]:
-    """Two whose ids are the same by chance get different ones."""
+    """Make ids unique where two are the same by chance."""
     taken: set[str] = set()
     out = []
     for thing in objects:

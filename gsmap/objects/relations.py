@@ -1,4 +1,4 @@
-"""How objects of one place stand to each other."""
+"""Spatial relations between objects: on, in and next to."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from gsmap.types import MapObject
 
-_ON_M = 0.12  # what stands on a thing begins so near to its top: boxes are of Gaussians' centres
-_OVER = 0.5  # and so much of its footprint lies over it
-_INSIDE = 0.8  # what is in a thing has so much of its box in that of the thing
-_NEXT_M = 0.3  # things next to each other are no farther apart in plan
+_ON_M = 0.12  # largest gap between an object and the one it stands on: boxes are of Gaussians' centres
+_OVER = 0.5  # fraction of its footprint over that object
+_INSIDE = 0.8  # fraction of an object's box inside the one it is in
+_NEXT_M = 0.3  # largest distance in plan of objects next to each other
 
 RelationKind = Literal["on", "in", "next to"]
 
@@ -28,10 +28,10 @@ class Relation:
 
 
 def relations(objects: Sequence[MapObject], metres: float | Mapping[int, float] = 1.0) -> list[Relation]:
-    """``on``, ``in`` and ``next to`` of objects that are there together, by their boxes (z up).
+    """Derive ``on``, ``in`` and ``next to`` between simultaneous objects, by their boxes (z up).
 
     Args:
-        objects: of any component; those of one component are related that are both there still, or both gone.
+        objects: of any component; relations hold within a component, between objects both present or both gone.
         metres: per unit of the map; by component, or for all.
     """
     out = []
@@ -45,7 +45,7 @@ def relations(objects: Sequence[MapObject], metres: float | Mapping[int, float] 
         over = footprint / size[i, :2].prod()
         apart = footprint < _OVER * np.minimum(size[:, :2].prod(1), size[i, :2].prod())
         gap = np.linalg.norm(np.clip(low - high, 0, None)[:, :2], axis=1)
-        for j in np.flatnonzero(gap < _NEXT_M).tolist():  # Nothing farther away is related.
+        for j in np.flatnonzero(gap < _NEXT_M).tolist():  # farther objects are not related
             other = objects[j]
             if i == j or one.component != other.component or one.there != other.there:
                 continue

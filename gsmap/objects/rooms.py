@@ -1,9 +1,8 @@
-"""Rooms: the floor plan of a place, cut where walls or the lintels of doors close it, and at narrow passages.
+"""Room segmentation: the floor plan of a place, cut at walls, lintels of doors and narrow passages.
 
-Between the height of doors and the ceiling nothing stands but walls, and above an open door its lintel: what is one
-piece of floor there is one room, whatever furniture stands in it. Where doors reach the ceiling, or nobody saw their
-lintels, the distance to the nearest wall tells: a passage narrower than `_DOOR_M` parts two rooms (as in Bormann
-et al. 2016, "Room segmentation: survey, implementation, and analysis").
+Between the height of doors and the ceiling there are only walls and lintels, so a connected floor at that height is one
+room, whatever its furniture. Where doors reach the ceiling, or lintels are unobserved, a passage narrower than `_DOOR_M`
+separates two rooms (as in Bormann et al. 2016, "Room segmentation: survey, implementation, and analysis").
 """
 
 from __future__ import annotations
@@ -31,11 +30,12 @@ _MIN_DOOR_M = 0.5  # width of an opening that joins two rooms
 
 
 def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, min_area_m2: float = 1.5) -> list[Room]:
-    """The rooms that captures of a place show, the largest first.
+    """Segment the rooms of a place, the largest first.
 
     Args:
-        captures: in one level frame, metres, z up.
-        eyes: (C, 3) where their cameras stood: they tell storeys apart; may be none.
+        captures: Gaussians of its scenes in one level frame, metres, z up.
+        eyes: (C, 3) camera centres, by which storeys are separated; may be empty.
+        min_area_m2: least floor area of a room.
     """
     parts = [_surface(gaussians) for gaussians in captures]
     points = np.concatenate([np.zeros((0, 3)), *(p for p, _ in parts)])
@@ -47,7 +47,7 @@ def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, min_area_m2: flo
     for height in _storeys(eyes, points):
         floor, ceiling = _floor_and_ceiling(points[flat, 2], height)
         mine = (points[:, 2] > floor - 0.3) & (points[:, 2] < ceiling + 0.3)
-        rooms += _of_storey(points[mine], flat[mine], whose[mine], floor, ceiling, len(rooms), min_area_m2)
+        rooms += _segment_storey(points[mine], flat[mine], whose[mine], floor, ceiling, len(rooms), min_area_m2)
     order = sorted(range(len(rooms)), key=lambda i: (-rooms[i].area_m2, *rooms[i].low))
     place = {old: new for new, old in enumerate(order)}
     return [
@@ -57,9 +57,9 @@ def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, min_area_m2: flo
 
 
 def _surface(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Points (P, 3) all over the Gaussians, half a cell apart, and which lie on a level surface.
+    """Sample points (P, 3) on the Gaussians, half a cell apart, and a mask of those on level surfaces.
 
-    Blank walls are made of few wide Gaussians, whose means alone would leave holes.
+    Blank walls consist of few wide Gaussians, whose means alone would leave holes.
     """
     opaque = gaussians.logit_opacities > np.log(_MIN_OPACITY / (1 - _MIN_OPACITY))
     rows = np.flatnonzero(opaque)
@@ -85,7 +85,7 @@ def _surface(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _storeys(eyes: np.ndarray, points: np.ndarray) -> list[float]:
-    """The height of the eyes on each storey, the lowest first; without cameras the middle of what there is."""
+    """Return the median camera height of each storey, the lowest first; without cameras, that of all points."""
     if not len(eyes):
         return [float(np.median(points[:, 2]))]
     heights = np.sort(eyes[:, 2])
@@ -94,7 +94,7 @@ def _storeys(eyes: np.ndarray, points: np.ndarray) -> list[float]:
 
 
 def _floor_and_ceiling(heights: np.ndarray, eye: float) -> tuple[float, float]:
-    """Where most of what is level lies below and above the eyes."""
+    """Estimate the heights of floor and ceiling by the level surfaces below and above the cameras."""
     floor = _mode(heights[(heights > eye - 2.0) & (heights < eye - 0.6)], eye - 1.5)
     above = heights[(heights > floor + _ABOVE_DOORS_M) & (heights < floor + 4.0)]
     below = np.count_nonzero(np.abs(heights - floor) < _BIN_M)
@@ -112,7 +112,7 @@ def _mode(values: np.ndarray, default: float) -> float:
     return float(np.median(values[np.abs(bins - best) <= 1]))
 
 
-def _of_storey(
+def _segment_storey(
     points: np.ndarray,
     flat: np.ndarray,
     whose: np.ndarray,
@@ -121,10 +121,11 @@ def _of_storey(
     first: int,
     min_area_m2: float,
 ) -> list[Room]:
-    """The rooms of one storey; their numbers begin with ``first``.
+    """Segment the rooms of one storey, numbered from ``first``.
 
     Args:
-        flat: (P,) bool, which points lie on a level surface. whose: (P,) index of the capture that shows each.
+        flat: (P,) bool, points on level surfaces.
+        whose: (P,) index of the scene of each point.
     """
     cell = _CELL_M
     low = points[:, :2].min(0) - 3 * cell
@@ -136,7 +137,7 @@ def _of_storey(
     high = (points[:, 2] >= bottom) & (points[:, 2] < top)
     level = np.minimum(((points[high, 2] - bottom) / (top - bottom) * bins).astype(int), bins - 1)
     filled[at[high, 0], at[high, 1], level] = True
-    wall = _long(filled.mean(2) >= _MIN_WALL_FILL, _MIN_WALL_M / cell)
+    wall = _remove_short(filled.mean(2) >= _MIN_WALL_FILL, _MIN_WALL_M / cell)
     inside = np.zeros(shape, bool)
     seen = flat & ((np.abs(points[:, 2] - floor) < 0.15) | (np.abs(points[:, 2] - ceiling) < 0.15))
     inside[at[seen, 0], at[seen, 1]] = True
@@ -144,9 +145,9 @@ def _of_storey(
     blocked = np.zeros(shape, bool)
     blocked[at[body, 0], at[body, 1]] = True
     inside = ndimage.binary_fill_holes(ndimage.binary_closing(inside | blocked, np.ones((3, 3)), iterations=2))
-    labels = _cut(inside & ~wall, min_area_m2)
-    grown = _grown(labels, wall & inside)
-    # A door that one capture shows open is a door, though another shows it shut.
+    labels = _label_rooms(inside & ~wall, min_area_m2)
+    grown = _extend_to_walls(labels, wall & inside)
+    # A door that is open in one scene is a door, though it is shut in another.
     open_floors = []
     trodden = flat & (np.abs(points[:, 2] - floor) < _BIN_M)
     for capture in np.unique(whose):
@@ -160,14 +161,14 @@ def _of_storey(
         mine = grown == number
         rows, columns = np.flatnonzero(mine.any(1)), np.flatnonzero(mine.any(0))
         part = mine[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        doors = {other for floors in open_floors for other in _joined_to(labels, number, floors)}
+        doors = {other for floors in open_floors for other in _connected_rooms(labels, number, floors)}
         joined = tuple(first + other - 1 for other in sorted(doors))
         rooms.append(Room(low + cell * np.array([rows[0], columns[0]]), part, cell, floor, ceiling, joined))
     return rooms
 
 
-def _long(wall: np.ndarray, cells: float) -> np.ndarray:
-    """Walls without pieces that are shorter: lamps and ducts hang from ceilings, too."""
+def _remove_short(wall: np.ndarray, cells: float) -> np.ndarray:
+    """Remove pieces of wall shorter than a number of cells, such as lamps and ducts."""
     labels, _ = ndimage.label(wall, np.ones((3, 3)))
     spans = ndimage.find_objects(labels)
     long = [max(s.stop - s.start for s in span) >= cells for span in spans]
@@ -175,11 +176,11 @@ def _long(wall: np.ndarray, cells: float) -> np.ndarray:
     return out
 
 
-def _cut(free: np.ndarray, min_area_m2: float) -> np.ndarray:
-    """Labels (X, Y) from 1 of the rooms of a free floor, 0 for none.
+def _label_rooms(free: np.ndarray, min_area_m2: float) -> np.ndarray:
+    """Return labels (X, Y) of the rooms of a free floor, from 1; 0 for none.
 
-    Each piece of floor whose middle is wider than a door is a room with what lies nearest to it on foot; one that is
-    nowhere so wide is a room as a whole.
+    Each core of floor wider than a door is a room with the cells nearest to it on foot; a piece of floor without a core
+    is one room.
     """
     distance = ndimage.distance_transform_edt(free) * _CELL_M
     pieces, count = ndimage.label(free)
@@ -197,7 +198,7 @@ def _cut(free: np.ndarray, min_area_m2: float) -> np.ndarray:
             labels[cores == core] = k
         if not inner:
             labels[mine] = 1
-        labels = _flooded(labels, mine)
+        labels = _flood(labels, mine)
         for k in range(1, labels.max() + 1):
             if (labels == k).sum() >= least:
                 number += 1
@@ -205,8 +206,8 @@ def _cut(free: np.ndarray, min_area_m2: float) -> np.ndarray:
     return out
 
 
-def _flooded(labels: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Labels spread over the free cells, each going to whose label reaches it in the fewest steps."""
+def _flood(labels: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Flood the free cells by labels, each cell from the nearest label in steps."""
     cross = ndimage.generate_binary_structure(2, 1)
     while True:
         spread = ndimage.grey_dilation(labels, footprint=cross)
@@ -216,14 +217,14 @@ def _flooded(labels: np.ndarray, free: np.ndarray) -> np.ndarray:
         labels = np.where(new, spread, labels)
 
 
-def _grown(labels: np.ndarray, wall: np.ndarray) -> np.ndarray:
-    """Labels with the cells of walls that they touch: half of such a cell lies before the wall."""
+def _extend_to_walls(labels: np.ndarray, wall: np.ndarray) -> np.ndarray:
+    """Extend labels to adjacent wall cells, half of which lie in front of the wall."""
     spread = ndimage.grey_dilation(labels, size=(3, 3))
     return np.where((labels == 0) & wall, spread, labels)
 
 
-def _joined_to(labels: np.ndarray, number: int, open_floor: np.ndarray) -> list[int]:
-    """Numbers of the rooms that one can walk to from one: over floor with nothing on it, as wide as a door at least.
+def _connected_rooms(labels: np.ndarray, number: int, open_floor: np.ndarray) -> list[int]:
+    """Return the numbers of rooms connected to a room by open floor at least as wide as a door.
 
     Args:
         labels: (X, Y) of rooms, without their walls.
@@ -239,7 +240,7 @@ def _joined_to(labels: np.ndarray, number: int, open_floor: np.ndarray) -> list[
         both = np.intersect1d(passages[labels == number], passages[labels == other])
         for passage in both[both > 0]:
             rows, columns = np.nonzero((passages == passage) & (labels != number) & (labels != other))
-            cut = not len(rows)  # one piece of floor, parted where it is narrow
+            cut = not len(rows)  # one piece of floor, cut at its narrowest
             if cut or max(np.ptp(rows), np.ptp(columns)) + 1 >= _MIN_DOOR_M / _CELL_M:
                 out.append(other)
                 break

@@ -70,20 +70,20 @@ class NodeLayer:
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Which Gaussians of a capture are one thing: furniture, lamps, pictures.
+    """The segments of a scene: connected groups of Gaussians that are one physical object each.
 
     Args:
-        members: (N,) int32 thing of each Gaussian, in the capture's order; -1 for the building and for dust.
+        members: (N,) int32 segment of each Gaussian, in the scene's order; -1 for the building and for floaters.
         positions: (M, 3) float64 mean of the members, scene frame and unit.
         extents: (M, 2, 3) float64 lowest and highest corner around the members, scene frame and unit.
         colours: (M, 3) float32 median colour, CIE L*a*b* (D65).
-        samples: (K, 3) float64 mean of the members in each small cell, scene frame and unit, thing after thing,
-        sample_colours: (K, 3) float32 their mean colours,
-        sample_counts: (M,) int32 and how many there are of each.
-        unit_m: metres per scene unit that they were found under.
+        samples: (K, 3) float64 mean of the members in each small cell, scene frame and unit, sorted by segment.
+        sample_colours: (K, 3) float32 mean colours of the samples.
+        sample_counts: (M,) int32 number of samples of each segment.
+        unit_m: metres per scene unit at which they were segmented.
 
     Raises:
-        InputError: arrays that do not fit together.
+        InputError: arrays of inconsistent shapes or values.
     """
 
     members: np.ndarray

@@ -9,7 +9,7 @@ import pytest
 from gsmap.localize import Differences, Region, sighted
 from gsmap.map.objects import Known, history_report, objects_report
 from gsmap.map.photos import things_in, with_photos
-from gsmap.objects import permanence
+from gsmap.objects import estimate_persistence
 from gsmap.store.photos import StoredPhoto
 from gsmap.types import MapObject, Sighting, Sim3
 from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
@@ -139,7 +139,10 @@ def test_a_later_photo_ends_what_stood_there():
     assert before.there
     assert not after.there
     assert (after.seen, after.looks) == (before.seen, before.looks + 1)
-    assert permanence(known(kept("1", "2026-07-01T00:00:00+00:00", ABSENT)).objects[0], {}).half_life_days is None
+    assert (
+        estimate_persistence(known(kept("1", "2026-07-01T00:00:00+00:00", ABSENT)).objects[0], {}).half_life_days
+        is None
+    )
 
 
 def test_what_is_said_of_another_place_is_of_another_thing():

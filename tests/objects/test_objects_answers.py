@@ -4,7 +4,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from gsmap.objects import graphml, object_graph, permanence, relations
+from gsmap.objects import estimate_persistence, graphml, object_graph, relations
 from gsmap.types import MapObject, Sighting
 
 DATES = {
@@ -70,7 +70,7 @@ def test_relations_are_of_metres():
     ],
 )
 def test_permanence(states, seen, looks, half_life):
-    stays = permanence(thing("x", [0, 0, 0], [1, 1, 1], states), DATES)
+    stays = estimate_persistence(thing("x", [0, 0, 0], [1, 1, 1], states), DATES)
     assert (stays.seen, stays.looks) == (seen, looks)
     assert stays.half_life_days == (None if half_life is None else pytest.approx(half_life))
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsmap.objects import Placed, fuse
+from gsmap.objects import PlacedSegments, fuse
 
 SIZE = np.array([0.6, 0.5, 0.8])
 GREY, RED = np.array([50.0, 0, 0]), np.array([50.0, 40, 20])
@@ -18,13 +18,13 @@ def surface(low, seed=0, size=SIZE) -> np.ndarray:
     return np.array(low) + points * size
 
 
-def capture(*things, shift=0.0, seed=0) -> Placed:
+def capture(*segments, shift=0.0, seed=0) -> PlacedSegments:
     """Of (corner, colour) things; the whole capture brighter by ``shift``."""
-    points = [surface(low, seed + i) for i, (low, _) in enumerate(things)]
+    points = [surface(low, seed + i) for i, (low, _) in enumerate(segments)]
     rng = np.random.default_rng(seed)
-    lab = [colour + np.array([shift, 0, 0]) + rng.normal(0, 3, (1500, 3)) for _, colour in things]
-    numbers = np.repeat(np.arange(len(things)), 1500)
-    return Placed(np.concatenate(points), numbers, np.concatenate(lab), len(things))
+    lab = [colour + np.array([shift, 0, 0]) + rng.normal(0, 3, (1500, 3)) for _, colour in segments]
+    numbers = np.repeat(np.arange(len(segments)), 1500)
+    return PlacedSegments(np.concatenate(points), numbers, np.concatenate(lab), len(segments))
 
 
 def test_things_at_one_place_are_one_and_others_are_not():
@@ -47,15 +47,15 @@ def test_another_exposure_is_no_other_thing_but_another_colour_is():
     before = capture(([0, 0, 0], GREY), *still)
     brighter = capture(([0, 0, 0], GREY), *still, shift=25.0, seed=3)
     # It shows an end of the thing alone, so that its shape does not say that it is the same.
-    shown = (brighter.things > 0) | (brighter.points[:, 0] < 0.15)
-    brighter = Placed(brighter.points[shown], brighter.things[shown], brighter.lab[shown], brighter.count)
+    shown = (brighter.segments > 0) | (brighter.points[:, 0] < 0.15)
+    brighter = PlacedSegments(brighter.points[shown], brighter.segments[shown], brighter.lab[shown], brighter.count)
     assert ((0, 0), (1, 0)) in fuse([before, brighter])
     # A red one of half the height in its place: the shape agrees too little for it to be the same thing painted.
-    points, things = surface([0, 0, 0], 3, SIZE * [1, 1, 0.4]), np.zeros(1500, int)
+    points, segments = surface([0, 0, 0], 3, SIZE * [1, 1, 0.4]), np.zeros(1500, int)
     rest = capture(*still, seed=4)
-    replaced = Placed(
+    replaced = PlacedSegments(
         np.concatenate([points, rest.points]),
-        np.concatenate([things, rest.things + 1]),
+        np.concatenate([segments, rest.segments + 1]),
         np.concatenate([np.tile(RED, (1500, 1)), rest.lab]),
         5,
     )
@@ -86,7 +86,7 @@ def test_an_object_has_one_thing_of_each_capture():
     """Two parts of it in one capture lie where the other has the whole: the larger one is it."""
     whole = capture(([0, 0, 0], GREY))
     points = surface([0, 0, 0], 4)
-    parts = Placed(points, (points[:, 0] > 0.45).astype(int), np.tile(GREY, (1500, 1)), 2)
+    parts = PlacedSegments(points, (points[:, 0] > 0.45).astype(int), np.tile(GREY, (1500, 1)), 2)
     groups = fuse([whole, parts])
     assert all(len({c for c, _ in group}) == len(group) for group in groups)
     assert ((0, 0), (1, 0)) in groups
@@ -96,7 +96,7 @@ def test_an_object_has_one_thing_of_each_capture():
 
 
 def test_captures_that_saw_nothing_and_none_at_all():
-    nothing = Placed(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 3)), 0)
+    nothing = PlacedSegments(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 3)), 0)
     assert fuse([nothing, capture(([0, 0, 0], GREY)), nothing]) == [((1, 0),)]
     assert fuse([nothing]) == []
 

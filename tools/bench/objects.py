@@ -30,7 +30,7 @@ from gsmap.change import compare
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.objects.segments import find_segments
-from gsmap.objects import Capture, Eyes, changed_thing, make_objects, open_eyes
+from gsmap.objects import RenderedViews, SegmentedScene, find_changed_segment, make_objects, render_views
 from gsmap.types import MapObject, PlacedScene, Segments
 from tools.make.change_truth import Truth, owners
 
@@ -67,13 +67,13 @@ def score(truth: Truth, with_changes: bool) -> Counter[str]:
         counts["things ms"] += round(1000 * (time.process_time() - between))
         counts["surface ms"] += round(1000 * (between - started))
         counts["captures"] += 1
-        captures.append(Capture(when, truth.T_place_scene(when), things))
+        captures.append(SegmentedScene(when, truth.T_place_scene(when), things))
         whose.append(owners(truth, when, truth.gaussians(when).means))
         _pieces(counts, truth.states(when), things, whose[-1])
 
-    def eyes(capture: Capture) -> Eyes:
+    def eyes(capture: SegmentedScene) -> RenderedViews:
         gaussians = formats.read(truth.folder / f"{capture.scene}.ply")
-        return open_eyes(gaussians, formats.read_cameras(truth.folder / f"{capture.scene}.cameras.json"))
+        return render_views(gaussians, formats.read_cameras(truth.folder / f"{capture.scene}.cameras.json"))
 
     moved, parted = _told(truth, captures) if with_changes else ([], [])
     started = time.process_time()
@@ -83,7 +83,7 @@ def score(truth: Truth, with_changes: bool) -> Counter[str]:
     return counts
 
 
-def _told(truth: Truth, captures: list[Capture]) -> tuple[list[Any], list[Any]]:
+def _told(truth: Truth, captures: list[SegmentedScene]) -> tuple[list[Any], list[Any]]:
     """What the changes between the first two captures say of their things, as `make_objects` takes it."""
     sides = [
         PlacedScene(truth.gaussians(when), truth.cameras(when), when, f"2026-01-0{i + 1}T00:00:00+00:00")
@@ -93,8 +93,8 @@ def _told(truth: Truth, captures: list[Capture]) -> tuple[list[Any], list[Any]]:
     parted: list[Any] = []
     for change in compare(*sides).changes:
         if change.kind in ("appeared", "disappeared", "replaced", "moved"):
-            before = 0, changed_thing(captures[0].things.members, change.before)
-            after = 1, changed_thing(captures[1].things.members, change.after)
+            before = 0, find_changed_segment(captures[0].segments.members, change.before)
+            after = 1, find_changed_segment(captures[1].segments.members, change.after)
             parted += [(before, 1)] * (before[1] >= 0) + [(after, 0)] * (after[1] >= 0)
             moved += [(before, after)] * (change.kind == "moved" and min(before[1], after[1]) >= 0)
     return moved, parted
@@ -113,7 +113,11 @@ def _pieces(counts: Counter[str], states: list[dict[str, Any]], things: Segments
 
 
 def _followed(
-    counts: Counter[str], truth: Truth, captures: list[Capture], whose: list[np.ndarray], objects: list[MapObject]
+    counts: Counter[str],
+    truth: Truth,
+    captures: list[SegmentedScene],
+    whose: list[np.ndarray],
+    objects: list[MapObject],
 ) -> None:
     before, after = ({s["id"]: s for s in truth.states(when)} for when in truth.times[:2])
     told = [[_of(captures[i], whose[i], thing.sightings[i].thing) for i in (0, 1)] for thing in objects]
@@ -144,11 +148,11 @@ def _followed(
         counts[what] += right
 
 
-def _of(capture: Capture, owner: np.ndarray, thing: int) -> int:
+def _of(capture: SegmentedScene, owner: np.ndarray, thing: int) -> int:
     """The piece that most of a thing's Gaussians are of."""
     if thing < 0:
         return -1
-    ids, counts = np.unique(owner[capture.things.members == thing], return_counts=True)
+    ids, counts = np.unique(owner[capture.segments.members == thing], return_counts=True)
     return int(ids[np.argmax(counts)])
 
 

@@ -17,8 +17,17 @@ from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.map.visits import MAX_SHIFT_M
 from gsmap.methods import RecipeKey, text_digest
-from gsmap.objects import Capture, Eyes, changed_thing, find_rooms, in_view, make_objects, open_eyes, recipe_key
-from gsmap.objects.fuse import Node
+from gsmap.objects import (
+    RenderedViews,
+    SegmentedScene,
+    find_changed_segment,
+    find_rooms,
+    is_in_view,
+    make_objects,
+    recipe_key,
+    render_views,
+)
+from gsmap.objects.fuse import SegmentId
 from gsmap.store import Store
 from gsmap.store.objects import ObjectSet, Places
 from gsmap.texts import few
@@ -172,7 +181,7 @@ def _made(
     things = {
         scene: graph.things for scene in poses if (graph := graphs[scene]) is not None and graph.things is not None
     }
-    captures = [Capture(scene, poses[scene], mine) for scene, mine in things.items()]
+    captures = [SegmentedScene(scene, poses[scene], mine) for scene, mine in things.items()]
     digests = {scene: _digest(things[scene]) if scene in things else "" for scene in poses}
     before: dict[tuple[str, str, int], tuple[SightingState, float]] = {}
     for old in sets:
@@ -186,17 +195,17 @@ def _made(
                 if one.asked in still and one.scene in still and same:
                     before[one.scene, one.asked, shown[one.asked]] = one.state, one.looked
 
-    def looked(capture: int, node: Node) -> tuple[SightingState, float] | None:
+    def looked(capture: int, node: SegmentId) -> tuple[SightingState, float] | None:
         return before.get((captures[capture].scene, captures[node[0]].scene, node[1]))
 
-    def could_see(capture: Capture, points: np.ndarray) -> bool:
+    def could_see(capture: SegmentedScene, points: np.ndarray) -> bool:
         if key is None or scenes[capture.scene].thinning is not None:
             return False  # what is left of it does not show what it looked at
-        return in_view(store.scenes.cameras(capture.scene), points, settings.objects.max_views)
+        return is_in_view(store.scenes.cameras(capture.scene), points, settings.objects.max_views)
 
-    def eyes(capture: Capture) -> Eyes:
+    def eyes(capture: SegmentedScene) -> RenderedViews:
         gaussians, cameras = store.scenes.gaussians(capture.scene), store.scenes.cameras(capture.scene)
-        return open_eyes(gaussians, cameras, settings.objects.max_views, settings.objects.longest_side_px)
+        return render_views(gaussians, cameras, settings.objects.max_views, settings.objects.longest_side_px)
 
     moved, parted = _told(store, captures)
     objects = make_objects(
@@ -259,15 +268,17 @@ def _when(scene: Scene) -> tuple[bool, float, str]:
     return False, parsed(scene.captured_at).timestamp(), scene.ingested_at or ""
 
 
-def _told(store: Store, captures: Sequence[Capture]) -> tuple[list[tuple[Node, Node]], list[tuple[Node, int]]]:
+def _told(
+    store: Store, captures: Sequence[SegmentedScene]
+) -> tuple[list[tuple[SegmentId, SegmentId]], list[tuple[SegmentId, int]]]:
     """What changes say of things, but for those that a person rejected.
 
     Returns:
         Things that are one though they moved; and things, each with a capture that does not show it where it stood.
     """
     at = {capture.scene: i for i, capture in enumerate(captures)}
-    moved: list[tuple[Node, Node]] = []
-    parted: list[tuple[Node, int]] = []
+    moved: list[tuple[SegmentId, SegmentId]] = []
+    parted: list[tuple[SegmentId, int]] = []
     for comparison in store.changes.current():
         if comparison.older not in at or comparison.newer not in at or not comparison.changes:
             continue
@@ -276,8 +287,8 @@ def _told(store: Store, captures: Sequence[Capture]) -> tuple[list[tuple[Node, N
         for change, kept in zip(found, comparison.changes, strict=True):
             if kept.status == "rejected" or kept.kind not in ("appeared", "disappeared", "replaced", "moved"):
                 continue
-            before = older, changed_thing(captures[older].things.members, change.before)
-            after = newer, changed_thing(captures[newer].things.members, change.after)
+            before = older, find_changed_segment(captures[older].segments.members, change.before)
+            after = newer, find_changed_segment(captures[newer].segments.members, change.after)
             if before[1] >= 0:
                 parted.append((before, newer))
             if after[1] >= 0:

@@ -5,7 +5,7 @@ import pytest
 from made_room import Room, looking_about
 
 from gsmap.geometry.colour import srgb_to_lab
-from gsmap.objects import Eyes, glance, judge, open_eyes
+from gsmap.objects import RenderedViews, classify_observation, observe_points, render_views
 from gsmap.types import Cameras
 
 GREEN = (0.2, 0.6, 0.3)
@@ -20,20 +20,20 @@ def chair() -> tuple[np.ndarray, np.ndarray]:
     return points, np.tile(srgb_to_lab(np.array(GREEN)), (len(points), 1)).astype(float)
 
 
-def eyes(colour=None, cameras: Cameras | None = None, low=(3.2, 1.2, 0.0), high=(3.7, 1.8, 0.9)) -> Eyes:
+def eyes(colour=None, cameras: Cameras | None = None, low=(3.2, 1.2, 0.0), high=(3.7, 1.8, 0.9)) -> RenderedViews:
     room = Room(1)
     if colour is not None:
         room.box(list(low), list(high), colour, 0)
-    return open_eyes(room.made()[0], looking_about() if cameras is None else cameras)
+    return render_views(room.made()[0], looking_about() if cameras is None else cameras)
 
 
-def verdict(seen: Eyes):
+def verdict(seen: RenderedViews):
     points, colours = chair()
-    return judge(glance(seen, points, 1.0), points, colours, np.zeros(3))
+    return classify_observation(observe_points(seen, points, 1.0), points, colours, np.zeros(3))
 
 
 @pytest.fixture(scope="module")
-def empty() -> Eyes:
+def empty() -> RenderedViews:
     return eyes()
 
 
@@ -55,7 +55,7 @@ def test_what_nobody_looked_at_is_unseen_and_not_absent():
     state, looked = verdict(eyes(cameras=Cameras(poses, behind.intrinsics_px, behind.sizes_px)))
     assert state == "unseen"
     assert looked < 0.5
-    assert verdict(Eyes((), (), ()))[0] == "unseen"
+    assert verdict(RenderedViews((), (), ()))[0] == "unseen"
 
 
 def test_a_thing_behind_another_is_unseen():
@@ -72,14 +72,14 @@ def test_made_up_cameras_have_seen_nothing():
     gaussians, _ = Room(1).made()
     cameras = looking_about()
     made_up = Cameras(cameras.T_frame_camera, cameras.intrinsics_px, cameras.sizes_px, synthesised=True)
-    assert open_eyes(gaussians, made_up).cameras == ()
-    assert open_eyes(gaussians, None).cameras == ()
+    assert render_views(gaussians, made_up).cameras == ()
+    assert render_views(gaussians, None).cameras == ()
 
 
 def test_units_of_the_capture_do_not_matter(empty):
     points, colours = chair()
-    metric = glance(empty, points, 1.0)
-    centimetres = Eyes(
+    metric = observe_points(empty, points, 1.0)
+    centimetres = RenderedViews(
         tuple(
             Cameras(
                 np.concatenate(
@@ -97,6 +97,6 @@ def test_units_of_the_capture_do_not_matter(empty):
         tuple(100 * depth for depth in empty.depths),
         empty.colours,
     )
-    same = glance(centimetres, 100 * points, 0.01)
+    same = observe_points(centimetres, 100 * points, 0.01)
     assert (same.through != metric.through).mean() < 0.01
-    assert judge(same, points, colours, np.zeros(3))[0] == "absent"
+    assert classify_observation(same, points, colours, np.zeros(3))[0] == "absent"

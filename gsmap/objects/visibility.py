@@ -1,4 +1,4 @@
-"""Whether a capture looked at a place, and whether something stood there: by its own cameras, in its own renders."""
+"""Visibility of objects in a scene: observation of points in renders from the scene's own cameras."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _MAX_LAB = 14.0  # difference of mean colours, L*a*b* units, of one surface
 
 
 @dataclass(frozen=True, eq=False)
-class Eyes:
-    """What a capture's cameras see, frame and unit of the capture.
+class RenderedViews:
+    """Renders of a scene from its own cameras, scene frame and unit.
 
     Args:
-        cameras: one each.
-        depths: (H, W) float32 each, 0 where nothing was drawn.
-        colours: (H, W, 3) float32 each, L*a*b*.
+        cameras: one camera of each render.
+        depths: (H, W) float32 of each render, 0 without a surface.
+        colours: (H, W, 3) float32 of each render, L*a*b*.
     """
 
     cameras: tuple[Cameras, ...]
@@ -37,13 +37,13 @@ class Eyes:
 
 
 @dataclass(frozen=True, eq=False)
-class Glance:
-    """What a capture saw at some points.
+class PointObservations:
+    """Observation of K points by the views of a scene.
 
     Args:
-        through: (K,) bool, some view's surface lies clearly behind the point.
-        on: (K,) bool, some view's surface lies on it.
-        colours: (K, 3) mean colour of that surface, L*a*b*; NaN where there is none.
+        through: (K,) bool, in free space of some view.
+        on: (K,) bool, on the surface of some view.
+        colours: (K, 3) mean colour of that surface, L*a*b*; NaN without one.
     """
 
     through: np.ndarray
@@ -51,28 +51,27 @@ class Glance:
     colours: np.ndarray
 
 
-def open_eyes(
+def render_views(
     gaussians: Gaussians,
     cameras: Cameras | None,
     max_views: int = MAX_VIEWS,
     longest_side_px: int = LONGEST_SIDE_PX,
-) -> Eyes:
-    """Render a capture through its own cameras; without cameras it has seen nothing."""
+) -> RenderedViews:
+    """Render a scene from its own cameras; no views if cameras are missing or synthesized."""
     if cameras is None or not len(cameras) or cameras.synthesised:
-        return Eyes((), (), ())
+        return RenderedViews((), (), ())
     small = cameras.evenly(max_views).resized(longest_side_px)
     views = tuple(small[i] for i in range(len(small)))
     seen = [render(gaussians, view, dominant_id=False) for view in views]
-    return Eyes(
+    return RenderedViews(
         views,
         tuple(np.where(image.alpha[0] > 0.5, image.depth[0], 0) for image in seen),
         tuple(srgb_to_lab(np.clip(np.nan_to_num(image.colour[0]), 0, 1)) for image in seen),
     )
 
 
-def in_view(cameras: Cameras | None, points: np.ndarray, max_views: int = MAX_VIEWS) -> bool:
-    """Whether any camera that a capture looks with has one of the points (K, 3) in its picture, whatever stands before
-    it; its frame and unit."""
+def is_in_view(cameras: Cameras | None, points: np.ndarray, max_views: int = MAX_VIEWS) -> bool:
+    """Return whether any of a scene's selected cameras has one of the points (K, 3) in its frustum, occluded or not."""
     if cameras is None or cameras.synthesised:
         return False
     some = cameras.evenly(max_views)
@@ -83,8 +82,8 @@ def in_view(cameras: Cameras | None, points: np.ndarray, max_views: int = MAX_VI
     return False
 
 
-def glance(eyes: Eyes, points: np.ndarray, unit_m: float) -> Glance:
-    """What a capture saw at points (K, 3), its frame and unit; ``unit_m`` is metres per unit."""
+def observe_points(eyes: RenderedViews, points: np.ndarray, unit_m: float) -> PointObservations:
+    """Observe points (K, 3) in the views of a scene, its frame and unit; ``unit_m`` is metres per unit."""
     through, times = np.zeros(len(points), bool), np.zeros(len(points))
     colours = np.zeros((len(points), 3))
     for view, depth, colour in zip(eyes.cameras, eyes.depths, eyes.colours, strict=True):
@@ -98,27 +97,29 @@ def glance(eyes: Eyes, points: np.ndarray, unit_m: float) -> Glance:
         times[rows[on]] += 1
         colours[rows[on]] += colour[row[on], column[on]]
     with np.errstate(invalid="ignore"):
-        return Glance(through, times > 0, colours / times[:, None])
+        return PointObservations(through, times > 0, colours / times[:, None])
 
 
-def judge(seen: Glance, points: np.ndarray, colours: np.ndarray, shift: np.ndarray) -> tuple[SightingState, float]:
-    """Whether a thing that other captures show is there.
+def classify_observation(
+    seen: PointObservations, points: np.ndarray, colours: np.ndarray, shift: np.ndarray
+) -> tuple[SightingState, float]:
+    """Classify the observation of an object of other scenes.
 
     Args:
-        seen: what the capture saw at its points.
-        points: (K, 3) of it, metres.
-        colours: (K, 3) its own there, L*a*b*.
-        shift: (3,) by which the capture's colours differ from those, for another exposure.
+        seen: observation of the object's points.
+        points: (K, 3) of the object, metres.
+        colours: (K, 3) colours of these points in the other scene, L*a*b*.
+        shift: (3,) difference in exposure of the scene's colours to those.
 
     Returns:
-        The state: ``unseen`` where too little of its place was looked at; ``seen`` where most of what was looked at
-        is a surface of its colour and was not looked through; else ``absent``. And the share that was looked at.
+        The state, ``unseen`` if too few of the points were observed, ``seen`` if most of the observed points are on a
+        surface of the object's colour, ``absent`` if not; and the fraction of observed points.
     """
     looked = seen.through | seen.on
     share = float(looked.mean()) if len(looked) else 0.0
     if share < _MIN_OBSERVED:
         return "unseen", share
-    # Books and leaves differ from pixel to pixel: what is compared is the mean of a patch.
+    # Texture of books and leaves differs from pixel to pixel, so means of patches are compared.
     rows = np.flatnonzero(seen.on)
     off = seen.colours[rows] - shift - colours[rows]
     label, counts = cell_labels(np.floor(points[rows] / _PATCH_M))
