@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from gsmap import register as registering
     from gsmap.export import PlannedTile
     from gsmap.map.persisting import Passing
-    from gsmap.merge.sights import SightStore
+    from gsmap.merge.reference_view_cache import ReferenceViewCache
     from gsmap.register import SceneView
 
 _MAX_PIXELS = 1 << 24  # of a kept photo: so few bytes can claim any number
@@ -201,13 +201,13 @@ class TileMaker:
     is_cut: bool
     budget_s: float | None
     captured_at: Mapping[str, str | None]
-    store: SightStore
+    store: ReferenceViewCache
     passing: Mapping[str, Passing] = field(default_factory=dict)
     photos: Mapping[str, Sequence[StoredPhoto]] = field(default_factory=dict)
 
     def __call__(self, progress: Progress) -> MergeResult:
         """Merged in metres, in the map's unit when it is done."""
-        from gsmap.merge.placed import pulled_inside
+        from gsmap.merge.overlap import clamp_inside
         from gsmap.merge.tile import LazyScene, merge_tile
 
         scenes, metres = _store(self.location).scenes, self.tile.metres_per_unit
@@ -237,4 +237,4 @@ class TileMaker:
         if metres == 1.0:
             return found
         merged = resized(found.gaussians, 1 / metres)
-        return replace(found, gaussians=replace(merged, means=pulled_inside(merged.means, bounds)))
+        return replace(found, gaussians=replace(merged, means=clamp_inside(merged.means, bounds)))

@@ -1,6 +1,6 @@
-"""Many captures of one place into one set of Gaussians.
+"""Merging of several scenes of one place into one set of Gaussians.
 
-``merge(scenes, method)`` is pure: captures already in the map frame in, Gaussians out. Built-in methods live in
+``merge(scenes, method)`` is pure: scenes in the map frame in, Gaussians out. Built-in methods live in
 `mergers`, other packages add theirs by entry point; all keep the contract in `gsmap.methods.merger`.
 """
 
@@ -22,7 +22,7 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
 VERSION = 1
-"""Of what is done around a merger: which pieces it is given, and what of its answer belongs to a tile."""
+"""Version of the steps around a merger: the selection of its inputs, and of the tile's part of its result."""
 
 __all__ = [
     "VERSION",
@@ -59,7 +59,7 @@ class Params:
         merger(self.method)
 
     def chosen(self) -> Any:
-        """The settings of the merger that is used."""
+        """Return the settings of the merger in use."""
         return self.mergers[self.method]
 
 
@@ -69,22 +69,22 @@ def methods() -> list[str]:
 
 
 def merger(method: str) -> Merger:
-    """A merger by name.
+    """Return a merger by name.
 
     Raises:
-        ConfigError: there is none of that name, or it does not keep the contract.
+        ConfigError: unknown name, or the merger breaks the contract.
     """
     found: Merger = family("merger").get(method)
     return found
 
 
 def default_params(method: str) -> Any:
-    """The method's ``Params`` with their defaults."""
+    """Return the method's default ``Params``."""
     return merger(method).Params()
 
 
 def checked_params(method: str, params: Any) -> Any:
-    """The params, or the method's defaults for None.
+    """Return the params, or the method's defaults for None.
 
     Raises:
         ConfigError: unknown method, params of another method.
@@ -102,27 +102,27 @@ def checked_params(method: str, params: Any) -> Any:
 
 
 def reach_m(method: str, params: Any = None) -> float:
-    """How far beyond a tile's border the Gaussians of scenes decide what is in it, in metres."""
+    """Return the distance in metres beyond a tile's border within which Gaussians affect its content."""
     return merger(method).reach_m(checked_params(method, params))
 
 
 def photos_m(method: str, params: Any = None) -> float | None:
-    """How far beyond a tile's border kept photographs are looked for, in metres; None where none are reproduced."""
+    """Return the distance in metres beyond a tile's border within which kept photos are used; None for no photos."""
     asked = getattr(merger(method), "photos_m", None)
     found: float | None = None if asked is None else asked(checked_params(method, params))
     return found
 
 
 def uses_dates(method: str, params: Any = None) -> bool:
-    """Whether the dates of the captures decide what a tile holds."""
+    """Return whether a tile's content depends on the dates of the scenes."""
     return merger(method).uses_dates(checked_params(method, params))
 
 
 def with_steps(method: str, params: Any, steps: int) -> Any:
-    """The params with so many optimisation steps.
+    """Return the params with a number of optimization steps.
 
     Raises:
-        ConfigError: a method that takes no steps, or a negative number of them.
+        ConfigError: the method has no steps, or the number is negative.
     """
     params, name = checked_params(method, params), merger(method).STEPS
     if name is None:
@@ -140,10 +140,10 @@ PREFERENCES = ("newest", "best", "both")
 
 
 def with_prefer(method: str, params: Any, prefer: str) -> Any:
-    """The params with whom to believe where captures disagree: the newest, whoever saw it best, or both.
+    """Return the params with the preferred scene where scenes disagree: the newest, the best observed, or both.
 
     Raises:
-        ConfigError: another word, or a method that weighs no dates.
+        ConfigError: unknown preference, or the method does not use dates.
     """
     params = checked_params(method, params)
     if prefer not in PREFERENCES:
@@ -158,7 +158,7 @@ def with_prefer(method: str, params: Any, prefer: str) -> Any:
 
 
 def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
-    """What names everything that is merged in this way; the inputs are added by whoever knows them.
+    """Return the recipe of a merge, without its inputs.
 
     Args:
         method: one of `methods()`.
@@ -168,7 +168,7 @@ def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
         ConfigError: unknown method, params of another method.
     """
     how, params = merger(method), checked_params(method, params)
-    # A merger that tells captures apart by their dates renders them for it.
+    # A merger that uses dates compares scenes by renders.
     renders = how.RENDERS or how.uses_dates(params)
     versions = {"merge": VERSION} | ({"compare": compare.VERSION} if renders else {})
     backend, settings = render.backend() if renders else "", plain(params)
@@ -184,21 +184,21 @@ def merge(
     budget_s: float | None = None,
     progress: Progress | None = None,
 ) -> MergeResult:
-    """Merge scenes that lie in one frame.
+    """Merge scenes in one frame.
 
     Args:
-        scenes: captures in the map frame. For a tile, all of their Gaussians within the merger's ``reading_m`` of the
-            bounds (`gsmap.merge.tile.merge_tile` reads just that).
+        scenes: scenes in the map frame; of a tile, all their Gaussians within the merger's ``reading_m`` of the bounds
+            (`gsmap.merge.tile.merge_tile` reads just these).
         method: one of `methods()`.
         params: the method's ``Params``; None takes the defaults.
-        bounds: (2, 3) lowest and highest corner of a tile; the result holds the Gaussians whose mean lies in it, and
-            tiles made apart, in any order, fit together. None merges everything.
-        budget_s: ceiling on the wall seconds an optimising method may take; the result then says `truncated`.
-        progress: told the fraction done in [0, 1] and what is being done.
+        bounds: (2, 3) lowest and highest corner of a tile; the result holds the Gaussians with means in it, and tiles
+            fit together whatever their order. None merges everything.
+        budget_s: limit on the wall-clock seconds of an optimizing method; the result is `truncated` if it was reached.
+        progress: called with the fraction done in [0, 1] and the current step.
 
     Raises:
         ConfigError: unknown method, params of another method, a budget that is not positive.
-        InputError: no scenes, or bounds that are empty.
+        InputError: no scenes, or empty bounds.
     """
     params = checked_params(method, params)
     if budget_s is not None and not budget_s > 0:

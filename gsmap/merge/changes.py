@@ -1,4 +1,4 @@
-"""Where captures disagree because the place changed: who is right, and whose pictures count there."""
+"""Resolution of changes between scenes of different dates: outdated Gaussians and view pixels are removed."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from gsmap.compare import GONE, HIDDEN, OTHER_IN_FRONT, REPAINTED, SAME, UNSEEN,
 from gsmap.geometry.neighbours import nearest_of
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.merge.exposure import apply_balance
-from gsmap.merge.placed import overlapping, share_in_view
+from gsmap.merge.overlap import boxes_overlap, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
 Prefer = Literal["newest", "best", "both"]
-"""Who wins where captures disagree: the ``newest``, whoever saw it ``best``, or nobody, so that ``both`` show."""
+"""Preferred scene where scenes disagree: the ``newest``, the ``best`` observed one, or none, so that ``both`` show."""
 
 LOOKING_M = 10.0
-"""How far around a tile captures and cameras are read where they are compared."""
+"""Distance around a tile, in metres, within which Gaussians and cameras are read for comparison."""
 
 MIN_CAMERAS = 12
-"""Cameras of each capture that are read at least for that, the nearest, wherever they stand."""
+"""Least number of cameras of each scene that are read for comparison, the nearest ones."""
 
-_SHOWS = 0.15  # share of a pixel from which on what is disputed shows in it
-_NEAR_M = 0.25  # of what changed, within which shards of it are looked for
+_SHOWS = 0.15  # blending weight of disputed Gaussians in a disputed pixel
+_NEAR_M = 0.25  # distance from a change within which fragments of it are searched
 _NEGLIGIBLE_GAIN = 0.02
-_INTRUDES = 0.15  # difference of colour, of [0, 1], by which a picture has become another
+_INTRUDES = 0.15  # difference of colour in [0, 1] that a misfit causes in a view
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
-    """Captures after those that disagree have been told apart.
+class ResolvedScenes:
+    """Scenes without outdated Gaussians.
 
     Args:
-        scenes: without the Gaussians that are overruled and in the newest's exposure, in the order they were given.
-        lost: how many Gaussians each lost.
-        changed: per scene (N,) bool, the Gaussians that stand where another capture was overruled: nothing of an older
-            capture is left there to share the work with, so they stay as they are.
-        behind: per scene (N,) bool, the Gaussians beside a change that lie behind what newer captures show: nobody
-            disproved them, but how the place looks now is not told by them.
-        rivals: per scene, what stands now where it is overruled; empty where it is not.
-        losers: per scene, the Gaussians it lost.
+        scenes: in the given order, without outdated Gaussians, and in the newest scene's exposure.
+        lost: number of removed Gaussians of each scene.
+        changed: per scene (N,) bool, Gaussians that replace removed ones of another scene; as no older scene shows
+            their place, they stay as they are.
+        behind: per scene (N,) bool, Gaussians beside a change that are occluded in newer scenes: they are not
+            disproved, but do not show the present place either.
+        rivals: per scene, the present Gaussians at the places of its removed ones; empty without any.
+        losers: per scene, its removed Gaussians.
     """
 
     scenes: list[PlacedScene]
@@ -57,14 +57,14 @@ class Settled:
     _flagged: dict[int, tuple[Gaussians, int]] = field(default_factory=dict)
 
     def overruled_pixels(self, scene: int, camera: Cameras, longest_side_px: int = 240) -> np.ndarray:
-        """(H, W) bool, where a picture of a scene from a camera (1) shows what is not so, or does not show what is."""
+        """Return (H, W) bool, pixels of a scene's view from one camera that show outdated or miss present content."""
         flagged, count = self._flagged_of(scene)
         width, height = (int(v) for v in camera.sizes_px[0])
         small = camera.resized(longest_side_px)
         if not count or not share_in_view(small, flagged.means[:count])[0]:
             return np.zeros((height, width), dtype=bool)
         shows = render(flagged, small, depth=False, dominant_id=False).colour[0, ..., 0] > _SHOWS
-        # A Gaussian's skirts reach beyond the pixels in which it shows.
+        # The tails of a Gaussian reach beyond the pixels that it visibly covers.
         shows = compare.dilate(shows)
         rows = ((np.arange(height) + 0.5) * shows.shape[0] / height).astype(int)
         columns = ((np.arange(width) + 0.5) * shows.shape[1] / width).astype(int)
@@ -72,8 +72,10 @@ class Settled:
         return out
 
     def _flagged_of(self, scene: int) -> tuple[Gaussians, int]:
-        """What is disputed of a scene, white, then the rest of it, black, and how many these are; kept for one scene,
-        as pictures are asked for scene by scene."""
+        """Return a scene's disputed Gaussians in white, the rest in black, and the number of disputed ones.
+
+        The result is cached for one scene, as views are processed scene by scene.
+        """
         if scene not in self._flagged:
             self._flagged.clear()
             disputed = Gaussians.concatenate([self.losers[scene], self.rivals[scene]])
@@ -82,11 +84,11 @@ class Settled:
         return self._flagged[scene]
 
     def is_disputed(self, scene: int) -> bool:
-        """Whether any picture of a scene may show what is not so, or not show what is."""
+        """Return whether any view of a scene may show outdated or miss present content."""
         return len(self.losers[scene]) + len(self.rivals[scene]) > 0
 
     def notes(self) -> list[str]:
-        """Remarks on what was dropped."""
+        """Return notes on removed Gaussians."""
         return [
             f"{n} Gaussians of scene {s.scene_id[:12]} are overruled where the place changed"
             for s, n in zip(self.scenes, self.lost, strict=True)
@@ -94,48 +96,52 @@ class Settled:
         ]
 
 
-def settle(
+def resolve_changes(
     scenes: Sequence[PlacedScene],
     prefer: Prefer = "newest",
     *,
     max_views: int = compare.MAX_VIEWS,
     one_exposure: bool = True,
-) -> Settled:
-    """Drop what captures of other dates disprove.
+) -> ResolvedScenes:
+    """Remove Gaussians that scenes of other dates disprove.
 
-    From the newest capture back, each older one is compared once with what all newer ones are sure of together: N
-    captures cost N comparisons. A Gaussian leaves where that looked through it, or shows its surface in another colour
-    (exposure apart); with ``best`` only if it also saw the place better, and otherwise the newer's Gaussians leave.
-    What no newer capture saw stays. Captures without a date, or of one date, overrule nothing.
+    From the newest scene back, each older one is compared once with the combined views of all newer ones, so that N
+    scenes cost N comparisons. A Gaussian is removed if it lies in free space of these, or on a surface of another
+    colour after exposure balancing; with ``best`` only if they also observed the place better, and otherwise the newer
+    scene's Gaussians are removed. Gaussians unobserved by newer scenes stay. Scenes without dates, or of one date,
+    remove nothing.
 
     Args:
-        one_exposure: bring all of it to the newest's exposure. Not of a piece of a map, whose neighbours would show the
-            same capture in another one.
+        scenes: scenes in the map frame.
+        prefer: preferred scene where scenes disagree.
+        max_views: largest number of views of each scene that are compared.
+        one_exposure: bring all scenes to the newest one's exposure. Not for a piece of a map, whose neighbours would
+            show the same scene in another exposure.
     """
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
     changed, behind = ([np.zeros(len(s.gaussians), dtype=bool) for s in scenes] for _ in range(2))
-    rivals = [_none(s) for s in scenes]
+    rivals = [_empty(s) for s in scenes]
     exposures: list[compare.Balance | None] = [None] * len(scenes)
-    truth: list[_Standing] = []
+    newer: list[_NewerScene] = []
     groups = _by_date(scenes) if prefer != "both" else []
     for group in groups:
         added = []
         for i in group:
             looks = compare.render_views(scenes[i], max_views=max_views)
-            parts = [one for one in truth if overlapping(one.looks.scene, scenes[i])]
+            parts = [one for one in newer if boxes_overlap(one.looks.scene, scenes[i])]
             if not parts:
-                added.append(_Standing(i, looks, np.ones(len(looks.gaussians), dtype=bool)))
+                added.append(_NewerScene(i, looks, np.ones(len(looks.gaussians), dtype=bool)))
                 continue
             joined = compare.combine_views([(one.looks, one.shows) for one in parts], scenes[i], max_views)
             found = compare.compare(looks, joined)
-            verdict = _verdict(looks, joined, found, prefer)
+            verdict = _find_disagreement(looks, joined, found, prefer)
             exposures[i] = _exposure(found)
             keeps[i] &= ~verdict.lost
             if prefer == "newest":
                 beside = _beside(looks.gaussians.means, joined, verdict)
                 behind[i] = beside & (found.older.state == HIDDEN)
                 exposed = _exposed(looks.gaussians, exposures[i])
-                keeps[i] &= ~_intruders(exposed, keeps[i] & beside, joined)
+                keeps[i] &= ~_find_misfits(exposed, keeps[i] & beside, joined)
             first = 0
             for one in parts:
                 rows = np.flatnonzero(one.shows)
@@ -146,15 +152,15 @@ def settle(
                 first += len(rows)
             rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
             if group is groups[-1]:
-                continue  # Nothing is compared with the oldest.
-            # Truth grows by what is new to it alone, so that it stays as large as the place.
+                continue  # nothing is compared with the oldest
+            # Only Gaussians unobserved by newer scenes are added, so that `newer` stays as large as the place.
             shows = keeps[i] & looks.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
             added.append(
-                _Standing(i, _in_one_exposure(compare.mask_outdated(looks, found, keeps[i]), exposures[i]), shows)
+                _NewerScene(i, _in_one_exposure(compare.mask_outdated(looks, found, keeps[i]), exposures[i]), shows)
             )
-        truth += added
-    return Settled(
-        [_left(s, k, e if one_exposure else None) for s, k, e in zip(scenes, keeps, exposures, strict=True)],
+        newer += added
+    return ResolvedScenes(
+        [_remaining(s, k, e if one_exposure else None) for s, k, e in zip(scenes, keeps, exposures, strict=True)],
         [int((~k).sum()) for k in keeps],
         [c[k] for c, k in zip(changed, keeps, strict=True)],
         [b[k] for b, k in zip(behind, keeps, strict=True)],
@@ -164,8 +170,8 @@ def settle(
 
 
 @dataclass(frozen=True, eq=False)
-class _Standing:
-    """A capture among the newer ones: which, its looks, and (N,) which of its Gaussians add to what is shown."""
+class _NewerScene:
+    """A newer scene: its index, its views, and (N,) bool, its Gaussians that are compared with older scenes."""
 
     scene: int
     looks: CaptureViews
@@ -173,15 +179,15 @@ class _Standing:
 
 
 @dataclass(frozen=True, eq=False)
-class _Verdict:
-    """(N,) which Gaussians of the older leave, (M,) which of the newer stand where it changed, (M,) which leave."""
+class _Disagreement:
+    """Masks of (N,) removed Gaussians of the older scene, (M,) replacing and (M,) removed ones of the newer."""
 
     lost: np.ndarray
     changed: np.ndarray
     beaten: np.ndarray
 
 
-def _verdict(older: CaptureViews, newer: CaptureViews, found: Comparison, prefer: Prefer) -> _Verdict:
+def _find_disagreement(older: CaptureViews, newer: CaptureViews, found: Comparison, prefer: Prefer) -> _Disagreement:
     lost = np.isin(found.older.state, (GONE, REPAINTED))
     changed = np.isin(found.newer.state, (GONE, REPAINTED))
     changed |= (found.newer.state != SAME) & _revealed(newer, found)
@@ -190,11 +196,11 @@ def _verdict(older: CaptureViews, newer: CaptureViews, found: Comparison, prefer
         stays = lost & (older.sharpness > found.older.sharpness)
         beaten = np.isin(found.newer.state, (GONE, REPAINTED)) & (newer.sharpness < found.newer.sharpness)
         lost, changed = lost & ~stays, changed & ~beaten
-    return _Verdict(lost, changed, beaten)
+    return _Disagreement(lost, changed, beaten)
 
 
 def _revealed(newer: CaptureViews, found: Comparison) -> np.ndarray:
-    """(M,) which Gaussians of the newer show where the older had a thing before them."""
+    """Return (M,) bool, Gaussians of the newer scene that an object of the older one occluded."""
     count = len(newer.gaussians)
     shown, bared = np.zeros(count), np.zeros(count)
     for picture in found.newer_views:
@@ -206,8 +212,8 @@ def _revealed(newer: CaptureViews, found: Comparison) -> np.ndarray:
     return out
 
 
-def _beside(older: np.ndarray, newer: CaptureViews, verdict: _Verdict) -> np.ndarray:
-    """(N,) which of the older's Gaussians (N, 3) lie beside what left or what is new."""
+def _beside(older: np.ndarray, newer: CaptureViews, verdict: _Disagreement) -> np.ndarray:
+    """Return (N,) bool, Gaussians of the older scene (N, 3) near removed or new ones."""
     disputed = np.concatenate([older[verdict.lost], newer.gaussians.means[verdict.changed]])
     if not len(disputed):
         return np.zeros(len(older), dtype=bool)
@@ -215,15 +221,14 @@ def _beside(older: np.ndarray, newer: CaptureViews, verdict: _Verdict) -> np.nda
     return out
 
 
-def _intruders(older: Gaussians, asked: np.ndarray, newer: CaptureViews) -> np.ndarray:
-    """(N,) which of the older's Gaussians that are asked would show, in pictures of the newer, where these look
-    otherwise.
+def _find_misfits(older: Gaussians, candidates: np.ndarray, newer: CaptureViews) -> np.ndarray:
+    """Return (N,) bool, candidate Gaussians of the older scene that would alter views of the newer one.
 
-    They are in the newer's exposure. A last look at what evidence of single Gaussians leaves beside a change: shards,
-    and what is smaller than a pixel.
+    They are in the newer scene's exposure. Removes what evidence on single Gaussians leaves beside a change: fragments,
+    and Gaussians smaller than a pixel.
     """
     out = np.zeros(len(older), dtype=bool)
-    rows = np.flatnonzero(asked)
+    rows = np.flatnonzero(candidates)
     if not len(rows):
         return out
     count = len(newer.gaussians)
@@ -246,7 +251,7 @@ def _intruders(older: Gaussians, asked: np.ndarray, newer: CaptureViews) -> np.n
 
 
 def _exposure(found: Comparison) -> compare.Balance | None:
-    """What brings the older's colours to the newest's exposure, so that the place shows in one; None for nothing."""
+    """Return the balance from the older scene's to the newest exposure; None if it is negligible."""
     greys = np.tile(np.array([[0.1], [0.5], [0.9]]), 3)
     off = np.log(np.maximum(found.balance.applied(greys), 1e-3) / greys)
     return found.balance if np.abs(off).max() > _NEGLIGIBLE_GAIN else None
@@ -256,28 +261,28 @@ def _exposed(gaussians: Gaussians, exposure: compare.Balance | None) -> Gaussian
     return gaussians if exposure is None else apply_balance(gaussians, exposure)
 
 
-def _left(scene: PlacedScene, stays: np.ndarray, exposure: compare.Balance | None) -> PlacedScene:
+def _remaining(scene: PlacedScene, stays: np.ndarray, exposure: compare.Balance | None) -> PlacedScene:
     if stays.all() and exposure is None:
         return scene
-    # Its views as they were rendered before show what is gone.
-    return replace(scene, sights=None, gaussians=_exposed(scene.gaussians[stays], exposure))
+    # Earlier renders of its views show the removed Gaussians.
+    return replace(scene, reference_views=None, gaussians=_exposed(scene.gaussians[stays], exposure))
 
 
 def _in_one_exposure(looks: CaptureViews, exposure: compare.Balance | None) -> CaptureViews:
-    return replace(looks, scene=_left(looks.scene, np.ones(len(looks.gaussians), dtype=bool), exposure))
+    return replace(looks, scene=_remaining(looks.scene, np.ones(len(looks.gaussians), dtype=bool), exposure))
 
 
 def _in_grey(gaussians: Gaussians, value: float) -> Gaussians:
-    """All of them in one grey, in [0, 1], from wherever they are seen."""
+    """Return the Gaussians in one grey, in [0, 1], independent of the viewing direction."""
     return replace(gaussians, sh=sh0_of_rgb(np.full((len(gaussians), 1, 3), value, np.float32)))
 
 
-def _none(scene: PlacedScene) -> Gaussians:
+def _empty(scene: PlacedScene) -> Gaussians:
     return scene.gaussians[np.zeros(0, dtype=np.int64)]
 
 
 def _by_date(scenes: Sequence[PlacedScene]) -> list[list[int]]:
-    """Indices of the scenes that have a date and meet another, by date, newest first; those of one date together."""
+    """Group the indices of dated scenes by date, newest first; empty for a single date."""
     times = {i: _time(scene.captured_at) for i, scene in enumerate(scenes)}
     dated = {i: time for i, time in times.items() if time is not None}
     groups = [[i for i, then in dated.items() if then == time] for time in sorted(set(dated.values()), reverse=True)]
@@ -285,7 +290,7 @@ def _by_date(scenes: Sequence[PlacedScene]) -> list[list[int]]:
 
 
 def newest_first(scenes: Sequence[PlacedScene]) -> list[int]:
-    """Indices of all scenes, the newest first; those without a date last, in their order."""
+    """Return the indices of all scenes, newest first, undated ones last in their order."""
     times = [_time(scene.captured_at) for scene in scenes]
     return sorted(range(len(scenes)), key=lambda i: (-t.timestamp() if (t := times[i]) else np.inf, i))
 

@@ -1,4 +1,4 @@
-"""Captures taken with different exposure and white balance, brought to one."""
+"""Exposure balancing: scenes of different exposure and white balance are brought to one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from gsmap.compare import Balance
 from gsmap.compare.colours import FLOOR
 from gsmap.geometry.sh import SH_C0, rgb_of_sh0, sh0_of_rgb
-from gsmap.merge.placed import overlapping, share_in_view
+from gsmap.merge.overlap import boxes_overlap, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, KeptPhoto, PlacedScene
 
@@ -24,10 +24,10 @@ _MAX_GAIN = 4.0
 
 
 def balance_exposure(scenes: Sequence[PlacedScene]) -> tuple[list[PlacedScene], np.ndarray]:
-    """The scenes with one gain per scene and colour channel removed, and the log-gains (S, 3) that were added.
+    """Balance scenes by one gain per scene and colour channel; return them and the applied log-gains (S, 3).
 
-    Gains are the least-squares answer to the median log-ratios of colour wherever two captures show the same surface;
-    their mean over scenes that are tied together is zero, so the brightness of the whole stays.
+    Gains are the least-squares solution to the median log-ratios of colour on common surfaces of scene pairs; their
+    mean over connected scenes is zero, which preserves the overall brightness.
     """
     log_gains = _solve(len(scenes), _ratios(scenes), np.log(_MAX_GAIN))
     if np.abs(log_gains).max(initial=0) < _NEGLIGIBLE_LOG_GAIN:
@@ -36,21 +36,21 @@ def balance_exposure(scenes: Sequence[PlacedScene]) -> tuple[list[PlacedScene], 
         replace(
             scene,
             gaussians=apply_gain(scene.gaussians, np.exp(gain)),
-            photos=tuple(_beside(photo, np.exp(gain)) for photo in scene.photos),
+            photos=tuple(_with_gain(photo, np.exp(gain)) for photo in scene.photos),
         )
         for scene, gain in zip(scenes, log_gains, strict=True)
     ]
     return balanced, log_gains
 
 
-def _beside(photo: KeptPhoto, gain: np.ndarray) -> KeptPhoto:
-    """A photograph that is brought to the colours of what is around it, in other colours."""
+def _with_gain(photo: KeptPhoto, gain: np.ndarray) -> KeptPhoto:
+    """Apply a gain to the surroundings that a photo's colours are balanced to."""
     around = photo.around
     return photo if around is None else replace(photo, around=lambda: apply_gain(around(), gain))
 
 
 def apply_gain(gaussians: Gaussians, gain: np.ndarray) -> Gaussians:
-    """Gaussians whose colours are multiplied by ``gain`` (3,), exactly, from every direction."""
+    """Multiply the colours of Gaussians by ``gain`` (3,), exactly, for every viewing direction."""
     sh = gaussians.sh * gain.astype(np.float32)
     # Colour is SH + 0.5: the offset must grow too.
     sh[:, 0] += ((gain - 1) * 0.5 / SH_C0).astype(np.float32)
@@ -58,8 +58,10 @@ def apply_gain(gaussians: Gaussians, gain: np.ndarray) -> Gaussians:
 
 
 def apply_balance(gaussians: Gaussians, balance: Balance) -> Gaussians:
-    """Gaussians in the exposure of another capture: their mean colours on the line of a balance, so that gain, gamma
-    and white balance are in it; what depends on the direction is multiplied by the slope of the line there."""
+    """Bring Gaussians to the exposure of another capture by a balance of gain, gamma and white balance.
+
+    Mean colours follow the balance, and direction-dependent terms are multiplied by its local slope.
+    """
     colours = rgb_of_sh0(gaussians.sh[:, 0]).astype(np.float64)
     within = np.clip(colours, 0, 1)
     slope = balance.slope * (within + FLOOR) ** (balance.slope - 1) * np.exp(balance.offset)
@@ -70,11 +72,11 @@ def apply_balance(gaussians: Gaussians, balance: Balance) -> Gaussians:
 
 
 def _ratios(scenes: Sequence[PlacedScene]) -> list[tuple[int, int, np.ndarray, float]]:
-    """(i, j, median log(colour_i / colour_j) (3,), pixels) of every pair of scenes that show a surface in common."""
+    """Return (i, j, median log(colour_i / colour_j) (3,), pixels) of every pair of scenes with a common surface."""
     found = []
     for i, scene in enumerate(scenes):
         for j, other in enumerate(scenes):
-            if i == j or scene.cameras is None or not overlapping(scene, other):
+            if i == j or scene.cameras is None or not boxes_overlap(scene, other):
                 continue
             cameras = _looking_at(scene.cameras, other.gaussians)
             samples = [_same_surface(scene, other, cameras[c]) for c in range(len(cameras))]
@@ -85,14 +87,14 @@ def _ratios(scenes: Sequence[PlacedScene]) -> list[tuple[int, int, np.ndarray, f
 
 
 def _looking_at(cameras: Cameras, gaussians: Gaussians) -> Cameras:
-    """The few cameras that have most of the Gaussians' means in view."""
+    """Select the few cameras with most of the Gaussians in view."""
     share = share_in_view(cameras, gaussians.means)
     best = np.argsort(-share, kind="stable")[:_MAX_VIEWS]
     return cameras[best[share[best] > 0]].resized(_LONGEST_SIDE_PX)
 
 
 def _same_surface(scene: PlacedScene, other: PlacedScene, camera: Cameras) -> np.ndarray:
-    """(K, 3) log-ratios of colour at pixels where both scenes show one surface, neither black nor blown out."""
+    """Return (K, 3) log-ratios of colour at pixels of a common surface that are neither black nor saturated."""
     a, b = render(scene.gaussians, camera), render(other.gaussians, camera)
     same = np.abs(a.depth[0] - b.depth[0]) < _MAX_DEPTH_RATIO * np.minimum(a.depth[0], b.depth[0])
     same &= (a.alpha[0] > _MIN_ALPHA) & (b.alpha[0] > _MIN_ALPHA)
@@ -103,12 +105,12 @@ def _same_surface(scene: PlacedScene, other: PlacedScene, camera: Cameras) -> np
 
 
 def _solve(count: int, ratios: list[tuple[int, int, np.ndarray, float]], largest: float) -> np.ndarray:
-    """Log-gains (count, 3) to add, so that ``gain_i - gain_j = -ratio_ij`` in the weighted least-squares sense."""
+    """Solve for log-gains (count, 3) with ``gain_i - gain_j = -ratio_ij`` by weighted least squares."""
     normal, right = np.zeros((count, count)), np.zeros((count, 3))
     for i, j, ratio, weight in ratios:
         normal[[i, j], [i, j]] += weight
         normal[[i, j], [j, i]] -= weight
         right[i] -= weight * ratio
         right[j] += weight * ratio
-    # The pseudo-inverse gives every group of tied scenes a mean of zero.
+    # The pseudo-inverse gives every group of connected scenes a mean of zero.
     return np.clip(np.linalg.pinv(normal, hermitian=True) @ right, -largest, largest)

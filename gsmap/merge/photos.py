@@ -1,8 +1,7 @@
-"""Photographs that a map keeps, as pictures that the merged map must look like.
+"""Kept photos as reference views of merging.
 
-A photograph is sharper than any splat. But it has its own exposure, and may show what the capture that it was found in
-does not: people, a chair that was moved, another season. So it is brought to the colours of that capture, and counts
-where it shows the same.
+A photo is sharper than a render, but has its own exposure, and may show people, moved objects or another season than
+the scene that it was localized in. So it is balanced to the colours of that scene, and counts only where both agree.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ _MIN_SLOPE = 0.5  # of that line: a photo of another place follows nothing
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """A photograph that is to be reproduced.
+class PhotoReference:
+    """A photo as a reference view.
 
     Args:
-        camera: one, map frame.
-        image: (H, W, 3) uint8 in the colours of the capture.
-        counts: (H, W) bool, where it shows what that shows.
-        depth: (H, W) float32 of that, 0 where there is none.
+        camera: one camera, map frame.
+        image: (H, W, 3) uint8 in the colours of the scene.
+        counts: (H, W) bool, pixels that agree with the scene.
+        depth: (H, W) float32 depth of the scene, 0 without a surface.
     """
 
     camera: Cameras
@@ -41,9 +40,8 @@ class Shown:
     depth: np.ndarray
 
 
-def shown(photo: KeptPhoto, scene: PlacedScene, longest_side_px: int) -> Shown | None:
-    """A photograph beside what its capture shows from there; None where that is something else, or its pose is not
-    known well enough."""
+def make_photo_reference(photo: KeptPhoto, scene: PlacedScene, longest_side_px: int) -> PhotoReference | None:
+    """Balance a photo to its scene and mask pixels that disagree; None for another place or an uncertain pose."""
     longest = int(photo.camera.sizes_px.max())
     camera = photo.camera.resized(min(longest_side_px, longest))
     seen = render(scene.gaussians if photo.around is None else photo.around(), camera, dominant_id=False)
@@ -68,11 +66,11 @@ def shown(photo: KeptPhoto, scene: PlacedScene, longest_side_px: int) -> Shown |
     if counts.sum() < _MIN_AGREEMENT * opaque.sum():
         return None
     image = np.round(line.applied(picture) * 255).astype(np.uint8)
-    return Shown(camera, image, counts, seen.depth[0])
+    return PhotoReference(camera, image, counts, seen.depth[0])
 
 
 def _resized(picture: np.ndarray, camera: Cameras) -> np.ndarray:
-    """(H, W, 3) float32 in [0, 1] of a camera's size."""
+    """Resize an image to a camera's size, (H, W, 3) float32 in [0, 1]."""
     from PIL import Image
 
     width, height = (int(side) for side in camera.sizes_px[0])

@@ -1,4 +1,4 @@
-"""What the merged map must look like: renders of each capture, alone, from its own cameras, and kept photographs."""
+"""Reference views of a merged tile: renders of each scene from its own cameras, and kept photos."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.projection import in_image, project
 from gsmap.merge import photos
-from gsmap.merge.changes import Settled, newest_first
-from gsmap.merge.placed import share_in_view
-from gsmap.merge.sights import surface_axes
+from gsmap.merge.changes import ResolvedScenes, newest_first
+from gsmap.merge.overlap import share_in_view
+from gsmap.merge.reference_view_cache import surface_axes
 from gsmap.render import Rendering, render
 from gsmap.types import Cameras, Gaussians, PlacedScene
 from gsmap.types.progress import Progress
 
-WEIGHT_UNIT = 0.1  # of `References.visible_pixels`, for what dominates no pixel: always less than one pixel
+WEIGHT_UNIT = 0.1  # of `References.visible_pixels`, for Gaussians that dominate no pixel: always less than one pixel
 
 
 MAX_VIEWS, PHOTO_WEIGHT = 360, 4.0  # defaults of `render_references`
@@ -29,18 +29,17 @@ _MAX_PHOTOS = 120  # of a tile; those in which most of it lies
 
 @dataclass(frozen=True, eq=False)
 class References:
-    """V pictures to reproduce.
+    """V reference views.
 
     Args:
-        cameras: V cameras, map frame, cropped to what counts.
-        images: V pictures (H, W, 3) uint8.
-        weights: V maps (H, W) uint8, 255 where the picture is to be believed and 0 where it says nothing: where the
-            capture saw nothing, and outside the tile.
-        scene: (V,) which scene each was rendered from, or shows what it shows.
-        view_weights: (V,) how often to use each view in one pass over all; at most once what was rendered.
-        visible_pixels: per scene (N,) float32: in how many pixels of its own views each Gaussian dominates; where
-            it dominates none, `WEIGHT_UNIT` times its largest weight in any pixel; 1 for all where there are no views.
-        num_photos: how many of the pictures are photographs.
+        cameras: V cameras, map frame, cropped to the valid pixels.
+        images: V images (H, W, 3) uint8.
+        weights: V maps (H, W) uint8, 255 for fully valid pixels, 0 where the scene is empty and outside the tile.
+        scene: (V,) scene of each view.
+        view_weights: (V,) uses of each view in one pass over all; at most 1 for rendered views.
+        visible_pixels: per scene (N,) float32 number of pixels of its own views that each Gaussian dominates; without
+            any, `WEIGHT_UNIT` times its largest weight in any pixel; 1 for all without views.
+        num_photos: number of views that are photos.
     """
 
     cameras: Cameras
@@ -60,20 +59,27 @@ def render_references(
     bounds: np.ndarray | None,
     halo_m: float,
     longest_side_px: int,
-    settled: Settled | None,
+    settled: ResolvedScenes | None,
     progress: Progress,
     *,
     max_views: int = MAX_VIEWS,
     photo_weight: float = PHOTO_WEIGHT,
 ) -> References:
-    """Render each scene from its own cameras; keep the views that show enough of the tile.
+    """Render each scene from its own cameras, and keep the views that show enough of the tile.
 
-    A camera of one capture says nothing about what that capture never saw: pixels count as far as the capture itself
-    covers them. For a tile they count where the surface seen lies inside it or within half the halo, so that what is
-    at the border is held from both sides, and they show what lies within the halo alone: what glimmers through from
-    beyond is not there when the tile is fitted, and must not be made up for. ``settled`` (`gsmap.merge.changes`) knows
-    where the pictures of a scene are overruled. Photographs count where they show what their scene shows
-    (`gsmap.merge.photos`).
+    Pixels are weighted by the scene's own opacity. For a tile, pixels are valid whose surface lies inside it or within
+    half the halo, so that the border is constrained from both sides, and only Gaussians within the halo are rendered,
+    as farther ones are absent when the tile is fitted.
+
+    Args:
+        scenes: in the map frame.
+        bounds: (2, 3) box of the tile; None for all.
+        halo_m: width of the tile's surroundings.
+        longest_side_px: longest side of the views.
+        settled: outdated pixels of each scene's views (`gsmap.merge.changes`); None for none.
+        progress: called with the fraction done in [0, 1] and the current step.
+        max_views: largest number of rendered views.
+        photo_weight: uses of a photo in every pass, relative to a rendered view; 0 ignores photos.
     """
     near = [inside(scene.gaussians.means, bounds, halo_m) for scene in scenes]
     pieces = [scene.gaussians if n.all() else scene.gaussians[n] for scene, n in zip(scenes, near, strict=True)]
@@ -87,17 +93,19 @@ def render_references(
     cameras, images, weights, kept, shares = [], [], [], [], []
     pixels, sure = ([np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes] for _ in range(2))
     largest = [np.zeros(len(scene.gaussians), dtype=np.float32) for scene in scenes]
-    sights = [
-        scene.sights(longest_side_px)
-        if scene.sights is not None and (settled is None or not settled.is_disputed(i))
+    reference_views = [
+        scene.reference_views(longest_side_px)
+        if scene.reference_views is not None and (settled is None or not settled.is_disputed(i))
         else None
         for i, scene in enumerate(scenes)
     ]
-    todo.sort(key=lambda one: (one[0], () if (shared := sights[one[0]]) is None else shared.cell(one[1]), one[1]))
+    todo.sort(
+        key=lambda one: (one[0], () if (shared := reference_views[one[0]]) is None else shared.cell(one[1]), one[1])
+    )
     for done, (i, c, camera) in enumerate(todo):
         progress(done / len(todo), "rendering the captures")
         disputed = None
-        if (shared := sights[i]) is not None:
+        if (shared := reference_views[i]) is not None:
             sight = shared.of(c)
             shared.count(sight, pixels[i], largest[i])
             if not shared.touches(sight, bounds, halo_m / 2):
@@ -145,14 +153,14 @@ def render_references(
     often = np.minimum(1.0, np.array(shares) / _FULL_TILE_FRACTION)
     often[num_rendered:] *= photo_weight
     return References(
-        _joined(cameras),
+        _concatenate_cameras(cameras),
         images,
         weights,
         scene=np.array(kept, dtype=np.int64),
         view_weights=often,
         visible_pixels=[
             _visible_pixels(np.where(s > 0, p, 0) if shared is None else p, w, whole=bounds is None)
-            for p, s, w, shared in zip(pixels, sure, largest, sights, strict=True)
+            for p, s, w, shared in zip(pixels, sure, largest, reference_views, strict=True)
         ],
         num_photos=len(kept) - num_rendered,
     )
@@ -162,33 +170,33 @@ def _photos(
     scenes: Sequence[PlacedScene],
     pieces: Sequence[Gaussians],
     longest_side_px: int,
-) -> Iterator[tuple[int, photos.Shown]]:
-    """Photographs that may show the tile and are to be believed, with the scene of each."""
-    asked = [
+) -> Iterator[tuple[int, photos.PhotoReference]]:
+    """Yield photos that show the tile and agree with their scene, with the index of that scene."""
+    candidates = [
         (i, photo, share)
         for i, (scene, piece) in enumerate(zip(scenes, pieces, strict=True))
         for photo in scene.photos
         if (share := float(share_in_view(photo.camera, piece.means)[0])) > 0
     ]
-    if len(asked) > _MAX_PHOTOS:
-        most = np.argsort([-share for _, _, share in asked], kind="stable")[:_MAX_PHOTOS]
-        asked = [asked[row] for row in sorted(most)]
-    for i, photo, _ in asked:
-        one = photos.shown(photo, scenes[i], longest_side_px)
+    if len(candidates) > _MAX_PHOTOS:
+        most = np.argsort([-share for _, _, share in candidates], kind="stable")[:_MAX_PHOTOS]
+        candidates = [candidates[row] for row in sorted(most)]
+    for i, photo, _ in candidates:
+        one = photos.make_photo_reference(photo, scenes[i], longest_side_px)
         if one is not None:
             yield i, one
 
 
-_SAMPLE = 600  # points by which views are chosen, where there are too many
+_SAMPLE = 600  # points by which views are selected, if there are too many
 
 
 def _best_views(
     todo: list[tuple[int, int, Cameras]], scenes: Sequence[PlacedScene], pieces: Sequence[Gaussians], count: int
 ) -> list[tuple[int, int, Cameras]]:
-    """At most ``count`` of the views: one after another which adds most to what the others see, in their order.
+    """Select at most ``count`` views greedily by coverage, in their order.
 
-    A view adds to each point in its picture what it has in pixels a metre there, less for every view that has the point
-    already, and less for a capture the older it is.
+    A view adds to each visible point its resolution in pixels per metre, less for every selected view of the point, and
+    less for older scenes.
     """
     if len(todo) <= count:
         return todo
@@ -199,7 +207,7 @@ def _best_views(
     for row, (i, _, camera) in enumerate(todo):
         pixels, depth = project(points, camera.T_camera_frame[0], camera.intrinsics_px[0])
         seen = in_image(pixels, depth, camera.sizes_px[0], near=0.1)
-        # What is nearer than a metre is not seen that much better.
+        # Nearer than a metre, resolution does not count more.
         sharpness[row, seen] = 1 / np.maximum(depth[seen], 1.0) / (1 + 0.1 * age[i])
     often = np.zeros(len(points), dtype=np.float32)
     chosen = []
@@ -214,16 +222,16 @@ def _best_views(
 def _count(
     seen: Rendering, disputed: np.ndarray | None, pixels: np.ndarray, sure: np.ndarray, largest: np.ndarray
 ) -> None:
-    """What shows where something was taken away was never seen there: it counts for nothing."""
-    shown = seen.dominant_id[0]
-    pixels += np.bincount(shown[shown >= 0], minlength=len(pixels))
-    undisputed = shown >= 0 if disputed is None else (shown >= 0) & ~disputed
-    sure += np.bincount(shown[undisputed], minlength=len(pixels))
+    """Count dominated pixels, all and undisputed: Gaussians visible only at disputed pixels count for nothing."""
+    dominant = seen.dominant_id[0]
+    pixels += np.bincount(dominant[dominant >= 0], minlength=len(pixels))
+    undisputed = dominant >= 0 if disputed is None else (dominant >= 0) & ~disputed
+    sure += np.bincount(dominant[undisputed], minlength=len(pixels))
     np.maximum(largest, seen.max_weight, out=largest)
 
 
 def _window(counts: np.ndarray, margin_px: int) -> tuple[slice, slice]:
-    """The part of a picture that counts, with a margin for windows of SSIM."""
+    """Return the bounding window of the valid pixels, with a margin for the windows of SSIM."""
     spans = []
     for axis in (1, 0):
         used = np.flatnonzero(counts.any(axis=axis))
@@ -240,10 +248,10 @@ def _cropped(camera: Cameras, window: tuple[slice, slice]) -> Cameras:
 
 
 def _visible_pixels(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:
-    """See `References.visible_pixels`.
+    """Compute `References.visible_pixels` of one scene.
 
-    What no view saw shows nothing of a whole capture; of a piece of one, other views may have seen it, so it goes after
-    what is seen and yet dominates nothing.
+    Unobserved Gaussians count 0 in a whole scene; in a piece of one, further views may observe them, so they count
+    half a pixel.
     """
     if not largest.any():
         return np.ones(len(pixels), dtype=np.float32)
@@ -252,19 +260,19 @@ def _visible_pixels(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.
 
 
 def view_schedule(view_weights: np.ndarray, steps: int, seed: int) -> np.ndarray:
-    """(steps,) which view to use at each step: each in proportion to its weight, spread evenly over time."""
+    """Return (steps,) the view of each step, in proportion to the weights and spread evenly over time."""
     rng = np.random.default_rng(seed)
     times, views = [], []
     for view, rate in enumerate(view_weights / view_weights.sum()):
         count = int(np.ceil(steps * rate)) + 1
-        # Every view takes its turn once per 1/rate steps, at a phase of its own each time.
+        # Every view is used once per 1/rate steps, at a random phase each time.
         times.append((np.arange(count) + rng.random(count)) / rate)
         views.append(np.full(count, view))
     return np.concatenate(views)[np.argsort(np.concatenate(times), kind="stable")][:steps]
 
 
 def inside_pixels(camera: Cameras, depth: np.ndarray, bounds: np.ndarray | None, band_m: float) -> np.ndarray:
-    """(H, W) bool, whether the surface seen in each pixel of a depth map lies in the bounds grown by a band."""
+    """Return (H, W) bool, pixels of a depth map whose surface lies in the bounds grown by a band."""
     if bounds is None:
         return np.ones(depth.shape, dtype=bool)
     found: np.ndarray = depth > 0
@@ -273,7 +281,7 @@ def inside_pixels(camera: Cameras, depth: np.ndarray, bounds: np.ndarray | None,
     return found
 
 
-def _joined(cameras: list[Cameras]) -> Cameras:
+def _concatenate_cameras(cameras: list[Cameras]) -> Cameras:
     if not cameras:
         return Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2)))
     return Cameras(

@@ -1,4 +1,4 @@
-"""Which Gaussians of overlapping captures to keep: one capture per place, and of it what shows."""
+"""Selection of Gaussians of overlapping scenes: one owner scene per cell."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import numpy as np
 from gsmap.types import Gaussians
 
 
-def one_owner_per_cell(
+def select_owners(
     gaussians: Gaussians, origin: np.ndarray, visible_pixels: np.ndarray, cell_m: float, cover_m: float
 ) -> np.ndarray:
-    """(N,) which Gaussians stay when every cell of a grid belongs to the capture that shows most of it.
+    """Return (N,) bool, Gaussians that stay when every grid cell belongs to the scene that shows most of it.
 
-    Two captures of one surface laid over one another blur it and stop its light twice: the ghosts of a plain union.
-    A Gaussian of another capture than its cell's owner stays only where the owner has nothing near: a place the owner
-    did not see.
+    Two scenes of one surface overlaid blur it and absorb light twice: the ghosts of a plain union. A Gaussian of
+    another scene than its cell's owner stays only where the owner has none near, as it did not observe the place.
 
     Args:
-        origin: (N,) capture each Gaussian came from.
-        visible_pixels: (N,) pixels that each Gaussian dominates in its own capture's views.
-        cell_m: side of a cell.
-        cover_m: an owner's Gaussian this near covers another's.
+        gaussians: N Gaussians of all scenes.
+        origin: (N,) scene of each Gaussian.
+        visible_pixels: (N,) pixels that each Gaussian dominates in its own scene's views.
+        cell_m: edge of a cell.
+        cover_m: distance within which a Gaussian of the owner replaces another scene's.
     """
     from scipy.spatial import cKDTree
 
@@ -45,8 +45,8 @@ def one_owner_per_cell(
     return stays
 
 
-def beside(means: np.ndarray, origin: np.ndarray, chosen: np.ndarray, distance_m: float) -> np.ndarray:
-    """(N,) which of the Gaussians that are not chosen lie within a distance of one of another capture that is."""
+def near_other_scene(means: np.ndarray, origin: np.ndarray, chosen: np.ndarray, distance_m: float) -> np.ndarray:
+    """Return (N,) bool, Gaussians not chosen that lie within a distance of a chosen one of another scene."""
     from scipy.spatial import cKDTree
 
     near = np.zeros(len(means), dtype=bool)

@@ -1,4 +1,4 @@
-"""Merging one tile of a map from scenes that are read piece by piece."""
+"""Merging of one tile from scenes that are read in pieces."""
 
 from __future__ import annotations
 
@@ -13,8 +13,14 @@ from gsmap.errors import InputError
 from gsmap.geometry.boxes import inside, moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import checked_params, merge, merger
-from gsmap.merge.placed import overlapping
-from gsmap.merge.sights import Nearby, PlacedSights, Sights, SightStore, keys_of
+from gsmap.merge.overlap import boxes_overlap
+from gsmap.merge.reference_view_cache import (
+    PlacedReferenceViews,
+    ReferenceViewCache,
+    RegionCache,
+    SceneReferenceViews,
+    keys_of,
+)
 from gsmap.types import Cameras, Gaussians, KeptPhoto, MergeResult, PlacedScene, Sim3
 from gsmap.types.progress import Progress
 
@@ -24,15 +30,15 @@ class LazyScene:
     """A placed scene that can be read in pieces.
 
     Args:
-        scene_id: which scene.
-        S_map_scene: where it lies.
-        load: the Gaussians whose means lie in a box (2, 3) of the scene's frame, or more of them; all for None.
+        scene_id: id of the scene.
+        S_map_scene: pose of the scene.
+        load: loads the Gaussians with means in a box (2, 3) of the scene frame, or more; all for None.
         cameras: its cameras, scene frame.
         captured_at: ISO 8601 time with zone, or None.
-        store: where what its views show is kept for other tiles.
-        without: names what ``load`` leaves out of it; empty where that is nothing.
-        load_within: as ``load`` of a box, but no more than asked for, where that is cheaper.
-        photos: kept photographs that show it and are to take part, its frame and unit.
+        store: cache of its reference views, shared with further tiles.
+        without: digest of the Gaussians that ``load`` leaves out; empty for none.
+        load_within: as ``load``, but without Gaussians outside of the box, where that is cheaper.
+        photos: kept photos of the scene, scene frame and unit.
     """
 
     scene_id: str
@@ -40,13 +46,13 @@ class LazyScene:
     load: Callable[[np.ndarray | None], Gaussians]
     cameras: Cameras | None = None
     captured_at: str | None = None
-    store: SightStore = field(default_factory=SightStore)
+    store: ReferenceViewCache = field(default_factory=ReferenceViewCache)
     without: str = ""
     load_within: Callable[[np.ndarray], Gaussians] | None = None
     photos: tuple[KeptPhoto, ...] = ()
 
     def centroid(self) -> np.ndarray | None:
-        """(3,) mean of all of its means, map frame; None where it holds nothing."""
+        """Return (3,) the mean of all its means, map frame; None if it is empty."""
         means = self.load(None).means
         return self.S_map_scene.apply(means.mean(0, dtype=np.float64)) if len(means) else None
 
@@ -60,10 +66,10 @@ def merge_tile(
     budget_s: float | None = None,
     progress: Progress | None = None,
 ) -> MergeResult:
-    """Read what lies around a tile, bring it to the map frame and merge it; see `gsmap.merge.merge`.
+    """Read the surroundings of a tile, transform them to the map frame and merge them; see `gsmap.merge.merge`.
 
-    Memory is bounded by what lies within the merger's ``reading_m`` of the tile, and around one camera of one scene.
-    ``origin`` of the result counts in ``scenes``.
+    Memory is bounded by the Gaussians within the merger's ``reading_m`` of the tile, and around one camera of one
+    scene. ``origin`` of the result indexes ``scenes``.
     """
     if not scenes:
         raise InputError("nothing to merge: no scene touches the tile", code="nothing_to_merge")
@@ -78,10 +84,10 @@ def merge_tile(
 
 
 def _undated(placed: Sequence[PlacedScene]) -> list[str]:
-    """A remark where captures that overlap cannot all be put in order of time."""
+    """Return a note if overlapping scenes lack dates."""
     if all(scene.captured_at is not None for scene in placed):
         return []
-    meeting = [scene for scene in placed if any(scene is not other and overlapping(scene, other) for other in placed)]
+    meeting = [scene for scene in placed if any(scene is not other and boxes_overlap(scene, other) for other in placed)]
     count = sum(scene.captured_at is None for scene in meeting)
     if not count:
         return []
@@ -93,7 +99,7 @@ def _undated(placed: Sequence[PlacedScene]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Reading:
-    """What a merger wants of every scene; see `gsmap.methods.merger.Merger`."""
+    """Distances and counts that a merger requires of every scene; see `gsmap.methods.merger.Merger`."""
 
     reach_m: float
     reading_m: float
@@ -118,37 +124,39 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pla
         cameras = cameras[found]
         if inside(cameras.centers, near).all() and reading.looking_m > 0:
             rows = found
-        if rows is None or reading.reading_m > reading.reach_m:  # the Gaussians themselves tell what cameras see
+        if rows is None or reading.reading_m > reading.reach_m:  # views are rendered from these Gaussians
             box = np.array([np.minimum(box[0], around[0]), np.maximum(box[1], around[1])])
     read = (scene.load_within or scene.load)(_box_in(S.inverse(), box))
     inner = inside(S.apply(read.means).astype(np.float32), box)
     read = read if inner.all() else read[inner]
-    sights = None
+    reference_views = None
     if rows is not None:
-        sights = partial(_sights, scene, around_m, rows, keys_of(read.means))
+        reference_views = partial(_reference_views, scene, around_m, rows, keys_of(read.means))
     moved = transform_gaussians(read, S)
-    place = Nearby(lambda near: transform_gaussians(scene.load(near), S), around_m / S.scale)
+    place = RegionCache(lambda near: transform_gaussians(scene.load(near), S), around_m / S.scale)
     photos = tuple(replace(_placed(p, S), around=partial(place.of, p.camera.centers[0])) for p in scene.photos)
-    return PlacedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, sights, photos)
+    return PlacedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, reference_views, photos)
 
 
 def _placed(photo: KeptPhoto, S: Sim3) -> KeptPhoto:
     return replace(photo, camera=transform_cameras(photo.camera, S), sigma_m=photo.sigma_m * S.scale)
 
 
-def _sights(
+def _reference_views(
     scene: LazyScene, around_m: float, rows: np.ndarray, keys: np.ndarray, longest_side_px: int
-) -> PlacedSights:
+) -> PlacedReferenceViews:
     assert scene.cameras is not None
     around = around_m / scene.S_map_scene.scale
-    sights = Sights(scene.scene_id + scene.without, scene.load, scene.cameras, around, longest_side_px, scene.store)
-    return PlacedSights(sights, scene.S_map_scene, rows, keys, np.argsort(keys, kind="stable"))
+    reference_views = SceneReferenceViews(
+        scene.scene_id + scene.without, scene.load, scene.cameras, around, longest_side_px, scene.store
+    )
+    return PlacedReferenceViews(reference_views, scene.S_map_scene, rows, keys, np.argsort(keys, kind="stable"))
 
 
 def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarray:
-    """The box, grown to hold at least the nearest few cameras.
+    """Grow a box to contain at least the nearest few cameras.
 
-    A box is convex: what a camera inside it sees of the tile is hidden by nothing outside it, so pieces suffice.
+    A box is convex, so nothing outside occludes the tile from a camera inside, and the piece in the box suffices.
     """
     distance = np.linalg.norm(np.maximum(np.maximum(box[0] - centers, centers - box[1]), 0), axis=1)
     nearest = centers[np.argsort(distance, kind="stable")[:count]]
@@ -158,7 +166,7 @@ def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarra
 
 
 def _box_in(S_b_a: Sim3, box: np.ndarray) -> np.ndarray:
-    """The axis-aligned box (2, 3) in frame b around a box of frame a, a touch larger against rounding."""
+    """Return the axis-aligned box (2, 3) in frame b around a box of frame a, padded against rounding."""
     moved = moved_box(box, S_b_a)
     pad = 1e-5 * (1 + np.abs(moved).max())
     return np.array([moved[0] - pad, moved[1] + pad])

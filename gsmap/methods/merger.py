@@ -45,7 +45,8 @@ class Merger(Protocol):
     def reading_m(self, params: Any, dated: bool) -> float:
         """How far beyond a tile's bounds Gaussians are read, in metres; at least `reach_m`.
 
-        More than that where Gaussians farther away stand in cameras' ways, and `PlacedScene.sights` does not do.
+        More than that where Gaussians farther away stand in cameras' ways, and `PlacedScene.reference_views` does not
+        do.
 
         Args:
             dated: whether captures of several dates come near the tile.
@@ -82,7 +83,7 @@ class Merger(Protocol):
             scenes: at least one, in the order of their ids, map frame. For a tile each holds at least its Gaussians
                 within `reading_m` of the bounds, and its cameras within `looking_m`; what must be known of the whole
                 capture it can be asked for (`PlacedScene.whole_centroid`), and what its views show
-                (`PlacedScene.sights`).
+                (`PlacedScene.reference_views`).
             params: an instance of ``Params``.
             bounds: (2, 3) float64 lowest and highest corner of the tile; None for everything.
             budget_s: ceiling on the wall seconds it may take (None for no ceiling); closed forms ignore it.

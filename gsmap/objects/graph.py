@@ -21,10 +21,10 @@ def object_graph(
     """Build a `networkx.MultiDiGraph` of objects, relations and rooms, with attributes that GraphML supports.
 
     Nodes: ``kind`` (object), ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
-    ``seen``, ``looks``, ``half_life_days`` (absent if unknown), ``there`` (seen in the newest observation), ``name`` and
-    ``label`` (absent if none was given). Edges: ``kind`` (on, in, next to). Rooms are nodes, too: ``kind`` (room),
-    ``component``, ``x y z`` (the middle of the floor), ``area_m2``; an object has an edge ``in room`` to the one it
-    stands in, and rooms have one ``door`` each way.
+    ``seen``, ``looks``, ``half_life_days`` (absent if unknown), ``there`` (seen in the newest observation), ``name``
+    and ``label`` (absent if none was given). Edges: ``kind`` (on, in, next to). Rooms are nodes, too: ``kind`` (room),
+    ``component``, ``x y z`` (middle of the floor), ``area_m2``; an object has an edge ``in room`` to its room, and
+    rooms have an edge ``door`` in each direction.
 
     Args:
         dates: as for `estimate_persistence`.

@@ -1,8 +1,8 @@
 """Room segmentation: the floor plan of a place, cut at walls, lintels of doors and narrow passages.
 
-Between the height of doors and the ceiling there are only walls and lintels, so a connected floor at that height is one
-room, whatever its furniture. Where doors reach the ceiling, or lintels are unobserved, a passage narrower than `_DOOR_M`
-separates two rooms (as in Bormann et al. 2016, "Room segmentation: survey, implementation, and analysis").
+Between the height of doors and the ceiling there are only walls and lintels, so a connected floor at that height is
+one room, whatever its furniture. Where doors reach the ceiling, or lintels are unobserved, a passage narrower than
+`_DOOR_M` separates two rooms (as in Bormann et al. 2016, "Room segmentation: survey, implementation, and analysis").
 """
 
 from __future__ import annotations

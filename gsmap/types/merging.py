@@ -42,8 +42,8 @@ class PlacedScene:
         captured_at: ISO 8601 time with zone, or None.
         centroid: reads the whole capture and returns (3,) the mean of its means, map frame (None where it is empty);
             given where `gaussians` is only a piece of it. See `whole_centroid`.
-        sights: what its views show (`gsmap.merge.sights.PlacedSights`), given the longest side of a picture; None where
-            it is to be rendered from `gaussians`.
+        reference_views: renders of its views (`gsmap.merge.reference_view_cache.PlacedReferenceViews`), given the
+            longest side of an image in pixels; None where they are to be rendered from `gaussians`.
         photos: photographs that show the place as this capture does, each as far as it does.
     """
 
@@ -52,7 +52,7 @@ class PlacedScene:
     scene_id: str = ""
     captured_at: str | None = None
     centroid: Callable[[], np.ndarray | None] | None = None
-    sights: Callable[[int], Any] | None = None
+    reference_views: Callable[[int], Any] | None = None
     photos: tuple[KeptPhoto, ...] = ()
 
     def whole_centroid(self) -> np.ndarray | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import default_params, merge
-from gsmap.merge.changes import settle
+from gsmap.merge.changes import resolve_changes
 from gsmap.merge.exposure import apply_gain, balance_exposure
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
@@ -63,7 +63,7 @@ def merged(method: str, **settings: object) -> Callable[[], dict[str, np.ndarray
 
 
 def changes() -> dict[str, np.ndarray]:
-    found = settle(scenes())
+    found = resolve_changes(scenes())
     pixels = found.overruled_pixels(0, cameras(np.zeros(1)))
     kept = {f"kept_{s.scene_id}": s.gaussians.means for s in found.scenes}
     return kept | {"lost": np.array(found.lost), "changed": found.changed[1], "overruled": pixels}

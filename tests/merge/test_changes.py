@@ -9,7 +9,7 @@ from synthetic_walls import cameras_facing, texture, wall
 from gsmap import compare
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.merge import changes, default_params, merge
-from gsmap.merge.changes import settle
+from gsmap.merge.changes import resolve_changes
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.mergers import tto
 from gsmap.merge.references import render_references
@@ -30,33 +30,33 @@ def standing(settled, index):
 
 def test_what_a_later_capture_looked_through_is_gone():
     old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
-    settled = settle([old, new])
+    settled = resolve_changes([old, new])
     assert standing(settled, 0) == 0
     assert len(box(5)) <= settled.lost[0] <= 1.05 * len(box(5))
     assert settled.lost[1] == 0
     # The other way round the box is new, and stays; so it does where nobody knows the time, or it is the same.
     later = replace(old, captured_at="2022-01-01")
-    assert standing(settle([later, new]), 0) == len(box(5))
+    assert standing(resolve_changes([later, new]), 0) == len(box(5))
     for when in (None, new.captured_at):
-        assert settle([replace(old, captured_at=when), new]).lost == [0, 0]
+        assert resolve_changes([replace(old, captured_at=when), new]).lost == [0, 0]
 
 
 def test_an_older_capture_in_another_exposure_loses_no_more_beside_what_went():
     scene = Gaussians.concatenate([wall(1, -1, 1, colour=plain), box(5)])
     old = dated("old", 2020, apply_gain(scene, np.full(3, 0.6)))
-    assert settle([old, dated("new", 2021, wall(2, -1, 1, colour=plain))]).lost == [len(box(5)), 0]
+    assert resolve_changes([old, dated("new", 2021, wall(2, -1, 1, colour=plain))]).lost == [len(box(5)), 0]
 
 
 def test_what_no_newer_capture_saw_stays():
     away = dated("new", 2021, wall(1, -1.5, 1.5), cameras=cameras_facing(np.linspace(-3.6, -3.0, 7)))
     old = dated("old", 2020, wall(0, -1.5, 1.5), box(5))
-    assert settle([old, away]).lost == [0, 0]
+    assert resolve_changes([old, away]).lost == [0, 0]
 
 
 def test_paint_is_told_from_exposure():
     old = dated("old", 2020, wall(0, -1.5, 1.5, colour=plain))
     painted = dated("new", 2021, wall(1, -1.5, 1.5, colour=patched))
-    settled = settle([old, painted])
+    settled = resolve_changes([old, painted])
     left = settled.scenes[0].gaussians.means
     in_patch = (np.abs(left[:, 0]) < 0.25) & (np.abs(left[:, 1]) < 0.2)
     far = (np.abs(old.gaussians.means[:, 0]) > 0.4) | (np.abs(old.gaussians.means[:, 1]) > 0.35)
@@ -65,10 +65,10 @@ def test_paint_is_told_from_exposure():
     # The same picture a stop and a half darker and in warmer light says nothing of paint ...
     gain = np.array([0.5, 0.4, 0.3])
     lit = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=plain), gain))
-    assert settle([old, lit]).lost == [0, 0]
+    assert resolve_changes([old, lit]).lost == [0, 0]
     # ... and hides none.
     both = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=patched), gain))
-    left = settle([old, both]).scenes[0].gaussians.means
+    left = resolve_changes([old, both]).scenes[0].gaussians.means
     assert ((np.abs(left[:, 0]) < 0.25) & (np.abs(left[:, 1]) < 0.2)).sum() == 0
 
 
@@ -76,7 +76,7 @@ def test_pictures_of_what_is_not_so_any_more_are_not_learnt():
     bare, with_box = [wall(1, -1.5, 1.5)], [wall(0, -1.5, 1.5), box(5)]
     for before, after in ((with_box, bare), (bare, with_box)):
         old, new = dated("old", 2020, *before), dated("new", 2021, *after)
-        settled = settle([old, new])
+        settled = resolve_changes([old, new])
         plain_views = render_references([old, new], None, 0.0, 64, None, quiet)
         views = render_references(settled.scenes, None, 0.0, 64, settled, quiet)
         middle = 3  # looks straight at the box
@@ -92,11 +92,11 @@ def test_who_is_preferred_is_shown(prefer):
     once = cameras_facing([0.0], distance=3.6)
     old = dated("old", 2020, wall(0, -1.5, 1.5), box(5))
     new = dated("new", 2021, wall(1, -1.5, 1.5), cameras=once)
-    stands = standing(settle([old, new], prefer), 0) > 0.9 * len(box(5))
+    stands = standing(resolve_changes([old, new], prefer), 0) > 0.9 * len(box(5))
     assert stands == (prefer != "newest")
     # And where it is the older one that looked through, the newer's box leaves for `best` alone.
     bare, boxed = dated("old", 2020, wall(0, -1.5, 1.5)), dated("new", 2021, wall(1, -1.5, 1.5), box(5), cameras=once)
-    stands = standing(settle([bare, boxed], prefer), 1) > 0.9 * len(box(5))
+    stands = standing(resolve_changes([bare, boxed], prefer), 1) > 0.9 * len(box(5))
     assert stands == (prefer != "best")
 
 
@@ -126,15 +126,15 @@ def test_what_lies_behind_the_newest_beside_a_change_wins_no_cell():
     back = wall(4, -0.2, 0.2, z=0.2, half_height=0.15)
     old = dated("a", 2020, wall(0, -1.5, 1.5, colour=plain), back)
     behind = np.arange(len(old.gaussians)) >= len(old.gaussians) - len(back)
-    painted = settle([old, dated("b", 2021, wall(1, -1.5, 1.5, colour=patched))])
+    painted = resolve_changes([old, dated("b", 2021, wall(1, -1.5, 1.5, colour=patched))])
     assert painted.behind[0].sum() == len(back)
     assert not painted.behind[1].any()
     # Far from what changed nothing is said of it.
-    unchanged = settle([old, dated("b", 2021, wall(1, -1.5, 1.5, colour=plain))])
+    unchanged = resolve_changes([old, dated("b", 2021, wall(1, -1.5, 1.5, colour=plain))])
     assert not unchanged.behind[0].any()
     new = dated("b", 2021, wall(1, -1.5, 1.5))
     both = [dated("a", 2020, wall(0, -1.5, 1.5)), new]
-    settled = settle(both)
+    settled = resolve_changes(both)
     wanted = render_references(settled.scenes, None, 1.0, 120, settled, quiet)
     for behind, share in ((False, (0.3, 0.7)), (True, (0.0, 0.05))):
         told = replace(settled, behind=[np.full(len(g), behind and i == 0) for i, g in enumerate(settled.changed)])
@@ -147,15 +147,15 @@ def test_the_newest_who_looked_decides():
     first = dated("a", 2020, wall(0, -1.5, 1.5), box(5))
     second = dated("b", 2021, wall(1, -1.5, 1.5))
     third = dated("c", 2022, wall(2, -1.5, 1.5), box(7))
-    settled = settle([first, second, third])
+    settled = resolve_changes([first, second, third])
     assert standing(settled, 2) == len(box(7))
-    assert standing(settle([first, second]), 0) == 0
+    assert standing(resolve_changes([first, second]), 0) == 0
     # What stood until the newest came is gone from all before it, however many saw it.
-    kept = settle([first, dated("b", 2021, wall(1, -1.5, 1.5), box(6)), dated("c", 2022, wall(2, -1.5, 1.5))])
+    kept = resolve_changes([first, dated("b", 2021, wall(1, -1.5, 1.5), box(6)), dated("c", 2022, wall(2, -1.5, 1.5))])
     assert standing(kept, 0) == standing(kept, 1) == 0
     # What the newest never saw is decided by the one before.
     aside = cameras_facing(np.linspace(-3.6, -3.0, 7))
-    assert standing(settle([first, second, dated("c", 2022, wall(2, -4.5, -2.5), cameras=aside)]), 0) == 0
+    assert standing(resolve_changes([first, second, dated("c", 2022, wall(2, -4.5, -2.5), cameras=aside)]), 0) == 0
 
 
 def test_captures_are_compared_in_linear_time(monkeypatch):
@@ -172,7 +172,7 @@ def test_captures_are_compared_in_linear_time(monkeypatch):
     for count in (4, 8, 16):
         calls.clear()
         scenes = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(count)]
-        settle(scenes, max_views=8)
+        resolve_changes(scenes, max_views=8)
         spent[count] = sum(calls)
     assert spent[16] - spent[8] == 2 * (spent[8] - spent[4])
     assert spent[16] <= 16 * (7 + 7 + 2 * 8)
@@ -194,7 +194,7 @@ def test_looks_of_many_captures_together_are_those_that_add_coverage():
 def test_a_capture_of_another_place_costs_nothing(monkeypatch):
     near, far = dated("a", 2020, wall(0, -1, 1)), dated("b", 2021, wall(1, 9, 11), cameras=cameras_facing([10.0]))
     monkeypatch.setattr(compare, "compare", None)
-    settled = settle([near, far])
+    settled = resolve_changes([near, far])
     assert settled.lost == [0, 0]
     assert isinstance(settled.rivals[0], Gaussians)
 
@@ -210,7 +210,7 @@ def test_truth_grows_by_what_is_new_to_it_alone(monkeypatch):
     real = compare.compare
     monkeypatch.setattr(compare, "compare", weighed)
     scenes = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(6)]
-    settle(scenes)
+    resolve_changes(scenes)
     assert weights[0] == len(scenes[-1].gaussians)
     assert max(weights) < 1.5 * weights[0]
 
@@ -220,10 +220,10 @@ def test_the_place_shows_in_the_newest_exposure():
     old = dated("old", 2020, wall(0, -1.5, 1.5, colour=plain))
     new = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=plain), gain))
     camera = cameras_facing([0.0])
-    before, after = (render(s.gaussians, camera).colour[0] for s in (old, settle([old, new]).scenes[0]))
+    before, after = (render(s.gaussians, camera).colour[0] for s in (old, resolve_changes([old, new]).scenes[0]))
     middle = np.s_[12:36, 16:48]
     np.testing.assert_allclose((after[middle] / before[middle]).mean((0, 1)), gain, atol=0.03)
-    assert settle([old, new], "both").scenes[0] is old
+    assert resolve_changes([old, new], "both").scenes[0] is old
 
 
 def test_the_newest_gamma_is_taken_with_its_exposure():
@@ -231,7 +231,7 @@ def test_the_newest_gamma_is_taken_with_its_exposure():
     ramp = lambda x, y: np.tile(np.clip(0.5 + 0.25 * x, 0.1, 0.9)[:, None], (1, 3))  # noqa: E731
     bent = lambda x, y: 0.9 * ramp(x, y) ** 1.4  # noqa: E731
     old, new = dated("old", 2020, wall(0, -1.5, 1.5, colour=ramp)), dated("new", 2021, wall(1, -1.5, 1.5, colour=bent))
-    left = settle([old, new]).scenes[0].gaussians
+    left = resolve_changes([old, new]).scenes[0].gaussians
     shown, wanted = rgb_of_sh0(left.sh[:, 0]), bent(*left.means[:, :2].T)
     seen = np.abs(left.means[:, 0]) < 1
     assert np.abs(shown - wanted)[seen].max() < 0.04
@@ -242,12 +242,12 @@ def test_tiles_keep_each_capture_in_its_own_exposure():
     """Neighbouring tiles would come to other gains, or to none."""
     old = dated("old", 2020, wall(0, -1.5, 1.5, colour=plain))
     new = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=plain), np.full(3, 0.6)))
-    piece = settle([old, new], one_exposure=False)
+    piece = resolve_changes([old, new], one_exposure=False)
     assert piece.scenes[0] is old or np.isin(piece.scenes[0].gaussians.sh, old.gaussians.sh).all()
 
 
 def test_cameras_that_nobody_held_saw_nothing():
     old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
     invented = replace(new, cameras=replace(new.cameras, synthesised=True))
-    assert settle([old, invented]).lost == [0, 0]
-    assert settle([old, new]).lost[0] > 0
+    assert resolve_changes([old, invented]).lost == [0, 0]
+    assert resolve_changes([old, new]).lost[0] > 0

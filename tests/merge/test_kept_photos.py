@@ -9,7 +9,7 @@ from synthetic_walls import cameras_facing, texture, two_scenes, wall
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import PlacedScene, default_params, merge, photos, photos_m, references
 from gsmap.merge.exposure import apply_gain, balance_exposure
-from gsmap.merge.photos import shown
+from gsmap.merge.photos import make_photo_reference
 from gsmap.merge.references import render_references
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.render import render
@@ -36,7 +36,7 @@ def photo_at(x, **options):
 
 
 def ask(photo, scene=None):
-    return shown(photo, scene or two_scenes(grain=0.0)[0], WIDTH)
+    return make_photo_reference(photo, scene or two_scenes(grain=0.0)[0], WIDTH)
 
 
 def error(gaussians: Gaussians, xs) -> float:
@@ -82,7 +82,7 @@ def test_a_larger_picture_is_reduced_and_a_smaller_one_taken_as_it_is():
     large = replace(photo_at(-0.5), camera=cameras_facing([-0.5]).resized(256))
     found = ask(replace(large, read=lambda: np.repeat(np.repeat(picture_at(-0.5), 4, 0), 4, 1)))
     assert found.image.shape == (48, 64, 3)
-    small = shown(photo_at(-0.5), two_scenes(grain=0.0)[0], 960)
+    small = make_photo_reference(photo_at(-0.5), two_scenes(grain=0.0)[0], 960)
     assert small.image.shape == (48, 64, 3)
 
 
@@ -133,7 +133,7 @@ def test_photographs_of_balanced_captures_are_brought_to_the_balanced_colours():
     brighter = apply_gain(b.gaussians, np.array([1.25, 1.1, 0.9]))
     photo = replace(photo_at(0.5), around=lambda: brighter)
     scenes, log_gains = balance_exposure([a, PlacedScene(brighter, b.cameras, "b", photos=(photo,))])
-    found = shown(scenes[1].photos[0], scenes[1], WIDTH)
+    found = make_photo_reference(scenes[1].photos[0], scenes[1], WIDTH)
     colours = found.image[found.counts].mean(0) / 255
     balanced = render(scenes[1].gaussians, cameras_facing([0.5])).colour[0][found.counts].mean(0)
     assert log_gains.any()

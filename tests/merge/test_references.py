@@ -3,8 +3,8 @@ from synthetic_walls import cameras_facing, two_scenes, wall
 
 from gsmap.merge import PlacedScene
 from gsmap.merge.exposure import apply_gain, balance_exposure
+from gsmap.merge.reference_view_cache import surface_axes
 from gsmap.merge.references import render_references, view_schedule
-from gsmap.merge.sights import surface_axes
 from gsmap.render import render
 
 

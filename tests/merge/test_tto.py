@@ -12,7 +12,7 @@ from gsmap.geometry.voxels import voxel_labels
 from gsmap.merge import PlacedScene, default_params, merge
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.mergers import tto
-from gsmap.merge.selection import one_owner_per_cell
+from gsmap.merge.selection import select_owners
 from gsmap.render import render
 from gsmap.render.native_fit import NativeFitter
 from gsmap.types import Gaussians
@@ -128,11 +128,11 @@ def test_a_cell_belongs_to_whoever_shows_most_of_it():
     gaussians = Gaussians(means, np.ones((2 * n, 4)), np.full((2 * n, 3), -4), np.zeros(2 * n), np.zeros((2 * n, 1, 3)))
     origin = np.repeat([0, 1], n)
     shown = np.concatenate([np.full(n, 5.0), np.full(n, 9.0)])
-    np.testing.assert_array_equal(one_owner_per_cell(gaussians, origin, shown, 1.0, 0.05), origin == 1)
+    np.testing.assert_array_equal(select_owners(gaussians, origin, shown, 1.0, 0.05), origin == 1)
     # The other capture fills in where the owner has nothing near, if it was seen to show something there.
     shown[[14, 15]] = 0
     sparse = np.delete(np.arange(2 * n), [14, 15])
-    stays = one_owner_per_cell(gaussians[sparse], origin[sparse], shown[sparse], 1.0, 0.05)
+    stays = select_owners(gaussians[sparse], origin[sparse], shown[sparse], 1.0, 0.05)
     np.testing.assert_array_equal(np.flatnonzero(stays[:n]), [4, 5])
 
 

@@ -189,11 +189,11 @@ def merge(place: Place, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def drops(place: Place) -> Iterator[dict[str, Any]]:
     """What merging drops of each older capture before it fits anything."""
-    from gsmap.merge.changes import settle
+    from gsmap.merge.changes import resolve_changes
 
     poses = place.poses()
     scenes = [place.placed(t, poses[t]) for t in place.times]
-    left = settle(scenes).scenes  # the newest is preferred
+    left = resolve_changes(scenes).scenes  # the newest is preferred
     for time_, before, after in zip(place.times[:-1], scenes, left, strict=False):
         dropped = ~scores.kept_rows(before.gaussians.means, after.gaussians.means)
         yield {"way": f"drops of {time_}", **scores.score_drops(place.truth, place.times[-1], time_, dropped)}

@@ -25,7 +25,7 @@ from gsmap.geometry.boxes import inside
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.merge import reach_m
 from gsmap.merge.mergers import tto
-from gsmap.merge.placed import pulled_inside
+from gsmap.merge.overlap import clamp_inside
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.render import render
 from gsmap.types import Gaussians, Sim3
@@ -119,7 +119,7 @@ def finish(begun: Begun, params: tto.Params, fit: Callable[..., tuple[Gaussians,
     for (start, frozen, wanted, _, deadline, progress), bounds in begun.fits:
         fitted, steps, _ = fit(start, frozen, wanted, params, deadline, progress)
         mine = inside(start.means, bounds)
-        parts.append(replace(fitted[mine], means=pulled_inside(fitted.means[mine], bounds)))
+        parts.append(replace(fitted[mine], means=clamp_inside(fitted.means[mine], bounds)))
         count += steps
     return Gaussians.concatenate(parts), count
 

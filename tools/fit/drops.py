@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.compare import segments
-from gsmap.merge.changes import settle
+from gsmap.merge.changes import resolve_changes
 from gsmap.types import PlacedScene
 from tools.bench import change_scores as scores
 from tools.make.change_truth import Truth
@@ -48,7 +48,7 @@ def main() -> int:
         usual, rows = getattr(module, name), []
         setattr(module, name, value)
         for truth, scenes in zip(places, captures, strict=True):
-            before, after = scenes[0].gaussians.means, settle(scenes).scenes[0].gaussians.means
+            before, after = scenes[0].gaussians.means, resolve_changes(scenes).scenes[0].gaussians.means
             rows.append(scores.score_drops(truth, truth.times[1], truth.times[0], ~scores.kept_rows(before, after)))
         setattr(module, name, usual)
         cells = []

@@ -30,7 +30,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.map.world import InWorld, in_world, world_notes
 from gsmap.merge import photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
-from gsmap.merge.sights import SightStore
+from gsmap.merge.reference_view_cache import ReferenceViewCache
 from gsmap.methods import text_digest
 from gsmap.store import Store
 from gsmap.store.photos import StoredPhoto
@@ -346,7 +346,7 @@ def _maker(
         is_cut=request.tile_size_m > 0 or request.bbox is not None,
         budget_s=request.budget_s,
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
-        store=SightStore(folder, settings.export.max_shared_bytes),
+        store=ReferenceViewCache(folder, settings.export.max_shared_bytes),
         passing={scene: planned.passing[scene] for scene in tile.poses if scene in planned.passing},
         photos=_by_scene(planned.photos.get((tile.component, tile.name), ())),
     )

@@ -1,4 +1,4 @@
-"""GaussReg's rule: each scene keeps the Gaussians that lie nearer to its own centroid than to any other scene's."""
+"""Merging by distance, as in GaussReg: each scene keeps the Gaussians nearest to its own centroid."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.merge.placed import united
+from gsmap.merge.overlap import concatenate_scenes
 from gsmap.types import MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
@@ -48,11 +48,13 @@ def merge(
     budget_s: float | None,
     progress: Progress,
 ) -> MergeResult:
-    """For two scenes one bisecting plane: keep i of A iff ``|mu_i - c_A| < |mu_i - c_B|``, and j of B the other way.
+    """Keep the Gaussians nearest to their own scene's centroid.
+
+    For two scenes this is a bisecting plane: keep i of A iff ``|mu_i - c_A| < |mu_i - c_B|``, and j of B the other way.
 
     A centroid is the unweighted mean of all means of the whole capture (GaussReg, fusion code); ties keep nothing.
     """
-    gaussians, origin = united(scenes)
+    gaussians, origin = concatenate_scenes(scenes)
     squared = np.full((len(gaussians), len(scenes)), np.inf)
     for column, scene in enumerate(scenes):
         centroid = scene.whole_centroid()

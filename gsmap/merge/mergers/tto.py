@@ -1,10 +1,10 @@
-"""Test-time optimisation: the merged map learns to look like each capture from that capture's own cameras.
+"""Test-time optimization: the merged map is fitted to renders of each scene from that scene's own cameras.
 
-Graph-GSReg's merging (voxelise the union, then minimise the difference to renders of the originals; no photographs
-needed) with what measurably helps: in every cell the capture that shows most of it is the one that starts there, what
-is nowhere seen goes, what is most alike becomes one where there is too much, the newest capture wins where the place
-changed, and exposures can be balanced. With `owner_cells` off, both preferred, an `ssim_weight`, `huber_delta` and
-`min_weight` of 0 and a `kept_fraction` of 1 it is the published method: an L1 fit of all voxels of the union.
+The merging of Graph-GSReg (voxelize the union, then minimize the difference to renders of the original scenes) with
+measured improvements: each cell starts from the scene that shows most of it, invisible Gaussians are removed, similar
+ones are merged above a number, the newest scene is preferred where the place changed, and exposures can be balanced.
+With `owner_cells` off, both preferred, an `ssim_weight`, `huber_delta` and `min_weight` of 0 and a `kept_fraction` of 1
+it is the published method: an L1 fit of all voxels of the union.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge import references
-from gsmap.merge.changes import Prefer, Settled, settle
+from gsmap.merge.changes import Prefer, ResolvedScenes, resolve_changes
 from gsmap.merge.exposure import balance_exposure
-from gsmap.merge.placed import pulled_inside, united
+from gsmap.merge.overlap import clamp_inside, concatenate_scenes
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
-from gsmap.merge.selection import beside, one_owner_per_cell
+from gsmap.merge.selection import near_other_scene, select_owners
 from gsmap.render.fit import make_fitter, with_enough_memory
 from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
@@ -34,7 +34,7 @@ VERSION = 8
 STEPS: str | None = "steps"
 RENDERS = True
 
-_BESIDE_M = 0.025  # of what changed, within which no other capture's Gaussians are laid over it
+_BESIDE_M = 0.025  # distance from new Gaussians within which no other scene's Gaussians stay
 
 
 _FIRST = LearningRates(
@@ -149,10 +149,10 @@ def merge(
     budget_s: float | None,
     progress: Progress,
 ) -> MergeResult:
-    """Drop what is gone, balance exposures, render references, choose what to keep, and fit it to the references."""
+    """Remove outdated Gaussians, balance exposures, render reference views, select Gaussians, and fit them."""
     deadline = None if budget_s is None else time.monotonic() + budget_s
     notes: list[str] = []
-    settled = settle(scenes, params.prefer, one_exposure=bounds is None)
+    settled = resolve_changes(scenes, params.prefer, one_exposure=bounds is None)
     scenes = settled.scenes
     notes += settled.notes()
     if params.balance_exposure:
@@ -169,7 +169,7 @@ def merge(
         max_views=params.max_views,
         photo_weight=params.photo_weight,
     )
-    # One capture alone shows nothing twice and is what its pictures show: thinned or fitted to them it could but lose.
+    # A single scene has no overlaps, and reproduces its own views already.
     alone = sum(bool(inside(scene.gaussians.means, bounds, params.halo_m).any()) for scene in scenes) < 2
     start, origin, new = _start(
         scenes, wanted, settled, replace(params, kept_fraction=1.0) if alone else params, bounds
@@ -180,9 +180,9 @@ def merge(
     if alone and not wanted.num_photos:
         mine = inside(start.means, bounds)
         return MergeResult(start[mine], origin[mine], notes=tuple(notes))
-    # The near half of the halo is fitted along, then dropped: were it frozen, what is at the border would make up for
-    # neighbours that are going to be refined too.
-    # What is new was fitted to photographs, and has no other capture to agree with.
+    # The inner half of the halo is fitted, then dropped: were it frozen, Gaussians at the border would compensate for
+    # neighbours that the next tile refines.
+    # New Gaussians stay: no other scene shows their place.
     frozen = ~inside(start.means, bounds, params.halo_m / 2) | new
     if wanted.num_photos:
         many = wanted.num_photos > 1
@@ -190,28 +190,31 @@ def merge(
     fitted, steps, truncated = with_enough_memory(
         lambda backend: _fit(start, frozen, wanted, params, deadline, progress, backend)
     )
-    # A Gaussian stays with the tile it started in: one that crossed the border would be lost to both or kept by both.
+    # A Gaussian stays in its initial tile: one that crosses the border would be lost or duplicated.
     mine = inside(start.means, bounds)
-    fitted = replace(fitted[mine], means=pulled_inside(fitted.means[mine], bounds))
+    fitted = replace(fitted[mine], means=clamp_inside(fitted.means[mine], bounds))
     return MergeResult(fitted, origin[mine], steps=steps, truncated=truncated, notes=tuple(notes))
 
 
 def _start(
     scenes: Sequence[PlacedScene],
     wanted: References,
-    settled: Settled,
+    settled: ResolvedScenes,
     params: Params,
     bounds: np.ndarray | None,
 ) -> tuple[Gaussians, np.ndarray, np.ndarray]:
-    """The voxelised originals within the halo, one capture per cell, and within the bounds only what shows most.
+    """Voxelize the scenes within the halo, select one scene per cell, and reduce the tile to its number of Gaussians.
 
-    What stands where the place changed is taken as it is. Also the scene of each Gaussian, and whether it is new.
+    New Gaussians, where the place changed, stay as they are.
+
+    Returns:
+        The initial Gaussians, (N,) the scene of each, and (N,) bool, new ones.
     """
-    gaussians, origin = united(scenes)
+    gaussians, origin = concatenate_scenes(scenes)
     near = inside(gaussians.means, bounds, params.halo_m)
     new = np.concatenate(settled.changed)[near]
     labels = voxel_labels(gaussians.means[near], params.voxel_m)
-    # A Gaussian of what changed shares its voxel with none.
+    # A new Gaussian shares its voxel with none.
     labels[new] = labels.max(initial=-1) + 1 + np.arange(int(new.sum()))
     labels = np.unique(labels, return_inverse=True)[1]
     merged, heaviest = merge_groups(gaussians[near], labels)
@@ -219,13 +222,13 @@ def _start(
     origin, new = origin[near][heaviest], new[heaviest]
     stays = np.ones(len(merged), dtype=bool)
     if params.owner_cells:
-        # What lies behind the newest wins it no cell.
+        # Gaussians occluded in newer scenes do not vote.
         behind = np.concatenate(settled.behind)[near][heaviest]
         votes = np.where(behind, np.minimum(visible, WEIGHT_UNIT), visible)
-        stays &= one_owner_per_cell(merged, origin, votes, _OWNER_CELL_M, _COVER_M)
+        stays &= select_owners(merged, origin, votes, _OWNER_CELL_M, _COVER_M)
     stays &= visible >= WEIGHT_UNIT * params.min_weight
     stays |= new
-    stays[beside(merged.means, origin, new, _BESIDE_M)] = False
+    stays[near_other_scene(merged.means, origin, new, _BESIDE_M)] = False
     mine = inside(merged.means, bounds)
     count = max(int(params.kept_fraction * inside(gaussians.means, bounds).sum()) - int((new & mine).sum()), 1)
     many = stays & mine & ~new
@@ -234,7 +237,7 @@ def _start(
     from gsmap.geometry.decimate import decimate  # with scipy, which naming a recipe does without
 
     fewer, into = decimate(merged[many], count, visible[many])
-    # One that is made of two captures' counts for the one of which more is seen.
+    # A Gaussian merged of two scenes counts for the more visible one.
     order = np.argsort(visible[many], kind="stable")
     of = np.empty(len(fewer), dtype=origin.dtype)
     of[into[order]] = origin[many][order]
@@ -252,7 +255,7 @@ def _fit(
     progress: Progress,
     backend: str,
 ) -> tuple[Gaussians, int, bool]:
-    """The start fitted to the references; steps taken; whether time ran out."""
+    """Fit the initial Gaussians to the reference views; return them, the steps taken, and whether time ran out."""
     one_pass = max(_MIN_PASS_STEPS, round(wanted.view_weights.sum()))
     steps = params.steps if params.steps is not None else round(params.max_passes * one_pass)
     options = FitOptions(ssim_weight=params.ssim_weight, huber_delta=params.huber_delta, betas=(params.momentum, 0.999))
@@ -261,7 +264,7 @@ def _fit(
     pictures = [fitter.load(image[None]) for image in wanted.images]
     weights = [fitter.load(weight[None]) for weight in wanted.weights]
     size_m = float(np.exp(np.median(start.log_scales.max(1))))
-    losses: list[Any] = []  # as the fitter returns them: numbers, once somebody asks
+    losses: list[Any] = []  # lazy values of the fitter, converted on use
     for step, view in enumerate(view_schedule(wanted.view_weights, steps, _SEED)):
         if deadline is not None and time.monotonic() > deadline:
             return fitter.gaussians(), step, True
@@ -269,7 +272,7 @@ def _fit(
         losses.append(fitter.step(cameras[view], pictures[view], weights[view]))
         if step % 20 == 0:
             progress(0.2 + 0.8 * step / steps, f"optimising, loss {_mean(losses[-20:]):.4f}")
-        if params.steps is None and step > _SURE_FRACTION * steps and _gains_nothing(losses, one_pass):
+        if params.steps is None and step > _SURE_FRACTION * steps and _has_converged(losses, one_pass):
             break
     return fitter.gaussians(), len(losses), False
 
@@ -284,8 +287,8 @@ def _mean(losses: list[Any]) -> float:
     return float(np.mean([float(loss) for loss in losses]))
 
 
-def _gains_nothing(losses: list[Any], one_pass: int) -> bool:
-    """Whether the last pass over all views was hardly better than the one before."""
+def _has_converged(losses: list[Any], one_pass: int) -> bool:
+    """Return whether the last pass over all views hardly improved on the one before."""
     if len(losses) % one_pass or len(losses) < 2 * one_pass:
         return False
     before, now = _mean(losses[-2 * one_pass : -one_pass]), _mean(losses[-one_pass:])

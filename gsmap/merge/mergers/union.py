@@ -1,4 +1,4 @@
-"""Concatenation, as PhotoReg merges: every Gaussian of every scene, ghosts included."""
+"""Merging by concatenation, as in PhotoReg: every Gaussian of every scene, including ghosts."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, settle
-from gsmap.merge.placed import united
+from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, resolve_changes
+from gsmap.merge.overlap import concatenate_scenes
 from gsmap.types import MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
@@ -56,6 +56,6 @@ def merge(
     budget_s: float | None,
     progress: Progress,
 ) -> MergeResult:
-    """All Gaussians of all scenes that no preferred one overrules."""
-    settled = settle(scenes, params.prefer, one_exposure=bounds is None)
-    return MergeResult(*united(settled.scenes), notes=tuple(settled.notes()))
+    """Concatenate the Gaussians of all scenes, except those that a preferred scene disproves."""
+    settled = resolve_changes(scenes, params.prefer, one_exposure=bounds is None)
+    return MergeResult(*concatenate_scenes(settled.scenes), notes=tuple(settled.notes()))

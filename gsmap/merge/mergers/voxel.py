@@ -1,4 +1,4 @@
-"""Voxelisation: the Gaussians of all scenes whose means share a voxel become one with the same moments."""
+"""Merging by voxelization: Gaussians with means in one voxel become one Gaussian with the same moments."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.geometry.voxels import merge_groups, voxel_labels
-from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, settle
-from gsmap.merge.placed import united
+from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, resolve_changes
+from gsmap.merge.overlap import concatenate_scenes
 from gsmap.types import MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
@@ -33,7 +33,7 @@ class Params:
 
 
 def reach_m(params: Params) -> float:
-    # A voxel may straddle the border: both tiles see all of it, and the merged mean decides whose it is.
+    # A voxel may cross the border: both tiles read all of it, and the merged mean decides its tile.
     return params.voxel_m
 
 
@@ -60,8 +60,8 @@ def merge(
     budget_s: float | None,
     progress: Progress,
 ) -> MergeResult:
-    """One Gaussian per voxel of the map's grid; see `gsmap.geometry.voxels.merge_groups`."""
-    settled = settle(scenes, params.prefer, one_exposure=bounds is None)
-    gaussians, origin = united(settled.scenes)
+    """Merge to one Gaussian per voxel of the map's grid; see `gsmap.geometry.voxels.merge_groups`."""
+    settled = resolve_changes(scenes, params.prefer, one_exposure=bounds is None)
+    gaussians, origin = concatenate_scenes(settled.scenes)
     merged, heaviest = merge_groups(gaussians, voxel_labels(gaussians.means, params.voxel_m))
     return MergeResult(merged, origin[heaviest], notes=tuple(settled.notes()))

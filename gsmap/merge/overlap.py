@@ -1,4 +1,4 @@
-"""Placed scenes and boxes: what lies in a tile, what overlaps, what is in view."""
+"""Spatial tests and concatenation of scenes in the map frame."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from gsmap.geometry.projection import in_image, project
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
 
-def pulled_inside(points: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
-    """Float32 points (N, 3) moved to the nearest place that `inside` calls inside."""
+def clamp_inside(points: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
+    """Clamp float32 points (N, 3) to half-open bounds, so that `gsmap.geometry.boxes.inside` accepts them."""
     if bounds is None:
         return points
     low, high = bounds.astype(np.float32)
@@ -21,14 +21,14 @@ def pulled_inside(points: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
     return np.clip(points, low, high)
 
 
-def united(scenes: Sequence[PlacedScene]) -> tuple[Gaussians, np.ndarray]:
-    """All Gaussians of the scenes in order, and the index (N,) int32 of the scene of each."""
+def concatenate_scenes(scenes: Sequence[PlacedScene]) -> tuple[Gaussians, np.ndarray]:
+    """Concatenate the Gaussians of scenes, and return the scene index (N,) int32 of each."""
     origin = np.repeat(np.arange(len(scenes), dtype=np.int32), [len(s.gaussians) for s in scenes])
     return Gaussians.concatenate([s.gaussians for s in scenes]), origin
 
 
-def overlapping(a: PlacedScene, b: PlacedScene) -> bool:
-    """Whether the boxes around two scenes' means meet: cheap, and spares comparing captures of different places."""
+def boxes_overlap(a: PlacedScene, b: PlacedScene) -> bool:
+    """Return whether the bounding boxes of two scenes' means intersect."""
     if len(a.gaussians) == 0 or len(b.gaussians) == 0:
         return False
     (a_low, a_high), (b_low, b_high) = (box_around(scene.gaussians.means) for scene in (a, b))
@@ -36,7 +36,7 @@ def overlapping(a: PlacedScene, b: PlacedScene) -> bool:
 
 
 def share_in_view(cameras: Cameras, points: np.ndarray, sample: int = 2000) -> np.ndarray:
-    """(C,) share of points (N, 3) that lie in front of each camera and in its picture, from an even sample of them."""
+    """Return (C,) the fraction of points (N, 3), sampled evenly, in the frustum of each camera."""
     points = points[:: max(1, len(points) // sample)].astype(np.float64)
     share = np.zeros(len(cameras))
     if len(points):

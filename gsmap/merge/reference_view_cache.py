@@ -1,7 +1,7 @@
-"""What the views of a capture show, rendered once and shared by all tiles that they show something of.
+"""Cache of reference views: renders of a scene's own views, shared by all tiles that they show.
 
-A view is rendered in the capture's own frame, from what lies around the place that its camera stands in: not from what
-lies around a tile. So what it shows does not depend on the tile that asks, nor on which tiles are made together.
+A view is rendered in the scene's own frame, from the Gaussians around its camera rather than around a tile, so that it
+does not depend on the tile, nor on which tiles are made together.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, Sim3
 
 _CAN_BE_HELD = 256 << 20
-"""Bytes of sights that a process keeps in memory where it has no folder for them."""
+"""Bytes of reference views that a process keeps in memory without a folder for them."""
 
 _CELL = 0.25
-"""Edge of the cells by which cameras are taken together, so that what is around them is read once for many; as a share
-of how far they look."""
+"""Edge of the cells by which cameras are grouped, so that their surroundings are read once; relative to the radius of
+these."""
 
 
-_KINDS = (np.float64, np.uint64, np.int32, np.float32, np.float32)  # of the arrays of a sight
+_KINDS = (np.float64, np.uint64, np.int32, np.float32, np.float32)  # of the arrays of a view
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What one view of a capture shows, in the capture's frame and unit.
+class ReferenceView:
+    """Visibility data of one view of a scene, scene frame and unit.
 
     Args:
-        box: (2, 3) lowest and highest corner of the surface that it shows.
-        keys: (K,) uint64, sorted: the Gaussians that it shows, as `keys_of` names them.
-        pixels: (K,) int32 in how many of its pixels each of them dominates.
-        largest: (K,) float32 largest weight of each of them in any of its pixels.
-        depth: (H, W) float32 expected z of the surface, 0 where there is none.
+        box: (2, 3) lowest and highest corner of the visible surface.
+        keys: (K,) uint64, sorted: keys of the visible Gaussians by `keys_of`.
+        pixels: (K,) int32 number of pixels that each of them dominates.
+        largest: (K,) float32 largest blending weight of each of them.
+        depth: (H, W) float32 expected z of the surface, 0 without one.
     """
 
     box: np.ndarray
@@ -62,7 +62,7 @@ class Sight:
         return self.box, self.keys, self.pixels, self.largest, self.depth
 
     def write(self, path: Path) -> None:
-        """Put a file at the path, whole or not at all."""
+        """Write the view to a file atomically."""
         sizes = np.array([len(self.keys), *self.depth.shape], dtype="<i8")
         with NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
             file.write(sizes.tobytes())
@@ -71,9 +71,13 @@ class Sight:
         os.replace(file.name, path)
 
     @classmethod
-    def read(cls, path: Path) -> Sight:
-        """Raises: OSError, ValueError: it is not there, or not whole."""
-        # Bare arrays one after the other: a tile reads hundreds, and headers take longer.
+    def read(cls, path: Path) -> ReferenceView:
+        """Read a view from a file.
+
+        Raises:
+            OSError, ValueError: the file is missing, or truncated.
+        """
+        # Bare arrays in sequence: a tile reads hundreds, and headers would take longer.
         content = path.read_bytes()
         shown, height, width = np.frombuffer(content, "<i8", 3).tolist()
         parts, at = [], 24
@@ -86,42 +90,42 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class SightStore:
-    """Where the sights of one run are kept while tiles are made.
+class ReferenceViewCache:
+    """Store of the reference views of one run while tiles are made.
 
     Args:
-        folder: for files that processes share, a name that no other run uses; where the folder it would lie in is not
-            there, a few sights are kept in memory instead.
-        max_bytes: that the files may take: those that were made first go first.
+        folder: folder of files shared by processes, unique to the run; if its parent does not exist, a few views are
+            kept in memory instead.
+        max_bytes: largest size of the files, of which the oldest are deleted first.
     """
 
     folder: str = field(default_factory=lambda: f"/nowhere/{secrets.token_hex(16)}")
     max_bytes: int = 4 << 30
 
-    def get(self, name: str, make: Callable[[], Sight]) -> Sight:
-        """The sight of that name; made where it is not kept."""
+    def get(self, name: str, make: Callable[[], ReferenceView]) -> ReferenceView:
+        """Return the view of a name, made if it is not kept."""
         folder = Path(self.folder)
         if not folder.parent.is_dir():
             return self._held(name, make)
         with suppress(OSError, ValueError):
-            return Sight.read(folder / name)
+            return ReferenceView.read(folder / name)
         made = make()
-        with suppress(OSError):  # a full disk: it is made again for the next tile
+        with suppress(OSError):  # with a full disk it is made again for the next tile
             folder.mkdir(exist_ok=True)
             made.write(folder / name)
             self._make_room(made.num_bytes)
         return made
 
-    def _held(self, name: str, make: Callable[[], Sight]) -> Sight:
+    def _held(self, name: str, make: Callable[[], ReferenceView]) -> ReferenceView:
         at = (self.folder, name)
         found = make() if at not in _HELD else _HELD.pop(at)
         _HELD[at] = found  # the newest last
-        while len(_HELD) > 1 and sum(sight.num_bytes for sight in _HELD.values()) > _CAN_BE_HELD:
+        while len(_HELD) > 1 and sum(view.num_bytes for view in _HELD.values()) > _CAN_BE_HELD:
             _HELD.popitem(last=False)
         return found
 
     def _make_room(self, num_bytes: int) -> None:
-        """Delete the oldest files where all take too much; looked at now and then."""
+        """Delete the oldest files if all take too much; tested once per sixteenth of the limit."""
         _WRITTEN[self.folder] += num_bytes
         if _WRITTEN[self.folder] < self.max_bytes / 16:
             return
@@ -137,20 +141,20 @@ class SightStore:
             over -= size
 
 
-_HELD: OrderedDict[tuple[str, str], Sight] = OrderedDict()
-_WRITTEN: Counter[str] = Counter()  # bytes since a folder was last looked at
+_HELD: OrderedDict[tuple[str, str], ReferenceView] = OrderedDict()
+_WRITTEN: Counter[str] = Counter()  # bytes by folder since its size was last tested
 
 
 T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class Nearby(Generic[T]):
-    """What lies around cameras, made once for those of one cell; the last place is remembered.
+class RegionCache(Generic[T]):
+    """Data of the surroundings of cameras, made once per cell of cameras; the last one is cached.
 
     Args:
-        make: of a box (2, 3), what lies in it, or more.
-        around: length, in the unit of the box: what lies at least so near to a camera on each axis is in it.
+        make: makes the data of a box (2, 3), or more.
+        around: half the edge of the box around a camera, at least, in the unit of the box.
     """
 
     make: Callable[[np.ndarray], T]
@@ -158,30 +162,30 @@ class Nearby(Generic[T]):
     _last: tuple[tuple[int, ...], T] | None = None
 
     def cell(self, centre: np.ndarray) -> tuple[int, ...]:
-        """By which cameras (3,) are taken together."""
+        """Return the cell of a camera centre (3,)."""
         return tuple(int(v) for v in np.floor(centre / (_CELL * self.around)))
 
     def of(self, centre: np.ndarray) -> T:
-        """What lies around a camera (3,)."""
+        """Return the data of the surroundings of a camera centre (3,)."""
         cell = self.cell(centre)
         if self._last is None or self._last[0] != cell:
-            self._last = None  # two of them need not be held at once
+            self._last = None  # freed first, so that two are never in memory
             low = np.array(cell) * _CELL * self.around
             self._last = cell, self.make(np.array([low - self.around, low + (1 + _CELL) * self.around]))
         return self._last[1]
 
 
 @dataclass(eq=False)
-class Sights:
-    """The views of one capture.
+class SceneReferenceViews:
+    """The reference views of one scene.
 
     Args:
-        scene_id: which capture.
-        load: its Gaussians whose means lie in a box (2, 3) of its frame, or more of them.
-        cameras: all of its cameras, its frame.
-        around: length, in its unit: a view shows what lies at least so near its camera on each axis.
-        longest_side_px: size of the pictures.
-        store: where sights are kept.
+        scene_id: id of the scene.
+        load: loads the Gaussians with means in a box (2, 3) of the scene frame, or more.
+        cameras: all cameras of the scene, its frame.
+        around: least distance, in the scene's unit, from a camera along each axis within which Gaussians are rendered.
+        longest_side_px: longest side of the views.
+        store: cache of the views.
     """
 
     scene_id: str
@@ -189,22 +193,22 @@ class Sights:
     cameras: Cameras
     around: float
     longest_side_px: int
-    store: SightStore
+    store: ReferenceViewCache
 
     @cached_property
-    def _nearby(self) -> Nearby[tuple[Gaussians, np.ndarray]]:
-        return Nearby(self._with_keys, self.around)
+    def _nearby(self) -> RegionCache[tuple[Gaussians, np.ndarray]]:
+        return RegionCache(self._with_keys, self.around)
 
-    def of(self, camera: int) -> Sight:
-        """What one of the cameras sees."""
+    def of(self, camera: int) -> ReferenceView:
+        """Return the view of a camera."""
         about = (self.scene_id, camera, self.longest_side_px, repr(self.around))
         return self.store.get(text_digest(" ".join(map(str, about)))[:32], lambda: self._seen(camera))
 
     def cell(self, camera: int) -> tuple[int, ...]:
-        """By which cameras are taken together."""
+        """Return the cell of a camera; cameras of one cell are best processed in sequence."""
         return self._nearby.cell(self.cameras.centers[camera])
 
-    def _seen(self, camera: int) -> Sight:
+    def _seen(self, camera: int) -> ReferenceView:
         gaussians, keys = self._nearby.of(self.cameras.centers[camera])
         view = self.cameras[camera].resized(self.longest_side_px)
         seen = render(gaussians, view, max_weight=True)
@@ -213,7 +217,9 @@ class Sights:
         rows = np.flatnonzero(seen.max_weight > 0)
         rows = rows[np.argsort(keys[rows], kind="stable")]
         depth = np.ascontiguousarray(seen.depth[0])
-        return Sight(_box_of(view, depth), keys[rows], pixels[rows].astype(np.int32), seen.max_weight[rows], depth)
+        return ReferenceView(
+            _box_of(view, depth), keys[rows], pixels[rows].astype(np.int32), seen.max_weight[rows], depth
+        )
 
     def _with_keys(self, box: np.ndarray) -> tuple[Gaussians, np.ndarray]:
         found = self.load(box)
@@ -222,59 +228,59 @@ class Sights:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedSights:
-    """The sights of a capture that lies in a map, for the piece of it that a tile reads.
+class PlacedReferenceViews:
+    """The reference views of a placed scene, for the piece of it that a tile reads.
 
     Args:
-        sights: of the capture.
-        S_map_scene: where it lies.
-        rows: (C,) which of its cameras each of the placed ones is.
-        keys: (N,) uint64, names of the placed Gaussians.
-        order: (N,) that sorts them.
+        views: of the scene.
+        S_map_scene: pose of the scene.
+        rows: (C,) index in the scene of each placed camera.
+        keys: (N,) uint64 keys of the placed Gaussians.
+        order: (N,) permutation that sorts the keys.
     """
 
-    sights: Sights
+    views: SceneReferenceViews
     S_map_scene: Sim3
     rows: np.ndarray
     keys: np.ndarray
     order: np.ndarray
 
-    def of(self, camera: int) -> Sight:
-        """What one of the placed cameras sees, in the frame of the capture."""
-        return self.sights.of(int(self.rows[camera]))
+    def of(self, camera: int) -> ReferenceView:
+        """Return the view of a placed camera, in the scene frame."""
+        return self.views.of(int(self.rows[camera]))
 
     def cell(self, camera: int) -> tuple[int, ...]:
-        """Placed cameras of one are best asked one after the other."""
-        return self.sights.cell(int(self.rows[camera]))
+        """Return the cell of a placed camera."""
+        return self.views.cell(int(self.rows[camera]))
 
-    def depth(self, sight: Sight) -> np.ndarray:
-        """(H, W) of a sight in the map's unit."""
-        found: np.ndarray = sight.depth * np.float32(self.S_map_scene.scale)
+    def depth(self, view: ReferenceView) -> np.ndarray:
+        """Return the depth (H, W) of a view in the map's unit."""
+        found: np.ndarray = view.depth * np.float32(self.S_map_scene.scale)
         return found
 
-    def touches(self, sight: Sight, bounds: np.ndarray | None, margin: float) -> bool:
-        """Whether the surface it shows may reach into bounds (2, 3) of the map grown by a margin."""
+    def touches(self, view: ReferenceView, bounds: np.ndarray | None, margin: float) -> bool:
+        """Return whether the surface of a view may reach into map bounds (2, 3) grown by a margin."""
         if bounds is None:
             return True
-        if not np.isfinite(sight.box).all():
+        if not np.isfinite(view.box).all():
             return False
-        low, high = moved_box(sight.box, self.S_map_scene)
+        low, high = moved_box(view.box, self.S_map_scene)
         return bool((low <= bounds[1] + margin).all() and (high >= bounds[0] - margin).all())
 
-    def count(self, sight: Sight, pixels: np.ndarray, largest: np.ndarray) -> None:
-        """Add to (N,) what the placed Gaussians show in it."""
-        if not len(sight.keys):
+    def count(self, view: ReferenceView, pixels: np.ndarray, largest: np.ndarray) -> None:
+        """Add the pixels and largest weights of the placed Gaussians in a view to (N,) arrays."""
+        if not len(view.keys):
             return
-        # Sorted into sorted: searching at random takes several times as long.
-        at = np.minimum(np.searchsorted(sight.keys, self.keys[self.order]), len(sight.keys) - 1)
-        known = sight.keys[at] == self.keys[self.order]
+        # Sorted queries: random access takes several times as long.
+        at = np.minimum(np.searchsorted(view.keys, self.keys[self.order]), len(view.keys) - 1)
+        known = view.keys[at] == self.keys[self.order]
         rows, at = self.order[known], at[known]
-        pixels[rows] += sight.pixels[at]
-        largest[rows] = np.maximum(largest[rows], sight.largest[at])
+        pixels[rows] += view.pixels[at]
+        largest[rows] = np.maximum(largest[rows], view.largest[at])
 
 
 def keys_of(means: np.ndarray) -> np.ndarray:
-    """(N,) uint64 that tell the Gaussians of one capture apart, whatever piece of it is read: mixed bits of (N, 3)."""
+    """Return (N,) uint64 keys of the Gaussians of one scene, independent of the piece that is read: hashed means."""
     bits = np.ascontiguousarray(means, dtype=np.float32).view(np.uint32).astype(np.uint64)
     mixed: np.ndarray = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
     for axis in (1, 2):
@@ -283,7 +289,7 @@ def keys_of(means: np.ndarray) -> np.ndarray:
 
 
 def _box_of(view: Cameras, depth: np.ndarray) -> np.ndarray:
-    """(2, 3) around the surface that a depth map shows; empty (low above high) where it shows none."""
+    """Return the (2, 3) box around the surface of a depth map; empty (low above high) without one."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     shown = depth > 0
     if not shown.any():
@@ -295,7 +301,7 @@ def _box_of(view: Cameras, depth: np.ndarray) -> np.ndarray:
 
 
 def surface_axes(camera: Cameras, depth: np.ndarray) -> list[np.ndarray]:
-    """Three (H, W) float32: x, y and z of the points of a depth map of one camera, in the camera's frame's parent."""
+    """Return x, y and z, each (H, W) float32, of the points of a depth map in the frame of the camera's pose."""
     height, width = depth.shape
     fx, fy, cx, cy = camera.intrinsics_px[0]
     x = (np.arange(width) + 0.5 - cx) / fx

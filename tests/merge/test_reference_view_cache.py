@@ -11,9 +11,9 @@ from synthetic_walls import cameras_facing, two_scenes, wall
 
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.merge import MergeResult, default_params, sights, with_steps
+from gsmap.merge import MergeResult, default_params, reference_view_cache, with_steps
+from gsmap.merge.reference_view_cache import ReferenceView, ReferenceViewCache, SceneReferenceViews, keys_of
 from gsmap.merge.references import render_references
-from gsmap.merge.sights import Sight, Sights, SightStore, keys_of
 from gsmap.merge.tile import LazyScene, _read, _Reading, merge_tile
 from gsmap.render import render
 from gsmap.types import Gaussians, PlacedScene, Sim3
@@ -22,7 +22,7 @@ S = Sim3(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5.0, 1, -2]),
 """Takes the map to a scene's own frame."""
 
 
-def lazy_scenes(store: SightStore, dates: tuple[str | None, str | None] = (None, None)) -> list[LazyScene]:
+def lazy_scenes(store: ReferenceViewCache, dates: tuple[str | None, str | None] = (None, None)) -> list[LazyScene]:
     """The two halves of a wall, each in a frame of its own with another unit."""
 
     def load(gaussians: Gaussians, box: np.ndarray | None) -> Gaussians:
@@ -40,7 +40,7 @@ def lazy_scenes(store: SightStore, dates: tuple[str | None, str | None] = (None,
 TILES = [np.array([[low, -2.0, -2], [low + 0.75, 2, 2]]) for low in (-1.5, -0.75, 0.0, 0.75)]
 
 
-def made(tile: np.ndarray, store: SightStore) -> MergeResult:
+def made(tile: np.ndarray, store: ReferenceViewCache) -> MergeResult:
     params = with_steps("tto", default_params("tto"), 3)
     return merge_tile(lazy_scenes(store), "tto", params, bounds=tile)
 
@@ -54,22 +54,22 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         counts.append(len(gaussians))
         return render(gaussians, *args, **how)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(sights, "render", noted)
+    monkeypatch.setattr(reference_view_cache, "render", noted)
     return counts
 
 
 def test_each_view_is_rendered_once_for_all_tiles(tmp_path: Path, rendered: list[int]) -> None:
     for tile in TILES:
-        made(tile, SightStore(str(tmp_path / "shared")))
+        made(tile, ReferenceViewCache(str(tmp_path / "shared")))
     assert len(rendered) == 14
     assert len(list((tmp_path / "shared").iterdir())) == 14
 
 
 def test_a_tile_is_the_same_whatever_else_is_made(tmp_path: Path, rendered: list[int]) -> None:
-    alone = [made(tile, SightStore()) for tile in TILES]
-    store = SightStore(str(tmp_path / "shared"))
+    alone = [made(tile, ReferenceViewCache()) for tile in TILES]
+    store = ReferenceViewCache(str(tmp_path / "shared"))
     others = [made(tile, store) for tile in reversed(TILES)][::-1]
-    small = SightStore(str(tmp_path / "small"), max_bytes=20_000)
+    small = ReferenceViewCache(str(tmp_path / "small"), max_bytes=20_000)
     forgetful = [made(tile, small) for tile in TILES]
     for result in (others, forgetful):
         for one, other in zip(alone, result, strict=True):
@@ -88,11 +88,11 @@ def test_sights_tell_what_the_whole_capture_shows() -> None:
             transform_cameras(scene.cameras, scene.S_map_scene),
             scene.scene_id,
         )
-        for scene in lazy_scenes(SightStore())
+        for scene in lazy_scenes(ReferenceViewCache())
         if scene.cameras is not None
     ]
-    pieces = [_read(scene, tile, reading) for scene in lazy_scenes(SightStore())]
-    assert all(piece.sights is not None for piece in pieces)
+    pieces = [_read(scene, tile, reading) for scene in lazy_scenes(ReferenceViewCache())]
+    assert all(piece.reference_views is not None for piece in pieces)
     expected = render_references(whole, tile, 1.0, 64, None, lambda *_: None)
     found = render_references(pieces, tile, 1.0, 64, None, lambda *_: None)
     assert len(found) == len(expected) > 3
@@ -112,7 +112,7 @@ def test_a_capture_whose_cameras_stand_far_off_is_rendered_for_the_tile() -> Non
     """From a drone: what lies around its cameras is not what they show."""
     scene = LazyScene("a", Sim3.identity(), lambda box: wall(0, -1, 1), cameras_facing([0.0], distance=60.0))
     piece = _read(scene, TILES[1], _Reading(1.0, 1.0, 11.0, 12))
-    assert piece.sights is None
+    assert piece.reference_views is None
     assert piece.cameras is not None
     assert len(piece.cameras) == 1
 
@@ -138,15 +138,15 @@ def test_captures_of_several_dates_are_read_far_enough_to_be_compared() -> None:
 
 
 def test_a_file_that_is_not_whole_is_made_again(tmp_path: Path) -> None:
-    store = SightStore(str(tmp_path / "shared"))
+    store = ReferenceViewCache(str(tmp_path / "shared"))
     gaussians = wall(0, -1, 1)
-    views = Sights("a", lambda box: gaussians, cameras_facing([0.0]), 10.0, 64, store)
+    views = SceneReferenceViews("a", lambda box: gaussians, cameras_facing([0.0]), 10.0, 64, store)
     first = views.of(0)
     (path,) = (tmp_path / "shared").iterdir()
     path.write_bytes(path.read_bytes()[:300])
     again = views.of(0)
     np.testing.assert_array_equal(again.depth, first.depth)
-    assert isinstance(Sight.read(path), Sight)
+    assert isinstance(ReferenceView.read(path), ReferenceView)
 
 
 def test_keys_tell_gaussians_apart() -> None:
