@@ -1,13 +1,13 @@
-"""Tiles of a map on disk: which there are, which must be made again, and writing them safely.
+"""Export of a map as tiles: planning, incremental updates, and crash-safe writing.
 
-Pure but for the output folder: what a tile holds comes from a callable, so nothing here knows the store or a merger::
+Independent of the store and of mergers: a callable makes the content of a tile::
 
     plan = plan_tiles(poses, scene_bounds, tile_size_m=10.0, components=components, reach_m=gsmap.merge.reach_m(method))
     recipe = TileRecipe(gsmap.merge.recipe_key(method, params), format="spz", dates=dates)
     result = export_tiles(plan, make, out, map_id=map_id, recipe=recipe)
 
 where ``make(planned, folder)(progress)`` returns `gsmap.merge.tile.merge_tile` of the scenes in ``planned.poses``
-within ``planned.bounds``. Tiles are jobs: ``run=`` says where they are made.
+within ``planned.bounds``. Tiles are jobs, which ``run=`` executes.
 """
 
 from gsmap.export.plan import Params, PlannedTile, plan_tiles

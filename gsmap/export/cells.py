@@ -1,4 +1,4 @@
-"""Which cells of a grid oriented boxes reach into: those of each box by itself, so that empty space costs nothing."""
+"""Intersection of oriented boxes with the cells of a grid, at a cost independent of empty space."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from gsmap.errors import ConfigError
 from gsmap.types import Sim3
 
-_FARTHEST = 2**40  # cells from the origin; beyond, a grid's numbers are no longer exact in float64
+_FARTHEST = 2**40  # cells from the origin, beyond which cell numbers are not exact in float64
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes:
-    """B boxes of Gaussians, oriented as their scenes lie in the map.
+class OrientedBoxes:
+    """B bounding boxes of scenes, oriented by their poses.
 
     Args:
-        centers, halves: (B, 3) middle and half the edges, map unit.
-        axes: (B, 3, 3) the scenes' rotations.
-        bounds: (B, 2, 3) the axis-aligned boxes around them, a touch larger, so that Gaussians on the very border lie
-            inside however their means round.
+        centers, halves: (B, 3) centres and half edges, map unit.
+        axes: (B, 3, 3) rotations of the scenes.
+        bounds: (B, 2, 3) axis-aligned boxes around them, padded so that Gaussians on the border lie inside despite
+            rounding.
     """
 
     centers: np.ndarray
@@ -30,8 +30,8 @@ class Boxes:
     bounds: np.ndarray
 
     @classmethod
-    def of(cls, poses: Sequence[Sim3], scene_bounds: Sequence[np.ndarray]) -> Boxes:
-        """From ``S_map_scene`` and the (2, 3) box of each scene in its own frame."""
+    def of(cls, poses: Sequence[Sim3], scene_bounds: Sequence[np.ndarray]) -> OrientedBoxes:
+        """Make boxes from ``S_map_scene`` and the (2, 3) box of each scene in its own frame."""
         count = len(poses)
         low, high = np.asarray(scene_bounds, dtype=np.float64).reshape(count, 2, 3).transpose(1, 0, 2)
         scales = np.array([pose.scale for pose in poses])[:, None]
@@ -48,13 +48,13 @@ class Boxes:
 
     @property
     def around(self) -> np.ndarray:
-        """(2, 3) the box around all of them."""
+        """(2, 3) box around all boxes."""
         return np.array([self.bounds[:, 0].min(0), self.bounds[:, 1].max(0)])
 
     def touch(self, which: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """(K,) whether box ``which[k]`` meets the axis-aligned one from ``low[k]`` to ``high[k]`` (K, 3).
+        """Return (K,) bool, whether box ``which[k]`` intersects the box from ``low[k]`` to ``high[k]`` (K, 3).
 
-        By the face normals of both, so that there is never a false no.
+        By the separating axes of the face normals, so that an intersection is never missed.
         """
         met = ((self.bounds[which, 0] <= high) & (self.bounds[which, 1] >= low)).all(1)
         near = np.flatnonzero(met)
@@ -68,12 +68,12 @@ class Boxes:
 
 @dataclass(frozen=True, eq=False)
 class CellSet:
-    """Cells, each once, in the order of x, then y, then z.
+    """A set of grid cells, sorted by x, then y, then z.
 
     Args:
         cells: (K, 3) int64.
-        values: the numbers that occur on each axis, sorted.
-        keys: (K,) of each cell, from the places of its numbers among those.
+        values: sorted unique coordinates on each axis.
+        keys: (K,) key of each cell, from the ranks of its coordinates.
     """
 
     cells: np.ndarray
@@ -90,13 +90,13 @@ class CellSet:
         return len(self.keys)
 
     def find(self, cells: np.ndarray) -> np.ndarray:
-        """(K,) place of each of these (K, 3) among ours; -1 where it is none."""
+        """Return (K,) the index of each of the cells (K, 3) in the set; -1 for none."""
         keys, known = _key(self.values, cells)
         places = np.minimum(np.searchsorted(self.keys, keys), len(self) - 1)
         return np.where(known & (self.keys[places] == keys), places, -1)
 
     def coarser(self, level: int) -> CellSet:
-        """The blocks of 2^level cells that hold any."""
+        """Return the blocks of 2^level cells that contain any cell."""
         return self if level == 0 else CellSet.of(self.cells >> level)
 
 
@@ -105,9 +105,9 @@ class Grid:
     """A grid of cubes through the map's origin.
 
     Args:
-        edge: of a cell, map unit.
-        bbox: (2, 3) only what lies within, by which cells are cut; None for all.
-        most: more cells than this are refused.
+        edge: edge of a cell, map unit.
+        bbox: (2, 3) box that cells are clipped to; None for all.
+        most: largest number of cells.
     """
 
     edge: float
@@ -115,21 +115,23 @@ class Grid:
     most: int
 
     def bounds(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Corners (K, 3) of blocks of cells from ``low`` to below ``high`` (K, 3), cut by the box."""
+        """Return the corners (K, 3) of blocks of cells from ``low`` to below ``high`` (K, 3), clipped to the box."""
         a, b = low * self.edge, high * self.edge
         return (a, b) if self.bbox is None else (np.maximum(a, self.bbox[0]), np.minimum(b, self.bbox[1]))
 
-    def reached(self, boxes: Boxes, reach: float = 0.0, within: CellSet | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The cells, of a set or of all, that each box touches when they are grown by ``reach``.
+    def reached(
+        self, boxes: OrientedBoxes, reach: float = 0.0, within: CellSet | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Find the cells, of a set or of all, that each box intersects when they are grown by ``reach``.
 
-        A box is put into the few cubes of 2^k cells around it, these are halved, and halves that it does not touch are
-        left out, down to single cells; all boxes at once.
+        An octree descent for all boxes at once: each starts from the few cubes of 2^k cells around it, which are split,
+        and parts without intersection are dropped, down to single cells.
 
         Returns:
-            (K,) row of the box and (K, 3) int64 cell of every touch.
+            (K,) row of the box and (K, 3) int64 cell of every intersection.
 
         Raises:
-            ConfigError: more cells than may be.
+            ConfigError: more cells than permitted.
         """
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             if self.bbox is None and not (np.prod(2 * boxes.halves / self.edge, axis=1) <= self.most).all():
@@ -158,8 +160,8 @@ class Grid:
                 which, low = np.repeat(which, 8), _corners(low, width // 2)
         return which, low
 
-    def _ranges(self, boxes: Boxes, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """(B, 3) first cell and the one after the last of the box around each box."""
+    def _ranges(self, boxes: OrientedBoxes, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return (B, 3) the first cell, and the one after the last, of the bounds of each box."""
         low, high = boxes.bounds[:, 0] - reach, boxes.bounds[:, 1] + reach
         if self.bbox is not None:
             low, high = np.maximum(low, self.bbox[0]), np.minimum(high, self.bbox[1])
@@ -170,8 +172,8 @@ class Grid:
             raise self.too_many(boxes)
         return first.astype(np.int64), last.astype(np.int64)
 
-    def too_many(self, boxes: Boxes) -> ConfigError:
-        """The error of boxes that reach into more cells than may be."""
+    def too_many(self, boxes: OrientedBoxes) -> ConfigError:
+        """Return the error for boxes that intersect more cells than permitted."""
         low, high = boxes.around
         spans = " x ".join(f"{side:.6g}" for side in high - low)
         return ConfigError(
@@ -182,7 +184,7 @@ class Grid:
 
 
 def _key(values: tuple[np.ndarray, ...], cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A number for each cell, and whether each of its own occurs on its axis."""
+    """Return a key for each cell, and whether all its coordinates are in the set."""
     key, known = np.zeros(len(cells), dtype=np.int64), np.ones(len(cells), dtype=bool)
     for axis, of_axis in enumerate(values):
         places = np.minimum(np.searchsorted(of_axis, cells[:, axis]), len(of_axis) - 1)
@@ -192,7 +194,7 @@ def _key(values: tuple[np.ndarray, ...], cells: np.ndarray) -> tuple[np.ndarray,
 
 
 def _corners(low: np.ndarray, width: int) -> np.ndarray:
-    """(8 K, 3) the lowest cells of the eight blocks of a width from each (K, 3) on."""
+    """Return (8 K, 3) the lowest cells of the eight blocks of a width starting at each cell (K, 3)."""
     steps = np.indices((2, 2, 2)).reshape(3, 8).T * width
     found: np.ndarray = (low[:, None] + steps).reshape(-1, 3)
     return found

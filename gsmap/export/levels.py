@@ -1,9 +1,9 @@
-"""Coarser levels of a tileset: merged, made to look like what they stand for, and measured.
+"""Levels of detail of a tileset: merged, fitted to the finer level, and measured.
 
-A level is merged pair by pair (`gsmap.geometry.decimate`), fitted to renders of what it replaces from where the
-captures' cameras stood, in pictures so small that its Gaussians are what they can show, and compared with such renders
-of views that it was not fitted to; where these do not gain by the fit, it is left out. How small a picture must be to
-be like enough decides from how far the level is shown: that is its geometric error.
+A level is merged pair by pair (`gsmap.geometry.decimate`), fitted to renders of the finer level from the scenes'
+cameras, at a resolution that matches the size of its Gaussians, and compared with renders of held-out views; a fit that
+does not improve these is discarded. The resolution at which a level is similar enough determines its geometric error,
+and so the distance from which it is shown.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Cameras, Gaussians
 
 VERSION = 4
-"""Raised whenever levels of the same tiles and cameras come out otherwise: they are then made again."""
+"""Raised whenever the levels of the same tiles and cameras change: they are then made again."""
 
-_SCREEN_PX = 16.0  # viewers of 3D Tiles refine what is off by more pixels than this, if not told otherwise
+_SCREEN_PX = 16.0  # default screen-space error of viewers of 3D Tiles, above which they refine
 _DEVIATION_PX = 3.0  # size of a level's Gaussians (largest deviation, median) in the views that it is fitted to
 _MIN_PSNR_DB = 30.0  # of a level that is similar enough to be shown
-_TRIED = 240  # cameras near a level of which the ones that see it best are taken
-_SAMPLE = 1000  # Gaussians that tell how well a camera sees a level
-_SEEN = 0.15  # share of them that makes a view of it
+_TRIED = 240  # cameras near a level, of which those with the best view are selected
+_SAMPLE = 1000  # Gaussians by which the view of a camera is rated
+_SEEN = 0.15  # fraction of them in the view of a selected camera
 _FIRST = LearningRates(means=0.035, quats=2e-3, log_scales=1e-2, logit_opacities=5e-2, sh_base=5e-3, sh_rest=5e-3)
-_LAST = 0.1  # of the first step, reached exponentially; the steps of merging, whose start is nearly right as well
+_LAST = 0.1  # last step relative to the first, reached exponentially
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ class Params:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """What a tile draws in place of finer ones.
+    """A level of detail that replaces finer Gaussians.
 
     Args:
-        gaussians: what is drawn.
-        error_m: geometric error, in the frame's unit: it is shown where this is less than 16 pixels.
-        psnr_db: of the worst and of the median view that it was not fitted to, at the distance where it is first shown;
-            None where no camera sees it.
+        gaussians: its Gaussians.
+        error_m: geometric error, in the frame's unit; the level is shown where it is less than 16 pixels.
+        psnr_db: PSNR of the worst and of the median held-out view, at the smallest distance where it is shown; None
+            without cameras that observe it.
     """
 
     gaussians: Gaussians
@@ -78,42 +78,48 @@ def make_level(
     *,
     deviation_px: float = _DEVIATION_PX,
 ) -> Level:
-    """At most so many Gaussians in place of finer ones.
+    """Make a level of at most ``max_count`` Gaussians.
 
     Args:
-        cameras: of the captures, in the frame of the Gaussians; None where there are none.
+        finer: Gaussians that it replaces.
+        max_count: largest number of Gaussians.
+        cameras: of the scenes, in the frame of the Gaussians; None for none.
+        params: see `Params`.
         deviation_px: size of its Gaussians (largest deviation, median) in the views that it is fitted to.
     """
     start, apart = tiles3d.coarser(finer, max_count)
-    views = None if cameras is None or not params.views else _views(finer, cameras, params.views)
+    views = None if cameras is None or not params.views else _select_views(finer, cameras, params.views)
     if views is None or len(start) == len(finer):
         return Level(start, apart)
     kept = np.arange(len(views)) % 4 == 3
-    depths = _depths(start, views)  # it has the depths of what it stands for, at a fraction of the cost
+    depths = _depths(start, views)  # same depths as the finer level, at a fraction of the cost
     footprint = float(np.exp(np.median(start.log_scales.max(1)))) / deviation_px
     fitted = with_enough_memory(
-        lambda backend: _fitted(start, finer, views[~kept], depths[~kept], footprint, params, backend)
+        lambda backend: _fit(start, finer, views[~kept], depths[~kept], footprint, params, backend)
     )
 
     @cache
-    def judges(footprint: float) -> list[_View]:
-        return [_View(camera, _picture(finer, camera)) for camera in _seen_at(views[kept], depths[kept], footprint)]
+    def judges(footprint: float) -> list[_MeasuredView]:
+        return [
+            _MeasuredView(camera, _render(finer, camera))
+            for camera in _resized_views(views[kept], depths[kept], footprint)
+        ]
 
-    level = max(fitted, start, key=lambda one: np.median(_decibels(one, judges(footprint))))
-    shown, decibels = _measured(level, judges, footprint)
+    level = max(fitted, start, key=lambda one: np.median(_psnr_db(one, judges(footprint))))
+    shown, decibels = _measure(level, judges, footprint)
     return Level(level, _SCREEN_PX * shown, (float(decibels.min()), float(np.median(decibels))))
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
-    """A camera, and the picture (H, W, 3) that a level is to show there."""
+class _MeasuredView:
+    """A camera and its target image (H, W, 3)."""
 
     camera: Cameras
     picture: np.ndarray
 
 
-def _views(gaussians: Gaussians, cameras: Cameras, count: int) -> Cameras | None:
-    """The cameras that see most of the Gaussians; None where fewer than four see enough."""
+def _select_views(gaussians: Gaussians, cameras: Cameras, count: int) -> Cameras | None:
+    """Select the cameras with most of the Gaussians in view; None if fewer than four have enough."""
     low, high = np.quantile(gaussians.means, (0.02, 0.98), axis=0)
     eyes = cameras.T_frame_camera[:, :3, 3]
     away = np.linalg.norm(np.maximum(0, np.maximum(low - eyes, eyes - high)), axis=1)
@@ -130,7 +136,7 @@ def _views(gaussians: Gaussians, cameras: Cameras, count: int) -> Cameras | None
 
 
 def _depths(gaussians: Gaussians, views: Cameras) -> np.ndarray:
-    """(V,) median depth of what each view shows, in small pictures."""
+    """Return (V,) the median depth of each view, from small renders."""
     out = np.full(len(views), np.nan)
     for v in range(len(views)):
         seen = render(gaussians, views[v].resized(64), dominant_id=False)
@@ -140,25 +146,25 @@ def _depths(gaussians: Gaussians, views: Cameras) -> np.ndarray:
     return np.where(np.isfinite(out), out, np.nanmedian(out) if np.isfinite(out).any() else 1.0)
 
 
-def _seen_at(views: Cameras, depths: np.ndarray, footprint: float) -> list[Cameras]:
-    """Each view in a picture whose pixels are ``footprint`` wide at its depth; never larger than the capture's own."""
+def _resized_views(views: Cameras, depths: np.ndarray, footprint: float) -> list[Cameras]:
+    """Resize each view so that a pixel at its depth is ``footprint`` wide; never above its own size."""
     focal = views.intrinsics_px[:, 0]
     longest = views.sizes_px.max(1) * depths / (footprint * focal)
     return [views[v].resized(int(np.clip(longest[v], 24, views.sizes_px[v].max()))) for v in range(len(views))]
 
 
-def _picture(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
+def _render(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
     picture: np.ndarray = np.clip(render(gaussians, camera, depth=False, dominant_id=False).colour[0], 0, 1)
     return picture
 
 
-def _decibels(level: Gaussians, views: list[_View]) -> np.ndarray:
-    """(V,) PSNR of a level in each picture."""
-    errors = [np.mean((_picture(level, view.camera) - view.picture) ** 2) for view in views]
+def _psnr_db(level: Gaussians, views: list[_MeasuredView]) -> np.ndarray:
+    """Return (V,) the PSNR of a level in each view."""
+    errors = [np.mean((_render(level, view.camera) - view.picture) ** 2) for view in views]
     return -10 * np.log10(np.maximum(errors, 1e-10))
 
 
-def _fitted(
+def _fit(
     start: Gaussians,
     finer: Gaussians,
     views: Cameras,
@@ -167,9 +173,9 @@ def _fitted(
     params: Params,
     backend: str,
 ) -> Gaussians:
-    """The start, made to look like the finer Gaussians."""
-    seen = _seen_at(views, depths, footprint)
-    wanted = [_picture(finer, camera) for camera in seen]
+    """Fit the initial Gaussians to renders of the finer level."""
+    seen = _resized_views(views, depths, footprint)
+    wanted = [_render(finer, camera) for camera in seen]
     size = float(np.exp(np.median(start.log_scales.max(1))))
     fitter = make_fitter(start, options=FitOptions(ssim_weight=0.2), backend=backend)
     pictures = [fitter.load(picture[None]) for picture in wanted]
@@ -184,13 +190,15 @@ def _fitted(
     return fitter.gaussians()
 
 
-def _measured(level: Gaussians, judges: Callable[[float], list[_View]], footprint: float) -> tuple[float, np.ndarray]:
-    """The smallest footprint of a pixel at which every second view is like enough, and PSNR (V,) there.
+def _measure(
+    level: Gaussians, judges: Callable[[float], list[_MeasuredView]], footprint: float
+) -> tuple[float, np.ndarray]:
+    """Return the smallest pixel footprint at which the median view is similar enough, and PSNR (V,) there.
 
-    Looked for from half the given one to four times; where none is, the last.
+    Searched from half to four times the given footprint; the last if none is similar enough.
     """
     for size in (footprint * 2.0 ** np.arange(-1, 3)).tolist():
-        decibels = _decibels(level, judges(size))
+        decibels = _psnr_db(level, judges(size))
         if np.median(decibels) >= _MIN_PSNR_DB:
             break
     return size, decibels

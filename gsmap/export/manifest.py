@@ -1,4 +1,4 @@
-"""``tiles.json``: what an export folder holds, written last and whole."""
+"""Manifest of an export folder, ``tiles.json``, replaced atomically after its tiles."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from gsmap.types.plain import plain
 
 FILE_NAME = "tiles.json"
 _VERSION = 2
-_NAMELESS = 1  # its tiles had a free text instead of a recipe, so that nobody knows what made them
+_NAMELESS = 1  # version whose tiles have no recipe
 _SAVE_EVERY_S = 2.0
-_SAVE_SHARE = 50  # times what the last one took, at least
+_SAVE_SHARE = 50  # least interval of saves, relative to the duration of the last one
 _MAX_BYTES = 1 << 30  # a tile's entry has some kilobytes
 _PATH = re.compile(r"component_\d+/[^/\\]+")
 
@@ -35,14 +35,14 @@ class Manifest:
     """The tiles of a folder, by component and name.
 
     Args:
-        map_id: which map the folder belongs to.
-        tiles: those that are finished.
+        map_id: id of the map that the folder belongs to.
+        tiles: the finished tiles.
         num_bytes: size of each tile's file, by path.
-        notes: what a person should know about the folder as it was found.
-        doomed: paths of files that are no longer a tile's and are still to be deleted.
-        metres: how long a metre is in the frame of each component, as the tiles were made.
-        world: where each component that is tied to the world lies in it, as JSON has it (docs/how-to/world.md).
-        offsets: what was taken off the coordinates of each scene's file, of scenes in map coordinates.
+        notes: notes on the state of the folder.
+        doomed: paths of obsolete files that are to be deleted.
+        metres: metric scale of each component as the tiles were made.
+        world: georeference of components, as in their JSON (docs/how-to/world.md).
+        offsets: coordinate offsets of the files of scenes in map coordinates, by scene.
     """
 
     map_id: str
@@ -58,12 +58,12 @@ class Manifest:
 
     @classmethod
     def load(cls, folder: Path, map_id: str) -> Manifest:
-        """The folder's manifest; an empty one where the folder is empty or missing.
+        """Load the folder's manifest; an empty one if the folder is empty or missing.
 
-        Tiles of version 1 have an empty key, which makes every one of them dirty.
+        Tiles of version 1 have an empty key, which makes them all dirty.
 
         Raises:
-            ConfigError: the folder holds another map's export, or files that are no export at all.
+            ConfigError: the folder holds the export of another map, or unrelated files.
             InputError: the manifest cannot be read.
         """
         path = folder / FILE_NAME
@@ -117,11 +117,11 @@ class Manifest:
         )
 
     def metres_per_unit(self, component: int) -> float:
-        """Of a component's frame; 1 where nothing is known."""
+        """Return the metric scale of a component; 1 if unknown."""
         return self.metres[component].metres_per_unit if component in self.metres else 1.0
 
     def has_file(self, folder: Path, tile: Tile) -> bool:
-        """Whether the tile's file lies there with the size it was written with; a tile without Gaussians has none."""
+        """Return whether the tile's file exists in its original size; a tile without Gaussians has no file."""
         if not tile.path:
             return True
         path = folder / tile.path
@@ -131,12 +131,12 @@ class Manifest:
             return False
 
     def save_sometimes(self, folder: Path) -> None:
-        """Save, unless that was done a moment ago: an interrupted export loses seconds, a large one does not crawl."""
+        """Save unless it was saved recently, so that an interrupted export loses seconds at most."""
         if time.monotonic() - self._saved_at > max(_SAVE_EVERY_S, _SAVE_SHARE * self._save_took_s):
             self.save(folder)
 
     def save(self, folder: Path) -> None:
-        """Replace the folder's manifest in one step."""
+        """Replace the folder's manifest atomically."""
         entries = [
             _entry(name, tile, self.num_bytes.get(tile.path, 0), self.metres_per_unit(tile.component))
             for (_, name), tile in sorted(self.tiles.items())
@@ -154,7 +154,7 @@ class Manifest:
 
 
 def _as_json(content: Mapping[str, object]) -> str:
-    """JSON with a line for each tile: with `json`'s own indents it takes eight times as long, again and again."""
+    """Serialize to JSON with a line per tile, eight times as fast as with the indents of `json`."""
     lines = []
     for name, value in content.items():
         if isinstance(value, list):
@@ -187,7 +187,7 @@ def _metre(entry: Mapping[str, Any]) -> Metre:
 
 
 def _entry(name: str, tile: Tile, num_bytes: int, metres_per_unit: float) -> dict[str, object]:
-    """A tile as ``tiles.json`` has it; docs/reference/storage.md explains every field."""
+    """Return the entry of a tile in ``tiles.json``; docs/reference/storage.md explains every field."""
     return {
         "name": name,
         "component": tile.component,
@@ -213,7 +213,7 @@ def _text(path: Path) -> str:
 
 
 def _checked_path(path: Any) -> str:
-    """A tile's path: a file in a component's folder, as every export writes it; empty where the tile holds nothing."""
+    """Validate the path of a tile: a file in a component's folder, or empty for a tile without Gaussians."""
     if not isinstance(path, str) or control_characters(path) or (path and _PATH.fullmatch(path) is None):
         raise ValueError(f"the path {path!r} of a tile is not component_N/NAME")
     if path.rpartition("/")[2] in (".", ".."):

@@ -1,4 +1,4 @@
-"""Which tiles an export consists of."""
+"""Planning of the tiles of an export."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.export import levels
-from gsmap.export.cells import Boxes, CellSet, Grid
+from gsmap.export.cells import CellSet, Grid, OrientedBoxes
 from gsmap.geometry.origins import float32_step, origin_of
 from gsmap.types import Sim3
 
@@ -46,12 +46,12 @@ class PlannedTile:
     """A tile to be exported.
 
     Args:
-        component: the component it belongs to; each has its own frame and folder.
-        name: of its file, without suffix; unique in its component.
+        component: its component, each of which has its own frame and folder.
+        name: name of its file, without suffix; unique in its component.
         bounds: (2, 3) float64 box in the component's map frame.
         poses: ``S_map_scene`` by scene id, of every scene that may reach into it.
-        extent: text that says which part of the map it is, however the scenes move.
-        metres_per_unit: of the component's map frame.
+        extent: text that identifies the part of the map, independent of the poses.
+        metres_per_unit: metric scale of the component's map frame.
     """
 
     component: int
@@ -73,22 +73,22 @@ def plan_tiles(
     metres_per_unit: Mapping[int, float] | None = None,
     max_tiles: int = Params.max_tiles,
 ) -> list[PlannedTile]:
-    """Tiles of a grid through the map's origin that scenes reach into, in a fixed order.
+    """Plan the tiles of a grid through the map's origin that scenes reach into, in a fixed order.
 
     Args:
         poses: ``S_map_scene`` by scene id, of the scenes to export.
         scene_bounds: (2, 3) box of each scene's Gaussians in the scene's frame.
         tile_size_m: edge of a tile; 0 makes one tile of each component.
         components: component of each scene; all 0 if None.
-        bbox: (2, 3) only this box of the map, in its unit as poses are; tiles are cut by it.
-        reach_m: how far beyond its bounds a tile's content depends on scenes.
-        metres_per_unit: of each component's frame; all 1 if None.
-        max_tiles: more tiles than this are refused.
+        bbox: (2, 3) box in the map's unit that tiles are clipped to; None for all.
+        reach_m: distance beyond its bounds within which scenes affect a tile.
+        metres_per_unit: metric scale of each component; all 1 if None.
+        max_tiles: largest number of tiles.
 
     Raises:
         ConfigError: a negative tile size, or one so small that there would be too many tiles.
-        InputError: no scenes, an empty box, a box that no scene touches, or a component so far from zero that single
-            precision does not hold a millimetre there.
+        InputError: no scenes, an empty box, a box outside of all scenes, or a component so far from the origin that
+            single precision does not resolve a millimetre.
     """
     if not (np.isfinite(tile_size_m) and tile_size_m >= 0):
         raise ConfigError(
@@ -103,7 +103,7 @@ def plan_tiles(
     tiles: list[PlannedTile] = []
     for component in sorted({components[s] for s in poses}):
         members = [scene for scene in sorted(poses) if components[scene] == component]
-        boxes = Boxes.of([poses[scene] for scene in members], [scene_bounds[scene] for scene in members])
+        boxes = OrientedBoxes.of([poses[scene] for scene in members], [scene_bounds[scene] for scene in members])
         metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
         _require_near(component, boxes.around, metres)
         reach = reach_m / metres
@@ -117,7 +117,7 @@ def plan_tiles(
             near = {members[row]: poses[members[row]] for row in reaching}
             tiles.append(PlannedTile(component, name, bounds, near, place, metres))
     if not tiles and bbox is not None:
-        whole = Boxes.of(list(poses.values()), [scene_bounds[scene] for scene in poses]).around
+        whole = OrientedBoxes.of(list(poses.values()), [scene_bounds[scene] for scene in poses]).around
         raise InputError(
             f"the box {_text(bbox)} lies outside the map, which spans {_text(whole)}: choose a box that touches it",
             code="box_outside_map",
@@ -126,7 +126,7 @@ def plan_tiles(
 
 
 def _require_near(component: int, box: np.ndarray, metres_per_unit: float) -> None:
-    """Refuse a component that priors have put at map coordinates: its Gaussians would be rounded."""
+    """Raise an error for a component at map coordinates, where its Gaussians would be rounded."""
     offset = origin_of(box)
     rounded_m = float32_step(box) / 2 * metres_per_unit
     if offset.any() and rounded_m > _MAX_ROUNDED_M:
@@ -141,8 +141,8 @@ def _require_near(component: int, box: np.ndarray, metres_per_unit: float) -> No
 _Tiles = Iterator[tuple[tuple[int, ...] | None, np.ndarray, list[int]]]
 
 
-def _in_one(boxes: Boxes, bbox: np.ndarray | None, reach: float) -> _Tiles:
-    """All of a component as one tile: no cell, its bounds, and the rows of the boxes that reach into it."""
+def _in_one(boxes: OrientedBoxes, bbox: np.ndarray | None, reach: float) -> _Tiles:
+    """Yield a component as one tile: no cell, its bounds, and the rows of the boxes that reach into it."""
     bounds = boxes.around if bbox is None else bbox
     everyone = np.arange(len(boxes))
     low, high = (np.tile(corner, (len(boxes), 1)) for corner in bounds)
@@ -150,8 +150,8 @@ def _in_one(boxes: Boxes, bbox: np.ndarray | None, reach: float) -> _Tiles:
         yield None, bounds, np.flatnonzero(boxes.touch(everyone, low - reach, high + reach)).tolist()
 
 
-def _in_cells(boxes: Boxes, grid: Grid, reach: float) -> _Tiles:
-    """Every cell that a box touches, in order, with its bounds and the rows of the boxes that reach into it."""
+def _in_cells(boxes: OrientedBoxes, grid: Grid, reach: float) -> _Tiles:
+    """Yield every cell that a box intersects, in order, with its bounds and the rows of the boxes within reach."""
     which, cells = grid.reached(boxes)
     holding = CellSet.of(cells)
     if not len(holding):

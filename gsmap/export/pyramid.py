@@ -1,4 +1,4 @@
-"""Coarser levels above an export's tiles, whatever format they are in: made upwards, two by two by two, and kept."""
+"""Pyramid of levels of detail over the tiles of an export: built bottom-up, two by two by two, and reused."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from gsmap.types import Cameras, Gaussians, Tile
 
 LEVELS_FOLDER = "levels"
 _MAX_PER_LEVEL = 100_000
-_COARSENING = 4  # a level draws at most this fraction of what replaces it: half the detail on surfaces
+_COARSENING = 4  # least ratio of the Gaussians of a level's children to its own: half the detail on surfaces
 _Cell = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """What one place of a tree draws: a tile, or a level in place of its children.
+class PyramidNode:
+    """A node of the pyramid: a tile, or a level that replaces its children from afar.
 
     Args:
-        uri: of its file, relative to the component's folder.
-        digest: of what it was made from.
-        cell: (2, 3) of the tile; of a level, around those of the tiles below.
-        parts: how many Gaussians stand for each tile below it, in the file's order.
-        boxes: (tiles, 2, 3) around what they draw; NaN where they are none.
+        uri: its file, relative to the component's folder.
+        digest: digest of its inputs.
+        cell: (2, 3) bounds of the tile; of a level, around those of its tiles.
+        parts: number of Gaussians of each of its tiles, in the file's order.
+        boxes: (tiles, 2, 3) boxes around these Gaussians; NaN without any.
         error_m: geometric error, in the frame's unit; 0 for a tile.
-        extras: what was measured, by name.
-        children: what replaces it.
-        height: how often the edge of a tile was doubled.
+        extras: measurements by name.
+        children: nodes that refine it.
+        height: number of doublings of a tile's edge.
     """
 
     uri: str
@@ -48,30 +48,30 @@ class Drawn:
     boxes: np.ndarray
     error_m: float = 0.0
     extras: Mapping[str, float] = field(default_factory=dict)
-    children: tuple[Drawn, ...] = ()
+    children: tuple[PyramidNode, ...] = ()
     height: int = 0
 
     @cached_property
-    def tiles(self) -> tuple[Drawn, ...]:
-        """Those below it, in order; itself if it is one."""
+    def tiles(self) -> tuple[PyramidNode, ...]:
+        """Tiles below the node, in order; itself if it is a tile."""
         return tuple(tile for child in self.children for tile in child.tiles) or (self,)
 
     @cached_property
     def box(self) -> np.ndarray:
-        """(2, 3) around what it and all below it draw."""
+        """(2, 3) box around the Gaussians of the node and of all below it."""
         boxes = np.concatenate([self.boxes, *(child.box[None] for child in self.children)])
         return np.stack([np.nanmin(boxes[:, 0], axis=0), np.nanmax(boxes[:, 1], axis=0)])
 
-    def walk(self) -> Iterator[Drawn]:
-        """It and all below it."""
+    def walk(self) -> Iterator[PyramidNode]:
+        """Yield the node and all below it."""
         yield self
         for child in self.children:
             yield from child.walk()
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What a folder's present tree says of a level or a tile; see `Drawn`. Without boxes the file is read for them."""
+class StoredNode:
+    """Data of a level or tile in a folder's present tree; see `PyramidNode`. Missing boxes are read from the file."""
 
     error_m: float
     extras: Mapping[str, float]
@@ -79,49 +79,52 @@ class Known:
     boxes: np.ndarray | None = None
 
 
-class Layout(Protocol):
-    """The files of one kind of tree."""
+class TreeLayout(Protocol):
+    """Files of one format of tree."""
 
     @property
     def file_name(self) -> str:
-        """Of the tree, in the folder of a component."""
+        """Name of the tree's file in the folder of a component."""
         ...
 
     @property
     def key(self) -> str:
-        """What decides how a level's file is written."""
+        """Text that identifies how a level's file is written."""
         ...
 
     def tile(
-        self, folder: Path, tile: Tile, known: Mapping[str, Known]
+        self, folder: Path, tile: Tile, known: Mapping[str, StoredNode]
     ) -> tuple[str, int, np.ndarray, Gaussians | None]:
-        """The uri of a tile's file in a tree, how many Gaussians it holds, the box (2, 3) of what they draw, and
-        themselves where it had to be read.
+        """Return the uri of a tile's file, its number of Gaussians, their box (2, 3), and the Gaussians if read.
 
         Args:
-            known: what the folder's present tree says, by uri, which may be of an earlier content of the file.
+            folder: folder of the component.
+            tile: the tile.
+            known: nodes of the folder's present tree, by uri, perhaps of an earlier content of the file.
         """
         ...
 
     def level_uri(self, name: str) -> str:
-        """Where the level of a name lies."""
+        """Return the uri of the level of a name."""
         ...
 
     def read(self, path: Path) -> Gaussians:
-        """What the file of a tile or a level holds."""
+        """Read the Gaussians of a tile's or level's file."""
         ...
 
-    def write(self, path: Path, gaussians: Gaussians, tiles: Sequence[Drawn]) -> tuple[tuple[int, ...], np.ndarray]:
-        """Write a level in one step; its parts and their boxes, as in `Drawn`."""
+    def write(
+        self, path: Path, gaussians: Gaussians, tiles: Sequence[PyramidNode]
+    ) -> tuple[tuple[int, ...], np.ndarray]:
+        """Write a level atomically; return its parts and their boxes, as in `PyramidNode`."""
         ...
 
-    def known(self, folder: Path) -> dict[str, Known]:
-        """The levels, and tiles, that the folder's present tree names, by uri; none where it is not ours."""
+    def known(self, folder: Path) -> dict[str, StoredNode]:
+        """Return the nodes of the folder's present tree, by uri; none for an unknown file."""
         ...
 
 
-def is_stale(out: Path, tiles: Sequence[Tile], layout: Layout) -> bool:
-    """Whether the trees over an export's tiles are to be written, also where an earlier one was killed."""
+def is_stale(out: Path, tiles: Sequence[Tile], layout: TreeLayout) -> bool:
+    """Return whether the trees over an export's tiles must be written, such as after an interruption."""
     changed_ns = (out / MANIFEST).stat().st_mtime_ns
     for folder in {(out / tile.path).parent for tile in tiles if tile.path}:
         try:
@@ -135,19 +138,19 @@ def is_stale(out: Path, tiles: Sequence[Tile], layout: Layout) -> bool:
     return False
 
 
-def pyramids(
+def build_pyramids(
     out: Path,
     tiles: Sequence[Tile],
     tile_size_m: float,
-    layout: Layout,
+    layout: TreeLayout,
     metres_per_unit: Mapping[int, float] | None,
     cameras: Callable[[int], Cameras | None],
     levels: Params,
-) -> Iterator[tuple[int, Path, Drawn]]:
-    """Each component, its folder, and the root of the levels above its tiles.
+) -> Iterator[tuple[int, Path, PyramidNode]]:
+    """Build the pyramid of each component; yield the component, its folder and the root.
 
-    Levels are named by what they were made from and how, so those whose tiles did not change are not made again; but
-    for one that was left out, since the level above it may be shown from as near. Memory is bounded by eight tiles.
+    Levels are named by the digest of their inputs, so those with unchanged tiles are reused, except for levels that
+    were dropped because the level above is shown from as near. Memory is bounded by eight tiles.
     """
     by_component: dict[int, list[Tile]] = defaultdict(list)
     for tile in tiles:
@@ -157,7 +160,7 @@ def pyramids(
         edge = tile_size_m / (1.0 if metres_per_unit is None else metres_per_unit[component])
         folder = (out / members[0].path).parent
         refuse_links(out, folder.name, LEVELS_FOLDER)
-        maker = _Maker(folder, layout, layout.known(folder), _once(cameras, component), levels)
+        maker = _PyramidBuilder(folder, layout, layout.known(folder), _once(cameras, component), levels)
         cells = np.array([_cell(tile, edge) for tile in members])
         cells -= cells.min(0)  # counted from the lowest one, so that each component ends in one root
         root, _ = maker.place(
@@ -166,8 +169,8 @@ def pyramids(
         yield component, folder, root
 
 
-def remove_unnamed(folder: Path, root: Drawn) -> None:
-    """Delete levels that no place of the tree names any more."""
+def remove_unnamed(folder: Path, root: PyramidNode) -> None:
+    """Delete levels that no node of the tree refers to."""
     named = {node.uri.split("/")[1] for node in root.walk() if node.uri.startswith(f"{LEVELS_FOLDER}/")}
     for path in (folder / LEVELS_FOLDER).glob("*"):
         if path.name not in named:
@@ -175,7 +178,7 @@ def remove_unnamed(folder: Path, root: Drawn) -> None:
 
 
 def _once(cameras: Callable[[int], Cameras | None], component: int) -> Callable[[], Cameras | None]:
-    """The cameras of a component, asked for once and only if they are needed."""
+    """Return a function that loads the cameras of a component once, and only if needed."""
     found: list[Cameras | None] = []
 
     def get() -> Cameras | None:
@@ -192,40 +195,40 @@ def _cell(tile: Tile, edge: float) -> _Cell:
 
 
 @dataclass(frozen=True, eq=False)
-class _Maker:
-    """How the levels of one component are made.
+class _PyramidBuilder:
+    """Builder of the levels of one component.
 
     Args:
-        folder: of the component.
-        layout: of its files.
-        known: levels and tiles that the folder's present tree names.
+        folder: folder of the component.
+        layout: its files.
+        known: nodes of the folder's present tree, by uri.
         cameras, levels: see `gsmap.export.levels`.
     """
 
     folder: Path
-    layout: Layout
-    known: Mapping[str, Known]
+    layout: TreeLayout
+    known: Mapping[str, StoredNode]
     cameras: Callable[[], Cameras | None]
     levels: Params
 
-    def place(self, tiles: Mapping[_Cell, Tile], height: int) -> tuple[Drawn, Gaussians | None]:
-        """What a block of 2^height cells along each axis draws, and its Gaussians if it is a tile that was read."""
+    def place(self, tiles: Mapping[_Cell, Tile], height: int) -> tuple[PyramidNode, Gaussians | None]:
+        """Return the node of a block of 2^height cells along each axis, and the Gaussians of a tile if read."""
         if not height:
             (tile,) = tiles.values()
             uri, count, box, read = self.layout.tile(self.folder, tile, self.known)
-            return Drawn(uri, tile.sha256, np.asarray(tile.bounds, np.float64), (count,), box[None]), read
+            return PyramidNode(uri, tile.sha256, np.asarray(tile.bounds, np.float64), (count,), box[None]), read
         blocks: dict[_Cell, dict[_Cell, Tile]] = defaultdict(dict)
         for (x, y, z), tile in tiles.items():
             blocks[x >> height - 1, y >> height - 1, z >> height - 1][x, y, z] = tile
         below = [self.place(blocks[block], height - 1) for block in sorted(blocks)]
         return (below[0][0] if len(below) == 1 else self.parent(below, height)), None
 
-    def parent(self, below: Sequence[tuple[Drawn, Gaussians | None]], height: int) -> Drawn:
-        """What is drawn in place of its children; the one of earlier where it was made of the same."""
+    def parent(self, below: Sequence[tuple[PyramidNode, Gaussians | None]], height: int) -> PyramidNode:
+        """Return the level over its children, reused if it was made of the same inputs."""
         children = [child for child, _ in below]
         fitted_by = backend()
         recipe = f"levels {VERSION} {self.levels} {self.layout.key}"
-        if fitted_by != "native":  # the CPU's levels keep the names that they had
+        if fitted_by != "native":  # names of levels that the CPU fitted have no backend
             recipe += f" {fitted_by}"
         made_of = [recipe, *(child.digest for child in children)]
         digest = hashlib.sha256("\n".join(made_of).encode()).hexdigest()
@@ -236,8 +239,8 @@ class _Maker:
         known = self.known.get(uri)
         if known is not None and is_file(path):
             boxes = known.boxes if known.boxes is not None else boxes_of(self.layout.read(path), known.parts)
-            parts, error_m, said = known.parts, known.error_m, dict(known.extras)
-            children = _better(children, error_m)
+            parts, error_m, extras = known.parts, known.error_m, dict(known.extras)
+            children = _usable_children(children, error_m)
         else:
             finer = Gaussians.concatenate(
                 [self.layout.read(self.folder / child.uri) if read is None else read for child, read in below]
@@ -246,25 +249,24 @@ class _Maker:
             level = make_level(finer, most, self.cameras(), self.levels)
             make_folder(path.parent)
             parts, boxes = self.layout.write(path, level.gaussians, tiles)
-            children = _better(children, level.error_m)
-            # A level must never be finer than what replaces it, or viewers would stop at it too early.
+            children = _usable_children(children, level.error_m)
+            # A level's error must exceed its children's, or viewers would stop refining too early.
             error_m = max(level.error_m, 1.5 * max(child.error_m for child in children), 1e-3)
             measured = level.psnr_db or ()
-            said = {name: round(v, 2) for name, v in zip(("psnr_worst_db", "psnr_db"), measured, strict=False)}
-        return Drawn(uri, digest, cell, parts, boxes, error_m, said, tuple(children), height)
+            extras = {name: round(v, 2) for name, v in zip(("psnr_worst_db", "psnr_db"), measured, strict=False)}
+        return PyramidNode(uri, digest, cell, parts, boxes, error_m, extras, tuple(children), height)
 
 
-def _better(children: Sequence[Drawn], error_m: float) -> list[Drawn]:
-    """The children of a level, those left out that are not like enough from nearer than it is: what is below them
-    replaces it instead."""
-    kept: list[Drawn] = []
+def _usable_children(children: Sequence[PyramidNode], error_m: float) -> list[PyramidNode]:
+    """Return the children of a level, those with no smaller error than its own replaced by their children."""
+    kept: list[PyramidNode] = []
     for child in children:
         kept += [child] if not child.children or child.error_m < error_m else child.children
     return kept
 
 
 def boxes_of(gaussians: Gaussians, parts: Sequence[int]) -> np.ndarray:
-    """(P, 2, 3) the box around what each run of Gaussians draws; NaN where it is empty."""
+    """Return (P, 2, 3) boxes around runs of Gaussians; NaN for an empty run."""
     from gsmap.formats.tiles3d import box_of
 
     ends = np.cumsum([0, *parts])

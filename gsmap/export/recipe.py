@@ -1,4 +1,4 @@
-"""What names a tile, and why one that an earlier export made must be made again."""
+"""Recipes of tiles, and the reasons for which an existing tile is made again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmap.methods import RecipeKey
 from gsmap.types import Tile
 
 VERSION = 1
-"""Raised whenever the same merged Gaussians are written otherwise: every tile is then made again."""
+"""Raised whenever the same merged Gaussians are written differently: every tile is then made again."""
 
 _TILES_3D, _STREAMED_SOG = "3dtiles", "streamed-sog"
 _TREES = {_TILES_3D: "glb", _STREAMED_SOG: "sog"}
@@ -25,21 +25,21 @@ _TREES = {_TILES_3D: "glb", _STREAMED_SOG: "sog"}
 
 @dataclass(frozen=True, eq=False)
 class TileRecipe:
-    """How all tiles of one export are made; with a `PlannedTile` it names that tile.
+    """Recipe of all tiles of one export; together with a `PlannedTile` it identifies that tile.
 
     Args:
-        merge: of the merger and its settings (`gsmap.merge.recipe_key`).
+        merge: recipe of the merger and its settings (`gsmap.merge.recipe_key`).
         format: suffix of the tiles' files without the dot, or a tree of coarser levels over them: ``3dtiles`` (of
             ``.glb``) or ``streamed-sog`` (of ``.sog``).
-        provenance: whether the file says of each Gaussian which scene it is from (``.ply`` alone).
-        budget_s: ceiling on the seconds that merging one tile may take, None for none.
+        provenance: whether the file stores the scene of each Gaussian (``.ply`` only).
+        budget_s: limit on the seconds of merging one tile, None for none.
         uncompressed: whether the content of ``3dtiles`` is float32 rather than SPZ.
-        dates: when each scene was captured, by scene id, if the merger uses dates; None if it does not.
-        without: names what of each scene is left out, by scene id, where something is.
-        photos: names the photographs that a tile is to look like, by its component and name, where there are any.
+        dates: capture date of each scene, by scene id, if the merger uses dates; None if it does not.
+        without: digest of the Gaussians of each scene that are left out, by scene id, if any.
+        photos: digest of the photos that a tile is fitted to, by its component and name, if any.
 
     Raises:
-        ConfigError: a format that cannot be written, or one that cannot be had with provenance or uncompressed.
+        ConfigError: unknown format, or one that excludes provenance or uncompressed.
     """
 
     merge: RecipeKey
@@ -80,15 +80,15 @@ class TileRecipe:
 
     @property
     def suffix(self) -> str:
-        """Of the tiles' files, without the dot."""
+        """Suffix of the tiles' files, without the dot."""
         return _TREES.get(self.format, self.format)
 
     def with_dates(self, dates: Mapping[str, str | None]) -> TileRecipe:
-        """The same for a merger that uses dates."""
+        """Return the recipe with dates, for a merger that uses them."""
         return replace(self, dates=dates)
 
     def key(self, planned: PlannedTile) -> str:
-        """Digest of everything that decides the tile's content but the poses; scene ids are digests of content."""
+        """Return the digest of all inputs of the tile's content but the poses; scene ids are digests of content."""
         scenes = sorted(planned.poses)
         inputs = [
             f"export {VERSION}",
@@ -99,7 +99,7 @@ class TileRecipe:
             f"extent {planned.extent}",
             *(f"scene {scene}" for scene in scenes),
         ]
-        if planned.metres_per_unit != 1.0:  # left out of a map in metres, whose tiles had the same key without it
+        if planned.metres_per_unit != 1.0:  # absent for a map in metres, whose keys predate it
             inputs.append(f"metres_per_unit {planned.metres_per_unit!r}")
         if self.dates is not None:
             inputs += [f"captured_at {scene} {self.dates.get(scene)}" for scene in scenes]
@@ -112,19 +112,19 @@ class TileRecipe:
 def dirty_reason(
     planned: PlannedTile, tile: Tile | None, recipe: TileRecipe, max_shift_m: float = Params.max_shift_m
 ) -> str:
-    """Why a tile made earlier must be made again, in words; empty where it need not.
+    """Return the reason for which an existing tile must be made again, as text; empty if it need not.
 
-    Poses are compared with those the tile was made with, not with the last revision, so slow drift cannot creep.
+    Poses are compared with those that the tile was made with, not with the last revision, so that slow drift counts.
     """
     if tile is None:
         return "new"
     if not tile.key:
         return "an older gsmap made it"
     if tile.key != recipe.key(planned):
-        return _what_changed(planned, tile, recipe)
+        return _first_change(planned, tile, recipe)
     corners = box_corners(planned.bounds)
     for scene, pose in planned.poses.items():
-        # How far the scene's content at the tile's corners has moved.
+        # Displacement of the scene at the tile's corners.
         then = tile.poses[scene] @ pose.inverse()
         moved = np.linalg.norm(then.apply(corners) - corners, axis=1).max() * planned.metres_per_unit
         if moved > max_shift_m:
@@ -132,8 +132,8 @@ def dirty_reason(
     return ""
 
 
-def _what_changed(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
-    """The first difference between what made a tile and what would make it now."""
+def _first_change(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
+    """Return the first difference between the recipe of a tile and the present one."""
     before, now = tile.recipe, recipe.merge.to_json()
     if before.get("method") != now["method"]:
         return f"another merge method: {before.get('method')}, now {now['method']}"
@@ -146,7 +146,7 @@ def _what_changed(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
 
 
 def _difference(before: Any, now: Any) -> str:
-    """The first leaf that differs, with both values."""
+    """Return the first leaf that differs, with both values."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         for name in sorted({*before, *now}):
             if before.get(name) != now.get(name):

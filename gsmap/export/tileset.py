@@ -1,4 +1,4 @@
-"""A 3D Tiles tileset over an export's tiles: coarser levels merged upwards, the finest level the tiles themselves."""
+"""3D Tiles tileset over the tiles of an export, with levels of detail above them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import MALFORMED, CorruptError
 from gsmap.export.levels import Params
-from gsmap.export.pyramid import LEVELS_FOLDER, Drawn, Known, pyramids, remove_unnamed
+from gsmap.export.pyramid import LEVELS_FOLDER, PyramidNode, StoredNode, build_pyramids, remove_unnamed
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
 from gsmap.types import Cameras, Gaussians, Sim3, Tile
@@ -34,26 +34,25 @@ def write_tilesets(
 ) -> list[Path]:
     """Write ``tileset.json`` into each component's folder, with coarser levels above the tiles (`gsmap.export.levels`).
 
-    What is kept, and memory: `gsmap.export.pyramid.pyramids`. 3D Tiles are in metres: the root's transform makes the
-    map's unit one, its geometric errors with it.
+    See `gsmap.export.pyramid.build_pyramids` for reuse and memory. 3D Tiles are in metres: the root's transform scales
+    the map's unit, including geometric errors.
 
     Args:
-        out: the export's folder; the tiles' ``.glb`` lie in it.
+        out: the export's folder with the tiles' ``.glb``.
         tile_size_m: edge of the grid's tiles, > 0.
-        metres_per_unit: of each component's frame; all 1 if None.
-        S_ecef_map: of components that are tied to the world: takes their frames to Earth-centred metres (EPSG:4978),
-            where globes draw them.
-        compressed: whether the tiles are packed as SPZ, and levels are to be.
-        cameras: of the captures, in the frame of a component.
-        levels: how they are made.
+        metres_per_unit: metric scale of each component; all 1 if None.
+        S_ecef_map: poses of georeferenced components in Earth-centred metres (EPSG:4978), for globes.
+        compressed: whether tiles and levels are packed as SPZ.
+        cameras: loads the cameras of the scenes of a component, in its frame.
+        levels: settings of the levels.
     """
     written = []
     layout = Tiles3D(compressed)
-    for component, folder, root in pyramids(
+    for component, folder, root in build_pyramids(
         out, tiles, tile_size_m, layout, metres_per_unit, cameras, levels or Params()
     ):
         metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
-        # The map's z is up where gsmap could tell.
+        # The map's z is up where gravity is known.
         transform = np.diag([metres, metres, metres, 1.0])
         if S_ecef_map is not None and component in S_ecef_map:
             transform = S_ecef_map[component].matrix()
@@ -66,10 +65,10 @@ def write_tilesets(
 
 @dataclass(frozen=True)
 class Tiles3D:
-    """The files of 3D Tiles: a ``.glb`` for every tile and level.
+    """Files of 3D Tiles: a ``.glb`` for every tile and level.
 
     Args:
-        compressed: packed as SPZ.
+        compressed: whether they are packed as SPZ.
     """
 
     compressed: bool = True
@@ -80,11 +79,11 @@ class Tiles3D:
         return str(self.compressed)
 
     def tile(
-        self, folder: Path, tile: Tile, known: Mapping[str, Known]
+        self, folder: Path, tile: Tile, known: Mapping[str, StoredNode]
     ) -> tuple[str, int, np.ndarray, Gaussians | None]:
         uri = Path(tile.path).name
         there = known.get(uri)
-        # What was written before the tree is what the tree was written of.
+        # A file older than the tree is the one that the tree describes.
         if (
             there is not None
             and there.boxes is not None
@@ -100,12 +99,14 @@ class Tiles3D:
     def read(self, path: Path) -> Gaussians:
         return tiles3d.read_content(path)
 
-    def write(self, path: Path, gaussians: Gaussians, tiles: Sequence[Drawn]) -> tuple[tuple[int, ...], np.ndarray]:
+    def write(
+        self, path: Path, gaussians: Gaussians, tiles: Sequence[PyramidNode]
+    ) -> tuple[tuple[int, ...], np.ndarray]:
         write_whole(path, partial(tiles3d.write_content, gaussians=gaussians, compressed=self.compressed))
         return (len(gaussians),), tiles3d.box_of(gaussians)[None]
 
-    def known(self, folder: Path) -> dict[str, Known]:
-        found: dict[str, Known] = {}
+    def known(self, folder: Path) -> dict[str, StoredNode]:
+        found: dict[str, StoredNode] = {}
 
         def walk(tile: dict) -> None:
             center, axes = (
@@ -114,7 +115,7 @@ class Tiles3D:
             )
             half = np.diag(axes)
             box, uri = np.stack([center - half, center + half]), tile["content"]["uri"]
-            found[uri] = Known(float(tile["geometricError"]), dict(tile.get("extras", {})), (0,), box[None])
+            found[uri] = StoredNode(float(tile["geometricError"]), dict(tile.get("extras", {})), (0,), box[None])
             for child in tile.get("children", ()):
                 walk(child)
 
@@ -122,7 +123,7 @@ class Tiles3D:
             with open(open_file(folder / FILE_NAME), "rb") as file:
                 walk(json.loads(file.read())["root"])
         except (OSError, *MALFORMED, CorruptError):
-            return {}  # none yet, or not ours: everything is made again
+            return {}  # missing or unknown: everything is made again
         return found
 
 
@@ -130,6 +131,6 @@ def _written_ns(path: Path) -> int:
     return path.stat().st_mtime_ns
 
 
-def _node(drawn: Drawn) -> TileNode:
+def _node(drawn: PyramidNode) -> TileNode:
     children = tuple(_node(child) for child in drawn.children)
     return TileNode(drawn.box, drawn.error_m, drawn.uri, children, drawn.extras)

@@ -1,4 +1,4 @@
-"""Writing an export: only dirty tiles, each appearing whole or not at all, the manifest last."""
+"""Incremental, crash-safe writing of an export: dirty tiles only, each atomically, and the manifest last."""
 
 from __future__ import annotations
 
@@ -47,15 +47,15 @@ _within: ContextVar[Progress] = ContextVar("progress of a tile that is made in t
 
 @dataclass(frozen=True, eq=False)
 class ExportResult:
-    """The tiles now in the folder, and what this export did.
+    """Result of an export.
 
     Args:
-        tiles: all of them, in the plan's order.
-        recomputed: how many of them this export made.
-        reused: how many it found made.
-        removed: how many that are no longer in the plan it took away.
-        notes: what a person should know about the tiles that it made.
-        set_aside: the tiles that could not be made since they end the process that makes them, and why.
+        tiles: all tiles in the folder, in the plan's order.
+        recomputed: number of tiles made.
+        reused: number of tiles that were up to date.
+        removed: number of tiles removed, as they are no longer planned.
+        notes: notes on the tiles made.
+        set_aside: quarantined tiles, whose jobs ended their process, and the reasons.
     """
 
     tiles: list[Tile]
@@ -68,13 +68,13 @@ class ExportResult:
 
 @dataclass(frozen=True)
 class StagedTile:
-    """The file of a tile that was made, not yet in its place.
+    """The staged file of a tile.
 
     Args:
-        name: of the file, in the folder that was given for it; empty where the tile holds nothing.
-        sha256, num_bytes: of the file.
+        name: name of the file in the staging folder; empty for a tile without Gaussians.
+        sha256, num_bytes: digest and size of the file.
         num_gaussians, truncated, notes: as in `gsmap.types.Tile`.
-        content: the file itself, where it was made on a machine that does not have the folder; None else.
+        content: bytes of the file if it was made on a machine without access to the folder; None by default.
     """
 
     name: str
@@ -87,7 +87,7 @@ class StagedTile:
 
 
 def run_here(job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
-    """Do jobs in this process, one after the other."""
+    """Run jobs in this process, in sequence."""
     for index, args in enumerate(arguments):
         yield index, job(*args)
 
@@ -107,30 +107,30 @@ def export_tiles(
     made: Callable[[Tile], None] | None = None,
     progress: Progress | None = None,
 ) -> ExportResult:
-    """Bring a folder to hold exactly the planned tiles, making only those that an earlier export did not.
+    """Update a folder to exactly the planned tiles, making only those that are missing or dirty.
 
-    The manifest is there before the first tile. Every tile is written under a temporary name, fsynced and renamed; the
-    manifest follows, and what it no longer names is deleted last. Interrupted anywhere, the folder holds whole tiles
-    only, and the same call goes on from there.
+    The manifest exists before the first tile. Every tile is written under a temporary name, fsynced and renamed; the
+    manifest follows, and obsolete files are deleted last. If interrupted, the folder holds complete tiles only, and the
+    same call resumes.
 
     Args:
         plan: from `plan_tiles`.
-        make: of a tile, and a path below which nothing lies yet and files may be kept until all tiles are made, what
-            makes its content, given where to report progress; can be pickled if ``run`` needs that.
-        out: folder; made if missing; one folder per component inside.
-        map_id: a folder keeps to one map.
-        recipe: how tiles are made and written; where it differs from a tile's, that tile is made again.
-        metres: how long a metre is in each component's frame, to be told in the manifest.
-        world: where components lie in the world, to be told there, too.
-        offsets: what was taken off the coordinates of scenes' files, to be told there, too.
-        params: from which movement on a tile is made again.
-        run: makes tiles, here or elsewhere (`gsmap.engine.run_jobs`).
-        made: told each new tile once its file is in place; called from the calling thread.
-        progress: told the fraction of tiles done and what is being done.
+        make: makes the content function of a tile, given the tile and an unused path for files that tiles share; the
+            function takes a progress callback, and must be picklable if ``run`` requires it.
+        out: folder, made if missing, with one folder per component inside.
+        map_id: id of the map that the folder belongs to.
+        recipe: recipe of the tiles; tiles with another one are made again.
+        metres: metric scale of each component, for the manifest.
+        world: georeference of components, for the manifest.
+        offsets: coordinate offsets of scenes' files, for the manifest.
+        params: see `gsmap.export.Params`.
+        run: runs jobs, here or elsewhere (`gsmap.engine.run_jobs`).
+        made: called with each new tile once its file is in place, in the calling thread.
+        progress: called with the fraction of tiles done and the current step.
 
     Raises:
         ConfigError: the folder belongs to another map or holds other files.
-        CorruptError: a link lies in it where a folder of tiles belongs: it would lead elsewhere.
+        CorruptError: a symbolic link is in place of a folder of tiles.
         DiskFullError, ReadOnlyError, DiskError, StoreError: the folder cannot be written.
     """
     params = params or Params()
@@ -146,28 +146,30 @@ def export_tiles(
     told = dict(metres or {}), dict(world or {}), dict(offsets or {})
     retold = (manifest.metres, manifest.world, manifest.offsets) != told
     manifest.metres, manifest.world, manifest.offsets = told
-    report = _Report(progress or silent, len(plan), reused)
+    report = _ProgressReport(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     aside: list[tuple[PlannedTile, str]] = []
-    staging = out / _STAGING / secrets.token_hex(16)  # what another export's workers may still write lies elsewhere
+    staging = (
+        out / _STAGING / secrets.token_hex(16)
+    )  # unique, as workers of an earlier export may still write to theirs
     try:
         if not (todo or gone or retold or manifest.doomed) and out.exists():
             return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
         make_folder(out)
         if not (out / FILE_NAME).exists():
-            manifest.save(out)  # whose folder it is, before anything lies in it
-        remove_tree(out, _STAGING)  # it may not be ours, and hold links
+            manifest.save(out)  # claims the folder for the map
+        remove_tree(out, _STAGING)  # it may be foreign, and hold links
         (out / _STAGING).mkdir()
         staging.mkdir()
         (staging / _MARK).touch()
-        with closing(_made(todo, make, run, recipe, staging, report)) as finished:
+        with closing(_make_tiles(todo, make, run, recipe, staging, report)) as finished:
             for planned_tile, staged in finished:
                 if isinstance(staged, SetAside):
                     aside.append((planned_tile, staged.reason))
                     continue
-                at, tile, num_bytes = _placed(planned_tile, staged, out, staging, recipe)
+                at, tile, num_bytes = _install(planned_tile, staged, out, staging, recipe)
                 if made is not None:
-                    made(tile)  # first: a tile that the manifest names is not made, and so not told, again
+                    made(tile)  # before the manifest, as a tile in it is not reported again
                 if at in old and old[at].path not in ("", tile.path):
                     manifest.doomed.add(old[at].path)
                 manifest.tiles[at], manifest.num_bytes[tile.path] = tile, num_bytes
@@ -192,7 +194,7 @@ def export_tiles(
             with suppress(OSError, CorruptError):
                 remove_tree(out, *left)
     tiles = [manifest.tiles[at] for at in sorted(planned) if at in manifest.tiles]
-    return ExportResult(tiles, len(news), reused, len(gone), manifest.notes + _told(news), tuple(aside))
+    return ExportResult(tiles, len(news), reused, len(gone), manifest.notes + _collect_notes(news), tuple(aside))
 
 
 def _must_make(
@@ -203,15 +205,15 @@ def _must_make(
     return tile is None or not manifest.has_file(out, tile)
 
 
-def _made(
+def _make_tiles(
     todo: Sequence[PlannedTile],
     make: Callable[[PlannedTile, str], Content],
     run: Run,
     recipe: TileRecipe,
     staging: Path,
-    report: _Report,
+    report: _ProgressReport,
 ) -> Generator[tuple[PlannedTile, StagedTile | SetAside], None, None]:
-    """Each tile with its staged file, or why there is none; to be closed, which gives up those that are being made."""
+    """Yield each tile with its staged file, or the reason for quarantine; closing it cancels the running jobs."""
     folder = str(staging.absolute())
     shared = os.path.join(folder, _SHARED)
     arguments = ((make(planned, shared), recipe, folder, _staged_name(planned, recipe)) for planned in todo)
@@ -227,26 +229,26 @@ def _made(
 
 
 def make_file(content: Content, recipe: TileRecipe, folder: str, name: str) -> StagedTile:
-    """Make one tile, and its file in a folder; or, on a machine that does not have the folder, its bytes: a job."""
+    """Make one tile and its file in a folder, or its bytes on a machine without access to the folder: a job."""
     found = content(_within.get())
     empty = StagedTile("", "", 0, len(found.gaussians), found.truncated, tuple(found.notes))
     if not len(found.gaussians):
         return empty
     if Path(folder, _MARK).exists():
-        digest, num_bytes = _written(Path(folder, name), found, recipe)
+        digest, num_bytes = _write_with_digest(Path(folder, name), found, recipe)
         return replace(empty, name=name, sha256=digest, num_bytes=num_bytes)
     with tempfile.TemporaryDirectory(prefix="gsmap-tile-") as elsewhere:
         path = Path(elsewhere, name)
-        digest, num_bytes = _written(path, found, recipe)
+        digest, num_bytes = _write_with_digest(path, found, recipe)
         return replace(empty, name=name, sha256=digest, num_bytes=num_bytes, content=path.read_bytes())
 
 
-def _written(path: Path, content: MergeResult, recipe: TileRecipe) -> tuple[str, int]:
-    """Digest and size of the file that is at the path now."""
+def _write_with_digest(path: Path, content: MergeResult, recipe: TileRecipe) -> tuple[str, int]:
+    """Write the file of a tile; return its digest and size."""
     try:
         _write(path, content, recipe)
     except GsmapError as error:
-        # A full disk is a matter of the folder, not of what was written.
+        # A full disk is an error of the folder, not of the content.
         raise error.__cause__ if isinstance(error.__cause__, OSError) else error from None
     return _synced_digest(path)
 
@@ -255,10 +257,10 @@ def _staged_name(planned: PlannedTile, recipe: TileRecipe) -> str:
     return f"component_{planned.component}_{planned.name}.{recipe.suffix}"
 
 
-def _placed(
+def _install(
     planned: PlannedTile, staged: StagedTile, out: Path, staging: Path, recipe: TileRecipe
 ) -> tuple[_At, Tile, int]:
-    """Put the file of a tile in its place, and describe it."""
+    """Move the file of a tile to its place, and return its key, description and size."""
     path = ""
     if staged.name:
         path = f"component_{planned.component}/{planned.name}.{recipe.suffix}"
@@ -302,7 +304,7 @@ def _synced_digest(path: Path) -> tuple[str, int]:
 
 
 def _remove_doomed(out: Path, manifest: Manifest) -> None:
-    """Delete the files of tiles that are no longer named, and their component's folder with the last one."""
+    """Delete the files of obsolete tiles, and their component's folder with the last one."""
     kept = {tile.path for tile in manifest.tiles.values()}
     doomed = sorted(manifest.doomed - kept)
     for path in doomed:
@@ -310,14 +312,14 @@ def _remove_doomed(out: Path, manifest: Manifest) -> None:
         remove_empty_folder(out, path.split("/")[0])
     for folder in {path.split("/")[0] for path in doomed}:
         if is_folder(out / folder):
-            sync_folder(out / folder)  # or they are back when the power was gone, and named by nothing
+            sync_folder(out / folder)  # so that a power failure does not restore them
     if manifest.doomed:
         manifest.doomed = set()
         manifest.save(out)
 
 
 def leftovers(out: Path) -> list[tuple[str, ...]]:
-    """Where in its folder an export that was killed had begun to write."""
+    """Return the paths, in its folder, that an interrupted export may have left incomplete."""
     found = [
         *out.glob(f".{FILE_NAME}.*"),
         *out.glob("component_*/.tileset.json.*"),
@@ -326,8 +328,8 @@ def leftovers(out: Path) -> list[tuple[str, ...]]:
     return [(_STAGING,), *(path.relative_to(out).parts for path in found)]
 
 
-def _told(news: dict[_At, Tile]) -> tuple[str, ...]:
-    """The notes of new tiles, each once, with the tile it is about or how many tiles it is about."""
+def _collect_notes(news: dict[_At, Tile]) -> tuple[str, ...]:
+    """Return the unique notes of new tiles, each with its tile or number of tiles."""
     about: dict[str, list[str]] = {}
     for (component, name), tile in sorted(news.items()):
         for note in tile.notes:
@@ -335,8 +337,8 @@ def _told(news: dict[_At, Tile]) -> tuple[str, ...]:
     return tuple(f"{at[0] if len(at) == 1 else f'{len(at)} tiles'}: {note}" for note, at in about.items())
 
 
-class _Report:
-    """Progress over all tiles."""
+class _ProgressReport:
+    """Progress report over all tiles."""
 
     def __init__(self, progress: Progress, total: int, done: int) -> None:
         self._progress, self._total, self._done = progress, total, done

@@ -10,7 +10,7 @@ import pytest
 
 from gsmap.cli.edge import read_pose
 from gsmap.errors import ConfigError, GsmapError, InputError
-from gsmap.export import streamed, tileset
+from gsmap.export import streamed_sog, tileset
 from gsmap.export.manifest import Manifest
 from gsmap.formats import g2o
 from gsmap.map.evaluating import _read_truth
@@ -50,7 +50,7 @@ def test_levels_of_a_tileset_that_is_not_ours_are_made_again(tmp_path: Path, tex
     (tmp_path / "tileset.json").write_text(text)
     assert tileset.Tiles3D().known(tmp_path) == {}
     (tmp_path / "lod-meta.json").write_text(text)
-    assert streamed.StreamedSog().known(tmp_path) == {}
+    assert streamed_sog.StreamedSog().known(tmp_path) == {}
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.export import TileRecipe, dirty_reason, plan_tiles
-from gsmap.export.cells import Boxes
+from gsmap.export.cells import OrientedBoxes
 from gsmap.geometry.rotations import exp_so3
 from gsmap.merge import recipe_key
 from gsmap.types import Sim3, Tile
@@ -107,13 +107,13 @@ def test_tiles_without_content_do_not_count():
 def test_a_plan_takes_work_by_the_scene(monkeypatch):
     """Ten times the scenes: ten times the boxes that are compared, however much lies between them."""
     compared = []
-    touch = Boxes.touch
+    touch = OrientedBoxes.touch
 
     def counting(self, which, low, high):
         compared.append(len(which))
         return touch(self, which, low, high)
 
-    monkeypatch.setattr(Boxes, "touch", counting)
+    monkeypatch.setattr(OrientedBoxes, "touch", counting)
     counts = []
     for num in (100, 1000):
         compared.clear()

@@ -21,7 +21,7 @@ from gsmap import formats
 from gsmap.cli.edge import read_pose
 from gsmap.errors import NotFoundError
 from gsmap.export.manifest import Manifest
-from gsmap.export.streamed import StreamedSog
+from gsmap.export.streamed_sog import StreamedSog
 from gsmap.export.tileset import Tiles3D
 from gsmap.formats import cameras_json, colmap, g2o, nerfstudio, tum
 from gsmap.geometry.rotations import quats_to_matrices

@@ -17,8 +17,8 @@ from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, NotFoundError, ReadOnlyError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
-from gsmap.export.pyramid import Layout, is_stale
-from gsmap.export.streamed import StreamedSog, write_streams
+from gsmap.export.pyramid import TreeLayout, is_stale
+from gsmap.export.streamed_sog import StreamedSog, write_streams
 from gsmap.export.tileset import Tiles3D, write_tilesets
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.map.dates import is_until, last_of, undated_note
@@ -307,7 +307,7 @@ def _export(
             progress=progress,
         )
     _put_aside(store, out, planned, result)
-    layout: Layout = Tiles3D(not request.uncompressed) if planned.recipe.is_tileset else StreamedSog()
+    layout: TreeLayout = Tiles3D(not request.uncompressed) if planned.recipe.is_tileset else StreamedSog()
     if planned.recipe.is_tree and is_stale(out, result.tiles, layout):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
         S_ecef_map = {component: one.S_ecef_map for component, one in planned.world.items()}

@@ -22,7 +22,7 @@ from gsmap.errors import BusyError, DiskError, DiskFullError, GsmapError, NotFou
 from gsmap.export.lock import folder_lock
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.pyramid import LEVELS_FOLDER, is_stale
-from gsmap.export.streamed import StreamedSog
+from gsmap.export.streamed_sog import StreamedSog
 from gsmap.export.tileset import Tiles3D
 from gsmap.export.write import leftovers
 from gsmap.map.pictures import FILE_NAME as PICTURES

@@ -1,6 +1,6 @@
-"""A streamed SOG over an export's tiles: what PlayCanvas' engine and SuperSplat's viewer load by level and place.
+"""Streamed SOG over the tiles of an export, for PlayCanvas' engine and SuperSplat's viewer.
 
-The tiles lie beside it as bundled ``.sog``; the tree names the same images unbundled, as the format asks for folders.
+The tiles are stored beside it as bundled ``.sog``, and unbundled in the folders that the format requires.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from gsmap.durable import is_file, make_folder, open_file, sync_file, sync_folder, write_whole
 from gsmap.errors import MALFORMED, CorruptError
 from gsmap.export.levels import Params
-from gsmap.export.pyramid import LEVELS_FOLDER, Drawn, Known, boxes_of, pyramids, remove_unnamed
+from gsmap.export.pyramid import LEVELS_FOLDER, PyramidNode, StoredNode, boxes_of, build_pyramids, remove_unnamed
 from gsmap.formats import sog, streamed_sog
 from gsmap.formats.streamed_sog import LodNode, Run
 from gsmap.types import Cameras, Gaussians, Tile
@@ -35,18 +35,18 @@ def write_streams(
 ) -> list[Path]:
     """Write ``lod-meta.json`` into each component's folder, with coarser levels of the tiles (`gsmap.export.levels`).
 
-    What is kept, and memory: `gsmap.export.pyramid.pyramids`. Positions and errors are in the map's frame and unit: the
-    format has no transform.
+    See `gsmap.export.pyramid.build_pyramids` for reuse and memory. Positions and errors are in the map's frame and
+    unit, as the format has no transform.
 
     Args:
-        out: the export's folder; the tiles' ``.sog`` lie in it.
+        out: the export's folder with the tiles' ``.sog``.
         tile_size_m: edge of the grid's tiles, > 0.
-        metres_per_unit: of each component's frame; all 1 if None.
-        cameras: of the captures, in the frame of a component.
-        levels: how they are made.
+        metres_per_unit: metric scale of each component; all 1 if None.
+        cameras: loads the cameras of the scenes of a component, in its frame.
+        levels: settings of the levels.
     """
     written = []
-    for _, folder, root in pyramids(
+    for _, folder, root in build_pyramids(
         out, tiles, tile_size_m, StreamedSog(), metres_per_unit, cameras, levels or Params()
     ):
         write_whole(folder / FILE_NAME, partial(streamed_sog.write_tree, root=_node(root, ())))
@@ -57,13 +57,13 @@ def write_streams(
 
 @dataclass(frozen=True)
 class StreamedSog:
-    """The files of a streamed SOG: a folder with ``meta.json`` and images for every tile and level."""
+    """Files of a streamed SOG: a folder with ``meta.json`` and images for every tile and level."""
 
     file_name: str = FILE_NAME
     key: str = f"sog {sog.VERSION}"
 
     def tile(
-        self, folder: Path, tile: Tile, known: Mapping[str, Known]
+        self, folder: Path, tile: Tile, known: Mapping[str, StoredNode]
     ) -> tuple[str, int, np.ndarray, Gaussians | None]:
         bundle = folder / Path(tile.path).name
         uri = self.level_uri(tile.sha256[:24])
@@ -80,19 +80,21 @@ class StreamedSog:
     def read(self, path: Path) -> Gaussians:
         return sog.read(path)
 
-    def write(self, path: Path, gaussians: Gaussians, tiles: Sequence[Drawn]) -> tuple[tuple[int, ...], np.ndarray]:
+    def write(
+        self, path: Path, gaussians: Gaussians, tiles: Sequence[PyramidNode]
+    ) -> tuple[tuple[int, ...], np.ndarray]:
         ordered, parts = streamed_sog.parted(gaussians, np.stack([tile.cell for tile in tiles]))
         make_folder(path.parent)
         write_whole(path, partial(sog.write, gaussians=ordered, ordered=True))
         _sync(path)
         return parts, boxes_of(ordered, parts)
 
-    def known(self, folder: Path) -> dict[str, Known]:
+    def known(self, folder: Path) -> dict[str, StoredNode]:
         try:
             with open(open_file(folder / FILE_NAME), "rb") as file:
                 levels = streamed_sog.runs(json.loads(file.read()))
             return {
-                uri: Known(
+                uri: StoredNode(
                     max(float(run.extras["error_m"]) for run in runs),
                     {name: float(value) for name, value in runs[0].extras.items() if name != "error_m"},
                     tuple(run.count for run in runs),
@@ -100,11 +102,11 @@ class StreamedSog:
                 for uri, runs in levels.items()
             }
         except (OSError, *MALFORMED, CorruptError):
-            return {}  # none yet, or not ours: everything is made again
+            return {}  # missing or unknown: everything is made again
 
 
-def _node(drawn: Drawn, above: tuple[tuple[Drawn, int], ...]) -> LodNode:
-    """A place of the tree; ``above`` are the levels over it, each with the number of its first tile among theirs."""
+def _node(drawn: PyramidNode, above: tuple[tuple[PyramidNode, int], ...]) -> LodNode:
+    """Return a node of the tree; ``above`` are the levels over it, each with the index there of its first tile."""
     if not drawn.children:
         shown = {}
         boxes = []
@@ -124,7 +126,7 @@ def _node(drawn: Drawn, above: tuple[tuple[Drawn, int], ...]) -> LodNode:
 
 
 def _sync(meta: Path) -> None:
-    """Make a folder of a SOG survive a power cut."""
+    """Sync the folder of a SOG to disk."""
     for file in meta.parent.iterdir():
         sync_file(file)
     sync_folder(meta.parent)
