@@ -36,7 +36,7 @@ def find_changes(
     both: tuple[SurfaceCells, SurfaceCells],
     cells: tuple[CellLabels, CellLabels],
     unlike: float,
-    looks: tuple[CaptureViews, CaptureViews],
+    views: tuple[CaptureViews, CaptureViews],
     params: Params,
 ) -> list[DetectedChange]:
     """Detect all changes between two captures, without their confidence.
@@ -64,7 +64,7 @@ def find_changes(
         else:
             newer[k - len(older)] = with_background(newer[k - len(older)], paint.cells[1])
     older, newer = absorb_fragments(older, both[0]), absorb_fragments(newer, both[1])
-    moves, older, newer = find_relocations(older, newer, both, cells, looks, params)
+    moves, older, newer = find_relocations(older, newer, both, cells, views, params)
     for move in moves:
         evidence = {"fit": move.score, "next_fit": move.runner_up}
         found.append(

@@ -67,16 +67,16 @@ class _Capture:
 
     side: SurfaceCells
     cells: CellLabels
-    looks: CaptureViews
+    views: CaptureViews
     segments: list[ChangedSegment]
     tree: FeatureTree
 
     @classmethod
     def of(
-        cls, side: SurfaceCells, cells: CellLabels, looks: CaptureViews, segments: Sequence[ChangedSegment]
+        cls, side: SurfaceCells, cells: CellLabels, views: CaptureViews, segments: Sequence[ChangedSegment]
     ) -> _Capture:
         loose = np.flatnonzero(cells.plane < 0)
-        return cls(side, cells, looks, list(segments), FeatureTree(_features(side, loose)))
+        return cls(side, cells, views, list(segments), FeatureTree(_features(side, loose)))
 
     def points(self, segment: ChangedSegment) -> np.ndarray:
         return self.side.points[segment.cells]
@@ -91,16 +91,16 @@ def find_relocations(
     newer: Sequence[ChangedSegment],
     sides: tuple[SurfaceCells, SurfaceCells],
     cells: tuple[CellLabels, CellLabels],
-    looks: tuple[CaptureViews, CaptureViews],
+    views: tuple[CaptureViews, CaptureViews],
     params: Params,
 ) -> tuple[list[Relocation], list[ChangedSegment], list[ChangedSegment]]:
     """Return the relocations between two captures, and the remaining segments of both."""
-    a = _Capture.of(sides[0], cells[0], looks[0], older)
-    b = _Capture.of(sides[1], cells[1], looks[1], newer)
+    a = _Capture.of(sides[0], cells[0], views[0], older)
+    b = _Capture.of(sides[1], cells[1], views[1], newer)
     moves: list[Relocation] = []
-    asked: set[bytes] = set()
+    tried_before: set[bytes] = set()
     for _ in range(_ROUNDS):
-        found = _moves_from(a, b, False, asked, params) + _moves_from(b, a, True, asked, params)
+        found = _moves_from(a, b, False, tried_before, params) + _moves_from(b, a, True, tried_before, params)
         news: list[Relocation] = []
         for move in sorted(found, key=lambda m: -m.score):
             if not any(_overlap(move, other, a, b) for other in moves + news):
@@ -115,13 +115,15 @@ def find_relocations(
     return _merge_pieces(moves, a, b), a.segments, b.segments
 
 
-def _moves_from(here: _Capture, there: _Capture, back: bool, asked: set[bytes], params: Params) -> list[Relocation]:
-    """Return relocations of segments that were not ``asked`` before; ``back`` if their capture is the newer."""
+def _moves_from(
+    here: _Capture, there: _Capture, back: bool, tried_before: set[bytes], params: Params
+) -> list[Relocation]:
+    """Return relocations of segments that are not in ``tried_before``; ``back`` if their capture is the newer."""
     found = []
     for seed in _seeds(here):
         name = bytes([back]) + seed.cells.tobytes()
-        if name not in asked:
-            asked.add(name)
+        if name not in tried_before:
+            tried_before.add(name)
             move = _moved(seed, here, there, back, params)
             found += [move] if move is not None else []
     return found
@@ -339,7 +341,7 @@ def _agreement(segment: ChangedSegment, here: _Capture, there: _Capture, pose: S
     moved = pose.apply(here.side.points[rows])
     on, similar = _fits(rows, moved, here.side, there.side)
     through = ~on
-    through[~on] = _looked_through(moved[~on], there.looks)
+    through[~on] = _in_free_space(moved[~on], there.views)
     seen = int((on | through).sum())
     if seen < min(0.7 * _FEWEST, 0.3 * len(rows)):
         return 0.0
@@ -360,10 +362,10 @@ def _fits(
     return on, on & (unlike < _ALIKE)
 
 
-def _looked_through(points: np.ndarray, looks: CaptureViews) -> np.ndarray:
+def _in_free_space(points: np.ndarray, views: CaptureViews) -> np.ndarray:
     """Return (N,) bool, points in free space of a capture's own views."""
     count = np.zeros(len(points), dtype=np.int64)
-    for view, sure in zip(looks.views[::2], looks.sure[::2], strict=True):
+    for view, sure in zip(views.views[::2], views.sure[::2], strict=True):
         at = project_points(points, view, 0.2)
         behind = sure[at.row, at.column] & (at.z < view.near[at.row, at.column] - 0.06)
         count[at.index[behind]] += 1

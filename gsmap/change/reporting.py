@@ -109,7 +109,7 @@ def detect_lighting_change(both: tuple[SurfaceCells, SurfaceCells], line: Balanc
     """
     gains = np.abs(np.log(line.gains()))
     sure = float(1 - np.exp(-max(gains.max() / _GAIN, spread / LIT_OTHERWISE)))
-    points = np.concatenate([side.points[side.looks > 0] for side in both])
+    points = np.concatenate([side.points[side.pixels > 0] for side in both])
     if not len(points) or (gains.max() < _GAIN and spread < LIT_OTHERWISE):
         return None
     none = np.zeros(0, dtype=np.int32)

@@ -74,14 +74,14 @@ def classify_cells(sides: tuple[SurfaceCells, SurfaceCells]) -> tuple[CellLabels
 def _judge(side: SurfaceCells, plane: np.ndarray) -> CellLabels:
     through, on = side.around(side.through, _SMOOTH_M), side.around(side.on, _SMOOTH_M)
     moved = (through >= _FEWEST_LOOKS) & (through >= _MIN_LOOKED_THROUGH * (through + on)) & (side.through >= side.on)
-    looks = side.around(side.looks, _SMOOTH_M)
-    strength = side.around(side.strength * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
-    offset = side.around(side.offset_m * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
-    painted = ~moved & (looks >= _FEWEST_LOOKS) & (strength >= _FAINT)
+    pixels = side.around(side.pixels, _SMOOTH_M)
+    strength = side.around(side.strength * side.pixels, _SMOOTH_M) / np.maximum(pixels, 1)
+    offset = side.around(side.offset_m * side.pixels, _SMOOTH_M) / np.maximum(pixels, 1)
+    painted = ~moved & (pixels >= _FEWEST_LOOKS) & (strength >= _FAINT)
     plane = np.where(moved, -1, plane)  # free space is no wall
     segment = np.full(len(side), -1, dtype=np.int64)
     segment[plane < 0] = components(side.points[plane < 0], _LINK_M)
-    judged = (side.through + side.on > 0) | (side.looks > 0)
+    judged = (side.through + side.on > 0) | (side.pixels > 0)
     return CellLabels(plane, segment, moved, painted, judged, strength, offset)
 
 
@@ -176,10 +176,10 @@ def find_colour_changes(
         at = int(plane[group[0]])
         leaks = [_leak(s, c, p, at) for s, c, p in zip(sides, cells, parts, strict=True)]
         colour = np.concatenate([side.colour[p] for side, p in zip(sides, parts, strict=True)])
-        looks = np.concatenate([side.looks[p] for side, p in zip(sides, parts, strict=True)])
-        if not looks.any():  # no pixel compared these cells themselves
+        pixels = np.concatenate([side.pixels[p] for side, p in zip(sides, parts, strict=True)])
+        if not pixels.any():  # no pixel compared these cells themselves
             continue
-        mean, size = np.average(colour, axis=0, weights=looks), np.average(np.abs(colour), axis=0, weights=looks)
+        mean, size = np.average(colour, axis=0, weights=pixels), np.average(np.abs(colour), axis=0, weights=pixels)
         hue, light = np.abs(mean[:2]).max(), abs(mean[2])
         found.append(
             ColourChange(
@@ -219,9 +219,9 @@ def lighting_spread(sides: tuple[SurfaceCells, SurfaceCells]) -> float:
     spreads = []
     for side in sides:
         label, counts = cell_labels(np.floor(side.points / _PLACE_M))
-        looks = np.bincount(label, side.looks, len(counts))
-        sums = np.stack([np.bincount(label, side.colour[:, k] * side.looks, len(counts)) for k in range(3)], axis=1)
-        mean = sums[looks > 0] / looks[looks > 0, None]
+        pixels = np.bincount(label, side.pixels, len(counts))
+        sums = np.stack([np.bincount(label, side.colour[:, k] * side.pixels, len(counts)) for k in range(3)], axis=1)
+        mean = sums[pixels > 0] / pixels[pixels > 0, None]
         if len(mean):
             spreads.append(1.4826 * np.median(np.abs(mean - np.median(mean, axis=0)), axis=0).max())
     return float(max(spreads, default=0.0))
@@ -240,7 +240,7 @@ def _leak(side: SurfaceCells, cells: CellLabels, inside: np.ndarray, plane: int)
     """Return the fraction of a change of colour that continues around it: paint ends at an edge, shadows fade."""
     if not len(inside):
         return 0.0
-    around = (side.looks > 0) & ~cells.moved & ~cells.painted & (cells.plane == plane)
+    around = (side.pixels > 0) & ~cells.moved & ~cells.painted & (cells.plane == plane)
     outside = np.flatnonzero(around)
     distance, _ = cKDTree(side.points[inside]).query(side.points[outside], distance_upper_bound=_RING_M[1])
     ring = outside[np.isfinite(distance) & (distance > _RING_M[0])]

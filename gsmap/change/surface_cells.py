@@ -36,7 +36,7 @@ class SurfaceCells:
         offset_m: (M,) mean distance of the other capture's surface behind this one, along its normal.
         colour: (M, 3) mean difference of colour, two of chroma and one of lightness, newer minus older.
         strength: (M,) the same relative to the least difference that counts, texture off by a pixel ignored.
-        looks: (M,) pixels that show the cell in both captures.
+        pixels: (M,) pixels that show the cell in both captures.
     """
 
     rows: np.ndarray
@@ -48,7 +48,7 @@ class SurfaceCells:
     offset_m: np.ndarray
     colour: np.ndarray
     strength: np.ndarray
-    looks: np.ndarray
+    pixels: np.ndarray
 
     def __len__(self) -> int:
         return len(self.points)
@@ -90,7 +90,7 @@ class _Sums:
     offset: np.ndarray
     colour: np.ndarray
     strength: np.ndarray
-    looks: np.ndarray
+    pixels: np.ndarray
 
     @classmethod
     def zeros(cls, count: int) -> _Sums:
@@ -109,8 +109,8 @@ def compare_surfaces(
     for picture in comparison.older_views[1::2]:
         _add(sums, (picture.own, picture.other), picture, comparison, limits)
     made = [
-        _side(looks, evidence, one, comparison.balance if k == 0 else None)
-        for k, (looks, evidence, one) in enumerate(
+        _side(capture, evidence, one, comparison.balance if k == 0 else None)
+        for k, (capture, evidence, one) in enumerate(
             zip((older, newer), (comparison.older, comparison.newer), sums, strict=True)
         )
     ]
@@ -141,8 +141,8 @@ def _add(
     difference, beyond = plain[one], beyond[one]
     offset = np.clip((b.depth - a.depth) * _along_normal(picture.own), -_CLIP_M, _CLIP_M)[one]
     for into, view, sign in zip(sums, views, (1.0, -1.0), strict=True):
-        ids, count = view.dominant_id[one], len(into.looks)
-        into.looks += np.bincount(ids, minlength=count)
+        ids, count = view.dominant_id[one], len(into.pixels)
+        into.pixels += np.bincount(ids, minlength=count)
         into.strength += np.bincount(ids, beyond, count)
         for k in range(3):
             into.colour[:, k] += np.bincount(ids, difference[:, k], count)
@@ -190,16 +190,16 @@ def _along_normal(view: Any) -> np.ndarray:
     return np.clip(np.abs((normal * rays).sum(-1)), _STEEPEST, 1.0)
 
 
-def _side(looks: CaptureViews, evidence: Any, sums: _Sums, line: Balance | None) -> SurfaceCells:
-    rows = np.flatnonzero(looks.surface)
-    gaussians = looks.gaussians
+def _side(capture: CaptureViews, evidence: Any, sums: _Sums, line: Balance | None) -> SurfaceCells:
+    rows = np.flatnonzero(capture.surface)
+    gaussians = capture.gaussians
     points = gaussians.means[rows].astype(np.float64)
     label, counts = cell_labels(np.floor(points / CELL_M))
     colours = np.clip(rgb_of_sh0(gaussians.sh[rows, 0]).astype(np.float64), 0, 1)
     if line is not None:
         colours = np.clip(np.exp(np.log(colours + FLOOR) * line.slope + line.offset) - FLOOR, 0, 1)
     total = lambda values: np.bincount(label, values[rows], len(counts))  # noqa: E731
-    looked = total(sums.looks)
+    counts_seen = total(sums.pixels)
     return SurfaceCells(
         rows,
         label,
@@ -207,8 +207,8 @@ def _side(looks: CaptureViews, evidence: Any, sums: _Sums, line: Balance | None)
         group_means(colours, label, counts),
         total(evidence.through.astype(np.float64)),
         total(evidence.on_surface.astype(np.float64)),
-        total(sums.offset) / np.maximum(looked, 1),
-        np.stack([total(sums.colour[:, k]) for k in range(3)], axis=1) / np.maximum(looked, 1)[:, None],
-        total(sums.strength) / np.maximum(looked, 1),
-        looked,
+        total(sums.offset) / np.maximum(counts_seen, 1),
+        np.stack([total(sums.colour[:, k]) for k in range(3)], axis=1) / np.maximum(counts_seen, 1)[:, None],
+        total(sums.strength) / np.maximum(counts_seen, 1),
+        counts_seen,
     )

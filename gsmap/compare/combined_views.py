@@ -27,30 +27,30 @@ def combine_views(
         of: the capture to be compared with the result.
         max_views: of one capture; the result has at most twice as many.
     """
-    chosen = _select_views([looks for looks, _ in parts], of, max_views)
+    chosen = _select_views([capture for capture, _ in parts], of, max_views)
     views, sure, placed, first = [], [], [], 0
-    for (looks, stays), picked in zip(parts, chosen, strict=True):
+    for (capture, stays), picked in zip(parts, chosen, strict=True):
         row = np.where(stays, np.cumsum(stays) - 1 + first, -1).astype(np.int32)
         first += int(stays.sum())
         for v in picked:
-            view, at = looks.views[v], looks.placed[v]
+            view, at = capture.views[v], capture.placed[v]
             dominant = np.where(view.dominant_id >= 0, row[view.dominant_id], -1)
             kept = stays[at.index]
             views.append(replace(view, dominant_id=dominant))
-            sure.append(looks.sure[v])
+            sure.append(capture.sure[v])
             placed.append(
                 replace(at, index=row[at.index[kept]], row=at.row[kept], column=at.column[kept], z=at.z[kept])
             )
-    gaussians = Gaussians.concatenate([looks.gaussians[stays] for looks, stays in parts])
+    gaussians = Gaussians.concatenate([capture.gaussians[stays] for capture, stays in parts])
     surface, times_seen, sharpness = (
-        np.concatenate([getattr(looks, name)[stays] for looks, stays in parts])
+        np.concatenate([getattr(capture, name)[stays] for capture, stays in parts])
         for name in ("surface", "times_seen", "sharpness")
     )
-    scene = PlacedScene(gaussians, scene_id="+".join(looks.scene.scene_id for looks, _ in parts))
+    scene = PlacedScene(gaussians, scene_id="+".join(capture.scene.scene_id for capture, _ in parts))
     return CaptureViews(scene, tuple(views), surface, times_seen, sharpness, tuple(sure), tuple(placed))
 
 
-def mask_outdated(looks: CaptureViews, comparison: Comparison, stays: np.ndarray) -> CaptureViews:
+def mask_outdated(capture: CaptureViews, comparison: Comparison, stays: np.ndarray) -> CaptureViews:
     """Mask the views of the older capture of a comparison where a newer capture disagrees.
 
     Its colours are balanced to the newer's, so that earlier captures are compared with one exposure.
@@ -59,7 +59,7 @@ def mask_outdated(looks: CaptureViews, comparison: Comparison, stays: np.ndarray
         stays: (N,) bool, its Gaussians that are valid still.
     """
     sure, views = [], []
-    for own, picture in zip(looks.sure, comparison.older_views, strict=True):
+    for own, picture in zip(capture.sure, comparison.older_views, strict=True):
         shown = picture.own.dominant_id
         stands = (shown >= 0) & stays[shown]
         undisputed = (picture.outcome == AGREE) | (picture.outcome == UNSURE) | (picture.outcome == OTHER_BEHIND)
@@ -68,14 +68,14 @@ def mask_outdated(looks: CaptureViews, comparison: Comparison, stays: np.ndarray
         view = picture.own
         colour = comparison.balance.applied(view.colour)
         views.append(replace(view, colour=colour, solid=view.solid & so, opaque=view.opaque & so))
-    return replace(looks, views=tuple(views), sure=tuple(sure))
+    return replace(capture, views=tuple(views), sure=tuple(sure))
 
 
 def _select_views(captures: Sequence[CaptureViews], of: PlacedScene, max_views: int) -> list[list[int]]:
     """Select views of each capture greedily by coverage, at most twice ``max_views`` in all."""
     chosen: list[list[int]] = [[] for _ in captures]
     points = of.gaussians.means[:: max(1, len(of.gaussians) // _SAMPLE)]
-    names = [(c, v) for c, looks in enumerate(captures) for v in range(len(looks.views))]
+    names = [(c, v) for c, capture in enumerate(captures) for v in range(len(capture.views))]
     if not names or not len(points):
         return chosen
     sees = np.zeros((len(names), len(points)), dtype=np.float32)

@@ -132,9 +132,9 @@ def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
 
 
-def _surface(looks: CaptureViews) -> tuple[Gaussians, np.ndarray]:
-    rows = np.flatnonzero(looks.surface)
-    return (looks.gaussians if len(rows) == len(looks.surface) else looks.gaussians[rows]), rows
+def _surface(capture: CaptureViews) -> tuple[Gaussians, np.ndarray]:
+    rows = np.flatnonzero(capture.surface)
+    return (capture.gaussians if len(rows) == len(capture.surface) else capture.gaussians[rows]), rows
 
 
 def _seen_by(view: View, gaussians: Gaussians, rows: np.ndarray) -> View:

@@ -117,10 +117,10 @@ class EvidenceCounts:
             beside = near.sums((state >= REPAINTED).astype(np.int32)) >= _BORDER * np.maximum(near.count, 1)
             state[(state == SAME) & beside & (differs >= _PART)] = REPAINTED
         _fill_unjudged(state, near, self.grazed > 0, self.colour_seen < MIN_VIEWS)
-        looks = min(MIN_VIEWS, views)
-        gone = (state == GONE) & (self.through >= looks) & ((self.sure >= 1) | (self.on_surface == 0))
+        required = min(MIN_VIEWS, views)
+        gone = (state == GONE) & (self.through >= required) & ((self.sure >= 1) | (self.on_surface == 0))
         gone[gone] = is_clear(points[gone], others, CLEAR_M)
-        painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= _ROOT_COLOUR) & (differs >= 1)
+        painted = (state == REPAINTED) & (self.colour_seen >= required) & (around >= _ROOT_COLOUR) & (differs >= 1)
         # Free space is no wall.
         shell = np.where(state == GONE, -1, shell)
         segment = label_segments(points, shell)

@@ -20,7 +20,7 @@ from gsmap.geometry.neighbours import nearest_of, neighbours_of
 
 _CELL_M = 0.05  # edge of the surface cells in which planes are detected
 _FEWEST = 5  # points of a hull
-_ASKED = 5  # nearest judged neighbours that vote
+_VOTERS = 5  # nearest judged neighbours that vote
 _CHANGE_LINK_M = 0.1  # changed Gaussians this near on one shell plane, or off all planes, are one change
 MIN_ROOTS, MIN_ROOT_FRACTION = 8, 0.2  # Gaussians beyond doubt, and their fraction, that prove a change
 _ISOLATED_COLOUR = 4.0  # times the least difference of colour, that counts beside a change without neighbours
@@ -114,8 +114,8 @@ def find_rooted(labels: ChangeLabels) -> np.ndarray:
     roots = np.bincount(label, labels.sure[rows])
     out = np.zeros(len(labels.changed), dtype=bool)
     out[rows] = ((roots >= MIN_ROOTS) & (roots >= MIN_ROOT_FRACTION * size))[label]
-    alone = (labels.changed & labels.sure) | (labels.differs >= _ISOLATED_COLOUR)
-    beyond, found = np.flatnonzero(alone & ~out), np.flatnonzero(out)
+    isolated = (labels.changed & labels.sure) | (labels.differs >= _ISOLATED_COLOUR)
+    beyond, found = np.flatnonzero(isolated & ~out), np.flatnonzero(out)
     while len(beyond) and len(found):
         near = nearest_of(labels.points[found], labels.points[beyond], _ADJACENT_M)[0]
         found, beyond = beyond[np.isfinite(near)], beyond[np.isinf(near)]
@@ -135,7 +135,7 @@ def spread_changes(labels: ChangeLabels) -> np.ndarray:
     for wall in np.unique(labels.shell[out & labels.judged & (labels.shell >= 0)]):
         on, hidden = labels.judged & (labels.shell == wall), labels.hidden & (labels.shell == wall)
         if out[on].mean() >= _MIN_CHANGED_FRACTION:
-            out[_with_most(labels, on, hidden & ~out, out, _ADJACENT_M)] = True
+            out[_with_changed_majority(labels, on, hidden & ~out, out, _ADJACENT_M)] = True
     if not count:
         return out
     judged = np.bincount(segment[loose], labels.judged[loose], count)
@@ -144,15 +144,15 @@ def spread_changes(labels: ChangeLabels) -> np.ndarray:
     of_these = loose[much[segment[loose]]]
     weak = of_these[labels.changed[of_these] | (labels.differs[of_these] >= _WEAK_COLOUR)]
     label = components(labels.points[weak], _CHANGE_LINK_M, segment[weak])
-    tied = np.bincount(label, labels.changed[weak]) >= _MIN_CHANGED_FRACTION * np.bincount(label)
-    out[weak[tied[label]]] = True
+    spreads = np.bincount(label, labels.changed[weak]) >= _MIN_CHANGED_FRACTION * np.bincount(label)
+    out[weak[spreads[label]]] = True
     mine = np.zeros(len(out), dtype=bool)
     mine[of_these] = True
-    out[_with_most(labels, mine & labels.judged, mine & ~labels.judged & ~out, out, _NEIGHBOUR_M)] = True
-    out[_with_most(labels, mine, mine & ~out, out, _NEIGHBOUR_M)] = True
-    asked = np.flatnonzero(out & ~labels.changed & labels.framed)
-    for k in np.unique(segment[asked]):
-        rows = asked[segment[asked] == k]
+    out[_with_changed_majority(labels, mine & labels.judged, mine & ~labels.judged & ~out, out, _NEIGHBOUR_M)] = True
+    out[_with_changed_majority(labels, mine, mine & ~out, out, _NEIGHBOUR_M)] = True
+    frames = np.flatnonzero(out & ~labels.changed & labels.framed)
+    for k in np.unique(segment[frames]):
+        rows = frames[segment[frames] == k]
         changed = labels.points[labels.changed & (segment == k)]
         out[rows[~in_hull(labels.points[rows], changed, MAX_OUTSIDE_HULL_M)]] = False
     return out
@@ -211,8 +211,8 @@ def find_remnants(sides: tuple[SegmentedCapture, SegmentedCapture]) -> list[np.n
         score = _NEW_WEIGHT * new[nearest]
         for k in np.unique(segment[left]):
             changed, rows = one.colours[one.changed & (segment == k)], np.flatnonzero(segment[left] == k)
-            if len(changed) >= max(_ASKED, MIN_ROOTS):
-                score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < _MAX_COLOUR_DISTANCE
+            if len(changed) >= max(_VOTERS, MIN_ROOTS):
+                score[rows] += cKDTree(changed).query(one.colours[left[rows]], _VOTERS)[0][:, -1] < _MAX_COLOUR_DISTANCE
         label = components(one.points[left], _SEGMENT_LINK_M, segment[left])
         goes = (np.bincount(label, score) >= _MIN_REMNANT_SCORE * np.bincount(label))[label]
         out[left[goes & ~stays]] = True
@@ -235,17 +235,17 @@ def is_clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarr
     return np.isinf(nearest_of(others, points, reach_m)[0])
 
 
-def _with_most(
+def _with_changed_majority(
     labels: ChangeLabels, judged: np.ndarray, others: np.ndarray, changed: np.ndarray, reach_m: float
 ) -> np.ndarray:
     """Return the rows of others most of whose judged neighbours changed. All masks are (N,).
 
     Such as the occluded inside of a replaced object, or the rest of a painted wall.
     """
-    asked, rows = np.flatnonzero(judged), np.flatnonzero(others)
-    if not len(asked) or not len(rows):
+    voters, rows = np.flatnonzero(judged), np.flatnonzero(others)
+    if not len(voters) or not len(rows):
         return rows[:0]
-    count = min(_ASKED, len(asked))
-    near = neighbours_of(labels.points[asked], labels.points[rows], count, reach_m)[1]
-    known = np.append(np.where(changed[asked], 1, -1), 0)
-    return rows[known[near].sum(1) > 0]
+    count = min(_VOTERS, len(voters))
+    near = neighbours_of(labels.points[voters], labels.points[rows], count, reach_m)[1]
+    votes = np.append(np.where(changed[voters], 1, -1), 0)
+    return rows[votes[near].sum(1) > 0]

@@ -166,14 +166,14 @@ def _as_json(content: Mapping[str, object]) -> str:
 
 
 def _component(component: int, metre: Metre, world: dict[str, Any] | None) -> dict[str, object]:
-    told: dict[str, object] = {} if world is None else {"world": world}
+    georeference: dict[str, object] = {} if world is None else {"world": world}
     return {
         "component": component,
         "metres_per_unit": metre.metres_per_unit,
         "metre_sigma": metre.sigma if math.isfinite(metre.sigma) else None,
         "metre_known_by": metre.known_by,
         "metre_note": metre.note,
-    } | told
+    } | georeference
 
 
 def _metre(entry: Mapping[str, Any]) -> Metre:

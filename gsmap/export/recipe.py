@@ -70,12 +70,12 @@ class TileRecipe:
 
     @property
     def is_tileset(self) -> bool:
-        """Whether the tiles are the leaves of a 3D Tiles tree."""
+        """True if the tiles are the leaves of a 3D Tiles tree."""
         return self.format == _TILES_3D
 
     @property
     def is_tree(self) -> bool:
-        """Whether the tiles lie below a tree of coarser levels."""
+        """True if the tiles lie below a tree of coarser levels."""
         return self.format in _TREES
 
     @property

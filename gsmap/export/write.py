@@ -143,9 +143,9 @@ def export_tiles(
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
     reused = len(plan) - len(todo)
-    told = dict(metres or {}), dict(world or {}), dict(offsets or {})
-    retold = (manifest.metres, manifest.world, manifest.offsets) != told
-    manifest.metres, manifest.world, manifest.offsets = told
+    metadata = dict(metres or {}), dict(world or {}), dict(offsets or {})
+    has_new_metadata = (manifest.metres, manifest.world, manifest.offsets) != metadata
+    manifest.metres, manifest.world, manifest.offsets = metadata
     report = _ProgressReport(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     aside: list[tuple[PlannedTile, str]] = []
@@ -153,7 +153,7 @@ def export_tiles(
         out / _STAGING / secrets.token_hex(16)
     )  # unique, as workers of an earlier export may still write to theirs
     try:
-        if not (todo or gone or retold or manifest.doomed) and out.exists():
+        if not (todo or gone or has_new_metadata or manifest.doomed) and out.exists():
             return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
         make_folder(out)
         if not (out / FILE_NAME).exists():

@@ -108,8 +108,8 @@ def reach_m(method: str, params: Any = None) -> float:
 
 def photos_m(method: str, params: Any = None) -> float | None:
     """Return the distance in metres beyond a tile's border within which kept photos are used; None for no photos."""
-    asked = getattr(merger(method), "photos_m", None)
-    found: float | None = None if asked is None else asked(checked_params(method, params))
+    photos_m_of = getattr(merger(method), "photos_m", None)
+    found: float | None = None if photos_m_of is None else photos_m_of(checked_params(method, params))
     return found
 
 

@@ -127,20 +127,20 @@ def resolve_changes(
     for group in groups:
         added = []
         for i in group:
-            looks = compare.render_views(scenes[i], max_views=max_views)
-            parts = [one for one in newer if boxes_overlap(one.looks.scene, scenes[i])]
+            views = compare.render_views(scenes[i], max_views=max_views)
+            parts = [one for one in newer if boxes_overlap(one.views.scene, scenes[i])]
             if not parts:
-                added.append(_NewerScene(i, looks, np.ones(len(looks.gaussians), dtype=bool)))
+                added.append(_NewerScene(i, views, np.ones(len(views.gaussians), dtype=bool)))
                 continue
-            joined = compare.combine_views([(one.looks, one.shows) for one in parts], scenes[i], max_views)
-            found = compare.compare(looks, joined)
-            verdict = _find_disagreement(looks, joined, found, prefer)
+            joined = compare.combine_views([(one.views, one.shows) for one in parts], scenes[i], max_views)
+            found = compare.compare(views, joined)
+            verdict = _find_disagreement(views, joined, found, prefer)
             exposures[i] = _exposure(found)
             keeps[i] &= ~verdict.lost
             if prefer == "newest":
-                beside = _beside(looks.gaussians.means, joined, verdict)
+                beside = _beside(views.gaussians.means, joined, verdict)
                 behind[i] = beside & (found.older.state == HIDDEN)
-                exposed = _exposed(looks.gaussians, exposures[i])
+                exposed = _exposed(views.gaussians, exposures[i])
                 keeps[i] &= ~_find_misfits(exposed, keeps[i] & beside, joined)
             first = 0
             for one in parts:
@@ -154,9 +154,9 @@ def resolve_changes(
             if group is groups[-1]:
                 continue  # nothing is compared with the oldest
             # Only Gaussians unobserved by newer scenes are added, so that `newer` stays as large as the place.
-            shows = keeps[i] & looks.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
+            shows = keeps[i] & views.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
             added.append(
-                _NewerScene(i, _in_one_exposure(compare.mask_outdated(looks, found, keeps[i]), exposures[i]), shows)
+                _NewerScene(i, _in_one_exposure(compare.mask_outdated(views, found, keeps[i]), exposures[i]), shows)
             )
         newer += added
     return ResolvedScenes(
@@ -174,7 +174,7 @@ class _NewerScene:
     """A newer scene: its index, its views, and (N,) bool, its Gaussians that are compared with older scenes."""
 
     scene: int
-    looks: CaptureViews
+    views: CaptureViews
     shows: np.ndarray
 
 
@@ -268,8 +268,8 @@ def _remaining(scene: PlacedScene, stays: np.ndarray, exposure: compare.Balance 
     return replace(scene, reference_views=None, gaussians=_exposed(scene.gaussians[stays], exposure))
 
 
-def _in_one_exposure(looks: CaptureViews, exposure: compare.Balance | None) -> CaptureViews:
-    return replace(looks, scene=_remaining(looks.scene, np.ones(len(looks.gaussians), dtype=bool), exposure))
+def _in_one_exposure(views: CaptureViews, exposure: compare.Balance | None) -> CaptureViews:
+    return replace(views, scene=_remaining(views.scene, np.ones(len(views.gaussians), dtype=bool), exposure))
 
 
 def _in_grey(gaussians: Gaussians, value: float) -> Gaussians:

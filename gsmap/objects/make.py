@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap import render
+from gsmap import render as rendering
 from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse
 from gsmap.objects.visibility import RenderedViews, classify_observation, observe_points
@@ -43,7 +43,7 @@ class Params:
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
     """Return the recipe of the objects of a component, without its inputs."""
-    return RecipeKey("objects", "fused", {"objects": VERSION}, plain(params or Params()), render.backend())
+    return RecipeKey("objects", "fused", {"objects": VERSION}, plain(params or Params()), rendering.backend())
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +64,13 @@ class SegmentedScene:
 def make_objects(
     captures: Sequence[SegmentedScene],
     component: int,
-    eyes: Callable[[SegmentedScene], RenderedViews],
+    render: Callable[[SegmentedScene], RenderedViews],
     *,
     metres: float = 1.0,
     moved: Sequence[tuple[SegmentId, SegmentId]] = (),
     parted: Sequence[tuple[SegmentId, int]] = (),
-    looked: Callable[[int, SegmentId], tuple[SightingState, float] | None] = lambda capture, node: None,
-    could_see: Callable[[SegmentedScene, np.ndarray], bool] = lambda capture, points: True,
+    find_earlier: Callable[[int, SegmentId], tuple[SightingState, float] | None] = lambda capture, node: None,
+    in_frustum: Callable[[SegmentedScene, np.ndarray], bool] = lambda capture, points: True,
     params: Params | None = None,
     progress: Progress = silent,
 ) -> list[MapObject]:
@@ -81,13 +81,14 @@ def make_objects(
 
     Args:
         captures: scenes of the component, oldest first.
-        eyes: renders the views of a scene; called at most once for each.
+        render: renders the views of a scene; called at most once for each.
         metres: per unit of the map.
         moved: pairs of segments, by index, of one moved object.
         parted: segments, each with the index of a scene that does not show it in place.
-        looked: state and observed fraction, from an earlier run, of a segment of another scene in a scene (by index);
+        find_earlier: state and observed fraction, from an earlier run, of a segment of another scene in a scene (by
+        index);
             None if it has to be observed now.
-        could_see: whether some camera of a scene has any of the points in its frustum, scene frame and unit.
+        in_frustum: whether some camera of a scene has any of the points in its frustum, scene frame and unit.
         params: see `Params`.
         progress: called with the fraction done in [0, 1] and the current step.
     """
@@ -117,15 +118,15 @@ def make_objects(
         for i, mine in enumerate(sightings):
             if c in mine:
                 continue
-            before = looked(c, (of[i], sightings[i][of[i]].thing))
+            before = find_earlier(c, (of[i], sightings[i][of[i]].thing))
             if before is not None:
                 results[i] = before
-            elif could_see(capture, S_scene_map.apply(points[i])):
+            elif in_frustum(capture, S_scene_map.apply(points[i])):
                 to_observe.append(i)
             else:
                 sightings[i][c] = Sighting(capture.scene, "unseen", -1, None, 0.0)
         if to_observe:
-            seen = eyes(capture)
+            seen = render(capture)
             own = [places[o][1] for (_, places), o in zip(kept, of, strict=True)]
             # Exposure by objects that the scene certainly shows, or by all that have a surface in place.
             sure = [i for i, mine in enumerate(sightings) if c in mine] or to_observe
@@ -137,11 +138,11 @@ def make_objects(
             for i in to_observe:
                 results[i] = classify_observation(observations[i], points[i] * metres, own[i], shift)
         for i, (state, share) in results.items():
-            asked = captures[of[i]].scene
+            observed_at = captures[of[i]].scene
             if any((node, c) in gone for node in kept[i][0]):
-                state, asked = "absent", ""  # a review may revert it, so it is not kept as an observation
+                state, observed_at = "absent", ""  # a review may revert it, so it is not kept as an observation
             box = np.array([points[i].min(0), points[i].max(0)]) if state == "seen" else None
-            sightings[i][c] = Sighting(capture.scene, state, -1, box, share, asked)
+            sightings[i][c] = Sighting(capture.scene, state, -1, box, share, observed_at)
     objects = []
     for (group, _), mine in zip(kept, sightings, strict=True):
         first, last = group[0], group[-1]

@@ -46,14 +46,14 @@ def estimate_persistence(thing: MapObject, dates: Mapping[str, str | None]) -> P
         thing: the object.
         dates: ISO 8601 date of each scene, by its id; undated observations do not count for the half-life.
     """
-    looked = [
+    observed = [
         (datetime.fromisoformat(when).timestamp() / _DAY_S, sighting.state == "seen")
         for sighting in thing.sightings
         if sighting.state != "unseen" and (when := dates.get(sighting.scene)) is not None
     ]
-    looked.sort()
+    observed.sort()
     at_risk, departures = 0.0, 0
-    for (before, there), (after, still) in pairwise(looked):
+    for (before, there), (after, still) in pairwise(observed):
         if there:
             at_risk += (after - before) * (1.0 if still else 0.5)
             departures += not still

@@ -20,7 +20,7 @@ _CELL_M = 0.1  # edge of the cells of the floor plan
 _MAX_GAUSSIANS = 150_000  # of a capture, evenly; its neighbours fill the gaps
 _MIN_OPACITY = 0.5  # of a surface
 _ABOVE_DOORS_M = 2.12  # above the floor, from which on nothing but walls and lintels stands
-_BELOW_CEILING_M = 0.1  # to which walls are looked for
+_BELOW_CEILING_M = 0.1  # up to which walls are detected
 _DEFAULT_CEILING_M = 2.4  # above the floor, where no ceiling was seen
 _MIN_WALL_FILL = 0.5  # fraction of the height in between that a wall fills
 _MIN_WALL_M = 0.8  # length of a wall
@@ -40,14 +40,14 @@ def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, min_area_m2: flo
     parts = [_surface(gaussians) for gaussians in captures]
     points = np.concatenate([np.zeros((0, 3)), *(p for p, _ in parts)])
     flat = np.concatenate([np.zeros(0, bool), *(f for _, f in parts)])
-    whose = np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
+    scene_of = np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
     if len(points) < 100:
         return []
     rooms: list[Room] = []
     for height in _storeys(eyes, points):
         floor, ceiling = _floor_and_ceiling(points[flat, 2], height)
         mine = (points[:, 2] > floor - 0.3) & (points[:, 2] < ceiling + 0.3)
-        rooms += _segment_storey(points[mine], flat[mine], whose[mine], floor, ceiling, len(rooms), min_area_m2)
+        rooms += _segment_storey(points[mine], flat[mine], scene_of[mine], floor, ceiling, len(rooms), min_area_m2)
     order = sorted(range(len(rooms)), key=lambda i: (-rooms[i].area_m2, *rooms[i].low))
     place = {old: new for new, old in enumerate(order)}
     return [
@@ -115,7 +115,7 @@ def _mode(values: np.ndarray, default: float) -> float:
 def _segment_storey(
     points: np.ndarray,
     flat: np.ndarray,
-    whose: np.ndarray,
+    scene_of: np.ndarray,
     floor: float,
     ceiling: float,
     first: int,
@@ -125,7 +125,7 @@ def _segment_storey(
 
     Args:
         flat: (P,) bool, points on level surfaces.
-        whose: (P,) index of the scene of each point.
+        scene_of: (P,) index of the scene of each point.
     """
     cell = _CELL_M
     low = points[:, :2].min(0) - 3 * cell
@@ -150,8 +150,8 @@ def _segment_storey(
     # A door that is open in one scene is a door, though it is shut in another.
     open_floors = []
     trodden = flat & (np.abs(points[:, 2] - floor) < _BIN_M)
-    for capture in np.unique(whose):
-        seen, stands = (at[(whose == capture) & what] for what in (trodden, body))
+    for capture in np.unique(scene_of):
+        seen, stands = (at[(scene_of == capture) & mask] for mask in (trodden, body))
         floors = np.zeros(shape, bool)
         floors[seen[:, 0], seen[:, 1]] = True
         floors[stands[:, 0], stands[:, 1]] = False

@@ -82,11 +82,11 @@ def is_in_view(cameras: Cameras | None, points: np.ndarray, max_views: int = MAX
     return False
 
 
-def observe_points(eyes: RenderedViews, points: np.ndarray, unit_m: float) -> PointObservations:
+def observe_points(views: RenderedViews, points: np.ndarray, unit_m: float) -> PointObservations:
     """Observe points (K, 3) in the views of a scene, its frame and unit; ``unit_m`` is metres per unit."""
     through, times = np.zeros(len(points), bool), np.zeros(len(points))
     colours = np.zeros((len(points), 3))
-    for view, depth, colour in zip(eyes.cameras, eyes.depths, eyes.colours, strict=True):
+    for view, depth, colour in zip(views.cameras, views.depths, views.colours, strict=True):
         pixels, z = project(points, view.T_camera_frame[0], view.intrinsics_px[0])
         rows = np.flatnonzero(in_image(pixels, z, view.sizes_px[0], near=0.05 / unit_m))
         column, row = pixels[rows].astype(np.int64).T
@@ -115,16 +115,16 @@ def classify_observation(
         The state, ``unseen`` if too few of the points were observed, ``seen`` if most of the observed points are on a
         surface of the object's colour, ``absent`` if not; and the fraction of observed points.
     """
-    looked = seen.through | seen.on
-    share = float(looked.mean()) if len(looked) else 0.0
+    observed = seen.through | seen.on
+    share = float(observed.mean()) if len(observed) else 0.0
     if share < _MIN_OBSERVED:
         return "unseen", share
     # Texture of books and leaves differs from pixel to pixel, so means of patches are compared.
     rows = np.flatnonzero(seen.on)
     off = seen.colours[rows] - shift - colours[rows]
     label, counts = cell_labels(np.floor(points[rows] / _PATCH_M))
-    alike = np.zeros(len(points), bool)
-    alike[rows] = (np.linalg.norm(group_means(off, label, counts), axis=1) < _MAX_LAB)[label]
+    similar = np.zeros(len(points), bool)
+    similar[rows] = (np.linalg.norm(group_means(off, label, counts), axis=1) < _MAX_LAB)[label]
     solid = seen.on & ~seen.through
-    there = (solid & alike).sum() >= _MIN_PRESENT * looked.sum() or solid.sum() >= _MIN_SAME_SHAPE * looked.sum()
+    there = (solid & similar).sum() >= _MIN_PRESENT * observed.sum() or solid.sum() >= _MIN_SAME_SHAPE * observed.sum()
     return ("seen" if there else "absent"), share

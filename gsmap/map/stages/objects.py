@@ -215,8 +215,8 @@ def _made(
         metres=unit,
         moved=moved,
         parted=parted,
-        looked=looked,
-        could_see=could_see,
+        find_earlier=looked,
+        in_frustum=could_see,
         params=settings.objects,
         progress=told,
     )
