@@ -85,9 +85,8 @@ def make_objects(
         metres: per unit of the map.
         moved: pairs of segments, by index, of one moved object.
         parted: segments, each with the index of a scene that does not show it in place.
-        find_earlier: state and observed fraction, from an earlier run, of a segment of another scene in a scene (by
-        index);
-            None if it has to be observed now.
+        find_earlier: state and observed fraction, from an earlier run, of a segment of another scene in a scene, by
+            index; None if it has to be observed now.
         in_frustum: whether some camera of a scene has any of the points in its frustum, scene frame and unit.
         params: see `Params`.
         progress: called with the fraction done in [0, 1] and the current step.
