@@ -1,1 +1,1 @@
-"""One file per way of merging; the contract is `gsmap.methods.merger.Merger`."""
+"""Built-in merging methods, one file each; the contract is `gsmap.methods.merger.Merger`."""
