@@ -1,4 +1,4 @@
-"""The documents: links lead somewhere, what they tell to type exists, and (slow) they build with their pictures."""
+"""Check the documents: links, commands, settings, length, and (slow) the build with its pictures."""
 
 import re
 import shlex
@@ -19,7 +19,8 @@ from gsmap.settings import parse
 from tools.make import docs as make_docs
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+DOCS = sorted(page for page in (ROOT / "docs").rglob("*.md") if not page.name.startswith("_build_"))
+PAGES = [*(ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")), *DOCS]
 _GENERATED = ("_pictures/", "../_pictures/")
 
 
@@ -114,11 +115,28 @@ def test_every_page_is_in_the_table_of_contents() -> None:
     text = (ROOT / "docs" / "index.md").read_text()
     blocks = re.findall(r"```{toctree}\n(.*?)```", text, re.S)
     listed = {line.strip() for block in blocks for line in block.splitlines()}
-    pages = {str(p.relative_to(ROOT / "docs").with_suffix("")) for p in PAGES[1:]}
+    pages = {str(p.relative_to(ROOT / "docs").with_suffix("")) for p in DOCS}
     design = {name for name in pages if name.startswith("design/") and name != "design/README"}
     assert pages - design - {"index"} <= listed
     told = (ROOT / "docs" / "design" / "README.md").read_text()
     assert all(Path(name).name in told for name in design)
+
+
+def test_documents_stay_short() -> None:
+    assert sum(len(page.read_text().split()) for page in PAGES) <= 50_000
+    assert (ROOT / "README.md").stat().st_size <= 9_000
+    assert (ROOT / "CHANGELOG.md").stat().st_size <= 12_000
+    assert len((ROOT / "ARCHITECTURE.md").read_text().splitlines()) <= 200
+    notes = [page for page in DOCS if page.parent.name == "design" and page.name != "README.md"]
+    assert len(notes) <= 25
+    assert all(len(note.read_text().split()) <= 450 for note in notes)
+
+
+def test_news_fragments_have_a_type_and_one_line() -> None:
+    for fragment in (ROOT / "changes").glob("*.md"):
+        if fragment.name != "README.md":
+            assert re.fullmatch(r"(\d+|\+[\w-]+)\.(added|changed|fixed|removed)\.md", fragment.name), fragment.name
+            assert len(fragment.read_text().strip().splitlines()) == 1, fragment.name
 
 
 def test_the_blocks_of_the_newcomers_path_are_found() -> None:
