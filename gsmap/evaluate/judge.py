@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 
 from gsmap.errors import ConfigError
-from gsmap.evaluate import overlap
 from gsmap.evaluate.calibration import (
     Nees,
     nees_of_edge,
@@ -41,12 +40,16 @@ class Params:
     """When an edge is wrong, and how edges are counted.
 
     Args:
-        max_rre_deg: an edge that is turned by more is wrong,
-        max_rte_m: and so is one that puts the source's middle farther off than this, in metres.
-        truth_sigma_deg: how exactly the truth is known: standard deviation of each scene's rotation ...
-        truth_sigma_m: ... and of where its middle lies; squared errors are told over these and the covariances.
-        bands: true overlaps at which a band of pairs ends and the next begins.
-        overlap: what the true overlap of a pair is.
+        max_rre_deg: Largest rotation error of a right edge in degrees, positive; a larger value counts more edges as
+            right.
+        max_rte_m: Largest translation error of a right edge in metres, positive, at the source's centroid; a larger
+            value counts more edges as right.
+        truth_sigma_deg: Standard deviation of the true rotation of each scene in degrees, at least 0; a larger value
+            lowers normalized errors (NEES).
+        truth_sigma_m: Standard deviation of the true position of each scene's centroid in metres, at least 0; a larger
+            value lowers normalized errors (NEES).
+        bands: True overlaps in (0, 1), increasing, that divide pairs into bands; recall and precision are reported for
+            each band.
     """
 
     max_rre_deg: float = 1.0
@@ -54,7 +57,6 @@ class Params:
     truth_sigma_deg: float = 0.0
     truth_sigma_m: float = 0.0
     bands: tuple[float, ...] = (0.1, 0.25, 0.5)
-    overlap: overlap.Params = field(default_factory=overlap.Params)
 
     def __post_init__(self) -> None:
         if not (self.max_rre_deg > 0 and self.max_rte_m > 0):

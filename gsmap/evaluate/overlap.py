@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -14,31 +13,20 @@ from gsmap.types import Gaussians, Sim3
 _KEPT = 32  # search trees in memory at once
 
 
-@dataclass(frozen=True)
-class Params:
-    """What counts as the same surface.
-
-    Args:
-        radius_m: a Gaussian coincides with another capture that has one within this distance.
-        min_opacity: Gaussians must be more opaque than this,
-        max_scale_m: and their largest standard deviation smaller than this, to count as surface.
-    """
-
-    radius_m: float = 0.08
-    min_opacity: float = 0.3
-    max_scale_m: float = 0.3
+RADIUS_M = 0.08  # a Gaussian coincides with a capture that has a Gaussian within this distance
+_MIN_OPACITY = 0.3  # of surface Gaussians ...
+_MAX_SCALE_M = 0.3  # ... and their largest standard deviation
 
 
-def solid_centres(gaussians: Gaussians, S_scene_world: Sim3, params: Params | None = None) -> np.ndarray:
+def solid_centres(gaussians: Gaussians, S_scene_world: Sim3) -> np.ndarray:
     """(N, 3) centres of the opaque, not huge Gaussians in the truth's world, in metres."""
-    params = params or Params()
     size_m = gaussians.scales.max(1, initial=0) / S_scene_world.scale
-    keep = (gaussians.opacities > params.min_opacity) & (size_m < params.max_scale_m)
+    keep = (gaussians.opacities > _MIN_OPACITY) & (size_m < _MAX_SCALE_M)
     return S_scene_world.inverse().apply(gaussians.means[keep])
 
 
 def true_overlaps(
-    scenes: Sequence[str], centres: Callable[[str], np.ndarray], params: Params | None = None
+    scenes: Sequence[str], centres: Callable[[str], np.ndarray], radius_m: float = RADIUS_M
 ) -> dict[frozenset[str], float]:
     """True overlap of each pair: the smaller of both directions' share of centres that coincide with the other capture.
 
@@ -46,11 +34,10 @@ def true_overlaps(
 
     Args:
         scenes: their ids.
-        centres: gives `solid_centres` of one.
+        centres: returns `solid_centres` of one scene.
+        radius_m: within which Gaussians coincide.
     """
     from scipy.spatial import cKDTree
-
-    radius_m = (params or Params()).radius_m
 
     @lru_cache(_KEPT)
     def tree_of(scene: str) -> Any:

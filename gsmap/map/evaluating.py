@@ -63,14 +63,14 @@ def poses(
         return JudgedScene(scene.id, scene.name, S_scene_world[scene.id], centroid, centers)
 
     params = params or Params()
-    solid = partial(_solid, store, S_scene_world, params)
-    overlaps = true_overlaps(list(S_scene_world), solid, params.overlap)
+    solid = partial(_solid, store, S_scene_world)
+    overlaps = true_overlaps(list(S_scene_world), solid)
     of_scenes, edges, graph = [judged(s) for s in scenes], reports.edge_rows(store), store.revisions.get()
     return judge(of_scenes, edges, graph, overlaps, params, metres)
 
 
-def _solid(store: Store, S_scene_world: Mapping[str, Sim3], params: Params, scene: str) -> np.ndarray:
-    return solid_centres(store.scenes.gaussians(scene), S_scene_world[scene], params.overlap)
+def _solid(store: Store, S_scene_world: Mapping[str, Sim3], scene: str) -> np.ndarray:
+    return solid_centres(store.scenes.gaussians(scene), S_scene_world[scene])
 
 
 def _read_truth(folder: Path, name: str) -> Sim3 | None:

@@ -22,7 +22,6 @@ from gsmap.map.changes import change_arrays, named
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.methods import text_digest
-from gsmap.register.view_cache import Params as ViewParams
 from gsmap.register.view_cache import ViewCache
 from gsmap.store import Store
 from gsmap.types import Cameras, PlacedScene, Registration, Scene, Sim3
@@ -34,7 +33,6 @@ FILE_NAME = "changes.json"
 _VERSION = 1
 _PICTURE = re.compile(r"c\d+\.png|why-[0-9a-f]{8}-[0-9a-f]{8}\.png|find-[0-9a-f]{16}\.png")
 _LOOKS = 2  # cameras of each capture that a picture of a pair is drawn from
-_OWN = ViewParams(own_share=0.0)  # pictures are of what a capture's own cameras saw
 _MAX_BYTES = 1 << 26
 
 
@@ -175,7 +173,7 @@ def pair_as_seen(store: Store, edge: Registration, looks: int) -> PairAsSeen:
     chosen = []
     for one, other in ((target, source), (source, target)):
         if one.cameras is not None and len(one.cameras):
-            rows = ViewCache(one.gaussians, one.cameras, _OWN).select_views(other.gaussians.means, looks)
+            rows = ViewCache(one.gaussians, one.cameras, synthesize=False).select_views(other.gaussians.means, looks)
             chosen += [one.cameras[[row]] for row in rows]
     return PairAsSeen(target, source, chosen, 1.0 if graph is None else graph.unit_m)
 

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from gsmap.evaluate import judge
     from gsmap.localize import scan
     from gsmap.map import visits
-    from gsmap.register import by_shape
 
 _log = logging.getLogger("gsmap.settings")
 
@@ -114,7 +113,6 @@ class Settings:
         objects: when things of several captures are one, and how they are looked for.
         localize: how photographs are found.
         scan: how a scan is looked for.
-        by_shape: how a scan without colours is compared with a scene.
         evaluate: when an edge counts as wrong.
         report: how much a report shows.
         view: how the map is looked at.
@@ -134,7 +132,6 @@ class Settings:
     objects: objects.Params = field(default=_params_of("gsmap.objects"))
     localize: localize.Params = field(default=_params_of("gsmap.localize"))
     scan: scan.Params = field(default=_params_of("gsmap.localize.scan"))
-    by_shape: by_shape.Params = field(default=_params_of("gsmap.register.by_shape"))
     evaluate: judge.Params = field(default=_params_of("gsmap.evaluate.judge"))
     report: report.Params = field(default=_params_of("gsmap.report"))
     view: view.Params = field(default=_params_of("gsmap.view"))

@@ -53,10 +53,14 @@ def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[st
         rank = f": no. {first} of what {names[scene]} was paired with, score {score:.3g}"
     if any(scene not in lookups or lookups[scene].key != keys[scene] for scene in names):
         return rank, "the next gsmap update looks for scenes that show what they show"
-    held, enough = _held(store, settings), f"{params.enough} edges without doubt (retrieve.enough)"
+    held, enough = (
+        _held(store, settings),
+        f"{params.max_edges_per_scene} edges without doubt (retrieve.max_edges_per_scene)",
+    )
     askers = {scene for first, scene, _ in listed if first <= params.top_k}
     is_open = {
-        one: lookups[one].num_left is None or sum(one in pair for pair in held) < params.enough for one in askers
+        one: lookups[one].num_left is None or sum(one in pair for pair in held) < params.max_edges_per_scene
+        for one in askers
     }
     if any(is_open.values()):
         return rank, "the next gsmap update tries it"
@@ -114,7 +118,7 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
     free_space = held("free-space violation", "free_space_violation", allowed, note=", beyond chance")
     if free_space.passed is False:
         judged = float(figures.get("num_judged", np.nan))
-        free_space = replace(free_space, passed=not verdict.violates_free_space(violation, judged, allowed, bars))
+        free_space = replace(free_space, passed=not verdict.violates_free_space(violation, judged, allowed))
     return [
         WhyStep(name="correspondences", value=pair.num_correspondences),
         WhyStep(name="clique", value=pair.num_inliers),

@@ -22,7 +22,7 @@ class Refiner(Protocol):
     VERSION: ClassVar[int]
 
     SCALES: ClassVar[bool]
-    """Whether it can refine the scale as well; where not, ``register.scale_refiner`` takes its place for such pairs."""
+    """Whether it can refine the scale as well; where not, ``colored_icp`` takes its place for such pairs."""
 
     def refine(
         self, target: Surface, source: Surface, start: Sim3, params: Any = None, *, with_scale: bool = False
@@ -30,7 +30,8 @@ class Refiner(Protocol):
         """A better pose than the start.
 
         A refiner whose module or object has ``USES_CORRESPONDENCES = True`` takes one more keyword,
-        ``correspondences``: those that the start rests on (`Correspondences`), or None.
+        ``correspondences``: those that the start rests on (`Correspondences`), or None. One that has ``SCHEDULES``, a
+        mapping from ``coarse`` or ``fine`` to any value, takes that of the pass as the keyword ``schedule``.
 
         Args:
             target, source: surfaces, both in metres.

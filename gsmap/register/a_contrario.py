@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from gsmap.register.correspondences import Correspondences
@@ -12,18 +10,10 @@ from gsmap.types import NodeLayer, Sim3
 _FAR_M = 1e4  # farther than any radius
 
 
-@dataclass(frozen=True)
-class Params:
-    """The background model.
-
-    Args:
-        cell_m: a node's context covers its neighbours', so near correspondences err together: cells of this size are
-            the independent trials, not nodes.
-        height_band_m: where gravity is known, partners are drawn from nodes within this of the candidate's height.
-    """
-
-    cell_m: float = 0.5
-    height_band_m: float = 0.5
+# A node's context covers its neighbours', so near correspondences err together: cells of this size are the independent
+# trials, not nodes.
+_CELL_M = 0.5
+_HEIGHT_BAND_M = 0.5  # where gravity is known, random partners lie within this of the candidate's height
 
 
 def agreeing(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarray:
@@ -62,14 +52,11 @@ class BackgroundModel:
         source: NodeLayer,
         source_points_m: np.ndarray,
         matches: Correspondences,
-        params: Params | None = None,
         *,
         source_heights: np.ndarray | None = None,
     ) -> None:
         from scipy.spatial import cKDTree
 
-        params = params or Params()
-        cell_m, height_band_m = params.cell_m, params.height_band_m
         self.matches = matches
         kinds = target.types[matches.target_ids].astype(np.float64)
         # Nodes of another type lie in another layer of a fourth dimension, so one tree serves all.
@@ -78,12 +65,12 @@ class BackgroundModel:
         theirs, own = np.zeros(len(source)), np.zeros(len(matches))
         if source_heights is not None and matches.source_heights is not None:
             theirs, own = source_heights, matches.source_heights
-        apart, low = float(np.ptp(theirs)) + 4 * height_band_m, theirs.min()
+        apart, low = float(np.ptp(theirs)) + 4 * _HEIGHT_BAND_M, theirs.min()
         stacked = np.sort(source.types * apart + (theirs - low))
         own = kinds * apart + (own - low)
-        pool = np.searchsorted(stacked, own + height_band_m) - np.searchsorted(stacked, own - height_band_m)
+        pool = np.searchsorted(stacked, own + _HEIGHT_BAND_M) - np.searchsorted(stacked, own - _HEIGHT_BAND_M)
         self._pool = np.maximum(pool, 1.0)
-        _, cell = np.unique(np.floor(matches.target / cell_m).astype(int), axis=0, return_inverse=True)
+        _, cell = np.unique(np.floor(matches.target / _CELL_M).astype(int), axis=0, return_inverse=True)
         self._cell = cell.ravel()
 
     def log10_nfa(self, pose: Sim3, radius_m: float = 0.15) -> float:

@@ -17,11 +17,12 @@ from importlib.resources import files
 import numpy as np
 
 from gsmap.errors import MissingDependencyError
+from gsmap.register import verdict
 from gsmap.register.conclusion import Judged, is_same_pose
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.metric import MetricScene, own_working_m, working_unit_m
 from gsmap.register.pair import measured
-from gsmap.register.params import Params as RegisterParams
+from gsmap.register.params import Params
 from gsmap.register.proposers import kiss_matcher
 from gsmap.register.scene_view import SceneView
 from gsmap.register.stopwatch import Stopwatch
@@ -32,49 +33,30 @@ _FILE = "by_shape.json"
 _NAMES = ("inliers", "overlap", "disagreement", "seen")
 
 
-@dataclass(frozen=True)
-class Params:
-    """How a pair without colours is registered.
-
-    Args:
-        voxels_m: cells at which features of the surfaces are matched, one after another: fine ones know details, coarse
-            ones survive noise.
-        min_inliers: fewer agreeing features propose nothing.
-        prior: share of proposed poses that are right before anything is known of them.
-        min_probability: that a pose is right.
-        rival: another pose that is as probable as this makes the answer ambiguous.
-        max_rotation_sigma_deg, max_translation_sigma_m: a pose that is known less well is none.
-    """
-
-    voxels_m: tuple[float, ...] = (0.1, 0.15, 0.25)
-    min_inliers: int = 5
-    prior: float = 0.2
-    min_probability: float = 0.9
-    rival: float = 0.3
-    max_rotation_sigma_deg: float = 1.5
-    max_translation_sigma_m: float = 0.05
+# Cells at which features of the surfaces are matched: fine ones keep details, coarse ones survive noise.
+VOXELS_M = (0.1, 0.15, 0.25)
+PRIOR = 0.2  # share of proposed poses that are right before anything is known of them
+_RIVAL_PROBABILITY = 0.3  # another pose that is as probable as this makes the result ambiguous
 
 
-def register_by_shape(
-    target: SceneView, source: SceneView, params: Params | None = None, settings: RegisterParams | None = None
-) -> Registration:
+def register_by_shape(target: SceneView, source: SceneView, params: Params | None = None) -> Registration:
     """Where ``source`` lies in ``target``, both in metres, as far as their shapes tell.
 
     Returns:
         As `register_pair`; ``evidence["probability"]`` is that of shape alone.
     """
-    params, settings, watch = params or Params(), settings or RegisterParams(), Stopwatch()
+    params, watch = params or Params(), Stopwatch()
     if not all(view.scale_policy == "known" or "landmarks" in view.graph.layers for view in (target, source)):
         return Registration(target.id, source.id, "no_match", "shapes are compared in metres, and a unit is not known")
     try:
-        judged = judged_by_shape(target, source, params, settings, watch)
+        judged = judged_by_shape(target, source, params, watch)
     except MissingDependencyError as error:
         return Registration(target.id, source.id, "no_match", f"shapes are compared by a package: {error}")
     if not judged:
         reason = "no pose under which features of both surfaces agree"
         return Registration(target.id, source.id, "no_match", reason, seconds=watch.seconds)
-    scored = sorted(((probability(j.proposal, j.evidence, params.prior), j) for j in judged), key=lambda s: -s[0])
-    best, reason = scored[0][1], _reason(scored, source, params)
+    scored = sorted(((probability(j.proposal, j.evidence, PRIOR), j) for j in judged), key=lambda s: -s[0])
+    best, reason = scored[0][1], _reason(scored, source, params.verdict)
     information = None
     if not reason and best.covariance is not None:
         information = np.linalg.inv(best.covariance)
@@ -102,21 +84,21 @@ def register_by_shape(
 
 
 def judged_by_shape(
-    target: SceneView, source: SceneView, params: Params, settings: RegisterParams, watch: Stopwatch | None = None
+    target: SceneView, source: SceneView, params: Params, watch: Stopwatch | None = None
 ) -> list[Judged]:
     """Every pose that is proposed, refined and measured, each once: also what the model is fitted on."""
     watch, grey = watch or Stopwatch(), (_grey(target), _grey(source))
     unit_m = working_unit_m(*grey, with_scale=False)
-    scenes = [MetricScene(view, unit_m, settings) for view in grey]
+    scenes = [MetricScene(view, unit_m) for view in grey]
     found: list[Judged] = []
-    for voxel_m in params.voxels_m:
+    for voxel_m in VOXELS_M:
         with watch.step("match"):
-            asked = kiss_matcher.Params(voxel_m=voxel_m, min_inliers=params.min_inliers)
+            asked = kiss_matcher.Params(voxel_m=voxel_m)
             proposals = kiss_matcher.propose(scenes[0], scenes[1], asked)
         for proposal in proposals:
             with watch.step("verdict"):
-                judged = measured(*grey, proposal, settings)
-            old = next((j for j in found if _same(j, judged, target, source, settings)), None)
+                judged = measured(*grey, proposal, params)
+            old = next((j for j in found if _same(j, judged, target, source)), None)
             if old is None:
                 found.append(judged)
             elif old.proposal.num_inliers < judged.proposal.num_inliers:
@@ -124,9 +106,9 @@ def judged_by_shape(
     return found
 
 
-def _same(a: Judged, b: Judged, target: SceneView, source: SceneView, settings: RegisterParams) -> bool:
+def _same(a: Judged, b: Judged, target: SceneView, source: SceneView) -> bool:
     poses = a.proposal.S_target_source, b.proposal.S_target_source
-    return is_same_pose(*poses, source.centre, own_working_m(target), settings.same_pose)
+    return is_same_pose(*poses, source.centre, own_working_m(target))
 
 
 def _grey(view: SceneView) -> SceneView:
@@ -137,7 +119,7 @@ def _grey(view: SceneView) -> SceneView:
     )
 
 
-def _reason(scored: Sequence[tuple[float, Judged]], source: SceneView, params: Params) -> str:
+def _reason(scored: Sequence[tuple[float, Judged]], source: SceneView, params: verdict.Params) -> str:
     """Why the most probable pose is not accepted; empty where it is."""
     probable, best = scored[0]
     seen = best.evidence
@@ -147,7 +129,7 @@ def _reason(scored: Sequence[tuple[float, Judged]], source: SceneView, params: P
             f"{seen.overlap:.0%}, {best.proposal.num_inliers} features agree, {seen.disagreement:.0%} of what both saw "
             "differs"
         )
-    if len(scored) > 1 and scored[1][0] >= params.rival:
+    if len(scored) > 1 and scored[1][0] >= _RIVAL_PROBABILITY:
         return f"ambiguous: its shape fits in two ways, the other with {scored[1][0]:.1%}"
     if best.covariance is None:
         return "too little surface coincides to tell the pose"

@@ -13,12 +13,17 @@ from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.metres import Belief
 from gsmap.register.metric import own_working_m
-from gsmap.register.params import Params, SamePose
+from gsmap.register.params import Params
 from gsmap.register.probability import probability
 from gsmap.register.proposing import num_nodes
 from gsmap.register.scene_view import SceneView
 from gsmap.types import Registration, Sim3
 from gsmap.types.registration import Proposal
+
+# Poses that differ by less than all of these would be refined to the same pose.
+SAME_ROTATION_DEG = 3.0
+SAME_DISTANCE_M = 0.3  # of the centre of the source's content
+SAME_LOG_SCALE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +65,11 @@ def conclude(
     status, reason = ("accepted", "") if accepted else ("rejected", best.flaw)
     # A pose that is known too badly to be an edge is no less a rival.
     others = [j for j in judged if not verdict.contradiction(j.proposal, j.evidence, params.verdict)]
-    others = [j for j in others if not _same(best, j, target, source, params.same_pose)]
+    others = [j for j in others if not _same(best, j, target, source)]
     rivals = [j for j in others if verdict.is_believable(j.proposal, j.evidence, params.verdict)]
-    probable = _probability_among(best, others, params.verdict)
+    probable = _probability_among(best, others)
     if probable < params.verdict.min_probability:
-        rivals = rivals or sorted(others, key=lambda j: -_odds(j, params.verdict))
+        rivals = rivals or sorted(others, key=lambda j: -_odds(j))
     if accepted and rivals:
         apart = _apart(best, rivals[0], target, source)
         status, reason = "no_match", f"ambiguous: {apart}, and the first is right with {probable:.0%}"
@@ -92,19 +97,19 @@ def conclude(
     )
 
 
-def is_same_pose(a: Sim3, b: Sim3, centre: np.ndarray, unit_m: float, params: SamePose) -> bool:
+def is_same_pose(a: Sim3, b: Sim3, centre: np.ndarray, unit_m: float) -> bool:
     """Both would be refined to one answer; ``centre`` is that of the source's content, ``unit_m`` working
     metres per unit of the target."""
     return bool(
-        abs(np.log(a.scale / b.scale)) < params.log_scale
-        and np.degrees(angle_between(a.rotation, b.rotation)) < params.rotation_deg
-        and np.linalg.norm(a.apply(centre) - b.apply(centre)) * unit_m < params.distance_m
+        abs(np.log(a.scale / b.scale)) < SAME_LOG_SCALE
+        and np.degrees(angle_between(a.rotation, b.rotation)) < SAME_ROTATION_DEG
+        and np.linalg.norm(a.apply(centre) - b.apply(centre)) * unit_m < SAME_DISTANCE_M
     )
 
 
-def _same(a: Judged, b: Judged, target: SceneView, source: SceneView, params: SamePose) -> bool:
+def _same(a: Judged, b: Judged, target: SceneView, source: SceneView) -> bool:
     poses = a.proposal.S_target_source, b.proposal.S_target_source
-    return is_same_pose(*poses, source.centre, own_working_m(target), params)
+    return is_same_pose(*poses, source.centre, own_working_m(target))
 
 
 def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:
@@ -115,16 +120,16 @@ def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:
     return f"two poses lie {degrees:.0f} deg and {metres:.1f} m apart"
 
 
-def _odds(judged: Judged, params: verdict.Params) -> float:
+def _odds(judged: Judged) -> float:
     """That a pose is right, by its own evidence."""
-    p = probability(judged.proposal, judged.evidence, params.prior)
+    p = probability(judged.proposal, judged.evidence, verdict.PRIOR)
     return p / (1.0 - p)
 
 
-def _probability_among(best: Judged, others: Sequence[Judged], params: verdict.Params) -> float:
+def _probability_among(best: Judged, others: Sequence[Judged]) -> float:
     """That a pose is right where one of the others may be instead: at most one of them all is."""
-    odds = _odds(best, params)
-    return odds / (1.0 + odds + sum(_odds(j, params) for j in others))
+    odds = _odds(best)
+    return odds / (1.0 + odds + sum(_odds(j) for j in others))
 
 
 def _figures(judged: Judged, probable: float) -> dict[str, float]:

@@ -13,26 +13,24 @@ from gsmap.register.correspondences import Correspondences
 Test = Literal["absolute", "ratio"]
 
 
+SIGMA_M = 0.03  # standard deviation of a landmark's position
+_RELATIVE = 0.01  # of the smaller distance, allowed by the absolute test on top of six standard deviations
+_RATIO = 0.1  # tolerance of the relative test
+MIN_DISTANCE_M = 0.25  # nodes closer than this hardly constrain the pose
+
+
 @dataclass(frozen=True)
 class Params:
-    """How two correspondences are tested against each other.
+    """Pairwise test of correspondences.
 
     Args:
-        test: ``absolute`` (distances may differ by ``6 sigma_m + relative * distance``) or ``ratio`` (Graph-GSReg's
-            relative test, ``| |dq| - s|dp| | < ratio * max``).
-        sigma_m: standard deviation of a node's position, for the absolute test.
-        relative: share of the smaller distance that the absolute test allows on top.
-        ratio: tolerance of the relative test.
-        min_distance_m: nodes closer than this tell nothing about the pose.
-        height_slope: allowed height difference per metre of distance where both scenes know gravity (the sine of
-            twice the error of an up vector); inf switches the height test off.
+        test: Test of two correspondences: ``absolute`` (their distances in both scenes may differ by a fixed error) or
+            ``ratio`` (by a share of the distance, as Graph-GSReg).
+        height_slope: Largest difference in height per metre of distance, at least 0, where both scenes know gravity;
+            a larger value tolerates tilted scenes and inf switches the test off.
     """
 
     test: Test = "absolute"
-    sigma_m: float = 0.03
-    relative: float = 0.01
-    ratio: float = 0.1
-    min_distance_m: float = 0.25
     height_slope: float = 0.05
 
     def __post_init__(self) -> None:
@@ -43,7 +41,14 @@ class Params:
             )
 
 
-def consistency_graph(matches: Correspondences, params: Params | None = None, *, scale: float = 1.0) -> np.ndarray:
+def consistency_graph(
+    matches: Correspondences,
+    params: Params | None = None,
+    *,
+    scale: float = 1.0,
+    sigma_m: float = SIGMA_M,
+    min_distance_m: float = MIN_DISTANCE_M,
+) -> np.ndarray:
     """Graph whose vertices are correspondences and whose edges join those that one similarity could explain.
 
     Two correspondences agree when the distances of their ends differ by less than ``6 sigma + relative * distance``
@@ -66,11 +71,11 @@ def consistency_graph(matches: Correspondences, params: Params | None = None, *,
         target_heights=matches.target_heights if heights else None,
         source_heights=matches.source_heights if heights else None,
         scale=float(scale),
-        slack=6.0 * params.sigma_m,
-        relative_slack=params.relative,
-        ratio=params.ratio if params.test == "ratio" else 0.0,
-        min_distance=params.min_distance_m,
-        height_slack=6.0 * params.sigma_m,
+        slack=6.0 * sigma_m,
+        relative_slack=_RELATIVE,
+        ratio=_RATIO if params.test == "ratio" else 0.0,
+        min_distance=min_distance_m,
+        height_slack=6.0 * sigma_m,
         height_slope=float(params.height_slope) if heights else 0.0,
     )
     return rows

@@ -14,42 +14,51 @@ from gsmap.types import NodeLayer
 _LLOYD_STEPS = 10  # of spherical k-means; made places' recall is the same after 5 and after 20
 
 
+_MAX_DISTANCE_M = 1.5  # objects nearer to each other are joined in the local graph
+NUM_WORDS = 48  # of the codebook, at most
+SHARPNESS = 20.0  # inverse temperature of the softmax by which a feature is shared among the words
+WEIGHT = 0.5  # length of the context against that of the feature in the embedding
+
+
 @dataclass(frozen=True)
 class Params:
-    """How an object's surroundings are counted and weighed.
+    """Context of objects.
 
     Args:
-        max_distance_m: objects nearer to each other than this are joined in the local graph.
-        hops: how far along it the surroundings reach.
-        num_words: of the codebook, at most.
-        sharpness: of the softmax by which a feature is shared among the words; the inverse of its temperature.
-        weight: length of the context against the feature's in the embedding; 0: features alone.
+        hops: Number of edges of the local graph, at least 1, that an object's context reaches; a larger value describes
+            a larger neighbourhood (Graph-GSReg: 3).
     """
 
-    max_distance_m: float = 1.5
     hops: int = 1
-    num_words: int = 48
-    sharpness: float = 20.0
-    weight: float = 0.5
 
 
-def with_context(a: NodeLayer, b: NodeLayer, params: Params | None = None) -> tuple[NodeLayer, NodeLayer]:
+def with_context(
+    a: NodeLayer,
+    b: NodeLayer,
+    params: Params | None = None,
+    *,
+    weight: float = WEIGHT,
+    max_distance_m: float = _MAX_DISTANCE_M,
+) -> tuple[NodeLayer, NodeLayer]:
     """Two layers of one descriptor with embeddings ``[feature, weight * context]`` of unit length.
 
     The words that contexts are counted over are those of the two layers themselves (`word_shares`): an image encoder's
     features all lie in one narrow cone, which a codebook that knows nothing of them cannot tell apart. Nothing of a
     context is stored, so that layers compare whatever other scenes a map holds, and in whatever order they came.
     """
-    params = params or Params()
-    if params.weight == 0 or not len(a) or not len(b):
+    hops = (params or Params()).hops
+    if weight == 0 or not len(a) or not len(b):
         return a, b
-    shares = word_shares(np.concatenate([a.features, b.features]), params.num_words, params.sharpness)
-    return _joined(a, shares[: len(a)], params), _joined(b, shares[len(a) :], params)
+    shares = word_shares(np.concatenate([a.features, b.features]), NUM_WORDS, SHARPNESS)
+    return (
+        _joined(a, shares[: len(a)], hops, weight, max_distance_m),
+        _joined(b, shares[len(a) :], hops, weight, max_distance_m),
+    )
 
 
-def _joined(layer: NodeLayer, shares: np.ndarray, params: Params) -> NodeLayer:
-    reach = neighbourhood(layer.positions, params.max_distance_m / layer.unit_m, params.hops)
-    both = np.concatenate([layer.features, params.weight * context_histograms(shares, reach)], axis=1)
+def _joined(layer: NodeLayer, shares: np.ndarray, hops: int, weight: float, max_distance_m: float) -> NodeLayer:
+    reach = neighbourhood(layer.positions, max_distance_m / layer.unit_m, hops)
+    both = np.concatenate([layer.features, weight * context_histograms(shares, reach)], axis=1)
     return replace(layer, embeddings=both / np.maximum(np.linalg.norm(both, axis=1, keepdims=True), 1e-12))
 
 

@@ -8,20 +8,8 @@ import numpy as np
 
 from gsmap.types import NodeLayer
 
-
-@dataclass(frozen=True)
-class Params:
-    """Which pairs of nodes may correspond.
-
-    Args:
-        min_similarity: least cosine of node embeddings (the paper's tau_node).
-        top_k: keep a pair when either node is among the other's k most similar of its type.
-        max_correspondences: keep the most similar this many.
-    """
-
-    min_similarity: float = 0.5
-    top_k: int = 1
-    max_correspondences: int = 1200
+MIN_SIMILARITY = 0.5  # cosine of node embeddings (the paper's tau_node)
+MAX_CORRESPONDENCES = 1200
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +49,10 @@ class Correspondences:
 def correspondences(
     target: NodeLayer,
     source: NodeLayer,
-    params: Params | None = None,
     *,
+    top_k: int = 1,
+    min_similarity: float = MIN_SIMILARITY,
+    max_correspondences: int = MAX_CORRESPONDENCES,
     units_m: tuple[float, float] = (1.0, 1.0),
     ups: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> Correspondences:
@@ -70,10 +60,12 @@ def correspondences(
 
     Args:
         target, source: one layer of each scene, made by the same descriptor.
+        top_k: a pair is kept when either node is among the other's so many most similar nodes of its type.
+        min_similarity: cosine of the embeddings.
+        max_correspondences: number of the most similar pairs that are kept.
         units_m: metres per unit of the target's and of the source's frame.
         ups: unit vectors against gravity, or None.
     """
-    params = params or Params()
     # Nodes of one type are brought together, so that each type's similarities are one product of two blocks.
     order_t, order_s = (np.argsort(layer.types, kind="stable") for layer in (target, source))
     types_t, types_s = target.types[order_t], source.types[order_s]
@@ -84,15 +76,15 @@ def correspondences(
     found = [np.zeros(0, np.float32)]
     for t0, t1, s0, s1 in zip(*bounds, strict=True):
         block = embeddings_t[t0:t1] @ embeddings_s[s0:s1].T
-        rows, columns = _alike(block, params)
+        rows, columns = _alike(block, top_k, min_similarity)
         found_t.append(order_t[t0 + rows])
         found_s.append(order_s[s0 + columns])
         found.append(block[rows, columns])
     t, s, similarity = np.concatenate(found_t), np.concatenate(found_s), np.concatenate(found)
-    if len(t) > params.max_correspondences:
-        least = np.partition(similarity, -params.max_correspondences)[-params.max_correspondences]
+    if len(t) > max_correspondences:
+        least = np.partition(similarity, -max_correspondences)[-max_correspondences]
         t, s, similarity = t[similarity >= least], s[similarity >= least], similarity[similarity >= least]
-    order = np.lexsort((s, t, -similarity))[: params.max_correspondences]
+    order = np.lexsort((s, t, -similarity))[:max_correspondences]
     return _between(target, source, t[order], s[order], similarity[order], units_m, ups)
 
 
@@ -157,18 +149,18 @@ def _between(
     )
 
 
-def _alike(similarity: np.ndarray, params: Params) -> tuple[np.ndarray, np.ndarray]:
+def _alike(similarity: np.ndarray, top_k: int, min_similarity: float) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the entries that are among the ``top_k`` of their row or of their column."""
     height, width = similarity.shape
-    if params.top_k == 1:
+    if top_k == 1:
         column, row = similarity.argmax(1), similarity.argmax(0)
         once = np.flatnonzero(column[row] != np.arange(width))  # the others are in already, from their row
         rows, columns = np.concatenate([np.arange(height), row[once]]), np.concatenate([column, once])
     else:
-        k, m = min(params.top_k, width), min(params.top_k, height)
+        k, m = min(top_k, width), min(top_k, height)
         keep = np.zeros(similarity.shape, dtype=bool)
         np.put_along_axis(keep, np.argpartition(-similarity, k - 1, axis=1)[:, :k], True, axis=1)
         np.put_along_axis(keep, np.argpartition(-similarity, m - 1, axis=0)[:m], True, axis=0)
         rows, columns = np.nonzero(keep)
-    enough = similarity[rows, columns] >= params.min_similarity
+    enough = similarity[rows, columns] >= min_similarity
     return rows[enough], columns[enough]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import json
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 
 import numpy as np
 
@@ -17,6 +20,16 @@ from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import PLANE_NEIGHBOURS, Surface
 from gsmap.types import Sim3
 
+BLOCK_M = 0.3  # residuals within a cell of this size, on surfaces that face one way, are one measurement
+# Pairs farther apart than this are ignored, and from a third of it on they weigh less, as in refining.
+RADIUS_M = 0.08
+_MAX_BLOCKS = 200  # larger cells are taken where there would be more
+# The pose is moved by this much each way (rotation and scale: over the overlap's radius) to see how much of a motion
+# the residuals of this many cells pull back.
+_PROBE_M = 0.01
+_PROBE_POINTS = 6000
+_COLOUR_SWAY = colored_icp.Params(colour_weight=3.0)  # ten times that of refining
+_COLOUR_PASS = colored_icp.Schedule((0.06,), (10_000,), last_tolerance=0.01)  # one radius; a tenth of a pair's cost
 _FEWEST = 20  # cells that coincide
 _FEWEST_OF_A_BLOCK = 3.0
 _LEAST_LOG_SCALE_SIGMA = 1e-6  # keeps the matrix regular
@@ -49,56 +62,24 @@ class Hidden:
         least_m: no translation is known better than this, and no rotation over the overlap's radius.
     """
 
-    shown: float = 0.644
-    by_colour: float = 0.867
-    swell_by_colour: float = 2.18
-    shift_m: float = 0.0
-    swell_m: float = 0.0043
-    field_m: float = 0.002
-    field_power: float = 2.11
-    shift_by_swell: float = 0.141
-    turn_by_shift: float = 1.0
-    most_swell: float = 0.02
-    least_m: float = 1e-4
+    shown: float
+    by_colour: float
+    swell_by_colour: float
+    shift_m: float
+    swell_m: float
+    field_m: float
+    field_power: float
+    shift_by_swell: float
+    turn_by_shift: float
+    most_swell: float
+    least_m: float
 
 
-def _grey() -> Hidden:
-    """Where there are no colours residuals and the scale alone tell (fitted with nothing else, to fewer places)."""
-    return Hidden(1.0, 0.0, 0.0, 0.0009, 0.0034, field_power=2.16, shift_by_swell=0.58, turn_by_shift=0.91)
-
-
-def _swayed() -> colored_icp.Params:
-    """One radius, near enough for colours; a tenth of a pair's cost."""
-    return colored_icp.Params((0.06,), colour_weight=3.0, max_points=(10_000,), last_tolerance=0.01)
-
-
-@dataclass(frozen=True)
-class Params:
-    """How well a refined pose is known.
-
-    Args:
-        radius_m: pairs farther apart than this are not counted, and from a third of it on they count less, as in
-            refining.
-        block_m: residuals within a cell of this size, on surfaces that face one way, are one measurement ...
-        max_blocks: ... or of a larger cell, where there would be more of them than this.
-        probe_m: the pose is moved by so much each way (rotation and scale: over the overlap's radius), to see how much
-            of it the residuals pull back ...
-        probe_points: ... of this many cells.
-        colours: how a pose is refined once more by what colours say of it, ten times as loud as in refining.
-        hidden: how much is thought to leave no residual where both surfaces have colours ...
-        hidden_grey: ... and where they have not.
-        field: which errors of the surfaces are thought possible.
-    """
-
-    radius_m: float = 0.08
-    block_m: float = 0.3
-    max_blocks: int = 200
-    probe_m: float = 0.01
-    probe_points: int = 6000
-    colours: colored_icp.Params = field(default_factory=_swayed)
-    hidden: Hidden = field(default_factory=Hidden)
-    hidden_grey: Hidden = field(default_factory=_grey)
-    field: error_field.Params = field(default_factory=error_field.Params)  # last: it hides dataclasses.field
+@cache
+def fitted(*, coloured: bool) -> Hidden:
+    """The fitted model for surfaces with colours, and the one for surfaces without."""
+    stored = json.loads((files("gsmap.register") / "covariance.json").read_text())
+    return Hidden(**stored["coloured" if coloured else "grey"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +121,7 @@ class Conditioning:
         field_m: standard deviation of the surfaces' errors that are alike beyond a block.
         radius_m: of the overlap.
         sway: (7,) motion about the centroid by which colours would move the pose; None where there are none.
-        params: what is thought to be hidden.
+        hidden: the model of errors that leave no residual.
         loose: (7, 7) and (6, 6) what is added to ``scaled`` and to ``rigid`` where planes leave a motion free: the
             errors of colours and correspondences, which hold it then, or of nothing.
     """
@@ -152,13 +133,8 @@ class Conditioning:
     field_m: float
     radius_m: float
     sway: np.ndarray | None
-    params: Params
+    hidden: Hidden
     loose: tuple[np.ndarray, np.ndarray]
-
-    @property
-    def hidden(self) -> Hidden:
-        """The model that holds for this pair."""
-        return self.params.hidden_grey if self.sway is None else self.params.hidden
 
     @property
     def log_scale_sigma(self) -> float:
@@ -216,8 +192,8 @@ def condition(
     target: Surface,
     source: Surface,
     pose: Sim3,
-    params: Params | None = None,
     correspondences: Correspondences | None = None,
+    hidden: Hidden | None = None,
 ) -> Conditioning | None:
     """How well a refined pose (metres) is known with its scale and without; None where too little overlaps to tell.
 
@@ -230,24 +206,24 @@ def condition(
     Along motions that planes leave free (`degeneracy`) the pose is known as well as colours and the ``correspondences``
     hold it, as in refining; where these do not either, the overlap may lie anywhere along itself.
     """
-    params = params or Params()
-    blocks = _Blocks.of(target, source, pose, params)
+    blocks = _Blocks.of(target, source, pose)
     if blocks is None:
         return None
-    hessian = _pulled_back(target, source, pose, blocks, params)
+    hessian = _pulled_back(target, source, pose, blocks)
     pull = (blocks.jacobian * blocks.weights[:, None]).T
     loose = np.zeros((7, 7)), np.zeros((6, 6))
     held = held_motions(blocks.hessian, blocks.points, blocks.noise_m, _resolution_m(target, source), PLANE_NEIGHBOURS)
     if held is not None:
-        others, errors_of_others = _other_information(target, source, pose, blocks, params, correspondences)
+        others, errors_of_others = _other_information(target, source, pose, blocks, correspondences)
         hessian, pull = held @ hessian @ held.T + others, held @ pull
         inverse, rigid = np.linalg.inv(hessian), np.linalg.inv(hessian[:6, :6])
         loose = inverse @ errors_of_others @ inverse, rigid @ errors_of_others[:6, :6] @ rigid
     influence = np.concatenate([np.linalg.solve(hessian, pull), np.linalg.solve(hessian[:6, :6], pull[:6])])
     seen = error_field.Blocks(blocks.jacobian, blocks.residual, blocks.positions, blocks.directions, blocks.counts)
-    errors = error_field.judge_errors(seen, influence, params.field)
+    errors = error_field.judge_errors(seen, influence)
     if errors is None:
         return None
+    sway = swayed(target, source, pose, blocks.centroid, with_scale=True)
     return Conditioning(
         scaled=errors.covariance[:7, :7],
         rigid=errors.covariance[7:, 7:],
@@ -255,19 +231,18 @@ def condition(
         centroid=blocks.centroid,
         field_m=errors.field_m,
         radius_m=blocks.radius_m,
-        sway=swayed(target, source, pose, blocks.centroid, params, with_scale=True),
-        params=params,
+        sway=sway,
+        hidden=hidden or fitted(coloured=sway is not None),
         loose=loose,
     )
 
 
-def known_by_correspondences(correspondences: Correspondences, pose: Sim3, params: Params | None = None) -> Known:
+def known_by_correspondences(correspondences: Correspondences, pose: Sim3, block_m: float = BLOCK_M) -> Known:
     """How well a pose (metres) is known that was fitted to correspondences alone, and not refined."""
-    params = params or Params()
     target, source = correspondences
     centroid = source.mean(0)
     information = pose.scale**2 * point_information(source - centroid)
-    variance = ((pose.apply(source) - target) ** 2).mean() * _repeats(target, params.block_m)
+    variance = ((pose.apply(source) - target) ** 2).mean() * _repeats(target, block_m)
     return Known.about(np.linalg.pinv(information, hermitian=True) * variance, centroid, pose.scale)
 
 
@@ -285,7 +260,6 @@ def _other_information(
     source: Surface,
     pose: Sim3,
     blocks: _Blocks,
-    params: Params,
     correspondences: Correspondences | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(7, 7) what holds a pose beside planes, about the overlap's centroid in the weights of `_Blocks`, and the
@@ -294,17 +268,17 @@ def _other_information(
     anywhere = blocks.points / blocks.points[3, 3] * variance / blocks.radius_m**2
     held, errors = anywhere.copy(), variance * anywhere
     if all(np.ptp(surface.lightness) > 0 for surface in (target, source)):
-        colours = replace(params.colours, colour_weight=colored_icp.Params().colour_weight)
-        told = colored_icp.colour_information(target, source, pose, blocks.centroid, colours)
+        weight = colored_icp.Params().colour_weight
+        told = colored_icp.colour_information(target, source, pose, blocks.centroid, _COLOUR_PASS)
         if told is not None:
             # In these units a cell's colour is off by its weight; those of a block are, all together.
-            together = max(1.0, colours.colour_weight**2 * float(blocks.counts.mean()))
+            together = max(1.0, weight**2 * float(blocks.counts.mean()))
             told = told * blocks.points[3, 3]
             held, errors = held + told, errors + told * variance * together
     if correspondences is not None:
         ties = colored_icp.Ties(correspondences)
         told, _ = ties.equations(pose, blocks.centroid, blocks.noise_m)
-        held, errors = held + told, errors + told * variance * _repeats(correspondences[0], params.block_m)
+        held, errors = held + told, errors + told * variance * _repeats(correspondences[0], BLOCK_M)
     return held, errors
 
 
@@ -313,7 +287,6 @@ def swayed(
     source: Surface,
     pose: Sim3,
     centroid: np.ndarray,
-    params: Params | None = None,
     *,
     with_scale: bool,
 ) -> np.ndarray | None:
@@ -323,10 +296,9 @@ def swayed(
     than planes. So the pose that colours prefer lies about as far from that of the planes as both lie from the truth,
     where the planes' own residuals show nothing.
     """
-    params = params or Params()
     if not all(np.ptp(surface.lightness) > 0 for surface in (target, source)):
         return None
-    other = colored_icp.refine(target, source, pose, params.colours, with_scale=with_scale)
+    other = colored_icp.refine(target, source, pose, _COLOUR_SWAY, with_scale=with_scale, schedule=_COLOUR_PASS)
     centre = Sim3(np.eye(3), centroid)
     there, here = (Similarities.stack([p @ centre]) for p in (other, pose))
     motion: np.ndarray = (here.inverse() @ there).log()[0]
@@ -354,7 +326,7 @@ def hidden_motion(field_m: float, radius_m: float, swell: float, hidden: Hidden)
     return hidden.turn_by_shift * shift / radius_m, shift
 
 
-def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks, params: Params) -> np.ndarray:
+def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks) -> np.ndarray:
     """(7, 7) Hessian about the overlap's centroid of the residuals' squares, the pairs found anew as the pose moves.
 
     The usual one takes the pairs as given. They follow a motion along a wall, though, and the noise of its normals then
@@ -362,14 +334,14 @@ def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks, 
     decimetre off. So the pose is moved each way, and of each motion (an eigenvector of both Hessians together) as much
     is taken to be held as pulls back.
     """
-    chosen = source.sample(params.probe_points)
+    chosen = source.sample(_PROBE_POINTS)
     points, centre = source.coarse[0][chosen], Sim3(np.eye(3), blocks.centroid)
     faces = _faces(source, pose)
     faces = None if faces is None else faces[chosen]
     spread = np.r_[np.full(3, 1 / blocks.radius_m), np.ones(3), 1 / blocks.radius_m]
     pulled = np.empty((7, 7))
-    for k, step in enumerate(params.probe_m * np.diag(spread)):
-        ahead, behind = (_pull(target, points, faces, retract(pose @ centre, x), centre, params) for x in (step, -step))
+    for k, step in enumerate(_PROBE_M * np.diag(spread)):
+        ahead, behind = (_pull(target, points, faces, retract(pose @ centre, x), centre) for x in (step, -step))
         pulled[k] = (ahead - behind) / (2 * step[k]) * len(source.coarse[0]) / len(chosen)
     hessian = blocks.hessian + 1e-9 * np.trace(blocks.hessian) / 7 * np.eye(7)
     root = np.linalg.cholesky(hessian)
@@ -387,24 +359,22 @@ def _faces(source: Surface, pose: Sim3) -> np.ndarray | None:
     return None if source.faces is None else source.faces @ pose.rotation.T
 
 
-def _pull(
-    target: Surface, points: np.ndarray, faces: np.ndarray | None, centred: Sim3, centre: Sim3, params: Params
-) -> np.ndarray:
+def _pull(target: Surface, points: np.ndarray, faces: np.ndarray | None, centred: Sim3, centre: Sim3) -> np.ndarray:
     """(7,) gradient of the weighted squares of the distances to the planes, by a motion about a centre."""
     pose = centred @ centre.inverse()
     moved = pose.apply(points)
-    distance, row = target.nearest(moved, params.radius_m, faces)
+    distance, row = target.nearest(moved, RADIUS_M, faces)
     hit = np.flatnonzero(np.isfinite(distance))
     normals = target.normals[row[hit]]
     residual = (normals * (moved[hit] - target.coarse[0][row[hit]])).sum(1)
     slope = point_to_plane_jacobian(centred, points[hit] - centre.translation, normals)
-    pull: np.ndarray = (_weights(residual, params) * residual) @ slope
+    pull: np.ndarray = (_weights(residual) * residual) @ slope
     return pull
 
 
-def _weights(residual: np.ndarray, params: Params) -> np.ndarray:
+def _weights(residual: np.ndarray) -> np.ndarray:
     """Geman-McClure."""
-    weights: np.ndarray = 1.0 / (1.0 + (residual / (_WIDTH * params.radius_m)) ** 2) ** 2
+    weights: np.ndarray = 1.0 / (1.0 + (residual / (_WIDTH * RADIUS_M)) ** 2) ** 2
     return weights
 
 
@@ -442,10 +412,10 @@ class _Blocks:
     radius_m: float
 
     @classmethod
-    def of(cls, target: Surface, source: Surface, pose: Sim3, params: Params) -> _Blocks | None:
+    def of(cls, target: Surface, source: Surface, pose: Sim3) -> _Blocks | None:
         points, _ = source.coarse
         moved = pose.apply(points)
-        distance, row = target.nearest(moved, params.radius_m, _faces(source, pose))
+        distance, row = target.nearest(moved, RADIUS_M, _faces(source, pose))
         hit = np.flatnonzero(np.isfinite(distance))
         if len(hit) < _FEWEST:
             return None
@@ -454,12 +424,12 @@ class _Blocks:
         axis = np.abs(normals).argmax(1)
         normals = normals * np.sign(normals[np.arange(len(normals)), axis])[:, None]
         residual = (normals * (moved - target.coarse[0][row[hit]])).sum(1)
-        weights = _weights(residual, params)
+        weights = _weights(residual)
         centroid = points.mean(0)
         jacobian = point_to_plane_jacobian(pose, points, normals) @ np.linalg.inv(_shift(centroid))
-        size, labels = params.block_m, _labels(moved, axis, params.block_m)
-        while (num := int(labels.max()) + 1) > params.max_blocks:
-            size *= max(1.05, float(np.sqrt(num / params.max_blocks)))  # blocks lie on surfaces
+        size, labels = BLOCK_M, _labels(moved, axis, BLOCK_M)
+        while (num := int(labels.max()) + 1) > _MAX_BLOCKS:
+            size *= max(1.05, float(np.sqrt(num / _MAX_BLOCKS)))  # blocks lie on surfaces
             labels = _labels(moved, axis, size)
         total = np.bincount(labels, weights)
         counts = total**2 / np.bincount(labels, weights**2)

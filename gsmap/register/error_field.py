@@ -9,19 +9,10 @@ import numpy as np
 _FREE = 3  # residuals more than parameters, at least: fewer have no variance
 
 
-@dataclass(frozen=True)
-class Params:
-    """Which error fields are thought possible.
-
-    Args:
-        lengths_m: over which distances errors may be alike (their correlation falls as ``exp(-distance / length)``).
-        shares: which share of a block's variance may be alike beyond the block.
-        few: a block of this many points has twice the variance of one of very many.
-    """
-
-    lengths_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
-    shares: tuple[float, ...] = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95)
-    few: float = 4.0
+LENGTHS_M = (0.5, 1.0, 2.0, 4.0, 8.0)  # correlation lengths: errors correlate by exp(-distance / length)
+# Possible shares of a block's variance that correlate beyond the block.
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95)
+SMALL_BLOCK = 4.0  # a block of this many points has twice the variance of one of very many
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +47,7 @@ class Errors:
     field_m: float
 
 
-def judge_errors(blocks: Blocks, influence: np.ndarray, params: Params | None = None) -> Errors | None:
+def judge_errors(blocks: Blocks, influence: np.ndarray) -> Errors | None:
     """The errors of estimates that are linear in those of the blocks, as the blocks' residuals show them.
 
     The errors are those of a displacement field (isotropic, stationary, with an exponential covariance), seen along the
@@ -71,12 +62,11 @@ def judge_errors(blocks: Blocks, influence: np.ndarray, params: Params | None = 
     Returns:
         None where the blocks are hardly more than the parameters.
     """
-    params = params or Params()
     count, dim = blocks.jacobian.shape
     free = count - dim
     if free < _FREE:
         return None
-    noise = np.sqrt(1.0 + params.few / blocks.counts)  # in these units the noise of all blocks is alike
+    noise = np.sqrt(1.0 + SMALL_BLOCK / blocks.counts)  # in these units the noise of all blocks is alike
     # An orthonormal basis of what no parameter explains.
     rest = np.linalg.qr(blocks.jacobian / noise[:, None], mode="complete")[0][:, dim:]
     left = rest.T @ (blocks.residual / noise)
@@ -84,11 +74,11 @@ def judge_errors(blocks: Blocks, influence: np.ndarray, params: Params | None = 
     alike = (blocks.directions @ blocks.directions.T) / np.outer(noise, noise)
     spread = influence * noise
     own, logs, outcomes, fields = spread @ spread.T, [], [], []
-    for length in params.lengths_m:
+    for length in LENGTHS_M:
         field = alike * np.exp(-distance / length)
         values, vectors = np.linalg.eigh(rest.T @ field @ rest)
         squares, shared = (vectors.T @ left) ** 2, spread @ field @ spread.T
-        for share in params.shares:
+        for share in SHARES:
             spectrum = share * np.maximum(values, 0.0) + 1.0 - share
             chi2 = max(float((squares / spectrum).sum()), 1e-30)
             logs.append(-0.5 * (np.log(spectrum).sum() + free * np.log(chi2)))

@@ -12,42 +12,24 @@ from gsmap.register.view_cache import ViewCache
 from gsmap.render import Rendering, render
 from gsmap.types import Sim3
 
-
-@dataclass(frozen=True)
-class Params:
-    """How two scenes are compared under a pose.
-
-    Args:
-        radius_m: surfaces closer than this coincide.
-        depth_tolerance_m: depths that differ by more than this ...
-        depth_tolerance: ... and this share of the depth disagree (the two tolerances are added).
-        made_reach_m: what a made view looks through counts as free this far in front of the surface it sees: farther
-            from that, no camera of the capture need have looked.
-        min_alpha: a pixel fainter than this shows nothing.
-        num_cameras: cameras of each scene that are asked, chosen to see most of the other scene.
-        pattern_px: patterns are compared within patches of this size ...
-        min_pattern: ... where both show one: local colours vary by this (standard deviation, RGB in [0, 1]) ...
-        pattern_correlation: ... and are not the same where they correlate by less than this, and by much less than
-            the patterns of the two scenes do on the whole.
-        patch_px: colours are compared after their mean over patches of this size is removed.
-        cell_m: the same for the surface cells of scenes without cameras.
-        min_seen: cameras of a scene that can judge fewer Gaussians of the other are not counted.
-        max_points: points of each scene that are tested for coinciding.
-    """
-
-    radius_m: float = 0.08
-    depth_tolerance_m: float = 0.10
-    depth_tolerance: float = 0.02
-    made_reach_m: float = 1.0
-    min_alpha: float = 0.5
-    num_cameras: int = 6
-    pattern_px: int = 8
-    min_pattern: float = 0.05
-    pattern_correlation: float = 0.1
-    patch_px: int = 16
-    cell_m: float = 0.4
-    min_seen: int = 100
-    max_points: int = 12_000
+_RADIUS_M = 0.08  # surfaces closer than this coincide
+# Depths disagree where they differ by more than the sum of both tolerances, in metres and as a share of the depth.
+_DEPTH_TOLERANCE_M = 0.10
+_DEPTH_TOLERANCE = 0.02
+# Free space in front of a surface that a synthesized view sees: farther from it no camera of the capture need have
+# looked.
+_SYNTHESIZED_REACH_M = 1.0
+_MIN_ALPHA = 0.5  # a fainter pixel shows no surface
+# Patterns are compared within patches of this size where both show one (standard deviation of RGB in [0, 1]); they
+# differ where their correlation is below _PATTERN_CORRELATION and far below that of the pair as a whole.
+_PATTERN_PX = 8
+_MIN_PATTERN = 0.05
+_PATTERN_CORRELATION = 0.1
+_PATCH_PX = 16  # colours are compared after the mean over a patch of this size is removed ...
+_CELL_M = 0.4  # ... and over a cell of this size for scenes without cameras
+_MIN_SEEN = 100  # cameras of a scene that see fewer Gaussians of the other scene are ignored
+NUM_CAMERAS = 6  # of each scene, chosen to see most of the other scene
+MAX_POINTS = 12_000  # of each scene that are tested for coinciding
 
 
 @dataclass(frozen=True)
@@ -94,7 +76,9 @@ def measure(
     source: Surface,
     pose: Sim3,
     views: tuple[Views, Views] = (None, None),
-    params: Params | None = None,
+    *,
+    num_cameras: int = NUM_CAMERAS,
+    max_points: int = MAX_POINTS,
 ) -> PoseEvidence:
     """Compare two scenes under ``S_target_source``.
 
@@ -104,30 +88,31 @@ def measure(
     Args:
         target, source: surfaces, in metres; so is the pose.
         views: the target's and the source's own.
+        num_cameras: of each scene, chosen to see most of the other scene.
+        max_points: of each scene that are tested for coinciding.
     """
-    params = params or Params()
-    rows_t, rows_s = target.sample(params.max_points), source.sample(params.max_points)
+    rows_t, rows_s = target.sample(max_points), source.sample(max_points)
     forward, back = pose.apply(source.coarse[0][rows_s]), pose.inverse().apply(target.coarse[0][rows_t])
-    distance, row = target.nearest(forward, params.radius_m)
+    distance, row = target.nearest(forward, _RADIUS_M)
     hit = np.isfinite(distance)
-    hit_back = np.isfinite(source.nearest(back, params.radius_m)[0])
+    hit_back = np.isfinite(source.nearest(back, _RADIUS_M)[0])
     overlap = min(float(hit.mean()), float(hit_back.mean())) if len(hit) and len(hit_back) else 0.0
     both_ways = [
-        None if own is None else _cross_view(*own, other, other_pose, points, params)
+        None if own is None else _cross_view(*own, other, other_pose, points, num_cameras)
         for own, other, other_pose, points in (
             (views[0], source, pose, forward),
             (views[1], target, pose.inverse(), back),
         )
     ]
-    judges = [stats for stats in both_ways if stats is not None and stats.num_seen >= params.min_seen]
+    judges = [stats for stats in both_ways if stats is not None and stats.num_seen >= _MIN_SEEN]
     colours = [stats.colour() for stats in judges]
     if views == (None, None):
-        cells = np.floor(forward[hit] / params.cell_m).astype(int)
+        cells = np.floor(forward[hit] / _CELL_M).astype(int)
         cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
         camera_free = CrossViewStats.of(0)
         camera_free.compare(_opponent(target.coarse[1][row[hit]]), _opponent(source.coarse[1][rows_s[hit]]), cell)
         colours = [camera_free.colour()]
-    areas = np.sum([stats.areas_m2(params.pattern_correlation) for stats in judges], axis=0) if judges else np.zeros(3)
+    areas = np.sum([stats.areas_m2() for stats in judges], axis=0) if judges else np.zeros(3)
     worst = max(judges, key=lambda stats: stats.free_space_violation, default=None)
     return PoseEvidence(
         overlap=overlap,
@@ -165,7 +150,7 @@ class CrossViewStats:
     def free_space_violation(self) -> float:
         return float((self.in_front & ~self.agrees).sum()) / self.num_seen
 
-    def areas_m2(self, pattern_correlation: float) -> np.ndarray:
+    def areas_m2(self) -> np.ndarray:
         """(3,) surface that was seen through, that shows another pattern, and all that could be judged."""
         through = self.area_m2[self.in_front & ~self.agrees].sum()
         judged = self.area_m2[self.in_front | self.agrees].sum()
@@ -174,7 +159,7 @@ class CrossViewStats:
         gaussian, area_m2, correlation = (np.concatenate(rows) for rows in zip(*self.patterns, strict=True))
         # A noisy capture's patterns correlate badly everywhere; only what does worse than that noise is another one.
         middle, upper = np.quantile(correlation, [0.5, 0.75])
-        unlike = correlation < min(pattern_correlation, middle - 3 * (upper - middle))
+        unlike = correlation < min(_PATTERN_CORRELATION, middle - 3 * (upper - middle))
         other = np.zeros(len(self.area_m2))
         np.maximum.at(other, gaussian[unlike], area_m2[unlike])
         return np.array([through, np.minimum(other, self.area_m2)[self.agrees].sum(), judged])
@@ -217,19 +202,19 @@ class CrossViewStats:
 
 
 def _cross_view(
-    views: ViewCache, unit_m: float, other: Surface, pose: Sim3, points: np.ndarray, params: Params
+    views: ViewCache, unit_m: float, other: Surface, pose: Sim3, points: np.ndarray, num_cameras: int
 ) -> CrossViewStats:
     """The other scene, laid into one by ``pose`` (metres), through that one's cameras; ``points`` of it, so laid."""
     if other.splats is None or not len(other):
         return CrossViewStats.of(0)
     stats = CrossViewStats.of(len(other))
     into_other = pose.inverse() @ Sim3(np.eye(3), np.zeros(3), unit_m)
-    for row in views.select_views(points / unit_m, params.num_cameras):
+    for row in views.select_views(points / unit_m, num_cameras):
         camera = transform_cameras(views.cameras[[row]], into_other)
         seen = render(other.splats, camera, backend="native")  # as in `ViewCache`
         focal_px = float(np.sqrt(camera.intrinsics_px[0, :2].prod()))
-        reach_m = np.inf if row < views.num_own else params.made_reach_m
-        _compare(stats, views.render(row), unit_m, seen, pose.scale, focal_px, params, reach_m)
+        reach_m = np.inf if row < views.num_own else _SYNTHESIZED_REACH_M
+        _compare(stats, views.render(row), unit_m, seen, pose.scale, focal_px, reach_m)
     return stats
 
 
@@ -240,7 +225,6 @@ def _compare(
     other: Rendering,
     scale: float,
     focal_px: float,
-    params: Params,
     reach_m: float,
 ) -> None:
     """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres.
@@ -249,10 +233,10 @@ def _compare(
         reach_m: what lies farther than this in front of the surface seen proves nothing.
     """
     depth, other_depth = own.depth[0] * unit_m, other.depth[0] * scale
-    solid = own.alpha[0] > params.min_alpha
+    solid = own.alpha[0] > _MIN_ALPHA
     near, far = _extremes(depth, solid)
-    tolerance = params.depth_tolerance_m + params.depth_tolerance * depth
-    both = solid & (other.alpha[0] > params.min_alpha)
+    tolerance = _DEPTH_TOLERANCE_M + _DEPTH_TOLERANCE * depth
+    both = solid & (other.alpha[0] > _MIN_ALPHA)
     in_front = both & (other_depth < near - tolerance)
     agrees = both & ~in_front & (other_depth <= far + tolerance)
     in_front[in_front] = near[in_front] - other_depth[in_front] <= reach_m  # elsewhere both may be infinite
@@ -260,25 +244,25 @@ def _compare(
     stats.in_front[other.dominant_id[0][in_front]] = True
     stats.agrees[other.dominant_id[0][agrees]] = True
     rows, columns = np.nonzero(agrees)
-    patch = rows // params.patch_px * -(-agrees.shape[1] // params.patch_px) + columns // params.patch_px
+    patch = rows // _PATCH_PX * -(-agrees.shape[1] // _PATCH_PX) + columns // _PATCH_PX
     a, b = _opponent(own.colour[0][agrees]), _opponent(other.colour[0][agrees])
     stats.compare(a, b, patch)
     pattern = np.full(agrees.shape, np.nan)
-    patch = rows // params.pattern_px * -(-agrees.shape[1] // params.pattern_px) + columns // params.pattern_px
-    pattern[agrees] = _pattern_correlation(a, b, patch, params)
+    patch = rows // _PATTERN_PX * -(-agrees.shape[1] // _PATTERN_PX) + columns // _PATTERN_PX
+    pattern[agrees] = _pattern_correlation(a, b, patch)
     judged = in_front | agrees
     area_m2 = (other_depth[judged] / focal_px) ** 2
     stats.see(other.dominant_id[0][judged], area_m2, pattern[judged])
 
 
-def _pattern_correlation(a: np.ndarray, b: np.ndarray, patch: np.ndarray, params: Params) -> np.ndarray:
+def _pattern_correlation(a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> np.ndarray:
     """(N,) correlation of lightness and chromas within the patch of each pixel; NaN where not both show a pattern."""
     if not len(a):
         return np.zeros(0)
     count = np.bincount(patch)
     a, b = _local(a, patch), _local(b, patch)
     aa, bb, ab = (_sums(x * y, patch).sum(1) for x, y in ((a, a), (b, b), (a, b)))
-    patterned = (np.minimum(aa, bb) > count * params.min_pattern**2) & (count > params.pattern_px**2 // 2)
+    patterned = (np.minimum(aa, bb) > count * _MIN_PATTERN**2) & (count > _PATTERN_PX**2 // 2)
     out: np.ndarray = np.where(patterned, ab / np.sqrt(np.maximum(aa * bb, 1e-12)), np.nan)[patch]
     return out
 

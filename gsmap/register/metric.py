@@ -27,7 +27,6 @@ class MetricScene:
 
     view: SceneView
     unit_m: float
-    params: Params
 
     @property
     def graph(self) -> SceneGraph:
@@ -35,11 +34,11 @@ class MetricScene:
 
     def surface(self) -> Surface:
         """The scene's surface in metres."""
-        return self.view.surface(self.unit_m, self.params.surface, self.params.views)
+        return self.view.surface(self.unit_m)
 
     def views(self) -> Views:
         """The scene through its own cameras, and metres per unit; None without cameras."""
-        cache = self.view.views(self.params.views)
+        cache = self.view.views
         return None if cache is None else (cache, self.unit_m)
 
 
@@ -62,7 +61,7 @@ class MetricPair:
         unit_m = working_unit_m(target, source, with_scale=proposal.with_scale)
         if proposal.with_scale and source.scale_policy == "known":
             unit_m = source.graph.working_m / scale  # the source knows what a metre is, the target only guesses
-        pair = cls(MetricScene(target, unit_m, params), MetricScene(source, unit_m * scale, params), scale)
+        pair = cls(MetricScene(target, unit_m), MetricScene(source, unit_m * scale), scale)
         return replace(pair, ties=pair.tied(proposal)) if verdict.is_rare(proposal, params.verdict) else pair
 
     @property

@@ -19,6 +19,10 @@ from gsmap.types import Registration, Sim3
 from gsmap.types.progress import Progress, silent
 from gsmap.types.registration import Proposal
 
+# Share of the correspondences that agree with a proposed pose that must agree with the refined one; with fewer the
+# proposed pose is judged in its place.
+_MIN_EXPLAINED = 0.5
+
 
 def register_pair(
     target: SceneView, source: SceneView, params: Params | None = None, progress: Progress | None = None
@@ -41,7 +45,7 @@ def register_pair(
         for proposal in proposals:
             if len(judged) - before >= params.max_poses:
                 break
-            if not _is_worth_judging(proposal, judged, target, source, params):
+            if not _is_worth_judging(proposal, judged, target, source):
                 continue
             done = min(len(judged) / params.max_poses, 1.0)
             report(0.2 + 0.7 * done, f"judging a pose by {proposal.proposer}")
@@ -74,14 +78,12 @@ def measured(target: SceneView, source: SceneView, proposal: Proposal, params: P
     return _judge(proposal, target, source, params or Params(), Stopwatch(), prescreen=False)
 
 
-def _is_worth_judging(
-    proposal: Proposal, judged: list[Judged], target: SceneView, source: SceneView, params: Params
-) -> bool:
+def _is_worth_judging(proposal: Proposal, judged: list[Judged], target: SceneView, source: SceneView) -> bool:
     """Neither explained by the background model, nor judged before."""
-    if proposal.log_nfa > params.prescreen_log_nfa:
+    if proposal.log_nfa > verdict.PRESCREEN_LOG_NFA:
         return False
     S, centre, unit_m = proposal.S_target_source, source.centre, own_working_m(target)
-    return not any(is_same_pose(S, j.proposal.S_target_source, centre, unit_m, params.same_pose) for j in judged)
+    return not any(is_same_pose(S, j.proposal.S_target_source, centre, unit_m) for j in judged)
 
 
 def _rivals(
@@ -127,20 +129,22 @@ def _judge(
         pose = refinement.coarse(pair, pair.to_metres(proposal.S_target_source), params, with_scale=proposal.with_scale)
     with watch.step("verdict"):
         views = pair.target.views(), pair.source.views()
-        seen = measure(*surfaces, pose, views, params.prescreen)
+        seen = measure(
+            *surfaces, pose, views, num_cameras=verdict.PRESCREEN_CAMERAS, max_points=verdict.PRESCREEN_POINTS
+        )
         # A clique that is significant by itself is worth a full look, whatever three cameras say of a rough pose.
         sure = verdict.is_significant(proposal, params.verdict)
-        flaw = "" if sure or not prescreen else verdict.fails_prescreen(seen, params.verdict)
+        flaw = "" if sure or not prescreen else verdict.fails_prescreen(seen)
     known, belief = None, None
     if not flaw:
         with watch.step("refine"):
             pose, known, belief = scaled_or_rigid(pair, pose, params, with_scale=proposal.with_scale)
         with watch.step("verdict"):
-            seen = measure(*surfaces, pose, views, params.evidence)
+            seen = measure(*surfaces, pose, views, num_cameras=params.num_cameras)
         with watch.step("polish"):
             polished = refinement.polished(pair, pose, params, with_scale=belief is None or not belief.rigid)
             if polished is not pose:
-                better = measure(*surfaces, polished, views, params.evidence)
+                better = measure(*surfaces, polished, views, num_cameras=params.num_cameras)
                 if better.colour_correlation > seen.colour_correlation:
                     pose, seen = polished, better
     S = pair.to_scene_units(pose)
@@ -151,16 +155,16 @@ def _judge(
     before, (after, log_nfa) = (0, (0, proposal.log_nfa))
     if support is not None:
         before, (after, log_nfa) = support.count(proposal.S_target_source)[0], support.count(S)
-    if after >= params.min_explained * before:
+    if after >= _MIN_EXPLAINED * before:
         refined = replace(refined, log_nfa=log_nfa)
     else:
         # The surfaces pulled the pose away from what proposed it: what that was is judged, as it was proposed.
         pose, belief = pair.to_metres(proposal.S_target_source), None
         ties = pair.tied(proposal)
         assert ties is not None
-        known = covariance.known_by_correspondences(ties, pose, params.covariance)
+        known = covariance.known_by_correspondences(ties, pose)
         with watch.step("verdict"):
-            seen = measure(*surfaces, pose, views, params.evidence)
+            seen = measure(*surfaces, pose, views, num_cameras=params.num_cameras)
         refined = proposal
     if not flaw and refined is proposal and not verdict.is_rare(proposal, params.verdict):
         flaw = "surfaces pull the pose away from its correspondences, which chance explains"

@@ -9,20 +9,10 @@ import numpy as np
 from gsmap.geometry.umeyama import umeyama
 from gsmap.types import Sim3
 
-
-@dataclass(frozen=True)
-class Params:
-    """Which sets of correspondences imply a pose.
-
-    Args:
-        max_rotation_sigma_deg: a set that fixes the rotation about some axis less well than this lies along a line.
-        max_rms_sigmas: root mean square residual, in standard deviations of a node's position, that a set may have. An
-            inlier's residual has sqrt(2) of them per axis, 2.45 over three. Twice that may still be a true match of
-            poorly repeated nodes, for the surfaces to judge; more is no pose at all.
-    """
-
-    max_rotation_sigma_deg: float = 3.0
-    max_rms_sigmas: float = 6.0
+_MAX_ROTATION_SIGMA_DEG = 3.0  # about any axis; correspondences that fix it less well lie along a line
+# Root mean square residual in standard deviations of a node's position. An inlier's residual has sqrt(2) of them per
+# axis, 2.45 over three. Twice that may still be a right match of poorly repeated nodes, for the surfaces to verify.
+_MAX_RMS_SIGMAS = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +38,6 @@ def fit_pose(
     *,
     with_scale: bool = False,
     sigma_m: float = 0.03,
-    params: Params | None = None,
 ) -> PoseFit:
     """Least-squares pose of (N, 3) corresponding points, refusing mirrored and near-collinear sets.
 
@@ -56,7 +45,6 @@ def fit_pose(
     the best proper one does not. Points along a line leave the rotation about it free: with positions known to
     ``sigma_m``, its standard deviation is the largest of ``F^-1/2``, ``F = sum(|x|^2 I - x x^T) / (2 sigma^2)``.
     """
-    params = params or Params()
     if len(target) < 3:
         return PoseFit(Sim3.identity(), np.inf, np.inf, "fewer than 3 correspondences")
     pose = umeyama(target, source, with_scale=with_scale)
@@ -70,9 +58,9 @@ def fit_pose(
         mirrored = source * [1.0, 1.0, -1.0]
         if _rms(target, umeyama(target, mirrored, with_scale=with_scale).apply(mirrored)) < 0.5 * rms:
             flaw = "correspondences are mirrored"
-    if not flaw and rotation_sigma > np.radians(params.max_rotation_sigma_deg):
+    if not flaw and rotation_sigma > np.radians(_MAX_ROTATION_SIGMA_DEG):
         flaw = "correspondences lie along a line"
-    if not flaw and rms > params.max_rms_sigmas * sigma_m:
+    if not flaw and rms > _MAX_RMS_SIGMAS * sigma_m:
         flaw = "correspondences do not fit one pose"
     return PoseFit(pose, rms, rotation_sigma, flaw)
 

@@ -11,10 +11,16 @@ from gsmap.errors import MissingDependencyError
 from gsmap.methods import family
 from gsmap.register import verdict
 from gsmap.register.metric import MetricScene, working_unit_m
-from gsmap.register.params import Params, Snap
+from gsmap.register.params import Params
 from gsmap.register.scene_view import SceneView
 from gsmap.register.stopwatch import Stopwatch
 from gsmap.types.registration import Proposal
+
+POOR_NODES = 500  # a scene graph none of whose layers has this many nodes is poor
+# A voted log scale is taken for 0, for refinement, below this plus the spread over the root of the number of
+# correspondences.
+_UNIT_LOG_SCALE = 0.005
+_UNIT_LOG_SCALE_SPREAD = 0.05
 
 
 class Proposing:
@@ -38,13 +44,13 @@ class Proposing:
             yield self._asked(params.proposer, "match", with_scale=False)
         if self.policies != {"known"} and family("proposer").get(params.proposer).SCALES:
             proposals = self._asked(params.proposer, "match", with_scale=True)
-            yield proposals if "unknown" in self.policies else [in_metres(p, params.snap) for p in proposals]
+            yield proposals if "unknown" in self.policies else [in_metres(p) for p in proposals]
         yield self._unlevelled()
         if self._wants_fallback():
             yield self._asked(params.fallback_proposer, "fallback", with_scale=False)
 
     def _wants_fallback(self) -> bool:
-        poor = num_nodes(self.target, self.source) < self.params.poor_nodes
+        poor = num_nodes(self.target, self.source) < POOR_NODES
         wanted = {"never": False, "always": True, "auto": poor}[self.params.fallback]
         return wanted and "unknown" not in self.policies
 
@@ -62,7 +68,7 @@ class Proposing:
         self, name: str, step: str, *, with_scale: bool, views: Sequence[SceneView] | None = None
     ) -> list[Proposal]:
         unit_m = working_unit_m(self.target, self.source, with_scale=with_scale)
-        target, source = (MetricScene(view, unit_m, self.params) for view in views or (self.target, self.source))
+        target, source = (MetricScene(view, unit_m) for view in views or (self.target, self.source))
         with self.watch.step(step):
             try:
                 found: list[Proposal] = (
@@ -88,10 +94,10 @@ def unlevelled(view: SceneView) -> SceneView | None:
     )
 
 
-def in_metres(proposal: Proposal, snap: Snap) -> Proposal:
+def in_metres(proposal: Proposal) -> Proposal:
     """The proposal as one between two scenes in metres, where its scale is 1 within what its correspondences can tell;
     what the scale is remains to be measured."""
-    spread = snap.log_scale + snap.log_scale_spread / np.sqrt(max(proposal.num_inliers, 1))
+    spread = _UNIT_LOG_SCALE + _UNIT_LOG_SCALE_SPREAD / np.sqrt(max(proposal.num_inliers, 1))
     near = abs(np.log(proposal.S_target_source.scale)) <= spread
     return replace(proposal, with_scale=False) if near else proposal
 

@@ -24,9 +24,10 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
     """
     params = params or Params()
     proposers = {params.proposer} | ({params.fallback_proposer} if params.fallback != "never" else set())
-    coarse = _asked(params.coarse_refiner, params)
-    fine = _asked(params.refiner, params) | {params.polisher}
-    families = {"proposers": proposers, "coarse_refiners": coarse, "refiners": fine}
+    refiners = {params.polisher}
+    for name in (params.coarse_refiner, params.refiner):
+        refiners |= {refiner_for(name, with_scale) for with_scale in (False, True)}
+    families = {"proposers": proposers, "refiners": refiners}
     settings: dict[str, Any] = {
         f.name: _chosen(getattr(params, f.name), families[f.name])
         if f.name in families
@@ -35,12 +36,8 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
     }
     if params.fallback == "never":
         del settings["fallback_proposer"]
-    if params.fallback != "auto":
-        del settings["poor_nodes"]
-    if params.scale_refiner not in coarse | fine:
-        del settings["scale_refiner"]
     versions = {"register": VERSION, "probability": probability.VERSION}
-    refiners = coarse | fine | {"colored_icp"}  # by which covariances ask what colours say
+    refiners |= {"colored_icp"}  # covariances use it, too
     for kind, names in (("proposer", proposers), ("refiner", refiners)):
         for name in sorted(names):
             versions |= family(kind).version(name)
@@ -55,11 +52,6 @@ def installed_version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "missing"
-
-
-def _asked(name: str, params: Params) -> set[str]:
-    """The refiners that one pass may ask: that of the name, and the one that takes its place for unknown scales."""
-    return {refiner_for(name, params, with_scale) for with_scale in (False, True)}
 
 
 def _chosen(settings: MethodParams, names: set[str]) -> dict[str, Any]:

@@ -32,20 +32,20 @@ def scaled_or_rigid(
     surfaces = pair.target.surface(), pair.source.surface()
     start = pose if with_scale else refinement.coarse(pair, pose, params, with_scale=True)
     scaled = refinement.fine(pair, start, params, with_scale=True)
-    conditioned = condition(*surfaces, scaled, params.covariance, pair.ties)
+    conditioned = condition(*surfaces, scaled, pair.ties)
     if conditioned is None:
         return scaled, None, None
     if "unknown" in pair.policies:
         return scaled, conditioned.known(scaled), None
     # ``pair`` may have brought a voted scale into the units; what counts is the whole.
     log_scale = float(np.log(scaled.scale * pair.scale))
-    belief = believe(log_scale, conditioned.log_scale_sigma, params.metres, told=pair.policies == {"known"})
+    belief = believe(log_scale, conditioned.log_scale_sigma, told=pair.policies == {"known"})
     if not belief.rigid:
         return scaled, conditioned.known(scaled), belief
     residual_sigma = float(np.sqrt(conditioned.scaled[6, 6]))
     extent_m = 2.0 * conditioned.radius_m / pair.target.unit_m  # not in working metres: both units are the metre
-    bends = bending(belief, residual_sigma, extent_m, params.metres)
+    bends = bending(belief, residual_sigma, extent_m)
     belief = replace(belief, note=belief.note or bends)
     rigid = refinement.fine(pair, conditioned.rescaled(scaled, 1.0 / pair.scale), params, with_scale=False)
-    sway = swayed(*surfaces, rigid, conditioned.centroid, params.covariance, with_scale=False)
+    sway = swayed(*surfaces, rigid, conditioned.centroid, with_scale=False)
     return rigid, conditioned.known(rigid, belief, sway), belief

@@ -8,9 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.errors import ConfigError
-from gsmap.register import surface
 from gsmap.register.surface import Surface
-from gsmap.register.view_cache import Params as ViewParams
 from gsmap.register.view_cache import ViewCache
 from gsmap.types import Cameras, Gaussians, SceneGraph
 from gsmap.types.scene import SCALE_POLICIES
@@ -32,10 +30,7 @@ class SceneView:
     cameras: Cameras | None
     graph: SceneGraph
     scale_policy: str = "auto"
-    _surfaces: dict[tuple[float, surface.Params, ViewParams], Surface] = field(
-        default_factory=dict, init=False, repr=False
-    )
-    _views: dict[ViewParams, ViewCache] = field(default_factory=dict, init=False, repr=False)
+    _surfaces: dict[float, Surface] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.scale_policy not in SCALE_POLICIES:
@@ -49,24 +44,17 @@ class SceneView:
         """(3,) middle of the scene's content, in its frame."""
         return np.median(self.gaussians.means, axis=0) if len(self.gaussians) else np.zeros(3)
 
-    def surface(
-        self, unit_m: float = 1.0, params: surface.Params | None = None, views: ViewParams | None = None
-    ) -> Surface:
+    def surface(self, unit_m: float = 1.0) -> Surface:
         """The scene's surface in metres; the last two are kept, so a scene met by many others is prepared once."""
-        params, views = params or surface.Params(), views or ViewParams()
-        key = (unit_m, params, views)
-        if key not in self._surfaces:
+        if unit_m not in self._surfaces:
             while len(self._surfaces) > 1:
                 self._surfaces.pop(next(iter(self._surfaces)))
-            self._surfaces[key] = Surface.of(self.gaussians, unit_m, params, self.cameras, self.views(views))
-        return self._surfaces[key]
+            self._surfaces[unit_m] = Surface.of(self.gaussians, unit_m, self.cameras, self.views)
+        return self._surfaces[unit_m]
 
-    def views(self, params: ViewParams | None = None) -> ViewCache | None:
-        """The scene through its own cameras, rendered once and kept; None without cameras."""
-        params = params or ViewParams()
+    @cached_property
+    def views(self) -> ViewCache | None:
+        """Renders of the scene through its own cameras, each made once; None without cameras."""
         if not self.cameras or not len(self.gaussians):
             return None
-        if params not in self._views:
-            self._views.clear()
-            self._views[params] = ViewCache(self.gaussians, self.cameras, params)
-        return self._views[params]
+        return ViewCache(self.gaussians, self.cameras)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -19,29 +19,17 @@ PLANE_NEIGHBOURS = 20  # cells, itself included, that a plane is laid through, a
 _GRADIENT_NEIGHBOURS = 10
 
 
-@dataclass(frozen=True)
-class Params:
-    """Which Gaussians are surface, and how finely they are sampled.
-
-    Args:
-        min_opacity: a surface Gaussian is at least this opaque ...
-        max_scale_m: ... and its largest standard deviation at most this; floaters and sky are the rest.
-        min_opaque_share: of a capture whose trainer left it fainter, this share of the Gaussians counts as opaque ...
-        faintest_opacity: ... down to this opacity.
-        stray_colour: floaters are told from the surface they touch by colours (RGB in [0, 1]) this unlike.
-        max_scale_quantile: of the opaque Gaussians at least this share is surface, however coarse the scene is.
-        resolution_m: points are averaged over cells of this size before they are aligned.
-        facing: how it is told which side of it a capture has seen.
-    """
-
-    min_opacity: float = 0.5
-    min_opaque_share: float = 0.4
-    faintest_opacity: float = 0.1
-    max_scale_m: float = 0.08
-    stray_colour: float = 0.3
-    max_scale_quantile: float = 0.7
-    resolution_m: float = 0.05
-    facing: facing.Params = field(default_factory=facing.Params)
+# A surface Gaussian is at least this opaque; of a fainter capture MIN_OPAQUE_SHARE of the Gaussians count as opaque,
+# down to FAINTEST_OPACITY.
+MIN_OPACITY = 0.5
+MIN_OPAQUE_SHARE = 0.4
+FAINTEST_OPACITY = 0.1
+# Its largest standard deviation is at most this, or the quantile of the opaque Gaussians, whichever is larger; floaters
+# and sky are larger.
+MAX_SCALE_M = 0.08
+MAX_SCALE_QUANTILE = 0.7
+MIN_FLOATER_COLOUR = 0.3  # colour difference (RGB in [0, 1]) from the surface around it that makes a point a floater
+RESOLUTION_M = 0.05  # points are averaged over cells of this size before they are aligned
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +43,7 @@ class Surface:
         splats: the N Gaussians themselves, in metres, with their mean colour alone; None where only points are known.
         unit_m: metres per unit of the scene, under which the surface was made.
         gaussians, cameras: the whole scene in its own unit; None where only points are known.
-        views: the scene through its cameras, which say what side of it they saw; None without.
-        facing: how they do.
+        views: the scene through its cameras, which orient its normals; None without.
     """
 
     points: np.ndarray
@@ -67,7 +54,6 @@ class Surface:
     gaussians: Gaussians | None = None
     cameras: Cameras | None = None
     views: ViewCache | None = None
-    facing: facing.Params = field(default_factory=facing.Params)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -77,24 +63,22 @@ class Surface:
         cls,
         gaussians: Gaussians,
         unit_m: float = 1.0,
-        params: Params | None = None,
         cameras: Cameras | None = None,
         views: ViewCache | None = None,
     ) -> Surface:
         """The surface of a scene whose unit is ``unit_m`` metres."""
-        params = params or Params()
         largest = gaussians.log_scales.max(1, initial=-np.inf) + np.log(unit_m)
         opacities = gaussians.opacities
-        bar = params.min_opacity
+        bar = MIN_OPACITY
         if len(opacities):
-            bar = np.clip(np.quantile(opacities, 1 - params.min_opaque_share), params.faintest_opacity, bar)
+            bar = np.clip(np.quantile(opacities, 1 - MIN_OPAQUE_SHARE), FAINTEST_OPACITY, bar)
         opaque = opacities >= bar
-        limit = np.log(params.max_scale_m)
+        limit = np.log(MAX_SCALE_M)
         if opaque.any():
-            limit = max(limit, float(np.quantile(largest[opaque], params.max_scale_quantile)))
+            limit = max(limit, float(np.quantile(largest[opaque], MAX_SCALE_QUANTILE)))
         keep = np.flatnonzero(opaque & (largest <= limit))
         colours = np.clip(rgb_of_sh0(gaussians.sh[keep, 0]), 0.0, 1.0)
-        stray, _ = find_floaters(gaussians.means[keep], colours, params.stray_colour)
+        stray, _ = find_floaters(gaussians.means[keep], colours, MIN_FLOATER_COLOUR)
         keep, colours = keep[~stray], colours[~stray]
         points = gaussians.means[keep].astype(np.float64) * unit_m
         splats = Gaussians(
@@ -104,7 +88,7 @@ class Surface:
             gaussians.logit_opacities[keep],
             gaussians.sh[keep, :1],
         )
-        return cls(points, colours, params.resolution_m, splats, unit_m, gaussians, cameras, views, params.facing)
+        return cls(points, colours, RESOLUTION_M, splats, unit_m, gaussians, cameras, views)
 
     def scaled(self, factor: float) -> Surface:
         """The same surface in a unit ``factor`` times smaller."""
@@ -161,9 +145,9 @@ class Surface:
     def faces(self) -> np.ndarray | None:
         """(M, 3) the normals turned to the side that the scene's own cameras saw, zeros where that is not known; None
         where it nowhere is."""
-        if self.views is None or not self.views.num_own or not self.facing.num_cameras or not len(self.coarse[0]):
+        if self.views is None or not self.views.num_own or not len(self.coarse[0]):
             return None
-        found = facing.faces(self.coarse[0], self.normals, self.tree, self.views, self.unit_m, self.facing)
+        found = facing.faces(self.coarse[0], self.normals, self.tree, self.views, self.unit_m)
         return found if found.any() else None
 
     def nearest(

@@ -10,53 +10,49 @@ from gsmap.register.evidence import PoseEvidence
 from gsmap.register.probability import probability, shortfalls
 from gsmap.types.registration import Proposal
 
+MAX_RUNNER_UP = 0.7  # size of a disagreeing clique, as a share of the best, up to which the best is significant
+# A free-space violation measured on few Gaussians contradicts a pose only where so many would violate free space with
+# less than this probability if the share were the allowed one (binomial test).
+_FREE_SPACE_LEVEL = 0.01
+PRIOR = 0.2  # share of verified poses that are right before anything is known of them
+# Prescreen of roughly refined poses.
+PRESCREEN_LOG_NFA = 6.0  # a clique with a larger log10 NFA is not refined at all
+PRESCREEN_CAMERAS = 3
+PRESCREEN_POINTS = 4000
+_PRESCREEN_MIN_COINCIDING = 50
+_PRESCREEN_COLOUR_CORRELATION = 0.05
+_PRESCREEN_COLOUR_T = 1.5
+_PRESCREEN_FREE_SPACE_VIOLATION = 0.3
+
 
 @dataclass(frozen=True)
 class Params:
-    """What a pose must show; a wrong edge costs a map more than ten right ones missed, hence a probability of .9.
-
-    How probable a pose is, of all its evidence, says `gsmap.register.probability`, fitted on made places. What one
-    scene has where the other looked through contradicts a pose whatever speaks for it: two wings that look alike agree
-    in everything else.
+    """Thresholds for accepting a pose; a wrong edge costs a map more than ten missed right ones.
 
     Args:
-        max_log_nfa: a clique is significant when fewer false alarms than this (log10) are expected of the background
-            model. Rooms furnished alike repeat whole arrangements, which violates the independence that it assumes:
-            measured down to -7 between different synthetic scenes, so the bar is lower than the theory's -2.
-        max_runner_up: ... and no disagreeing clique comes nearer to its size than this share of it.
-        min_coinciding: source cells that must coincide with the target's surface.
-        max_free_space_violation: share of a scene's surface in front of what the other scene's cameras saw: places
-            change (a door that was open is shut), but not by more [0, 1].
-        free_space_level: a share that was measured on few Gaussians contradicts a pose only where so many of them would
-            violate free space with less than this probability if the share were the allowed one (binomial test)
-            (0, 0.5]; otherwise it counts in the probability alone. A smaller level lets more poses come so far.
-        min_colour_correlation: local colours of both scenes' renders must agree this well: places are repainted, but
-            not all of it.
-        min_probability: that the pose is right, of all evidence together.
-        prior: share of judged poses that are right before anything is known of them; most pairs that come so far do
-            share a place, most pairs of a large map do not come so far.
-        prescreen_min_coinciding: a rough pose under which fewer cells coincide is not worth refining further ...
-        prescreen_colour_correlation: ... nor one whose colours agree less than this ...
-        prescreen_colour_t: ... and less surely than this ...
-        prescreen_free_space_violation: ... nor one that violates free space by more.
-        max_rotation_sigma_deg: a pose whose rotation is known less well (standard deviation in the least known
-            direction, at the overlap's centroid) is not an edge.
-        max_translation_sigma_m: the same for translation.
-        max_scale_sigma: the same for the logarithm of the scale.
+        max_log_nfa: Largest log10 of the number of false alarms (NFA) at which a clique counts as significant,
+            at most 0; a larger value accepts more poses, and different rooms with the same furniture reach -7.
+        min_coinciding: Smallest number of source surface cells, at least 1, that must coincide with the target's
+            surface; a larger value rejects small overlaps.
+        max_free_space_violation: Largest fraction in [0, 1] of one scene's surface that may stand in the free space of
+            the other; a larger value tolerates more change between captures.
+        min_colour_correlation: Smallest correlation in [-1, 1] of local colours in renders of both scenes; a larger
+            value rejects more repainted places.
+        min_probability: Smallest probability in [0, 1] that a pose is right by all evidence together; a larger value
+            accepts fewer wrong and fewer right poses.
+        max_rotation_sigma_deg: Largest standard deviation of the rotation, in degrees, in its least certain direction
+            at the overlap's centroid; a larger value accepts less certain poses.
+        max_translation_sigma_m: Largest standard deviation of the translation, in metres, in its least certain
+            direction at the overlap's centroid; a larger value accepts less certain poses.
+        max_scale_sigma: Largest standard deviation of the logarithm of the scale; a larger value accepts less certain
+            scales.
     """
 
     max_log_nfa: float = -8.0
-    max_runner_up: float = 0.7
     min_coinciding: int = 300
     max_free_space_violation: float = 0.18
-    free_space_level: float = 0.01
     min_colour_correlation: float = 0.15
     min_probability: float = 0.9
-    prior: float = 0.2
-    prescreen_min_coinciding: int = 50
-    prescreen_colour_correlation: float = 0.05
-    prescreen_colour_t: float = 1.5
-    prescreen_free_space_violation: float = 0.3
     max_rotation_sigma_deg: float = 1.5
     max_translation_sigma_m: float = 0.05
     max_scale_sigma: float = 0.025
@@ -65,7 +61,7 @@ class Params:
 def is_significant(proposal: Proposal, params: Params | None = None) -> bool:
     """The correspondences alone rule out the background model, and no rival pose comes near."""
     params = params or Params()
-    return is_rare(proposal, params) and bool(proposal.runner_up <= params.max_runner_up)
+    return is_rare(proposal, params) and bool(proposal.runner_up <= MAX_RUNNER_UP)
 
 
 def is_rare(proposal: Proposal, params: Params) -> bool:
@@ -80,24 +76,21 @@ def not_significant(proposal: Proposal, params: Params, besides: str = "") -> st
     elif not is_rare(proposal, params):
         why = f"log10 NFA {proposal.log_nfa:.1f}, needs < {params.max_log_nfa:.1f}"
     else:
-        why = f"a rival clique has {proposal.runner_up:.0%} of its size, allowed {params.max_runner_up:.0%}"
+        why = f"a rival clique has {proposal.runner_up:.0%} of its size, allowed {MAX_RUNNER_UP:.0%}"
     if besides.startswith(_NOT_SIGNIFICANT):
         return besides
     return f"{_NOT_SIGNIFICANT}: {why}" + (f" ({besides})" if besides else "")
 
 
-def fails_prescreen(evidence: PoseEvidence, params: Params | None = None) -> str:
+def fails_prescreen(evidence: PoseEvidence) -> str:
     """Why a roughly refined pose cannot come to be accepted; empty while it may."""
-    params = params or Params()
-    if evidence.num_coinciding < params.prescreen_min_coinciding:
-        return _too_little(evidence, params.prescreen_min_coinciding)
-    pale = evidence.colour_correlation < params.prescreen_colour_correlation
-    if pale and evidence.colour_t < params.prescreen_colour_t:
-        return _colours_disagree(evidence, params.prescreen_colour_correlation)
-    if violates_free_space(
-        evidence.free_space_violation, evidence.num_judged, params.prescreen_free_space_violation, params
-    ):
-        return _violates(evidence, params.prescreen_free_space_violation)
+    if evidence.num_coinciding < _PRESCREEN_MIN_COINCIDING:
+        return _too_little(evidence, _PRESCREEN_MIN_COINCIDING)
+    pale = evidence.colour_correlation < _PRESCREEN_COLOUR_CORRELATION
+    if pale and evidence.colour_t < _PRESCREEN_COLOUR_T:
+        return _colours_disagree(evidence, _PRESCREEN_COLOUR_CORRELATION)
+    if violates_free_space(evidence.free_space_violation, evidence.num_judged, _PRESCREEN_FREE_SPACE_VIOLATION):
+        return _violates(evidence, _PRESCREEN_FREE_SPACE_VIOLATION)
     return ""
 
 
@@ -138,12 +131,12 @@ def contradiction(proposal: Proposal, evidence: PoseEvidence, params: Params) ->
         return _too_little(evidence, params.min_coinciding)
     if evidence.colour_correlation < params.min_colour_correlation:
         return _colours_disagree(evidence, params.min_colour_correlation)
-    if violates_free_space(evidence.free_space_violation, evidence.num_judged, params.max_free_space_violation, params):
+    if violates_free_space(evidence.free_space_violation, evidence.num_judged, params.max_free_space_violation):
         return _violates(evidence, params.max_free_space_violation)
     return ""
 
 
-def violates_free_space(share: float, num_judged: float, allowed: float, params: Params) -> bool:
+def violates_free_space(share: float, num_judged: float, allowed: float) -> bool:
     """Whether a share of Gaussians violates free space by more than is allowed, and than so few of them explain.
 
     Args:
@@ -154,9 +147,7 @@ def violates_free_space(share: float, num_judged: float, allowed: float, params:
 
     if not share > allowed:
         return False
-    return not num_judged > 0 or bool(
-        binom.sf(round(share * num_judged) - 1, num_judged, allowed) < params.free_space_level
-    )
+    return not num_judged > 0 or bool(binom.sf(round(share * num_judged) - 1, num_judged, allowed) < _FREE_SPACE_LEVEL)
 
 
 def is_believable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> bool:
@@ -166,7 +157,7 @@ def is_believable(proposal: Proposal, evidence: PoseEvidence, params: Params) ->
 
 def improbable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> str:
     """Why all evidence together does not carry a pose; empty where it does."""
-    probable = probability(proposal, evidence, params.prior)
+    probable = probability(proposal, evidence, PRIOR)
     # Where the cameras of one scene could not judge, nothing was learnt of what a clique beyond chance is worth.
     if probable >= params.min_probability or (not evidence.num_seen and is_significant(proposal, params)):
         return ""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,27 +16,14 @@ from gsmap.types import Cameras, Gaussians
 _KEPT = 64  # renders of 128 x 96 pixels: 16 MB; bounds memory, changes no answer
 
 
-@dataclass(frozen=True)
-class Params:
-    """How a scene is seen through its own cameras, and how cameras are chosen among.
-
-    Args:
-        image_size_px: longer side of the renders.
-        selection_px: longer side of the coarse images by which cameras are chosen.
-        selection_points: opaque centres, at most, that stand for a scene when cameras are chosen.
-        selection_margin: share of the depth by which a point may lie behind what a coarse pixel shows and still count
-            as visible: half a coarse pixel of a slanted wall.
-        own_share: where a scene's own cameras see less than this share of it, as a few of many do, views are made in
-            its free space as well ...
-        own_half: ... and chosen among where its own see less than this share of what all see of some points.
-    """
-
-    image_size_px: int = 128
-    selection_px: int = 16
-    selection_points: int = 8_000
-    selection_margin: float = 0.1
-    own_share: float = 0.8
-    own_half: float = 0.5
+IMAGE_SIZE_PX = 128  # longer side of the renders
+_SELECTION_PX = 16  # longer side of the coarse depth images by which cameras are selected
+_SELECTION_POINTS = 8_000  # opaque centres that stand for a scene when cameras are selected
+# Share of the depth by which a point may lie behind a coarse pixel's depth and still count as visible: half a coarse
+# pixel of a slanted wall.
+_SELECTION_MARGIN = 0.1
+_MIN_OWN_SHARE = 0.8  # of a scene; where its cameras see less, views are synthesized in its free space
+_MIN_OWN_HALF = 0.5  # of the visible points; where its own cameras see less, synthesized views are selected, too
 
 
 class ViewCache:
@@ -48,18 +34,19 @@ class ViewCache:
     once; the latest are kept.
     """
 
-    def __init__(self, gaussians: Gaussians, cameras: Cameras, params: Params | None = None) -> None:
-        self.params = params or Params()
+    def __init__(
+        self, gaussians: Gaussians, cameras: Cameras, *, image_size_px: int = IMAGE_SIZE_PX, synthesize: bool = True
+    ) -> None:
         g = gaussians
         # The mean colour alone: the rest was fitted to directions from which the other scene's cameras do not look.
         self.gaussians = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, g.sh[:, :1])
-        self.cameras = self._with_made(cameras).resized(self.params.image_size_px)
+        self.cameras = (self._with_made(cameras) if synthesize else cameras).resized(image_size_px)
         self.num_own = 0 if cameras.synthesised else len(cameras)  # the first; those that follow are made
         self._renders: OrderedDict[int, Rendering] = OrderedDict()
 
     def _with_made(self, cameras: Cameras) -> Cameras:
         """The scene's own cameras and, where they see too little of it, made ones."""
-        if cameras.synthesised or self._share_seen(cameras) >= self.params.own_share:
+        if cameras.synthesised or self._share_seen(cameras) >= _MIN_OWN_SHARE:
             return cameras
         made = synthesise_cameras(self.gaussians)
         return Cameras(
@@ -70,7 +57,7 @@ class ViewCache:
 
     def _share_seen(self, cameras: Cameras) -> float:
         """The share of the sample of opaque centres that any camera sees."""
-        coarse = cameras.resized(self.params.selection_px)
+        coarse = cameras.resized(_SELECTION_PX)
         seen = np.zeros(len(self._sample), bool)
         for at, pixel, z, nearest in self._projected(coarse):
             seen[at[z <= nearest[pixel]]] = True
@@ -96,7 +83,7 @@ class ViewCache:
         made = [np.where(np.isfinite(depth), depth, -np.inf) for depth in self._nearest[self.num_own :]]
         inside = _visible(self._coarse, points, self._nearest[: self.num_own] + made)
         own = inside[: self.num_own]
-        if own.any(0).sum() >= self.params.own_half * inside.any(0).sum():
+        if own.any(0).sum() >= _MIN_OWN_HALF * inside.any(0).sum():
             inside = own
         return _greedy(inside, count)
 
@@ -111,7 +98,7 @@ class ViewCache:
 
     @cached_property
     def _coarse(self) -> Cameras:
-        return self.cameras.resized(self.params.selection_px)
+        return self.cameras.resized(_SELECTION_PX)
 
     @cached_property
     def _nearest(self) -> list[np.ndarray]:
@@ -122,7 +109,7 @@ class ViewCache:
     def _sample(self) -> np.ndarray:
         """(N, 3) opaque centres that stand for the scene."""
         solid = np.flatnonzero(self.gaussians.logit_opacities > 0.0)
-        rows = np.linspace(0, len(solid) - 1, min(len(solid), self.params.selection_points)).astype(int)
+        rows = np.linspace(0, len(solid) - 1, min(len(solid), _SELECTION_POINTS)).astype(int)
         return self.gaussians.means[solid[rows]]
 
     def _projected(self, coarse: Cameras) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
@@ -131,7 +118,7 @@ class ViewCache:
             pixel, z, at = _project(self._sample, view, intrinsics, size)
             nearest = np.full(int(size.prod()), np.inf, np.float32)
             np.minimum.at(nearest, pixel, z)
-            yield at, pixel, z, nearest * np.float32(1 + self.params.selection_margin)
+            yield at, pixel, z, nearest * np.float32(1 + _SELECTION_MARGIN)
 
 
 def select_views(

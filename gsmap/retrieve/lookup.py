@@ -20,7 +20,19 @@ VERSION = 5
 
 _BLOCK_ROWS = 250_000  # of an index that are in memory at a time: 15 MB
 _SAME_NODE_M = 0.05  # two nodes nearer than this may be one
-_LEAST_SPREAD = 0.05  # of what is said of the best scene: differences below that are chance
+VOTES_PER_NODE = 200  # most similar nodes that each node votes for
+_MIN_SIMILARITY = 0.6  # nodes whose vectors have a smaller cosine do not match
+_EQUAL_SIMILARITY = 0.02  # a match is common where other scenes have nodes whose cosine is at most this much smaller
+_TURNED_SIGNS = 2  # of the axes that name a node's list, so many are searched on both sides
+_MAX_MATCHES = 24  # highest weighted matches of two scenes by which they are aligned
+CHECKED_SCENES = 300  # most voted for scenes that are verified geometrically
+PEERS = 30  # nearest aligned candidates, at most a third of all, by which a score is normalized
+# Largest difference of the distance and of the rise of two nodes between two scenes, and largest residual of an aligned
+# match; working metres.
+_TOLERANCE_M = 0.2
+_MIN_DISTANCE_M = 0.5  # nodes nearer to each other are not counted as independent inliers; working metres
+_SCALE_SLACK = 0.25  # share of a distance that it may differ by where the metre of one of the scenes is guessed
+_LEAST_SPREAD = 0.05  # of the best score: smaller differences are chance
 
 
 def look_up(voters: Sequence[Voters], segments: Sequence[Segment], params: Params) -> list[list[Candidate]]:
@@ -78,9 +90,9 @@ class _Matches:
 
     def __init__(self, asker: Voters, members: _Members, params: Params) -> None:
         self.asker, self.own = asker, members.place_of.get(asker.member.scene, -1)
-        self.probes = codes.probes(asker.asking.keys, asker.asking.codes, params.turned_signs)
-        most = int(2 * codes.SCALE**2 * (1 - params.min_similarity) + 1e-6)
-        self.nearest = np.full((len(asker.asking), params.votes_per_node), most, np.int32)
+        self.probes = codes.probes(asker.asking.keys, asker.asking.codes, _TURNED_SIGNS)
+        most = int(2 * codes.SCALE**2 * (1 - _MIN_SIMILARITY) + 1e-6)
+        self.nearest = np.full((len(asker.asking), VOTES_PER_NODE), most, np.int32)
         self.seen: set[int] | None = set() if members.are_few(params) else None
         self.parts: list[tuple[np.ndarray, ...]] = []
 
@@ -157,11 +169,11 @@ def _ranked(found: _Matches, members: _Members, params: Params) -> list[Candidat
     best = np.unique(node * len(members.members) + place, return_index=True)[1]
     best.sort()
     worth = np.zeros(len(node))
-    worth[best] = _worth(node[best], squared[best], len(members.members), params)
+    worth[best] = _worth(node[best], squared[best], len(members.members))
     votes = np.bincount(place, weights=worth, minlength=len(members.members))
-    chosen = np.argsort(-np.round(votes, 6), kind="stable")[: params.checked_scenes]
+    chosen = np.argsort(-np.round(votes, 6), kind="stable")[:CHECKED_SCENES]
     chosen = chosen[votes[chosen] > 0]
-    scores = _scores(_Checked.of(asker, chosen, node, place, worth, theirs, members), params)
+    scores = _scores(_Checked.of(asker, chosen, node, place, worth, theirs, members))
     out = [
         Candidate(members.members[k].scene, round(float(score), 4), round(float(votes[k]), 4))
         for k, score in zip(chosen, scores, strict=True)
@@ -172,17 +184,17 @@ def _ranked(found: _Matches, members: _Members, params: Params) -> list[Candidat
     return sorted(out, key=lambda c: (-c.score, -c.votes, c.scene))
 
 
-def _worth(node: np.ndarray, squared: np.ndarray, num_scenes: int, params: Params) -> np.ndarray:
+def _worth(node: np.ndarray, squared: np.ndarray, num_scenes: int) -> np.ndarray:
     """(K,) what each match says; matches of a node lie together, nearest first, each of another scene."""
     if not len(node):
         return np.zeros(0)
     cosine = codes.similarity(squared.astype(np.float64))
     # How many scenes have a match as good as this one, or nearly: one search in all nodes' matches, laid end to end.
     step = 4.0 * node
-    alike = np.searchsorted(step - cosine, step - cosine + params.equal_similarity, side="right")
+    alike = np.searchsorted(step - cosine, step - cosine + _EQUAL_SIMILARITY, side="right")
     first = np.searchsorted(node, node)
     rarity = np.log(1 + num_scenes / (alike - first))
-    worth: np.ndarray = rarity**2 * np.maximum(cosine - params.min_similarity, 0.0)
+    worth: np.ndarray = rarity**2 * np.maximum(cosine - _MIN_SIMILARITY, 0.0)
     return worth
 
 
@@ -239,52 +251,52 @@ class _Checked:
         )
 
 
-def _scores(checked: _Checked, params: Params) -> np.ndarray:
+def _scores(checked: _Checked) -> np.ndarray:
     """(C,) by how much the matches that lie alike in both scenes say more than is usual of scenes that lie there."""
     count = len(checked.coarse)
     if not count:
         return np.zeros(0)
-    alike, centres = _laid(checked, params)
+    alike, centres = _laid(checked)
     rarity = np.log((count + 1) / (alike.sum(0) + 0.5)) ** 2
     said = np.round(alike @ rarity, 6)
     # What lies alike in many scenes is decoration; where the same room may be laid in two ways, the rest decides.
-    other, others = _laid(replace(checked, worth=checked.worth * rarity[checked.node]), params)
+    other, others = _laid(replace(checked, worth=checked.worth * rarity[checked.node]))
     then = np.round(other @ rarity, 6)
     centres[then > said] = others[then > said]
     said = np.maximum(said, then)
     # Scenes that show the same decoration come to lie at the same place, and agree in as much of it.
     gaps = np.round(((centres[:, None] - centres) ** 2).sum(2), 6)
     np.fill_diagonal(gaps, np.inf)
-    beside = np.argsort(gaps, axis=1, kind="stable")[:, : min(params.peers, count // 3)]
-    mean = said[beside].sum(1) / max(params.peers, 1)
-    spread = np.sqrt(np.maximum((said[beside] ** 2).sum(1) / max(params.peers, 1) - mean**2, 0.0))
+    beside = np.argsort(gaps, axis=1, kind="stable")[:, : min(PEERS, count // 3)]
+    mean = said[beside].sum(1) / max(PEERS, 1)
+    spread = np.sqrt(np.maximum((said[beside] ** 2).sum(1) / max(PEERS, 1) - mean**2, 0.0))
     least = max(_LEAST_SPREAD * float(said.max()), 1e-9)
     out: np.ndarray = np.maximum(said - mean, 0.0) / (spread + least)
     return out
 
 
-def _laid(checked: _Checked, params: Params) -> tuple[np.ndarray, np.ndarray]:
+def _laid(checked: _Checked) -> tuple[np.ndarray, np.ndarray]:
     """Lay each scene onto the one that asks, where most of its most telling matches agree.
 
     Returns:
         (C, M) bool the nodes that lie at the same place then as one that they match, and (C, 3) where the scenes'
         middles come to lie.
     """
-    rows, fits = _first_matches(checked, params)
+    rows, fits = _first_matches(checked)
     for reach in (1.5, 1.0):
-        turns, shifts = _fitted(checked, rows, params)
+        turns, shifts = _fitted(checked, rows)
         laid = np.einsum("kij,kj->ki", turns[checked.row], checked.theirs) + shifts[checked.row]
         off = np.linalg.norm(laid - checked.mine, axis=1)
-        borne_out = fits[checked.row] & (off <= reach * params.tolerance_m * checked.coarse[checked.row])
+        borne_out = fits[checked.row] & (off <= reach * _TOLERANCE_M * checked.coarse[checked.row])
         rows = np.flatnonzero(borne_out)
     alike = np.zeros((len(fits), checked.num_nodes), bool)
     alike[checked.row[rows], checked.node[rows]] = True
     return alike, shifts
 
 
-def _first_matches(checked: _Checked, params: Params) -> tuple[np.ndarray, np.ndarray]:
+def _first_matches(checked: _Checked) -> tuple[np.ndarray, np.ndarray]:
     """The matches that bear out the best pair of each scene, of its most telling ones; and (C,) where there is one."""
-    num, count = len(checked.coarse), params.matches
+    num, count = len(checked.coarse), _MAX_MATCHES
     at = np.full((num, count), -1)
     order = np.lexsort((checked.node, -np.round(checked.worth, 9), checked.row))
     order = order[checked.worth[order] > 0]
@@ -295,18 +307,18 @@ def _first_matches(checked: _Checked, params: Params) -> tuple[np.ndarray, np.nd
     a, b = (points[at].astype(np.float32) for points in (checked.mine, checked.theirs))
     coarse = checked.coarse.astype(np.float32)[:, None, None]
     da, db = _distances(a), _distances(b)
-    loose = np.where(checked.metric, 0, params.scale_slack).astype(np.float32)[:, None, None]
-    slack = params.tolerance_m * coarse + loose * np.maximum(da, db)
+    loose = np.where(checked.metric, 0, _SCALE_SLACK).astype(np.float32)[:, None, None]
+    slack = _TOLERANCE_M * coarse + loose * np.maximum(da, db)
     agree = np.abs(da - db) <= slack
     rise = a[:, :, None, 2] - a[:, None, :, 2] - b[:, :, None, 2] + b[:, None, :, 2]
     agree &= ~checked.upright[:, None, None] | (np.abs(rise) <= slack)
     agree &= (np.minimum(da, db) > _SAME_NODE_M * coarse) & (weights[:, :, None] > 0) & (weights[:, None] > 0)
-    apart = agree & (np.minimum(da, db) > params.apart_m * coarse)
+    apart = agree & (np.minimum(da, db) > _MIN_DISTANCE_M * coarse)
     borne_out, fits = _borne_out(agree, apart, weights)
     return at[borne_out], fits
 
 
-def _fitted(checked: _Checked, rows: np.ndarray, params: Params) -> tuple[np.ndarray, np.ndarray]:
+def _fitted(checked: _Checked, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(C, 3, 3) and (C, 3) what lays each scene's nodes onto the asker's, by these of the matches: turned, about the
     vertical where both know it, and moved; and to scale, as far as it may be off, where the metre is guessed."""
     row, num = checked.row[rows], len(checked.coarse)
@@ -323,7 +335,7 @@ def _fitted(checked: _Checked, rows: np.ndarray, params: Params) -> tuple[np.nda
     u, _, v = np.linalg.svd(both)
     u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
     large, small = means(x**2).sum(1), means(y**2).sum(1)
-    least = max(1.0 - params.scale_slack, 1e-3)
+    least = max(1.0 - _SCALE_SLACK, 1e-3)
     scale = np.clip(np.sqrt(np.maximum(large, 1e-12) / np.maximum(small, 1e-12)), least, 1.0 / least)
     turns = (u @ v) * np.where(checked.metric, 1.0, scale)[:, None, None]
     return turns, here - np.einsum("kij,kj->ki", turns, there)

@@ -10,6 +10,8 @@ import numpy as np
 from gsmap.retrieve.params import Params
 from gsmap.retrieve.rounds import Pair
 
+REACH_SIGMAS = 3.0  # standard deviations of their distance within which two scenes may touch
+
 
 @dataclass(frozen=True, eq=False)
 class Placed:
@@ -50,7 +52,7 @@ def neighbours(placed: Mapping[str, Placed], params: Params) -> list[Pair]:
         sigmas = np.array([placed[ids[row]].sigma for row in rows])
         radii = np.array([placed[ids[row]].radius for row in rows])
         # hypot(a, b) <= a + b, so this reach leaves none out.
-        reach = radii + params.reach_sigmas * sigmas
+        reach = radii + REACH_SIGMAS * sigmas
         octave = np.floor(np.log2(np.maximum(reach, 1e-12))).astype(int)
         near = [np.zeros((2, 0), dtype=np.int64)]
         for size in np.unique(octave):
@@ -62,11 +64,11 @@ def neighbours(placed: Mapping[str, Placed], params: Params) -> list[Pair]:
             near += [np.stack([asker, other]), np.stack([other, asker])]
         row, other = np.divmod(np.unique(np.concatenate([a * len(rows) + b for a, b in near])), len(rows))
         distance = np.linalg.norm(centres[other] - centres[row], axis=1)
-        gap = distance - radii[other] - radii[row] - params.reach_sigmas * np.hypot(sigmas[other], sigmas[row])
+        gap = distance - radii[other] - radii[row] - REACH_SIGMAS * np.hypot(sigmas[other], sigmas[row])
         row, other, distance = (part[(gap <= 0) & (row != other)] for part in (row, other, distance))
         order = np.lexsort((other, distance, row))
         row, other, distance = row[order], other[order], distance[order]
-        nearest = np.arange(len(row)) - np.searchsorted(row, row) < params.num_spatial
+        nearest = np.arange(len(row)) - np.searchsorted(row, row) < params.num_neighbours
         ends = np.sort(np.stack([rows[row], rows[other]]), axis=0)[:, nearest]
         found.append(np.column_stack([*ends, distance[nearest]]))
     every = np.concatenate(found)

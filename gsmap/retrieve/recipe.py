@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 from gsmap.methods import RecipeKey
 from gsmap.retrieve.lookup import VERSION
 from gsmap.retrieve.params import Params
 from gsmap.retrieve.voters import INDEX_VERSION
-from gsmap.types.plain import plain
-
-_NOT_ASKED = ("enough", "num_spatial", "reach_sigmas")  # of which pairs are tried, not of what is found
 
 
 def index_recipe(params: Params) -> str:
@@ -20,5 +15,5 @@ def index_recipe(params: Params) -> str:
 
 def recipe_key(params: Params) -> RecipeKey:
     """The recipe of a lookup; its input, which the caller adds, is the key of the scene's graph."""
-    settings = {f.name: plain(getattr(params, f.name)) for f in fields(params) if f.name not in _NOT_ASKED}
+    settings = {"top_k": params.top_k, "nodes_per_scene": params.nodes_per_scene}
     return RecipeKey("retrieve", "lookup", {"retrieve": VERSION, "index": INDEX_VERSION}, settings)

@@ -17,9 +17,9 @@ def directed(a: str, b: str) -> Pair:
 class Rounds:
     """Pairs to try, round by round: after each, what held says which are still wanted.
 
-    A pair is not tried where both of its scenes have `Params.enough` edges without doubt and are tied to each other
-    already, by an edge or over a third scene. So a scene that lies in an island of its own is tried with all that it is
-    paired with, and so is one that votes for a place which the map knows another way to: that closes a loop.
+    A pair is redundant where both of its scenes have `Params.max_edges_per_scene` undisputed edges and are connected
+    already, by an edge or over a third scene. So a scene in a component of its own is tried with all its candidates,
+    and a candidate that the graph reaches by a long path only is tried, too, which closes a loop.
 
     Args:
         lists: pairs that a scene is proposed to be tried with, best first; one list for each scene that asks.
@@ -46,7 +46,7 @@ class Rounds:
     def is_rigid(self, a: str, b: str) -> bool:
         """Whether an edge between two scenes would add little that the map lacks."""
         near_a, near_b = self._tied.get(a, set()), self._tied.get(b, set())
-        enough = min(len(near_a), len(near_b)) >= self._params.enough
+        enough = min(len(near_a), len(near_b)) >= self._params.max_edges_per_scene
         return enough and (b in near_a or not near_a.isdisjoint(near_b))
 
     def next(self) -> list[Pair]:
@@ -54,7 +54,7 @@ class Rounds:
         ranked: dict[Pair, int] = {}
         for k, pairs in enumerate(self._lists):
             count = 0
-            while self._at[k] < len(pairs) and count < self._params.enough:
+            while self._at[k] < len(pairs) and count < self._params.max_edges_per_scene:
                 rank, pair = self._at[k], pairs[self._at[k]]
                 self._at[k] += 1
                 if pair in ranked or (pair not in self.tried and not self.is_rigid(*pair)):

@@ -57,7 +57,6 @@ JUDGING = tuple(
 
 NAMES_NOTHING = (
     "retrieve.",
-    "by_shape.",  # nothing of it is kept
     "scan.",  # nothing of it is kept
     "report.",  # a page, made whenever it is asked for
     "view.",  # levels of detail are named by their own
@@ -83,7 +82,6 @@ ONLY_IF = {
     **_chosen_by("describe.object.embedders", "describe.object.embedder", "embedder"),
     **_chosen_by("localize.extractors", "localize.extractor", "extractor"),
     **_chosen_by("register.proposers", "register.proposer", "proposer"),
-    **_chosen_by("register.coarse_refiners", "register.coarse_refiner", "refiner"),
     **_chosen_by("register.refiners", "register.refiner", "refiner"),
 }
 """What must be chosen for the settings of a method to count; where nothing asks for the method, they must not."""
@@ -93,7 +91,6 @@ IDLE = {
     "describe.object.embedders": {"describe.objects": False},
     "localize.extractors": {},
     "register.proposers": {"register.fallback": "never"},
-    "register.coarse_refiners": {},
     "register.refiners": {},
 }
 """Beside another method, what keeps one from being asked: `colored_icp` stands in where the scale is unknown."""
@@ -177,15 +174,13 @@ def test_a_setting_changes_the_keys_of_what_it_influences_and_no_others(name: st
     if condition:
         (switch, method), plural = next(iter(condition.items())), ".".join(name.split(".")[:3])
         plural = next(p for p in IDLE if name.startswith(p + "."))
-        kind = next(f for f in families() if f"{f}s" == plural.split(".")[-1].removeprefix("coarse_"))
+        kind = next(f for f in families() if f"{f}s" == plural.split(".")[-1])
         elsewhere = next((n for n in families()[kind].names() if n != method and n != "none"), None)
         if elsewhere is not None and method != "colored_icp":
             idle = changed(settings, {**IDLE[plural], switch: elsewhere})
             leaf = next(leaf for leaf in leaves(idle) if leaf.name == name)
             assert keys(with_another(idle, name, leaf.value)) == keys(idle), f"{name} counts though nothing asks for it"
         settings = changed(settings, condition)
-    elif name == "register.scale_refiner":
-        pytest.skip("there is only one built-in choice")
     leaf = next(leaf for leaf in leaves(settings) if leaf.name == name)
     before, after = keys(settings), keys(with_another(settings, name, leaf.value))
     assert {kind for kind in before if before[kind] != after[kind]} == expected(name)

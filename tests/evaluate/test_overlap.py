@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gsmap.evaluate.overlap import Params, solid_centres, true_overlaps
+from gsmap.evaluate.overlap import solid_centres, true_overlaps
 from gsmap.geometry.rotations import exp_so3
 from gsmap.ingest import read_captures
 from gsmap.types import Gaussians, Sim3
@@ -28,7 +28,7 @@ def test_the_smaller_of_both_shares():
     assert found[frozenset("ac")] == 0
     assert found[frozenset("ad")] == 0
     assert len(found) == 6
-    assert true_overlaps("ab", centres.__getitem__, Params(radius_m=0.06)) == {frozenset("ab"): 0}
+    assert true_overlaps("ab", centres.__getitem__, radius_m=0.06) == {frozenset("ab"): 0}
 
 
 def test_only_opaque_and_not_huge_gaussians_count_in_metres():

@@ -170,7 +170,7 @@ def test_settings_of_register_leave_the_graphs(watched: Watched) -> None:
 
 def test_a_stale_edge_is_made_again_though_its_pair_is_no_candidate(watched: Watched) -> None:
     m = watched.map
-    m.with_settings({"retrieve.top_k": 0, "retrieve.num_spatial": 0, **ANOTHER_BAR})
+    m.with_settings({"retrieve.top_k": 0, "retrieve.num_neighbours": 0, **ANOTHER_BAR})
     edge = watched.edge_key()
     assert [{row.target_name, row.source_name} for row in m.register("auto")] == [{"capture_a", "capture_b"}]
     assert watched.edge_key() != edge

@@ -109,7 +109,7 @@ def test_a_lost_or_damaged_index_is_made_anew_and_says_the_same(made: Described,
         assert m.store.check().ok
         whole = m.store.indexes.lookups([scene.id for scene in m.scenes()])
         m.store.indexes.forget([one.id for one in m.store.indexes.segments(_recipe(m))])
-        m.with_settings({"retrieve.votes_per_node": 33})
+        m.with_settings({"retrieve.top_k": 33})
         assert m.register("auto") == []
         again = m.store.indexes.lookups([scene.id for scene in m.scenes()])
     # Other settings: all have asked, and those that the newcomer found find it.
@@ -154,7 +154,7 @@ def test_an_interrupted_run_goes_on_with_what_it_had_proposed(
 
 def test_pairs_are_not_tried_where_the_map_is_rigid(made: Described, tmp_path: Path) -> None:
     with gsmap.map.create(tmp_path / "rigid.gsmap") as m:
-        m.with_settings({"retrieve.enough": 1, "retrieve.num_spatial": 0})
+        m.with_settings({"retrieve.max_edges_per_scene": 1, "retrieve.num_neighbours": 0})
         for name in NAMES:
             made.ingest(m, name)
             m.register("auto")
@@ -185,7 +185,7 @@ def test_why_tells_what_is_not_looked_up_from_what_is_not_listed(made: Described
         pair = f"{NAMES[0]}:{NAMES[3]}"
         assert "looks for" in m.why(pair).advice
     with gsmap.map.open(site) as m:
-        m.with_settings({"retrieve.top_k": 1, "retrieve.num_spatial": 0})
+        m.with_settings({"retrieve.top_k": 1, "retrieve.num_neighbours": 0})
         m.register("auto")
         told = {}
         for k, a in enumerate(NAMES):

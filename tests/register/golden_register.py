@@ -57,7 +57,7 @@ def _kiss_matcher() -> dict[str, np.ndarray]:
     if not hasattr(os, "sched_setaffinity"):
         raise MissingDependencyError("this system cannot keep kiss_matcher on one core: its pose varies between runs")
     world = splat_world(8, points=20_000, policy="known", cut_m=(6.0, 0.0), with_cameras=False)
-    scenes = (MetricScene(view, 1.0, Params()) for view in (world.target, world.source))
+    scenes = (MetricScene(view, 1.0) for view in (world.target, world.source))
     return _proposals(kiss_matcher.propose(*scenes))
 
 

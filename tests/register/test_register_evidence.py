@@ -11,7 +11,6 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence, measure
 from gsmap.register.surface import Surface
-from gsmap.register.view_cache import Params as ViewParams
 from gsmap.register.view_cache import ViewCache
 from gsmap.types import Cameras, Gaussians, Proposal, Sim3
 
@@ -113,7 +112,7 @@ def test_a_pose_a_little_off_agrees_less():
 def test_rooms_half_a_turn_off_contradict_each_other():
     world = splat_world(0, points=30_000)
     surfaces = Surface.of(world.target.gaussians), Surface.of(world.source.gaussians)
-    views = (world.target.views(), 1.0), (world.source.views(), 1.0)
+    views = (world.target.views, 1.0), (world.source.views, 1.0)
     right = measure(*surfaces, world.S_target_source, views)
     assert right.free_space_violation < 0.01
     assert right.colour_correlation > 0.6
@@ -182,7 +181,7 @@ def test_haze_that_only_a_foreign_camera_meets_is_not_held_against_a_scene():
 
 def test_view_cache_renders_each_view_once_and_keeps_a_bounded_number():
     wall, count = _wall(3.0, step=0.1), 80
-    cache = ViewCache(wall, _cameras(*[(0.01 * i, 0, 0) for i in range(count)]), ViewParams(64))
+    cache = ViewCache(wall, _cameras(*[(0.01 * i, 0, 0) for i in range(count)]), image_size_px=64)
     first = cache.render(0)
     assert cache.render(0) is first
     assert first.colour.shape == (1, 48, 64, 3)

@@ -9,9 +9,8 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import SceneView
 from gsmap.register.covariance import condition
-from gsmap.register.facing import Params as FacingParams
 from gsmap.register.refiners import colored_icp
-from gsmap.register.surface import Params as SurfaceParams
+from gsmap.register.surface import Surface
 from gsmap.types import Cameras, Gaussians, SceneGraph, Sim3
 
 THICK = 0.08
@@ -89,8 +88,6 @@ def test_what_no_camera_of_the_capture_saw_faces_nowhere():
     room = capture(1.0, 0)
     alone = SceneView("alone", room.gaussians, None, room.graph)
     assert alone.surface().faces is None
-    unasked = SurfaceParams(facing=FacingParams(num_cameras=0))
-    assert room.surface(params=unasked).faces is None
     # Cameras that look away from the wall leave it unknown, but for what lies level with what they see.
     away = np.flatnonzero(room.cameras.T_frame_camera[:, 0, 2] > 0)
     seen = SceneView("away", room.gaussians, room.cameras[away], room.graph).surface()
@@ -102,14 +99,16 @@ def test_what_no_camera_of_the_capture_saw_faces_nowhere():
 def test_a_wall_s_back_is_not_laid_on_its_front():
     S = Sim3(exp_so3([0.3, 0.5, -2.0]), [4.0, 1.0, -2.0])
     target, source = capture(-1.0, 0), capture(1.0, 1, S.inverse())
-    blind = SurfaceParams(facing=FacingParams(num_cameras=0))
+    surfaces = {
+        "blind": [Surface.of(view.gaussians) for view in (target, source)],
+        "facing": [target.surface(), source.surface()],
+    }
     centre = S.inverse().apply(np.array([[0.0, 1.0, 0.8]]))[0]
     # The start is off as a coarse pose is, towards one wall on the other.
     start = Sim3(np.eye(3), [-0.05, 0.01, 0.0]) @ S
     off = {}
-    for name, params in (("blind", blind), ("facing", None)):
-        surfaces = target.surface(params=params), source.surface(params=params)
-        found = colored_icp.refine(*surfaces, start)
+    for name, pair in surfaces.items():
+        found = colored_icp.refine(*pair, start)
         off[name] = pose_error(found, S, centre).centroid_m
         if name == "blind":
             wrong = found
@@ -117,10 +116,7 @@ def test_a_wall_s_back_is_not_laid_on_its_front():
     assert off["facing"] < 0.01
     # Laid on each other, the two sides seem to hold the pose across them; who tells them apart knows it less well.
     across = S.rotation.T @ [1.0, 0, 0]
-    sigmas = [
-        np.sqrt(across @ condition(target.surface(params=p), source.surface(params=p), wrong).rigid[3:6, 3:6] @ across)
-        for p in (blind, None)
-    ]
+    sigmas = [np.sqrt(across @ condition(*pair, wrong).rigid[3:6, 3:6] @ across) for pair in surfaces.values()]
     assert sigmas[1] > 1.5 * sigmas[0]
 
 

@@ -9,7 +9,6 @@ from gsmap.register import consistency
 from gsmap.register.clique import maximum_clique
 from gsmap.register.consistency import consistency_graph, unpack
 from gsmap.register.correspondences import Correspondences, correspondences
-from gsmap.register.correspondences import Params as MatchParams
 from gsmap.register.pose import fit_pose
 from gsmap.types import NodeLayer, Sim3
 
@@ -31,7 +30,7 @@ def test_correspondences_stay_within_type_and_find_the_true_partners():
 def test_correspondences_are_the_brute_force_top_k():
     rng = np.random.default_rng(1)
     a, b = layer(rng, 40, types=2), layer(rng, 50, types=2)
-    found = correspondences(a, b, MatchParams(min_similarity=-1, top_k=2))
+    found = correspondences(a, b, min_similarity=-1, top_k=2)
     similarity = np.where(a.types[:, None] == b.types, a.embeddings @ b.embeddings.T, -np.inf)
     rows = similarity >= np.sort(similarity, 1)[:, [-2]]
     columns = similarity >= np.sort(similarity, 0)[[-2]]
@@ -44,7 +43,9 @@ def test_correspondences_of_nothing_and_the_cap():
     rng = np.random.default_rng(2)
     empty = NodeLayer.empty("m", 8)
     assert len(correspondences(layer(rng, 5, dim=8), empty)) == 0
-    assert len(correspondences(layer(rng, 50), layer(rng, 50), MatchParams(-1, 5, 20))) == 20
+    assert (
+        len(correspondences(layer(rng, 50), layer(rng, 50), min_similarity=-1, top_k=5, max_correspondences=20)) == 20
+    )
 
 
 @pytest.mark.parametrize("test", ["absolute", "ratio"])
@@ -67,10 +68,10 @@ def test_consistency_graph_equals_its_definition(test, scale):
     got = unpack(consistency_graph(matches, params, scale=scale))
     dq = np.linalg.norm(q[:, None] - q, axis=-1)
     dp = scale * np.linalg.norm(p[:, None] - p, axis=-1)
-    allowed = params.ratio * np.maximum(dq, dp) if test == "ratio" else 6 * params.sigma_m + 0.01 * np.minimum(dq, dp)
+    allowed = 0.1 * np.maximum(dq, dp) if test == "ratio" else 6 * consistency.SIGMA_M + 0.01 * np.minimum(dq, dp)
     height = np.abs((q[:, 2][:, None] - q[:, 2]) - scale * (p[:, 2][:, None] - p[:, 2]))
-    expected = (np.abs(dq - dp) < allowed) & (np.minimum(dq, dp) >= params.min_distance_m)
-    expected &= height < 6 * params.sigma_m + params.height_slope * np.maximum(dq, dp)
+    expected = (np.abs(dq - dp) < allowed) & (np.minimum(dq, dp) >= consistency.MIN_DISTANCE_M)
+    expected &= height < 6 * consistency.SIGMA_M + params.height_slope * np.maximum(dq, dp)
     for ids in (matches.target_ids, matches.source_ids):
         expected &= ids[:, None] != ids
     np.fill_diagonal(expected, False)
@@ -115,7 +116,7 @@ def test_a_mirrored_set_passes_the_distances_but_not_the_pose():
     rng = np.random.default_rng(5)
     q = rng.normal(size=(15, 3)) * [2.0, 2.0, 0.5]
     p = q * [1.0, 1.0, -1.0] + rng.normal(size=q.shape) * 0.01
-    assert unpack(consistency_graph(_pairs(q, p), consistency.Params(min_distance_m=0))).sum() == 15 * 14
+    assert unpack(consistency_graph(_pairs(q, p), min_distance_m=0)).sum() == 15 * 14
     assert "mirrored" in fit_pose(q, p).flaw
 
 
@@ -124,8 +125,8 @@ def test_height_test_rejects_a_set_that_stands_on_its_head():
     q = rng.normal(size=(15, 3)) * 2
     upside_down = Sim3(exp_so3([np.pi, 0, 0]), np.ones(3))
     p = upside_down.apply(q)
-    free = unpack(consistency_graph(_pairs(q, p), consistency.Params(min_distance_m=0)))
-    held = unpack(consistency_graph(_pairs(q, p, (q[:, 2], p[:, 2])), consistency.Params(min_distance_m=0)))
+    free = unpack(consistency_graph(_pairs(q, p), min_distance_m=0))
+    held = unpack(consistency_graph(_pairs(q, p, (q[:, 2], p[:, 2])), min_distance_m=0))
     assert free.sum() == 15 * 14
     assert held.sum() < 0.2 * 15 * 14
 

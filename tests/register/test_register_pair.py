@@ -11,7 +11,7 @@ from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.vantage import synthesise_cameras
-from gsmap.register import Params, SceneView, refinement, register_pair
+from gsmap.register import Params, SceneView, refinement, register_pair, verdict
 from gsmap.register import pair as pair_module
 from gsmap.register.conclusion import Judged, conclude
 from gsmap.register.evidence import PoseEvidence
@@ -314,7 +314,7 @@ def test_false_alarms_are_those_of_the_pose_that_is_judged(monkeypatch):
     """A refiner that turns the pose by as much as leaves some of the clique: fewer agree, so chance explains more."""
     world = splat_world(0)
     found = register_pair(world.target, world.source)
-    (best, *_) = graph.propose(*(MetricScene(view, 1.0, Params()) for view in (world.target, world.source)))
+    (best, *_) = graph.propose(*(MetricScene(view, 1.0) for view in (world.target, world.source)))
     assert found.evidence["log_nfa"] == best.support.count(found.S_target_source)[1]
     refine = refinement._refined
     monkeypatch.setattr(refinement, "_refined", lambda *args: _moved(refine(*args), 0.12))
@@ -343,7 +343,7 @@ def test_a_rival_that_is_known_too_loosely_to_be_an_edge_is_a_rival():
     assert status(contradicted) == ("accepted", pytest.approx(alone))
     # At most one of both is right: odds of each against neither and against the other.
     weaker = replace(loose, evidence=replace(evidence, colour_correlation=0.16, overlap=0.05), flaw="not probable")
-    odds = [p / (1 - p) for p in (alone, probability(moved, weaker.evidence, Params().verdict.prior))]
+    odds = [p / (1 - p) for p in (alone, probability(moved, weaker.evidence, verdict.PRIOR))]
     assert odds[1] > 0.2
     assert status(weaker)[1] == pytest.approx(odds[0] / (1 + sum(odds)))
 

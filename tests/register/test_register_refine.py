@@ -11,28 +11,35 @@ from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
-from gsmap.register import Params, degeneracy, error_field, metres
+from gsmap.register import Params, covariance, degeneracy, error_field, metres, surface
 from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, agreeing
 from gsmap.register.correspondences import Correspondences
 from gsmap.register.covariance import (
-    Hidden,
+    RADIUS_M,
     condition,
+    fitted,
     in_scene_units,
     known_by_correspondences,
     point_to_plane_jacobian,
     swayed,
 )
-from gsmap.register.covariance import Params as CovarianceParams
 from gsmap.register.metric import MetricPair
 from gsmap.register.refiners import colored_icp, gicp, icp
 from gsmap.register.scale import vote_scales
 from gsmap.register.scaling import scaled_or_rigid
-from gsmap.register.surface import Params as SurfaceParams
 from gsmap.register.surface import Surface
 from gsmap.types import Gaussians, Proposal, Sim3
 
-_NONE = Hidden(shown=1.0, by_colour=0.0, swell_by_colour=0.0, shift_m=0.0, swell_m=0.0, shift_by_swell=0.0, least_m=0.0)
-NOTHING_HIDDEN = CovarianceParams(hidden=_NONE, hidden_grey=_NONE)
+NOTHING_HIDDEN = replace(
+    fitted(coloured=True),
+    shown=1.0,
+    by_colour=0.0,
+    swell_by_colour=0.0,
+    shift_m=0.0,
+    swell_m=0.0,
+    shift_by_swell=0.0,
+    least_m=0.0,
+)
 
 
 def believed(log_scale: float, sigma: float) -> metres.Belief:
@@ -164,7 +171,7 @@ def test_covariance_is_as_large_as_the_errors_are(cut_m):
         target = _warped(Surface.of(world.target.gaussians), 0.01, seed)
         source = _warped(Surface.of(world.source.gaussians), 0.01, 99 + seed)
         pose = colored_icp.refine(target, source, world.S_target_source)
-        covariance = condition(target, source, pose, NOTHING_HIDDEN).known(pose, believed(0.0, 0.0)).covariance
+        covariance = condition(target, source, pose, hidden=NOTHING_HIDDEN).known(pose, believed(0.0, 0.0)).covariance
         off = (Similarities.stack([pose]).inverse() @ Similarities.stack([world.S_target_source])).log()[0, :6]
         errors.append(off @ np.linalg.solve(covariance[:6, :6], off))
     # Of a narrow strip residuals tell little, and fields that are alike all over it are still found possible.
@@ -185,7 +192,7 @@ def test_noise_of_walls_does_not_hold_what_slides_along_them():
         )
         return Surface(points + rng.normal(0, 0.006, points.shape), np.full(points.shape, 0.5), 0.05)
 
-    found = condition(corridor(0), corridor(1), Sim3.identity(), NOTHING_HIDDEN)
+    found = condition(corridor(0), corridor(1), Sim3.identity(), hidden=NOTHING_HIDDEN)
     variances, axes = np.linalg.eigh(found.of_rigid(1.0, 0.0, 0.0, None)[3:6, 3:6])
     assert np.sqrt(variances[1]) < 0.003
     assert np.sqrt(variances[2]) > 0.5  # anywhere within the overlap: nothing holds it
@@ -262,11 +269,11 @@ def test_what_planes_leave_free_is_known_as_well_as_correspondences_know_it():
     for _ in range(8):
         ties = _same_points(rng)
         pose = colored_icp.refine(target, source, Sim3.identity(), correspondences=ties)
-        found = condition(target, source, pose, NOTHING_HIDDEN, ties)
+        found = condition(target, source, pose, ties, NOTHING_HIDDEN)
         sigma = np.sqrt(found.of_rigid(1.0, 0.0, 0.0, None)[3, 3])
         ratios.append((pose.apply(found.centroid[None])[0] - found.centroid)[0] / sigma)
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 2.0
-    without = condition(target, source, pose, NOTHING_HIDDEN)
+    without = condition(target, source, pose, hidden=NOTHING_HIDDEN)
     assert np.sqrt(without.of_rigid(1.0, 0.0, 0.0, None)[3, 3]) > 0.5 > 50 * sigma
 
 
@@ -274,7 +281,7 @@ def test_colours_hold_what_planes_leave_free():
     rng = np.random.default_rng(4)
     target, source = (_front(rng, along, textured=True) for along in ((-2.0, 6.0), (2.0, 10.0)))
     pose = colored_icp.refine(target, source, Sim3(np.eye(3), [0.03, 0.01, 0.0]))
-    found = condition(target, source, pose, NOTHING_HIDDEN)
+    found = condition(target, source, pose, hidden=NOTHING_HIDDEN)
     off = abs((pose.apply(found.centroid[None])[0] - found.centroid)[0])
     sigma = np.sqrt(found.of_rigid(1.0, 0.0, 0.0, None)[3, 3])
     assert off < 0.01
@@ -286,11 +293,11 @@ def test_a_pose_of_correspondences_alone_is_known_as_well_as_they_fit():
     for _ in range(60):
         ties = _same_points(rng, 40)
         pose = umeyama(*ties)
-        covariance = known_by_correspondences(ties, pose, replace(CovarianceParams(), block_m=0.01)).covariance
+        covariance = known_by_correspondences(ties, pose, block_m=0.01).covariance
         off = Similarities.stack([pose]).inverse().log()[0, :6]
         values.append(off @ np.linalg.solve(covariance[:6, :6], off))
     assert 5.35 / 1.5 < np.median(values) < 5.35 * 1.5  # a chi-square with 6 degrees of freedom
-    together = known_by_correspondences(ties, pose, replace(CovarianceParams(), block_m=100.0)).covariance
+    together = known_by_correspondences(ties, pose, block_m=100.0).covariance
     assert np.allclose(together, 40 * covariance, rtol=1e-6)  # one block: one measurement
 
 
@@ -327,16 +334,17 @@ def _walls(rng, blocks: int = 150) -> error_field.Blocks:
     return error_field.Blocks(jacobian, np.zeros(blocks), positions, directions, np.full(blocks, 1e9))
 
 
-def test_errors_are_judged_by_the_restricted_likelihood_of_one_field():
+def test_errors_are_judged_by_the_restricted_likelihood_of_one_field(monkeypatch):
     """With one length and one share there is nothing to average: the generalised least squares written out."""
     rng = np.random.default_rng(3)
     blocks = replace(_walls(rng), residual=rng.normal(size=150) * 0.01, counts=rng.uniform(3, 90, 150))
-    params = error_field.Params(lengths_m=(1.5,), shares=(0.3,))
+    monkeypatch.setattr(error_field, "LENGTHS_M", (1.5,))
+    monkeypatch.setattr(error_field, "SHARES", (0.3,))
     influence = rng.normal(size=(4, 150))
-    found = error_field.judge_errors(blocks, influence, params)
+    found = error_field.judge_errors(blocks, influence)
     distance = np.linalg.norm(blocks.positions[:, None] - blocks.positions[None], axis=2)
     K = 0.3 * np.exp(-distance / 1.5) * (blocks.directions @ blocks.directions.T)
-    K += np.diag(0.7 * (1 + params.few / blocks.counts))
+    K += np.diag(0.7 * (1 + error_field.SMALL_BLOCK / blocks.counts))
     X, y, W = blocks.jacobian, blocks.residual, np.linalg.inv(K)
     left = y - X @ np.linalg.solve(X.T @ W @ X, X.T @ W @ y)
     variance = left @ W @ left / (150 - 7 - 2)
@@ -373,7 +381,8 @@ def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfa
     """Over the overlap's radius, as the square of the errors that residuals show, and in proportion to the swelling."""
     target, source = surfaces
     pose = world.S_target_source
-    hidden = Hidden(
+    hidden = replace(
+        NOTHING_HIDDEN,
         shown=1.0,
         by_colour=0.0,
         swell_by_colour=0.0,
@@ -385,9 +394,9 @@ def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfa
         field_power=2.0,
         least_m=0.003,
     )
-    bare, found = (condition(target, source, pose, p) for p in (NOTHING_HIDDEN, CovarianceParams(hidden=hidden)))
+    bare, found = (condition(target, source, pose, hidden=h) for h in (NOTHING_HIDDEN, hidden))
     growth = (bare.field_m / 0.004) ** 2
-    near = np.isfinite(target.nearest(pose.apply(source.coarse[0]), found.params.radius_m)[0])
+    near = np.isfinite(target.nearest(pose.apply(source.coarse[0]), RADIUS_M)[0])
     inside = source.coarse[0][near]
     radius = np.sqrt(((inside - inside.mean(0)) ** 2).sum(1).mean())
     swell = growth * 0.03 / radius
@@ -413,11 +422,10 @@ def test_colours_that_lie_otherwise_than_planes_widen_the_pose(world, surfaces):
     """Textures that lie 2 cm off on their surfaces, as where colours and depths do not belong together: planes fit as
     before, and nothing of their residuals tells."""
     pose = world.S_target_source
-    told = replace(_NONE, by_colour=0.5, swell_by_colour=0.7)
-    params = CovarianceParams(hidden=told, hidden_grey=_NONE)
+    told = replace(NOTHING_HIDDEN, by_colour=0.5, swell_by_colour=0.7)
     target = _textured(surfaces[0], Sim3.identity())
     right, off = (_textured(surfaces[1], pose, shift_m) for shift_m in (0.0, 0.02))
-    bare, found = condition(target, off, pose, NOTHING_HIDDEN), condition(target, off, pose, params)
+    bare, found = condition(target, off, pose, hidden=NOTHING_HIDDEN), condition(target, off, pose, hidden=told)
     still = swayed(target, right, pose, bare.centroid, with_scale=False)
     sway = swayed(target, off, pose, bare.centroid, with_scale=False)
     assert np.linalg.norm(still[3:6]) < 0.002 < 0.005 < np.linalg.norm(sway[3:6]) < 0.025
@@ -440,9 +448,9 @@ def test_colours_that_lie_otherwise_than_planes_widen_the_pose(world, surfaces):
 def test_where_a_surface_has_no_colours_the_model_for_grey_ones_holds(world, surfaces):
     grey = [Surface(s.points, np.full(s.points.shape, 0.5, np.float32), s.resolution_m) for s in surfaces]
     pose = world.S_target_source
-    told = replace(_NONE, shift_m=0.02, field_power=0.0)
-    found = condition(*grey, pose, CovarianceParams(hidden=_NONE, hidden_grey=told))
-    bare = condition(*grey, pose, NOTHING_HIDDEN)
+    told = replace(NOTHING_HIDDEN, shift_m=0.02, field_power=0.0)
+    found = condition(*grey, pose, hidden=told)
+    bare = condition(*grey, pose, hidden=NOTHING_HIDDEN)
     assert found.sway is None
     assert swayed(grey[0], surfaces[1], pose, found.centroid, with_scale=False) is None
     assert np.allclose(np.diag(found.of_scaled(1.0) - bare.of_scaled(1.0))[3:6], 0.02**2)
@@ -465,10 +473,10 @@ def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     """Refined under a scale that is 0.3 percent wrong, a pose moves as its covariance says of that much scale."""
     target, source = surfaces
     pose = world.S_target_source
-    conditioned = condition(target, source, pose, NOTHING_HIDDEN)
+    conditioned = condition(target, source, pose, hidden=NOTHING_HIDDEN)
     wrong = conditioned.rescaled(pose, 1.003)
     assert wrong.scale == pytest.approx(1.003)
-    again = colored_icp.refine(target, source, wrong, colored_icp.Params((0.06,), max_points=(20_000,)))
+    again = colored_icp.refine(target, source, wrong, schedule=colored_icp.Schedule((0.06,), (20_000,)))
     centre = np.median(source.points, axis=0)
     moved = [np.linalg.norm(again.apply(centre) - other.apply(centre)) for other in (wrong, pose)]
     assert moved[0] < 0.003
@@ -481,7 +489,7 @@ def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     # Near a corner, growing moves: with nothing else uncertain, what the scale moved is one standard deviation.
     near = np.linalg.norm(pose.apply(source.points) - [3.0, 0.0, 0.3], axis=1) < 1.0
     corner = condition(
-        target, Surface(source.points[near], source.colours[near], source.resolution_m), pose, NOTHING_HIDDEN
+        target, Surface(source.points[near], source.colours[near], source.resolution_m), pose, hidden=NOTHING_HIDDEN
     )
     alone = replace(corner, rigid=1e-9 * np.eye(6)).known(pose, believed(0.0, 0.003)).covariance
     moved = corner.rescaled(pose, np.exp(0.003))
@@ -502,19 +510,19 @@ def test_a_scale_some_percent_off_is_reached_from_a_pose_that_it_put_off(factor)
     assert belief.measured_sigma == belief.log_scale_sigma
 
 
-def test_an_edge_is_as_wide_as_its_colours_say():
+def test_an_edge_is_as_wide_as_its_colours_say(monkeypatch):
     """The whole way of a pair: colours of this world are off point by point, so they would move the pose a little."""
     world = splat_world(3)
     pair = MetricPair.of(world.target, world.source, Proposal("test", world.S_target_source, False, 50), Params())
     sigmas = []
     for share in (0.0, 50.0):
-        hidden = replace(NOTHING_HIDDEN, hidden=replace(_NONE, by_colour=share))
-        params = replace(Params(), covariance=hidden)
-        pose, known, belief = scaled_or_rigid(pair, world.S_target_source, params, with_scale=False)
+        model = replace(NOTHING_HIDDEN, by_colour=share)
+        monkeypatch.setattr(covariance, "fitted", lambda *, coloured, model=model: model)
+        pose, known, belief = scaled_or_rigid(pair, world.S_target_source, Params(), with_scale=False)
         assert belief.rigid
         sigmas.append(known.sigmas)
     surfaces = pair.target.surface(), pair.source.surface()
-    centroid = condition(*surfaces, pose, NOTHING_HIDDEN).centroid
+    centroid = condition(*surfaces, pose, hidden=NOTHING_HIDDEN).centroid
     sway = swayed(*surfaces, pose, centroid, with_scale=False)
     told = 50 * np.sqrt((sway[3:6] ** 2).mean())
     assert np.sqrt(sigmas[1][1] ** 2 - sigmas[0][1] ** 2) == pytest.approx(told, rel=0.1)
@@ -539,12 +547,11 @@ def test_a_small_overlap_knows_angles_and_scale_less_well(world, surfaces):
 
 def test_a_measured_scale_is_one_or_what_was_measured():
     """One where that is more probable than a drift; and then as sure as Bayes' rule, written out, makes it."""
-    params = metres.Params(drift_sigma=0.02, rigid_odds=3.0)
     grid = np.linspace(-0.2, 0.2, 400_001)
     said = set()
     for log_scale, sigma in [(0.0, 0.001), (-0.0028, 0.001), (-0.0029, 0.001), (0.00034, 1e-4), (0.00037, 1e-4),
                              (0.0114, 0.005), (0.0118, 0.005), (0.02, 0.02), (0.0, 0.2), (-0.02, 0.0005)]:  # fmt: skip
-        found = metres.believe(log_scale, sigma, params)
+        found = metres.believe(log_scale, sigma)
         drifts = norm.pdf(grid, 0, 0.02) * norm.pdf(log_scale, grid, sigma)
         share = 3 * norm.pdf(log_scale, 0, sigma) / (drifts.sum() * (grid[1] - grid[0]))
         said.add(found.rigid)
@@ -575,11 +582,12 @@ def test_surfaces_that_measure_another_size_than_their_residuals_explain_are_sai
     assert metres.bending(replace(rigid, note="disagrees"), 0.0005, 6.0) == ""  # was said
 
 
-def test_surface_leaves_out_what_is_faint_or_huge():
+def test_surface_leaves_out_what_is_faint_or_huge(monkeypatch):
     g = Gaussians(np.arange(12.0).reshape(4, 3), np.tile([1.0, 0, 0, 0], (4, 1)),
                   np.log([[0.02] * 3, [0.02] * 3, [3.0] * 3, [0.02] * 3]), [3.0, -3.0, 3.0, 3.0],
                   np.zeros((4, 1, 3)))  # fmt: skip
-    kept = Surface.of(g, unit_m=2.0, params=SurfaceParams(max_scale_quantile=0.0))
+    monkeypatch.setattr(surface, "MAX_SCALE_QUANTILE", 0.0)
+    kept = Surface.of(g, unit_m=2.0)
     assert np.allclose(kept.points, 2.0 * g.means[[0, 3]])
 
 
@@ -650,7 +658,7 @@ def test_ratio_histogram_equals_its_definition(heights):
     assert np.abs(np.cumsum(got) - np.cumsum(expected)).max() <= 3
 
 
-def test_photometric_refiner_lays_renders_over_each_other():
+def test_photometric_refiner_lays_renders_over_each_other(monkeypatch):
     from gsmap.geometry.transforms import transform_gaussians
     from gsmap.register.refiners import photometric
 
@@ -660,7 +668,8 @@ def test_photometric_refiner_lays_renders_over_each_other():
     source = Surface.of(transform_gaussians(scene, S.inverse()))
     centre = scene_centroid(source.gaussians)
     start = _off(S, centre, 0.3, 0.015)
-    found = photometric.refine(target, source, start, photometric.Params(iterations=6))
+    monkeypatch.setattr(photometric, "MAX_ITERATIONS", 6)
+    found = photometric.refine(target, source, start)
     before, after = (pose_error(p, S, centre) for p in (start, found))
     assert after.rre_deg < 0.2 * before.rre_deg
     assert after.centroid_m < 0.2 * before.centroid_m
@@ -681,6 +690,6 @@ def test_photometric_refiner_reads_each_scene_in_its_own_unit():
         target = Surface.of(metric, cameras=world.target.cameras)
         source = Surface.of(scene, unit_m)
         start = Sim3(exp_so3([0.0, 0.004, 0.0]), [0.01, 0.0, 0.0])
-        answers.append(photometric.refine(target, source, start, photometric.Params(iterations=2)).matrix())
+        answers.append(photometric.refine(target, source, start).matrix())
     assert not np.allclose(answers[0], start.matrix(), atol=1e-4)
     assert np.allclose(*answers, atol=1e-4)

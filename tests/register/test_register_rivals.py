@@ -28,11 +28,12 @@ def test_a_smaller_set_that_moved_on_its_own_is_the_runner_up():
     assert rival.runner_up == pytest.approx(1 / best.runner_up)
 
 
-def test_a_set_too_small_to_be_a_rival_is_none():
+def test_a_set_too_small_to_be_a_rival_is_none(monkeypatch):
     world, _ = two_pose_world(first=40, second=10)
     (only,) = graph.propose_by_kind(*world.graphs(), "landmarks")
     assert only.runner_up == 0.0
-    lenient = graph.propose_by_kind(*world.graphs(), "landmarks", graph.Params(rival_share=0.2))
+    monkeypatch.setattr(graph, "RIVAL_SHARE", 0.2)
+    lenient = graph.propose_by_kind(*world.graphs(), "landmarks")
     assert len(lenient) == 2
 
 
@@ -100,7 +101,7 @@ def test_a_room_that_looks_the_same_after_half_a_turn_is_ambiguous(symmetric):
 
 
 def test_both_poses_of_the_symmetric_room_are_proposed(symmetric):
-    scenes = (MetricScene(view, 1.0, Params()) for view in (symmetric.target, symmetric.source))
+    scenes = (MetricScene(view, 1.0) for view in (symmetric.target, symmetric.source))
     proposals = graph.propose(*scenes)
     wanted = symmetric.S_target_source, HALF_TURN @ symmetric.S_target_source
     for S in wanted:

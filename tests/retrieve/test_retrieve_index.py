@@ -8,7 +8,7 @@ from retrieve_worlds import UP, layer, turned, walk
 
 from gsmap._native import near_codes
 from gsmap.errors import CorruptError
-from gsmap.retrieve import Params, look_up, new_segment, voters_of
+from gsmap.retrieve import Params, look_up, lookup, new_segment, voters_of
 from gsmap.retrieve import codes as coding
 from gsmap.types import SceneGraph
 from gsmap.types.retrieval import IndexArrays
@@ -91,12 +91,13 @@ def test_segments_stay_few_and_are_seldom_written_again():
     assert written < 2000 * 40
 
 
-def test_any_order_and_any_segments_say_the_same():
+def test_any_order_and_any_segments_say_the_same(monkeypatch):
     rng = np.random.default_rng(4)
     graphs = walk(40)
     graphs += [replace(graph, scene_id=f"x{graph.scene_id}") for graph in graphs[:6]]  # as alike as can be: ties
     voters = _voters(graphs)
-    params = Params(top_k=5, checked_scenes=3)  # where ties are cut, too
+    monkeypatch.setattr(lookup, "CHECKED_SCENES", 3)  # where ties are cut, too
+    params = Params(top_k=5)
     first = look_up(voters, [new_segment(voters)], params)
     for count in (1, 2, 7):
         order = rng.permutation(len(voters))
@@ -211,7 +212,7 @@ def test_a_place_visited_more_often_than_scenes_are_compared_with_is_found():
         nodes = layer(rng, len(seen), embeddings=seen, type_ids=np.zeros(len(seen)), positions=places)
         graphs.append(SceneGraph(f"s{k:03}", {"landmarks": nodes}, UP))
     params = Params()
-    assert params.peers < 59
+    assert lookup.PEERS < 59
     voters = _voters(graphs)
     found = look_up(voters[:8], [new_segment(voters)], params)
     visits = {f"s{k:03}" for k in range(60)}

@@ -6,6 +6,7 @@ import numpy as np
 from retrieve_worlds import layer, walk
 
 from gsmap.retrieve import Params, Placed, candidate_pairs, neighbours
+from gsmap.retrieve.neighbours import REACH_SIGMAS
 from gsmap.types import NodeLayer, SceneGraph
 
 
@@ -25,7 +26,7 @@ def test_true_partners_are_found_among_many_scenes():
 
 
 def test_any_order_of_scenes_gives_the_same_pairs():
-    rng, params = np.random.default_rng(0), Params(top_k=2, num_spatial=1)
+    rng, params = np.random.default_rng(0), Params(top_k=2, num_neighbours=1)
     graphs = walk(30)
     graphs += [replace(graph, scene_id=f"x{graph.scene_id}") for graph in graphs[:6]]  # as alike as can be: ties
     placed = {graph.scene_id: Placed(0, np.zeros(3), 1.0) for graph in graphs[:9]}
@@ -99,7 +100,7 @@ def test_gravity_free_landmarks_vote_only_where_a_scene_does_not_know_up():
 def test_neighbours_of_many_sizes_are_those_that_touch():
     """Against comparing all with all."""
     rng = np.random.default_rng(7)
-    params = Params(num_spatial=1000)
+    params = Params(num_neighbours=1000)
     placed = {
         f"s{i:03}": Placed(
             int(rng.integers(2)), rng.uniform(0, 25, 3), float(np.exp(rng.normal())), rng.uniform(0, 0.3)
@@ -110,12 +111,12 @@ def test_neighbours_of_many_sizes_are_those_that_touch():
     for a, p in placed.items():
         for b, q in placed.items():
             gap = np.linalg.norm(p.centre - q.centre) - p.radius - q.radius
-            if a < b and p.component == q.component and gap <= params.reach_sigmas * np.hypot(p.sigma, q.sigma):
+            if a < b and p.component == q.component and gap <= REACH_SIGMAS * np.hypot(p.sigma, q.sigma):
                 expected.add((a, b))
     found = neighbours(placed, params)
     assert set(found) == expected
     assert len(found) == len(expected) > 50
-    nearest = neighbours(placed, Params(num_spatial=2))
+    nearest = neighbours(placed, Params(num_neighbours=2))
     assert set(nearest) < expected
 
 

@@ -2,7 +2,7 @@
 
 from gsmap.retrieve import Params, Rounds
 
-PARAMS = Params(enough=2)
+PARAMS = Params(max_edges_per_scene=2)
 
 
 def _tried(rounds, right=()):

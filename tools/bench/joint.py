@@ -151,15 +151,15 @@ def solved(place: Place, found: list[Registration]) -> tuple[dict[int, Sim3], di
 
 def jointly(place: Place, start: dict[int, Sim3], *, by_information: bool) -> dict[int, Sim3]:
     """Gauss-Newton over all poses, every pair's cells paired anew in every round."""
-    params, unit = colored_icp.Params(), place.unit_m
+    unit, radii_m = place.unit_m, colored_icp.FULL.radii_m
     poses = {i: Sim3(S.rotation, S.translation * unit) for i, S in start.items()}
     used = [p for p in place.pairs if p.target in poses and p.source in poses]
     free = {i: k for k, i in enumerate(sorted(poses)[1:])}  # the first holds the frame
-    noise, W = [params.radii_m[-2] / params.least_sigmas] * len(used), np.diag(np.r_[np.ones(3), np.full(3, 1 / unit)])
+    noise, W = [radii_m[-2] / colored_icp._MIN_SIGMAS] * len(used), np.diag(np.r_[np.ones(3), np.full(3, 1 / unit)])
     for around in range(ROUNDS):
         if around in (0, WIDE_ROUNDS):  # then as fine as each pair's noise allows, as a pair alone is refined
-            finest = params.radii_m[-2 if around == 0 else -1]
-            radii = [min(params.radii_m[-2], max(finest, params.least_sigmas * n)) for n in noise]
+            finest = radii_m[-2 if around == 0 else -1]
+            radii = [min(radii_m[-2], max(finest, colored_icp._MIN_SIGMAS * n)) for n in noise]
             laid = [_laid(pair) for pair in used]
         system, gradient = lil_matrix((6 * len(free), 6 * len(free))), np.zeros(6 * len(free))
         for k, pair in enumerate(used):
@@ -174,7 +174,7 @@ def jointly(place: Place, start: dict[int, Sim3], *, by_information: bool) -> di
                 gradient[6 * a : 6 * a + 6] += J.T @ g
                 for b, K in ends:
                     system[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] += J.T @ H @ K
-        step = -params.overstep * spsolve(system.tocsc(), gradient).reshape(-1, 6)
+        step = -colored_icp._OVERSTEP * spsolve(system.tocsc(), gradient).reshape(-1, 6)
         moved = 0.0
         for i, k in free.items():
             new, middle = poses[i] @ exp(step[k][None]).item(0), place.captures[i].view.centre * unit
@@ -201,16 +201,14 @@ def again(place: Place, start: dict[int, Sim3]) -> dict[int, Sim3]:
 
 def by_cells(place: Place, start: dict[int, Sim3]) -> dict[int, Sim3]:
     """A pose graph over the pairs' own poses, each weighed by its cells there."""
-    params, unit, found = colored_icp.Params(), place.unit_m, []
+    unit, found, radii_m = place.unit_m, [], colored_icp.FULL.radii_m
     for pair in place.pairs:
         S = pair.found.S_target_source
         assert S is not None
-        S, noise = Sim3(S.rotation, S.translation * unit), params.radii_m[-2] / params.least_sigmas
-        for finest in params.radii_m[-2:]:
+        S, noise = Sim3(S.rotation, S.translation * unit), radii_m[-2] / colored_icp._MIN_SIGMAS
+        for finest in radii_m[-2:]:
             laid = _laid(pair)
-            system, _, noise = _equations(
-                pair, laid, S, min(params.radii_m[-2], max(finest, params.least_sigmas * noise))
-            )
+            system, _, noise = _equations(pair, laid, S, min(radii_m[-2], max(finest, colored_icp._MIN_SIGMAS * noise)))
         W = np.diag(np.r_[np.ones(3), np.full(3, unit)])
         information = _SURE * np.eye(7)
         information[:6, :6] = _CELLS_ALIKE * W @ system @ W
@@ -220,7 +218,7 @@ def by_cells(place: Place, start: dict[int, Sim3]) -> dict[int, Sim3]:
 
 def _laid(pair: Pair) -> tuple[_Laid, _Laid]:
     """The cells of each capture, to be laid on the other's."""
-    count = colored_icp.Params().max_points[-1] // 2
+    count = colored_icp.FULL.max_points[-1] // 2
     return _Laid(*pair.surfaces, count), _Laid(*pair.surfaces[::-1], count, backward=True)
 
 

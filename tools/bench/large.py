@@ -24,9 +24,9 @@ import argparse
 import itertools
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from scipy.stats import chi2
@@ -36,9 +36,7 @@ from gsmap.evaluate.overlap import solid_centres, true_overlaps
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.similarities import Similarities
 from gsmap.ingest import read_captures
-from gsmap.register import register_pair
-from gsmap.register.surface import Params as SurfaceParams
-from gsmap.register.surface import Surface
+from gsmap.register import register_pair, surface
 from gsmap.types import Sim3
 from tools.bench.register import described, rescaled
 from tools.bench.registration_methods import Capture
@@ -147,10 +145,11 @@ def gicp(a: Capture, b: Capture, start: Sim3) -> tuple[float, float]:
     """The errors of GICP from a start (captures in metres), at the radius that is best by the truth."""
     import small_gicp
 
-    params = replace(SurfaceParams(), resolution_m=0.02, max_scale_m=0.5)
     clouds = []
     for capture in (a, b):
-        cloud = small_gicp.PointCloud(Surface.of(capture.view.gaussians, 1.0, params).points)
+        with mock.patch.object(surface, "MAX_SCALE_M", 0.5):
+            points = surface.Surface.of(capture.view.gaussians).points
+        cloud = small_gicp.PointCloud(points)
         tree = small_gicp.KdTree(cloud, num_threads=1)
         small_gicp.estimate_normals_covariances(cloud, tree, num_neighbors=20, num_threads=1)
         clouds.append((cloud, tree))

@@ -49,7 +49,6 @@ from gsmap.map.stages.describe import graph_keys
 from gsmap.merge import merge
 from gsmap.register import SceneView, register_pair
 from gsmap.register.clique import maximum_clique
-from gsmap.register.consistency import consistency_graph
 from gsmap.register.metric import MetricPair
 from gsmap.register.pose import fit_pose
 from gsmap.register.proposers import graph
@@ -225,7 +224,7 @@ def clique_stages(target: Capture, source: Capture, params: graph.Params, *, wit
             off = metre * np.linalg.norm(truth.apply(m.source / units[1]) - m.target / units[0], axis=1)
             right = off < RIGHT_M
             for scale, _ in (matching.vote() if with_scale else []) or [(1.0, 1.0)]:
-                clique = maximum_clique(consistency_graph(m, matching.test, scale=scale), params.step_limit)
+                clique = maximum_clique(matching.compatibility_graph(m, scale), params.step_limit)
                 if len(clique) < 3 or len(clique) <= best.clique:
                     continue
                 fit = fit_pose(m.target[clique.members], m.source[clique.members], with_scale=with_scale)

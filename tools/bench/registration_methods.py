@@ -16,8 +16,9 @@ from gsmap.methods import MethodParams
 from gsmap.register import Params, SceneView, register_pair
 from gsmap.register.a_contrario import BackgroundModel, agreeing
 from gsmap.register.clique import maximum_clique
+from gsmap.register.consistency import SIGMA_M, consistency_graph, unpack
 from gsmap.register.consistency import Params as TestParams
-from gsmap.register.consistency import consistency_graph, unpack
+from gsmap.register.context import Params as ContextParams
 from gsmap.register.context import with_context
 from gsmap.register.correspondences import Correspondences, correspondences
 from gsmap.register.metric import MetricScene
@@ -128,37 +129,36 @@ def ablation(change: str, kind: str) -> Method:
 
 def _hypothesis(target: Capture, source: Capture, kind: str, change: str) -> tuple[float, Sim3, int] | None:
     """log10 NFA, pose and number of correspondences it rests on."""
-    params = graph.Params()
     if any(kind not in c.graph.layers or not len(c.graph.layers[kind]) for c in (target, source)):
         return None
     a, b = _layer(target, kind, change), _layer(source, kind, change)
     if kind == "objects" and change not in ("no-context", "fpfh-nodes"):
-        hops = {"3-hop": 3, "5-hop": 5}.get(change, params.context.hops)
-        a, b = with_context(a, b, replace(params.context, hops=hops))
+        hops = {"3-hop": 3, "5-hop": 5}.get(change, ContextParams().hops)
+        a, b = with_context(a, b, ContextParams(hops))
     unit = float(np.sqrt(a.unit_m * b.unit_m))  # one metre for both: the pose is rigid
     ups = target.graph.up, source.graph.up
-    matching = params.objects if kind == "objects" else params.landmarks
-    m = correspondences(a, b, matching, units_m=(unit, unit), ups=ups)
+    top_k, sigma_m = (5, 0.05) if kind == "objects" else (1, SIGMA_M)  # as in `gsmap.register.proposers.graph`
+    m = correspondences(a, b, top_k=top_k, units_m=(unit, unit), ups=ups)
     if len(m) < 4:
         return None
-    sigma = params.objects_sigma_m if kind == "objects" else params.consistency.sigma_m
-    test = replace(params.consistency, sigma_m=sigma)
+    test, tolerances = TestParams(), {"sigma_m": sigma_m}
     if change == "ratio":
-        test = replace(test, test="ratio")
+        test = TestParams(test="ratio")
     elif change == "no-height":
-        test = replace(test, height_slope=np.inf)
+        test = TestParams(height_slope=np.inf)
     elif change == "no-distance":  # correspondences then only have to be one-to-one
-        test = replace(test, sigma_m=1e6, min_distance_m=0.0)
+        tolerances = {"sigma_m": 1e6, "min_distance_m": 0.0}
+    compatibility = consistency_graph(m, test, **tolerances)
     if change == "no-clique":
         members = np.arange(len(m))
     elif change == "best-score":
-        members = _best_score(m, unpack(consistency_graph(m, test)))
+        members = _best_score(m, unpack(compatibility))
     else:
-        members = maximum_clique(consistency_graph(m, test), STEP_LIMIT).members
+        members = maximum_clique(compatibility, STEP_LIMIT).members
     if len(members) < 3:
         return None
     pose = fit_pose(m.target[members], m.source[members]).S_target_source
-    radius = max(4.0 * np.sqrt(2.0) * sigma, 0.15)
+    radius = max(4.0 * np.sqrt(2.0) * sigma_m, 0.15)
     inliers = m[agreeing(m, pose, radius)]
     if len(inliers) > len(members):
         pose = fit_pose(inliers.target, inliers.source).S_target_source
@@ -203,7 +203,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def kiss_gicp(voxel_m: float) -> Method:
     def run(target: Capture, source: Capture) -> Answer:
-        scenes = (MetricScene(capture.view, 1.0, Params()) for capture in (target, source))
+        scenes = (MetricScene(capture.view, 1.0) for capture in (target, source))
         found = kiss_matcher.propose(*scenes, kiss_matcher.Params(voxel_m))
         if not found:
             return Answer(None)
@@ -269,7 +269,7 @@ def _fpfh_matches(target: Capture, source: Capture, voxel_m: float) -> tuple[Cor
 def teaser_style(target: Capture, source: Capture, voxel_m: float = 0.2) -> Answer:
     """Mutual FPFH matches, absolute distance test, maximum clique, SVD, GICP."""
     m, spent = _fpfh_matches(target, source, voxel_m)
-    clique = maximum_clique(consistency_graph(m, TestParams(sigma_m=FPFH_SIGMA_M)), STEP_LIMIT)
+    clique = maximum_clique(consistency_graph(m, sigma_m=FPFH_SIGMA_M), STEP_LIMIT)
     if len(clique) < 4:
         return Answer(None, shared_s=spent)
     pose = fit_pose(m.target[clique.members], m.source[clique.members], sigma_m=FPFH_SIGMA_M).S_target_source
@@ -284,7 +284,7 @@ def mac_style(target: Capture, source: Capture, voxel_m: float = 0.2) -> Answer:
     grown greedily by weight from the 1000 heaviest nodes instead of listed all.
     """
     m, spent = _fpfh_matches(target, source, voxel_m)
-    adjacency = unpack(consistency_graph(m, TestParams(sigma_m=FPFH_SIGMA_M)))
+    adjacency = unpack(consistency_graph(m, sigma_m=FPFH_SIGMA_M))
     first = adjacency.astype(np.float32)
     weights = first * (first @ first)
     tau, best = 0.15, (-1.0, None, 0)

@@ -15,8 +15,8 @@ draws another building.
 For each N it prints, of up to 60 of the captures, each asking an index of all N as a newcomer does: the share of its
 true neighbours among the first 5, 10, top_k and 15 of its list, and by votes alone; pairs a scene and the share of
 them that is right, as they are tried where nothing else holds (a capture has two neighbours here, fewer than
-`retrieve.enough`); recall where all N ask at once; with --older the same of votes of all nodes for all, as it was
-before there was an index.
+`retrieve.max_edges_per_scene`); recall where all N ask at once; with --older the same of votes of all nodes for all, as
+it was before there was an index.
 
 --cost prints, for an index as it lies in a map: segments, bytes, CPU s of one newcomer's lookup (reading included), of
 putting it into the index, and how much memory asking takes. Beyond the captures that are there it is filled with copies

@@ -43,8 +43,8 @@ from gsmap.describe.unit import estimate_unit_m, working_unit_m
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.ingest import read_captures
-from gsmap.register import Params, SceneView
-from gsmap.register.covariance import Conditioning, Hidden, condition, swayed
+from gsmap.register import SceneView
+from gsmap.register.covariance import RADIUS_M, Conditioning, Hidden, condition, fitted, swayed
 from gsmap.register.metres import believe
 from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import Surface
@@ -211,7 +211,7 @@ class Pair:
 
     def told(self, hidden: Hidden) -> Conditioning:
         """The conditioning, so much thought to be hidden."""
-        return replace(self.conditioned, params=replace(self.conditioned.params, hidden=hidden))
+        return replace(self.conditioned, hidden=hidden)
 
     def under(self, hidden: Hidden) -> tuple[np.ndarray, np.ndarray]:
         """(7, 7) and (6, 6) covariances of the two poses."""
@@ -256,8 +256,8 @@ def working_metres(gaussians: Gaussians, cameras: Cameras | None) -> float:
 
 def _pair(target: Surface, S_target: Sim3, source: Surface, S_source: Sim3, right_m: float, seed: int) -> Pair | None:
     """None where too little overlaps, or another pose was found, which the verdict is to tell."""
-    params, truth = Params(), S_target @ S_source.inverse()
-    near = np.isfinite(target.nearest(truth.apply(source.coarse[0]), params.covariance.radius_m)[0])
+    truth = S_target @ S_source.inverse()
+    near = np.isfinite(target.nearest(truth.apply(source.coarse[0]), RADIUS_M)[0])
     if near.mean() < LEAST_OVERLAP:
         return None
     rng, centre = np.random.default_rng(seed), np.median(source.points, axis=0)
@@ -265,14 +265,14 @@ def _pair(target: Surface, S_target: Sim3, source: Surface, S_source: Sim3, righ
         (np.radians(START_DEG), START_M), rng.normal(size=(2, 3)), strict=True
     ))  # fmt: skip
     R = exp_so3(turn)
-    coarse, fine = params.coarse_refiners["colored_icp"], params.refiners["colored_icp"]
-    pose = colored_icp.refine(target, source, truth @ Sim3(R, centre - R @ centre + shift), coarse)
-    scaled = colored_icp.refine(target, source, pose, coarse, with_scale=True)
-    scaled = colored_icp.refine(target, source, scaled, fine, with_scale=True)
+    coarse, fine = colored_icp.SCHEDULES["coarse"], colored_icp.SCHEDULES["fine"]
+    pose = colored_icp.refine(target, source, truth @ Sim3(R, centre - R @ centre + shift), schedule=coarse)
+    scaled = colored_icp.refine(target, source, pose, with_scale=True, schedule=coarse)
+    scaled = colored_icp.refine(target, source, scaled, with_scale=True, schedule=fine)
     conditioned = condition(target, source, scaled)
     if conditioned is None:
         return None
-    rigid = colored_icp.refine(target, source, conditioned.rescaled(scaled, 1.0), fine)
+    rigid = colored_icp.refine(target, source, conditioned.rescaled(scaled, 1.0), schedule=fine)
     centroid = Sim3(np.eye(3), conditioned.centroid)
     inverse = Similarities.stack([truth @ centroid])
     errors = [(Similarities.stack([p @ centroid]).inverse() @ inverse).log()[0] for p in (scaled, rigid)]
@@ -301,7 +301,7 @@ def fit(pairs: list[Pair]) -> Hidden:
             total += np.linalg.slogdet(matrix)[1] + error @ np.linalg.solve(matrix, error)
         return total
 
-    hidden = Hidden()
+    hidden = fitted(coloured=True)
     for names, rigid in ((SCALE, False), (MOTION, True)) * ROUNDS:
         hidden = _largest(hidden, names, partial(cost, rigid=rigid))
     return hidden

@@ -21,9 +21,8 @@ import gsmap.register
 from gsmap.geometry.rotations import angle_between
 from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.localize.scan import as_gaussians
-from gsmap.register import Params as RegisterParams
-from gsmap.register import SceneView
-from gsmap.register.by_shape import _NAMES, Params, doubts, judged_by_shape
+from gsmap.register import Params, SceneView
+from gsmap.register.by_shape import _NAMES, PRIOR, doubts, judged_by_shape
 from gsmap.types import NodeLayer, SceneGraph
 from gsmap.types.scan import Scan
 from gsmap_synthetic import DemoCapture, Place, film, make_captures, make_place, walk
@@ -66,7 +65,7 @@ def main() -> None:
     held = np.empty(len(x))
     for k in range(len(samples)):
         held[home == k] = odds(x[home == k], *fit_curves(x[home != k], right[home != k], ridge=_RIDGE))
-    prior = np.log(Params().prior / (1 - Params().prior))
+    prior = np.log(PRIOR / (1 - PRIOR))
     given = held + prior > np.log(9)
     print(f"left out in turn: {given[right].mean():.0%} of the right given, {given[~right].sum()} wrong ones")
     knots, worth, base = fit_curves(x, right, ridge=_RIDGE)
@@ -103,7 +102,7 @@ def of_place(seed: int, place: Place, own: list[DemoCapture], others: list[DemoC
             source = view("scan", gaussians, synthesise_cameras(gaussians))
             for capture, same in targets:
                 target = view(capture.name, capture.gaussians, capture.cameras)
-                for judged in judged_by_shape(target, source, Params(), RegisterParams()):
+                for judged in judged_by_shape(target, source, Params()):
                     S, T = judged.proposal.S_target_source, capture.T_scene_world
                     middle = source.centre
                     off = float(np.linalg.norm(S.apply(middle) - T[:3, :3] @ middle - T[:3, 3]))

@@ -286,7 +286,7 @@ def calibrated(model: Model, odds: np.ndarray, rows: list[Judged]) -> Model:
 
 def report(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.Params) -> None:
     """What probabilities accept, and what is true of what they say."""
-    p = probabilities(odds, bars)
+    p = probabilities(odds)
     right, stands = np.array([row.right for row in rows]), np.array([not contradicted(row, bars) for row in rows])
     print(f"{name}: {right.sum()} right poses, {(~right).sum()} wrong ones")
     for bar in (0.5, 0.9, 0.95, 0.99, 0.999):
@@ -303,7 +303,7 @@ def report(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.Params
 
 def report_pairs(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.Params) -> None:
     """Of how many pairs a right pose, and a wrong one, would be accepted; by overlap those that gsmap proposes."""
-    p = probabilities(odds, bars)
+    p = probabilities(odds)
     yes = [q >= bars.min_probability and not contradicted(row, bars) for row, q in zip(rows, p, strict=True)]
     one_place = {tuple(row.pair) for row in rows if row.error is not None}
     accepted = {tuple(row.pair) for row, y in zip(rows, yes, strict=True) if y and row.right}
@@ -320,9 +320,9 @@ def report_pairs(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.
         print(f"  overlap {low:.0%} to {min(high, 1):.0%}: {share}")
 
 
-def probabilities(odds: np.ndarray, bars: verdict.Params) -> np.ndarray:
+def probabilities(odds: np.ndarray) -> np.ndarray:
     """Of log-odds without a prior, under the verdict's."""
-    out: np.ndarray = 1 / (1 + np.exp(-(odds + np.log(bars.prior / (1 - bars.prior)))))
+    out: np.ndarray = 1 / (1 + np.exp(-(odds + np.log(verdict.PRIOR / (1 - verdict.PRIOR)))))
     return out
 
 

@@ -27,6 +27,7 @@ from gsmap.map.stages.localize import parse_near
 from gsmap.map.stages.register import placed_scenes
 from gsmap.methods import RecipeKey
 from gsmap.register import SceneView
+from gsmap.register.conclusion import SAME_DISTANCE_M, SAME_LOG_SCALE, SAME_ROTATION_DEG
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Registration, Scene
 from gsmap.types.progress import StageProgress
@@ -133,7 +134,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
         if sought.coloured:
             found.append(register.register_pair(target, source, settings.register))
         else:
-            found.append(register.register_by_shape(target, source, settings.by_shape, settings.register))
+            found.append(register.register_by_shape(target, source, settings.register))
         if found[-1].status == "accepted":
             supports.append(Support.of(poses.poses[scene], found[-1]))
     told(1.0, "done")
@@ -141,8 +142,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     if supports:
         names = {scene.id: scene.name for scene in scenes.values()}
         metres = metres_of_scenes(store, settings, poses)[supports[0].scene]
-        same = settings.register.same_pose
-        one = OnePlace(same.rotation_deg, same.distance_m / metres, same.log_scale, AGREE_SIGMAS)
+        one = OnePlace(SAME_ROTATION_DEG, SAME_DISTANCE_M / metres, SAME_LOG_SCALE, AGREE_SIGMAS)
         joined = join(supports, source.centre, one, names)
     seconds = time.process_time() - began
     remarks = (*graph.notes, *notes) if sought.coloured else tuple(notes)

@@ -217,7 +217,11 @@ def _register_candidates(work: _Work, known: Known) -> list[Registration]:
         ask(store, work.described, new, params, work.progress)
     ties = Counter(scene for pair in known.held.values() for scene in pair)
     # Whose list was not gone down to its end, and who has lost edges since.
-    short = {s for s, (_, left) in asked.items() if s in keys and (left is None or (left and ties[s] < params.enough))}
+    short = {
+        s
+        for s, (_, left) in asked.items()
+        if s in keys and (left is None or (left and ties[s] < params.max_edges_per_scene))
+    }
     lookups = store.indexes.lookups(short.union(new))
     lists = {
         one.scene: [directed(one.scene, c.scene) for c in one.candidates[: params.top_k] if c.scene in work.described]

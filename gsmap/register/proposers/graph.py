@@ -20,61 +20,46 @@ SCALES = True
 PACKAGES = ()
 
 
+_TOP_K = {"objects": 5}  # most similar nodes that each node is paired with; 1 for other kinds
+_SIGMA_M = {"objects": 0.05}  # of positions; other kinds as landmarks, whose centres are better defined
+_NUM_SCALES = 6  # scales tried of those voted for, over all pairs of layers
+_MIN_VOTE_SHARE = 0.5  # of the best scale's score
+# With fewer candidates the votes of a scale have next to no noise; with more, where gravity is known, a scale below
+# _MIN_VOTE counts as noise (measured: landmarks of places apart mostly stay below 3.3, overlapping ones start at 7.2;
+# weight-free objects of places apart stay below 1.3).
+_NOISY_CANDIDATES = 500
+_MIN_VOTE, _MIN_VOTE_OBJECTS = 3.5, 1.5
+_MIN_INLIERS = 5  # fewer compatible correspondences propose nothing
+# Correspondences within so many standard deviations of their distance, or within the radius, agree with a pose.
+_INLIER_SIGMAS = 4.0
+_MIN_INLIER_RADIUS_M = 0.15
+RIVAL_SHARE = 0.6  # a clique that disagrees with the best one is a rival from this share of its size on
+_RIVAL_DISTANCE_M = 1.0  # correspondences that the best pose leaves farther apart disagree with it
+# Nodes may be confused by a rival where they are as similar as all but this share of the best pose's correspondences.
+_TWIN_QUANTILE = 0.1
+_MAX_TWINS = 2400  # the most similar pairs of such nodes
+_RIVAL_SEARCHES = 3  # cliques among them that are tried until one implies a pose
+
+
 @dataclass(frozen=True)
 class Params:
-    """How the nodes of two graphs propose poses.
+    """Pose proposals by matching two scene graphs.
 
     Args:
-        kinds: of nodes, that propose; each on its own.
-        landmarks: how landmarks are paired.
-        objects: how objects are paired.
-        context: what is told of objects' surroundings.
-        consistency: how pairs are tested against each other; its sigma is that of landmarks.
-        objects_sigma_m: the same for objects, whose centres are less well defined.
-        scale: the vote, where the scale is not known.
-        num_scales: scales tried of those voted for, over all pairs of layers.
-        min_vote_share: a scale that stands out by less than this share of the best one's score is not tried.
-        noisy_candidates: votes of fewer candidates than this make no noise to speak of; of more, where gravity is
-            known, a scale counts as noise below the two bars that follow.
-        min_vote: the bar for landmarks (measured: places apart mostly stay below 3.3, overlapping ones start at 7.2).
-        objects_min_vote: the bar for objects (weight-free objects of places apart stay below 1.3).
-        step_limit: of a clique search, about two nanoseconds each; a search that stops there is not exact.
-        min_inliers: fewer compatible correspondences propose nothing.
-        inlier_sigmas: correspondences within this many standard deviations of their distance agree with a pose ...
-        min_inlier_radius_m: ... and within this distance whatever the standard deviation.
-        rival_share: a clique that disagrees with the best is a rival from this share of its size on.
-        rival_distance_m: correspondences that the best pose leaves farther apart than this disagree with it.
-        twin_quantile: nodes are alike, and may be taken for each other by a rival, where they are as similar as all but
-            this share of the best pose's own correspondences [0, 1]; smaller finds more rivals.
-        rival_searches: cliques among them that are looked at until one implies a pose [1, ...].
-        max_twins: pairs of nodes that are alike, of which so many, the most similar, take part in that search.
-        pose: which cliques imply a pose.
-        background: what correspondences would do of themselves, for the number of false alarms.
+        kinds: Kinds of nodes that propose poses, each on its own: ``landmarks``, ``objects`` or both.
+        context: Context of objects.
+        consistency: Pairwise test of correspondences.
+        max_correspondences: Number of the most similar candidate correspondences, at least 4, that are kept; a larger
+            value finds more matches and is slower.
+        step_limit: Number of steps of a clique search, at least 1, about two nanoseconds each; a search that reaches
+            the limit returns the largest clique found so far.
     """
 
     kinds: tuple[str, ...] = ("landmarks", "objects")
-    landmarks: correspondences.Params = field(default_factory=correspondences.Params)
-    objects: correspondences.Params = field(default_factory=lambda: correspondences.Params(top_k=5))
     context: context.Params = field(default_factory=context.Params)
     consistency: consistency.Params = field(default_factory=consistency.Params)
-    objects_sigma_m: float = 0.05
-    scale: scale.Params = field(default_factory=scale.Params)
-    num_scales: int = 6
-    min_vote_share: float = 0.5
-    noisy_candidates: int = 500
-    min_vote: float = 3.5
-    objects_min_vote: float = 1.5
+    max_correspondences: int = correspondences.MAX_CORRESPONDENCES
     step_limit: int = 2_000_000
-    min_inliers: int = 5
-    inlier_sigmas: float = 4.0
-    min_inlier_radius_m: float = 0.15
-    rival_share: float = 0.6
-    rival_distance_m: float = 1.0
-    twin_quantile: float = 0.1
-    rival_searches: int = 3
-    max_twins: int = 2400
-    pose: pose.Params = field(default_factory=pose.Params)
-    background: a_contrario.Params = field(default_factory=a_contrario.Params)
 
 
 def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:
@@ -97,8 +82,8 @@ def propose_by_kind(
     params = params or Params()
     pairs = comparable_layers(target, source, kind, with_scale=with_scale)
     matchings = [Matching(a, b, target, source, kind, params, with_scale) for a, b in pairs]
-    matchings = [m for m in matchings if len(m.matches) >= params.min_inliers]
-    trials = _voted(matchings, params) if with_scale else [(matching, 1.0) for matching in matchings]
+    matchings = [m for m in matchings if len(m.matches) >= _MIN_INLIERS]
+    trials = _voted(matchings) if with_scale else [(matching, 1.0) for matching in matchings]
     found = [(p, m, s) for m, s in trials if (p := m.pose_of_largest_clique(m.matches, s)) is not None]
     if not found:
         return []
@@ -110,7 +95,7 @@ def propose_by_kind(
         if again is not None and again.num_inliers > best.num_inliers:
             best = again
     # The rival: the best clique once everything that agrees with this pose is out of the way.
-    at_least = int(np.ceil(params.rival_share * best.num_inliers))
+    at_least = int(np.ceil(RIVAL_SHARE * best.num_inliers))
     rival = matching.pose_of_largest_clique(matching.disagreeing(best.S_target_source, matching.matches), s, at_least)
     share = 0.0 if rival is None else rival.num_inliers / best.num_inliers
     assert best.support is not None
@@ -155,11 +140,11 @@ def _of_working_size(
     return near or pairs
 
 
-def _voted(matchings: list[Matching], params: Params) -> list[tuple[Matching, float]]:
+def _voted(matchings: list[Matching]) -> list[tuple[Matching, float]]:
     """The scales most voted for over all pairs of layers, each with the pair that votes for it; best first."""
     votes = [(score, i, s) for i, matching in enumerate(matchings) for s, score in matching.vote()]
-    votes = sorted(votes, reverse=True)[: params.num_scales]
-    return [(matchings[i], s) for score, i, s in votes if score > params.min_vote_share * votes[0][0]]
+    votes = sorted(votes, reverse=True)[:_NUM_SCALES]
+    return [(matchings[i], s) for score, i, s in votes if score > _MIN_VOTE_SHARE * votes[0][0]]
 
 
 class Matching:
@@ -182,39 +167,46 @@ class Matching:
         if kind == "objects":
             a, b = context.with_context(a, b, params.context)
         self.a, self.b, self.kind, self.params, self.with_scale = a, b, kind, params, with_scale
-        sigma = params.objects_sigma_m if kind == "objects" else params.consistency.sigma_m
-        self.test = replace(params.consistency, sigma_m=sigma)
-        self.radius_m = max(params.inlier_sigmas * np.sqrt(2.0) * sigma, params.min_inlier_radius_m)
+        self.sigma_m = _SIGMA_M.get(kind, consistency.SIGMA_M)
+        self.radius_m = max(_INLIER_SIGMAS * np.sqrt(2.0) * self.sigma_m, _MIN_INLIER_RADIUS_M)
         # A rigid pose needs one metre for both scenes, whatever each was guessed to be.
         common = float(np.sqrt(a.unit_m * b.unit_m))
         self.units_m = (a.unit_m, b.unit_m) if with_scale else (common, common)
         self.ups = (target.up, source.up)
-        pairing = params.objects if kind == "objects" else params.landmarks
-        self.matches = correspondences.correspondences(a, b, pairing, units_m=self.units_m, ups=self.ups)
+        self.matches = correspondences.correspondences(
+            a,
+            b,
+            top_k=_TOP_K.get(kind, 1),
+            max_correspondences=params.max_correspondences,
+            units_m=self.units_m,
+            ups=self.ups,
+        )
 
     @cached_property
     def background(self) -> a_contrario.BackgroundModel:
         points = self.b.positions * self.units_m[1]
         heights = None if self.ups[0] is None or self.ups[1] is None else points @ self.ups[1]
-        return a_contrario.BackgroundModel(
-            self.a, self.b, points, self.matches, self.params.background, source_heights=heights
-        )
+        return a_contrario.BackgroundModel(self.a, self.b, points, self.matches, source_heights=heights)
 
     def vote(self) -> list[tuple[float, float]]:
         """Scales worth a trial and how far each stands out, best first."""
-        scales = scale.vote_scales(self.matches, self.params.scale)
-        if len(self.matches) < self.params.noisy_candidates or self.matches.target_heights is None:
+        scales = scale.vote_scales(self.matches)
+        if len(self.matches) < _NOISY_CANDIDATES or self.matches.target_heights is None:
             return scales
-        noise = self.params.objects_min_vote if self.kind == "objects" else self.params.min_vote
-        return [(s, score) for s, score in scales if score >= noise]
+        min_vote = _MIN_VOTE_OBJECTS if self.kind == "objects" else _MIN_VOTE
+        return [(s, score) for s, score in scales if score >= min_vote]
+
+    def compatibility_graph(self, among: Correspondences, at_scale: float) -> np.ndarray:
+        """Bit rows of the compatibility graph of some correspondences (`consistency.consistency_graph`)."""
+        return consistency.consistency_graph(among, self.params.consistency, scale=at_scale, sigma_m=self.sigma_m)
 
     def pose_of_largest_clique(self, among: Correspondences, at_scale: float, at_least: int = 0) -> Proposal | None:
         """The pose of the largest clique among some of the correspondences, if it has so many members."""
         params = self.params
-        at_least = max(at_least, params.min_inliers)
+        at_least = max(at_least, _MIN_INLIERS)
         if len(among) < at_least:
             return None
-        compatibility = consistency.consistency_graph(among, self.test, scale=at_scale)
+        compatibility = self.compatibility_graph(among, at_scale)
         clique = maximum_clique(compatibility, params.step_limit, more_than=at_least - 1)
         if len(clique) < at_least:
             return None
@@ -237,14 +229,14 @@ class Matching:
 
     def with_twins(self, members: Correspondences) -> Matching:
         """The same layers with other candidates: all pairs as similar as some correspondences, that share an end."""
-        params, out = self.params, copy(self)
+        out = copy(self)
         out.__dict__.pop("background", None)
         out.matches = correspondences.as_similar(
             self.a,
             self.b,
             members,
-            params.twin_quantile,
-            params.max_twins,
+            _TWIN_QUANTILE,
+            _MAX_TWINS,
             units_m=self.units_m,
             ups=self.ups,
         )
@@ -253,15 +245,14 @@ class Matching:
     def disagreeing(self, S_target_source: Sim3, among: Correspondences) -> Correspondences:
         """Those of some correspondences that a pose leaves farther apart than a rival's may be."""
         moved = S_target_source.apply(among.source / self.units_m[1]) * self.units_m[0]
-        return among[np.linalg.norm(moved - among.target, axis=1) > self.params.rival_distance_m]
+        return among[np.linalg.norm(moved - among.target, axis=1) > _RIVAL_DISTANCE_M]
 
     def _fit(self, members: Correspondences) -> pose.PoseFit:
         return pose.fit_pose(
             members.target,
             members.source,
             with_scale=self.with_scale,
-            sigma_m=self.test.sigma_m,
-            params=self.params.pose,
+            sigma_m=self.sigma_m,
         )
 
     def in_metres(self, S_target_source: Sim3) -> Sim3:
@@ -323,13 +314,12 @@ class CliqueSupport:
         Returns:
             None where no rival has ``rival_share`` of the pose's correspondences.
         """
-        params = self.matching.params
         twins = self.matching.with_twins(self.members)
         own = int(a_contrario.agreeing(twins.matches, twins.in_metres(S_target_source), twins.radius_m).sum())
         left = twins.matches
         for S in (S_target_source, *others):
             left = twins.disagreeing(S, left)
-        for _ in range(params.rival_searches if own else 0):
+        for _ in range(_RIVAL_SEARCHES if own else 0):
             rival = twins.pose_of_largest_clique(left, self.scale)
             if rival is None or not isinstance(rival.support, CliqueSupport):
                 return None
@@ -340,7 +330,7 @@ class CliqueSupport:
                 share = inliers / own
                 return (
                     replace(rival, log_nfa=equal_nfa, runner_up=1.0 / share, support=support)
-                    if share >= params.rival_share
+                    if share >= RIVAL_SHARE
                     else None
                 )
             # Fronts are flat, and a mirrored set of their nodes may be larger than one that implies a pose.

@@ -18,19 +18,20 @@ SCALES = False
 PACKAGES = ("kiss_matcher",)  # it has no wheel for Python 3.13
 
 
+_MIN_INLIERS = 5  # fewer agreeing features propose nothing
+_MIN_CELLS = 50  # of each surface
+
+
 @dataclass(frozen=True)
 class Params:
     """Global matching of surfaces by KISS-Matcher.
 
     Args:
-        voxel_m: cell size at which features are computed.
-        min_inliers: fewer agreeing features propose nothing.
-        min_cells: a surface with fewer cells is not tried.
+        voxel_m: Size of the cells at which features are computed, in metres, positive; a larger value is faster and
+            more robust to noise, and misses details.
     """
 
     voxel_m: float = 0.15
-    min_inliers: int = 5
-    min_cells: int = 50
 
 
 def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:
@@ -48,7 +49,7 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
         raise MissingDependencyError("kiss_matcher is not installed") from error
 
     points_t, points_s = target.surface().coarse[0], source.surface().coarse[0]
-    if min(len(points_t), len(points_s)) < params.min_cells:
+    if min(len(points_t), len(points_s)) < _MIN_CELLS:
         return []
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(params.voxel_m))
     # Frames may lie far from their content; float32 inside the matcher does not forgive that.
@@ -56,7 +57,7 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
     with _one_core():
         solution = matcher.estimate((points_s - centre_s).astype(np.float32), (points_t - centre_t).astype(np.float32))
     inliers = int(matcher.get_num_final_inliers())
-    if not solution.valid or inliers < params.min_inliers:
+    if not solution.valid or inliers < _MIN_INLIERS:
         return []
     u, _, vt = np.linalg.svd(np.asarray(solution.rotation, dtype=np.float64))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt

@@ -25,44 +25,55 @@ _GREY = 1e-3  # range of lightness, less than a step of 8 bits: rounding errors 
 _LEAST_NOISE = 0.03  # of the radius: planes that fit better than this leave other terms their weight, as colours'
 
 
+_MIN_SIGMAS = 4.0  # of the distances between the planes: a smaller radius would cut off noise and hold the pose
+_MAX_ITERATIONS = 20  # Gauss-Newton steps at each radius
+_COLOUR_RADIUS_M = 0.1  # at larger radii lightness extrapolated in a tangent plane means nothing
+_OVERSTEP = 1.5  # factor on steps: pairs follow the pose only in part, so steps fall short, most along the scale
+_MAX_SCALE_CHANGE = 1.3  # from the start's scale; beyond it the start is returned
+
+
 @dataclass(frozen=True)
 class Params:
     """Colored ICP (after Park et al. 2017).
 
     Args:
-        radii_m: correspondence distances, coarse to fine.
-        least_sigmas: among radii that are fine enough for colour, none is taken that is smaller than this many standard
-            deviations of the distances between the planes: it would cut off noise, and hold the pose where it is.
-        iterations: Gauss-Newton steps at each radius.
-        colour_weight: how many standard deviations of the distances to the planes one of local colour counts for, at
-            fine radii: 1 were errors of colours as independent of each other as those of points, but a texture is
-            blurred or lit otherwise as a whole; 0 leaves colour out.
-        colour_radius_m: at radii beyond this colour is left out: lightness extrapolated so far in a tangent plane means
-            nothing.
-        max_points: cells of both surfaces together that take part at each radius.
-        tolerance: a radius is done with when a step moves the pairs by less than this share of it ...
-        last_tolerance: ... and the last one by less than this: from pose to pose pairs change, and steps shrink slowly.
-        overstep: factor on steps: pairs follow the pose only in part, so steps fall short, most of all along the scale.
-        max_scale_change: factor by which the scale may move away from the start's before the start is given back.
+        colour_weight: Weight of a colour residual relative to a distance residual, each in standard deviations, at
+            least 0; a larger value aligns textures more strongly and 0 ignores colour.
     """
 
-    radii_m: tuple[float, ...] = (0.4, 0.15, 0.06, 0.03)
-    least_sigmas: float = 4.0
-    iterations: int = 20
+    # 1 were errors of colours as independent of each other as those of points, but a texture is blurred or lit
+    # otherwise as a whole.
     colour_weight: float = 0.3
-    colour_radius_m: float = 0.1
-    max_points: tuple[int, ...] = (3000, 6000, 10_000, 40_000)
-    tolerance: float = 0.01
-    last_tolerance: float = 0.002
-    overstep: float = 1.5
-    max_scale_change: float = 1.3
 
     def __post_init__(self) -> None:
-        if len(self.radii_m) != len(self.max_points):
-            raise ConfigError(
-                f"colored_icp needs as many max_points as radii_m, got {len(self.max_points)} and {len(self.radii_m)}",
-                code="setting_mismatch",
-            )
+        if not self.colour_weight >= 0:
+            raise ConfigError(f"colour_weight must not be negative, got {self.colour_weight}", code="out_of_range")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The radii of one alignment, coarse to fine.
+
+    Args:
+        radii_m: correspondence distances.
+        max_points: cells of both surfaces together at each radius.
+        tolerance: a radius ends when a step moves the pairs by less than this share of it ...
+        last_tolerance: ... and the last radius by less than this: pairs change from pose to pose, and steps shrink
+            slowly.
+    """
+
+    radii_m: tuple[float, ...]
+    max_points: tuple[int, ...]
+    tolerance: float = 0.01
+    last_tolerance: float = 0.002
+
+
+FULL = Schedule((0.4, 0.15, 0.06, 0.03), (3000, 6000, 10_000, 40_000))
+SCHEDULES = {
+    "coarse": Schedule((0.4, 0.15), (3000, 6000), tolerance=0.02, last_tolerance=0.01),
+    "fine": Schedule((0.06, 0.03), (10_000, 40_000)),
+}
+"""The part of `FULL` that each pass of a registration runs."""
 
 
 def refine(
@@ -73,6 +84,7 @@ def refine(
     *,
     with_scale: bool = False,
     correspondences: Correspondences | None = None,
+    schedule: Schedule = FULL,
 ) -> Sim3:
     """Similarity (or rigid) pose that lays the source's cells on the target's planes and colours (both in metres).
 
@@ -94,15 +106,15 @@ def refine(
     centre = source.coarse[0].mean(0)
     last, noise, dim = np.inf, 0.0, 7 if with_scale else 6
     ties = None if correspondences is None else Ties(correspondences)
-    tolerances = (*[params.tolerance] * (len(params.radii_m) - 1), params.last_tolerance)
-    for radius, count, tolerance in zip(params.radii_m, params.max_points, tolerances, strict=True):
-        if last <= params.colour_radius_m:
-            radius = min(last, max(radius, params.least_sigmas * noise))
+    tolerances = (*[schedule.tolerance] * (len(schedule.radii_m) - 1), schedule.last_tolerance)
+    for radius, count, tolerance in zip(schedule.radii_m, schedule.max_points, tolerances, strict=True):
+        if last <= _COLOUR_RADIUS_M:
+            radius = min(last, max(radius, _MIN_SIGMAS * noise))
             if radius > _HARDLY_FINER * last:
                 continue
         last = radius
         pairs, degenerate = _Pairs(target, source, count, pose, radius, params), False
-        for iteration in range(params.iterations):
+        for iteration in range(_MAX_ITERATIONS):
             # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
             found = pairs.equations(pose, centre)
             if found.count < _FEWEST:
@@ -116,13 +128,13 @@ def refine(
             step = np.zeros(7)
             damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
             step[:dim] = -np.linalg.solve((system + damping)[:dim, :dim], gradient[:dim])
-            step *= params.overstep
+            step *= _OVERSTEP
             # No single step goes farther than the correspondences reach.
             step *= min(1.0, 0.1 / max(np.abs(step[:3]).max(), 1e-12), radius / max(np.abs(step[3:6]).max(), 1e-12))
             step[6] = np.clip(step[6], -0.05, 0.05)
             centred = pose @ Sim3(np.eye(3), centre)
             pose = retract(centred, step if with_scale else step[:6]) @ Sim3(np.eye(3), -centre)
-            if abs(np.log(pose.scale / start.scale)) > np.log(params.max_scale_change):
+            if abs(np.log(pose.scale / start.scale)) > np.log(_MAX_SCALE_CHANGE):
                 return start
             centre = centre + found.middle
             moved = np.r_[step[:3] * found.extent_m, step[3:6], step[6] * found.extent_m]
@@ -133,11 +145,11 @@ def refine(
 
 
 def colour_information(
-    target: Surface, source: Surface, pose: Sim3, centre: np.ndarray, params: Params
+    target: Surface, source: Surface, pose: Sim3, centre: np.ndarray, schedule: Schedule
 ) -> np.ndarray | None:
     """(7, 7) information about ``centre`` that colours add to a pair's plane distance at the last radius, in units of
     that distance's variance; None where too little overlaps."""
-    pairs = _Pairs(target, source, params.max_points[-1], pose, params.radii_m[-1], params)
+    pairs = _Pairs(target, source, schedule.max_points[-1], pose, schedule.radii_m[-1], Params())
     both, planes = (pairs.equations(pose, centre, coloured=c) for c in (True, False))
     return None if both.count < _FEWEST else (both.system - planes.system) / (2 * both.pairs)
 
@@ -167,7 +179,7 @@ class _Pairs:
         self._back = _Laid(source, target, count // 2, start.inverse(), backward=True)
         self._radius_m, self._params = radius_m, params
         grey = any(np.ptp(surface.lightness) < _GREY for surface in (target, source))
-        self.coloured = params.colour_weight > 0 and radius_m <= params.colour_radius_m and not grey
+        self.coloured = params.colour_weight > 0 and radius_m <= _COLOUR_RADIUS_M and not grey
         self._resolution_m = max(target.resolution_m, source.resolution_m)
 
     def equations(self, pose: Sim3, centre: np.ndarray, *, coloured: bool = True) -> _Equations:

@@ -11,18 +11,13 @@ from gsmap.types import Sim3
 VERSION = 1
 SCALES = False
 
+_RADII_M = (0.35, 0.12, 0.06)  # correspondence distances, one run each, coarse to fine
+_MAX_ITERATIONS = 20  # of each run
+
 
 @dataclass(frozen=True)
 class Params:
-    """Generalised ICP (Segal et al. 2009).
-
-    Args:
-        radii_m: correspondence distances, one run each, coarse to fine.
-        max_iterations: of each run.
-    """
-
-    radii_m: tuple[float, ...] = (0.35, 0.12, 0.06)
-    max_iterations: int = 20
+    """Generalised ICP has no settings."""
 
 
 def refine(
@@ -32,5 +27,4 @@ def refine(
 
     Surfaces are in metres. A start that carries a scale keeps it. Returns the start where too little overlaps.
     """
-    params = params or Params()
-    return align("GICP", target, source, start, radii_m=params.radii_m, max_iterations=params.max_iterations)
+    return align("GICP", target, source, start, radii_m=_RADII_M, max_iterations=_MAX_ITERATIONS)

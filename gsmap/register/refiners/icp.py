@@ -11,6 +11,8 @@ from gsmap.types import Sim3
 VERSION = 1
 SCALES = False
 
+_MAX_ITERATIONS = 50  # of each run
+
 
 @dataclass(frozen=True)
 class Params:
@@ -20,13 +22,12 @@ class Params:
     the pose drifts along walls and floors (measured in a room: 1.3 m at 0.35, 9 cm at 0.12).
 
     Args:
-        radii_m: correspondence distances, one run each, coarse to fine.
-        max_iterations: of each run.
-        means: align the surface Gaussians' own means, as Graph-GSReg does, and not what they average to in cells.
+        radii_m: Largest correspondence distances in metres, positive, one run each, coarse to fine; larger values
+            reach farther and drift more.
+        means: Align the means of all surface Gaussians, as Graph-GSReg does, instead of their averages over cells.
     """
 
     radii_m: tuple[float, ...] = (0.12, 0.06)
-    max_iterations: int = 50
     means: bool = False
 
 
@@ -44,6 +45,6 @@ def refine(
         source,
         start,
         radii_m=params.radii_m,
-        max_iterations=params.max_iterations,
+        max_iterations=_MAX_ITERATIONS,
         every_point=params.means,
     )

@@ -15,33 +15,21 @@ from gsmap.types import Cameras, Gaussians, Sim3
 VERSION = 1
 SCALES = True
 
+_NUM_VIEWS = 6  # cameras of the target that see most of the source
+_IMAGE_SIZE_PX = 128  # longer side of the renders
+MAX_ITERATIONS = 3  # Gauss-Newton steps
+# Probes of the derivative by rotation, translation and log scale: each moves a pixel at room distance about equally.
+_STEP_RAD = 0.003
+_STEP_M = 0.006
+_STEP_LOG = 0.003
+_DEPTH_TOLERANCE = 0.1  # share of the depth; pixels that differ by more show different surfaces and are ignored
+_MIN_ALPHA = 0.7  # fainter pixels of either render are ignored
+_MIN_PIXELS = 500  # with fewer pixels left the start is returned
+
 
 @dataclass(frozen=True)
 class Params:
-    """Alignment of renders.
-
-    Args:
-        num_views: cameras of the target that see most of the source.
-        image_size_px: longer side of the renders.
-        iterations: Gauss-Newton steps.
-        step_rad: probe of the derivative by rotation; about a pixel at room distance, as are the other two.
-        step_m: probe of the derivative by translation.
-        step_log: probe of the derivative by the logarithm of the scale.
-        depth_tolerance: pixels whose two depths differ by more than this share show different surfaces and do not
-            count.
-        min_alpha: pixels fainter than this in either render do not count.
-        min_pixels: with fewer pixels that count, the start is given back.
-    """
-
-    num_views: int = 6
-    image_size_px: int = 128
-    iterations: int = 3
-    step_rad: float = 0.003
-    step_m: float = 0.006
-    step_log: float = 0.003
-    depth_tolerance: float = 0.1
-    min_alpha: float = 0.7
-    min_pixels: int = 500
+    """Alignment of renders has no settings."""
 
 
 def refine(
@@ -64,7 +52,6 @@ def refine(
         source.gaussians,
         target.cameras,
         own,
-        params or Params(),
         unit_m=unit_t,
         with_scale=with_scale,
     )
@@ -80,7 +67,6 @@ def _aligned(
     source: Gaussians,
     cameras: Cameras,
     start: Sim3,
-    params: Params,
     *,
     unit_m: float,
     with_scale: bool,
@@ -88,12 +74,12 @@ def _aligned(
     """The same between the scenes' own units; ``unit_m`` metres per unit of the target."""
     from gsmap.render import render
 
-    cameras = _most_seeing(cameras.resized(params.image_size_px), source, start, params.num_views)
+    cameras = _most_seeing(cameras.resized(_IMAGE_SIZE_PX), source, start, _NUM_VIEWS)
     if not len(cameras):
         return start
     seen = render(target, cameras, backend="native")
     dim = 7 if with_scale else 6
-    probes = np.r_[np.full(3, params.step_rad), np.full(3, params.step_m / unit_m / start.scale), params.step_log][:dim]
+    probes = np.r_[np.full(3, _STEP_RAD), np.full(3, _STEP_M / unit_m / start.scale), _STEP_LOG][:dim]
     centre = np.median(source.means, axis=0).astype(np.float64)
 
     def residual(pose: Sim3, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -101,8 +87,8 @@ def _aligned(
         shot = render(source, transform_cameras(cameras, pose.inverse()), backend="native")
         if mask is None:
             depth = shot.depth * pose.scale
-            mask = (seen.alpha > params.min_alpha) & (shot.alpha > params.min_alpha)
-            mask &= np.abs(depth - seen.depth) < params.depth_tolerance * seen.depth
+            mask = (seen.alpha > _MIN_ALPHA) & (shot.alpha > _MIN_ALPHA)
+            mask &= np.abs(depth - seen.depth) < _DEPTH_TOLERANCE * seen.depth
         return shot.colour[mask].astype(np.float64), mask
 
     def cost(colours: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -112,9 +98,9 @@ def _aligned(
         return difference, weights, spread
 
     pose = start
-    for _ in range(params.iterations):
+    for _ in range(MAX_ITERATIONS):
         colours, mask = residual(pose, None)
-        if mask.sum() < params.min_pixels:
+        if mask.sum() < _MIN_PIXELS:
             return start
         wanted = seen.colour[mask].astype(np.float64)
         difference, weights, spread = cost(colours, wanted)
