@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap.geometry.metres import PLAUSIBLE_M
+from gsmap.geometry.metric_scale import PLAUSIBLE_M
 from gsmap.geometry.projection import in_image, project
 from gsmap.types import Cameras
 

@@ -1,4 +1,4 @@
-"""How honest covariances are: normalised squared errors (NEES) against the chi-square they should follow."""
+"""Compare normalized estimation errors squared (NEES) of edges and poses with their chi-square distribution."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from gsmap.types import Sim3
 from gsmap.types.rows import NeesRow
 
 SURE_LOG_SCALE = 1e-6
-"""Standard deviation at which a rigid pose is taken to claim its scale, which its row leaves open."""
+"""Standard deviation that a rigid pose claims for its scale, which its covariance leaves open."""
 _SAME_SCALE = 1e-9
 _THREE_SIGMA = 0.9973002039367398  # of a normal distribution
 
 
 @dataclass(frozen=True)
 class Nees:
-    """One squared error over its covariance.
+    """Normalized estimation error squared.
 
     Args:
-        value: follows a chi-square with ``dof`` degrees of freedom where the covariance is honest.
-        dof: 7, or 6 where both the pose and the truth are rigid, so that there is no scale to be wrong in.
+        value: follows a chi-square distribution with ``dof`` degrees of freedom if the covariance is right.
+        dof: 7, or 6 where both the pose and the truth are rigid.
     """
 
     value: float
@@ -32,11 +32,11 @@ class Nees:
 
 
 def truth_covariance(sigma_rad: float, sigma: float, centroid: np.ndarray) -> np.ndarray:
-    """(7, 7) covariance on the source side of a true ``S_target_source``, whose two scenes' truths are not exact.
+    """Return the (7, 7) covariance on the source side of a true ``S_target_source`` from the errors of both truths.
 
     Args:
-        sigma_rad, sigma: standard deviations of each scene's truth, rotation and translation (source's unit), about ...
-        centroid: (3,) ... the middle of the source, in its own frame.
+        sigma_rad, sigma: standard deviations of each scene's rotation and translation (source's unit) about ...
+        centroid: (3,) ... the centroid of the source, in its own frame.
     """
     variances = 2.0 * np.r_[np.full(3, sigma_rad**2), np.full(3, sigma**2), 0.0]
     carry = Similarities.stack([Sim3(np.eye(3), np.asarray(centroid, dtype=np.float64))]).adjoint()[0]
@@ -45,9 +45,9 @@ def truth_covariance(sigma_rad: float, sigma: float, centroid: np.ndarray) -> np
 
 
 def nees_of_edge(estimated: Sim3, information: np.ndarray, true: Sim3, of_truth: np.ndarray | None = None) -> Nees:
-    """NEES of ``S_target_source`` from its (7, 7) information on the source side.
+    """Return the NEES of ``S_target_source`` from its (7, 7) information on the source side.
 
-    A rigid edge between captures whose scales truly differ is judged by its scale row, too: it claimed to know.
+    The scale of a rigid edge counts where the true scale is not 1.
 
     Args:
         of_truth: (7, 7) covariance of the truth itself (`truth_covariance`); exact where None.
@@ -61,7 +61,7 @@ def nees_of_edge(estimated: Sim3, information: np.ndarray, true: Sim3, of_truth:
 
 
 def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3, of_truth: np.ndarray | None = None) -> Nees:
-    """NEES of a scene's pose in the scene that holds the frame, ``S_anchor_scene``.
+    """Return the NEES of a scene's pose relative to the anchor, ``S_anchor_scene``.
 
     Args:
         covariance: (7, 7) relative to the anchor (`relative_covariance`), on the scene's side.
@@ -81,14 +81,14 @@ def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3, of_truth: 
 
 
 def relative_covariance(estimated: Sim3, covariance: np.ndarray, of_anchor: np.ndarray) -> np.ndarray | None:
-    """(7, 7) covariance of ``S_anchor_scene`` on the scene's side, from those of the scene and its anchor in the map.
+    """Return the (7, 7) covariance of ``S_anchor_scene`` on the scene's side, from those of the scene and its anchor.
 
-    The optimiser holds an anchor by a prior that is a little soft, which every other scene's covariance contains.
+    The optimizer fixes an anchor by a slightly soft prior, which every other scene's covariance contains.
 
     Returns:
-        None where the anchor is not held so: where priors hold the frame, scenes share an error of unknown size.
+        None where the anchor is not fixed so: where pose priors fix the frame, scenes share an error of unknown size.
     """
-    if not _is_held(of_anchor):
+    if not _is_anchor_prior(of_anchor):
         return None
     carry = Similarities.stack([estimated.inverse()]).adjoint()[0]
     relative: np.ndarray = covariance - carry @ of_anchor @ carry.T
@@ -96,8 +96,8 @@ def relative_covariance(estimated: Sim3, covariance: np.ndarray, of_anchor: np.n
     return relative if np.linalg.eigvalsh(relative[:known, :known])[0] > 0 else None
 
 
-def _is_held(covariance: np.ndarray) -> bool:
-    """Whether a covariance is a gauge's: the same in every direction, and nothing correlated."""
+def _is_anchor_prior(covariance: np.ndarray) -> bool:
+    """Return whether a covariance is that of an anchor's prior: isotropic and uncorrelated."""
     variances = np.diag(covariance)
     off = covariance - np.diag(variances)
     small = np.abs(off) <= 1e-3 * np.sqrt(np.outer(variances, variances)) + 1e-15
@@ -107,7 +107,7 @@ def _is_held(covariance: np.ndarray) -> bool:
 
 
 def nees_rows(of: str, found: Sequence[Nees]) -> tuple[NeesRow, ...]:
-    """A row for each number of degrees of freedom: what was measured beside what an honest covariance would show."""
+    """Return one row per number of degrees of freedom: measured statistics and their expected values."""
     rows = []
     for dof in sorted({one.dof for one in found}):
         values = np.array([one.value for one in found if one.dof == dof])
@@ -126,7 +126,7 @@ def nees_rows(of: str, found: Sequence[Nees]) -> tuple[NeesRow, ...]:
 
 
 def _error(estimated: Sim3, true: Sim3) -> np.ndarray:
-    """(7,) the tangent on the source side that makes the estimated pose the true one."""
+    """Return the (7,) tangent on the source side from the estimated to the true pose."""
     error: np.ndarray = (Similarities.stack([estimated]).inverse() @ Similarities.stack([true])).log()[0]
     return error
 

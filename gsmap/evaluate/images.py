@@ -1,4 +1,4 @@
-"""How alike two pictures are: PSNR, SSIM, LPIPS."""
+"""Compare two images by PSNR, SSIM and LPIPS."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _SSIM_RADIUS_PX = 5
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of images (H, W, 3) with values in [0, 1]; infinite where they are equal."""
+    """Return the peak signal-to-noise ratio in dB of images (H, W, 3) in [0, 1]; infinite for equal ones."""
     image, reference = _pair(image, reference)
     error = np.mean((image - reference) ** 2)
     return float(-10 * np.log10(error)) if error > 0 else float("inf")
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Structural similarity of images (H, W, 3) with values in [0, 1], mean over channels and pixels.
+    """Return the structural similarity of images (H, W, 3) in [0, 1], averaged over channels and pixels.
 
     Wang et al. 2004: an 11 x 11 Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03, only where the window fits.
 
@@ -52,16 +52,16 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 class Lpips:
-    """Learned perceptual distance (Zhang et al. 2018) by a network the user supplies; 0 is alike.
+    """Learned perceptual distance (Zhang et al. 2018) by a network that the user supplies; 0 for equal images.
 
     Args:
         path: an ONNX file with two image inputs (1, 3, H, W), RGB in [-1, 1], whose first output is the distance.
-        limits: what it may take.
+        limits: of memory and time.
 
     Raises:
-        MissingDependencyError: no file was given: its weights are not ours to ship.
+        MissingDependencyError: no file was given; gsmap does not ship the weights.
         NotFoundError: there is no such file.
-        InputError: the file is no such network, or goes beyond the limits.
+        InputError: the file is no such network, or exceeds the limits.
     """
 
     def __init__(self, path: str | Path | None, limits: ModelLimits | None = None) -> None:
@@ -80,7 +80,7 @@ class Lpips:
             )
 
     def __call__(self, image: np.ndarray, reference: np.ndarray) -> float:
-        """Distance of images (H, W, 3) with values in [0, 1]."""
+        """Return the distance of images (H, W, 3) with values in [0, 1]."""
         pair = [np.ascontiguousarray(v.transpose(2, 0, 1)[None] * 2 - 1, np.float32) for v in _pair(image, reference)]
         try:
             return float(np.mean(self._model.run(None, dict(zip(self._inputs, pair, strict=True)))[0]))

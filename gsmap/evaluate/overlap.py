@@ -1,4 +1,4 @@
-"""True overlap: how much of two captures is one surface, by their true poses."""
+"""Compute the true overlap of captures from their true poses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmap.types import Gaussians, Sim3
 
-_KEPT = 32  # search trees in memory at once
+_CACHED_TREES = 32
 
 
 RADIUS_M = 0.08  # a Gaussian coincides with a capture that has a Gaussian within this distance
@@ -19,7 +19,7 @@ _MAX_SCALE_M = 0.3  # ... and their largest standard deviation
 
 
 def solid_centres(gaussians: Gaussians, S_scene_world: Sim3) -> np.ndarray:
-    """(N, 3) centres of the opaque, not huge Gaussians in the truth's world, in metres."""
+    """Return the (N, 3) centres of surface Gaussians (opaque, not huge) in the true world frame, in metres."""
     size_m = gaussians.scales.max(1, initial=0) / S_scene_world.scale
     keep = (gaussians.opacities > _MIN_OPACITY) & (size_m < _MAX_SCALE_M)
     return S_scene_world.inverse().apply(gaussians.means[keep])
@@ -28,9 +28,10 @@ def solid_centres(gaussians: Gaussians, S_scene_world: Sim3) -> np.ndarray:
 def true_overlaps(
     scenes: Sequence[str], centres: Callable[[str], np.ndarray], radius_m: float = RADIUS_M
 ) -> dict[frozenset[str], float]:
-    """True overlap of each pair: the smaller of both directions' share of centres that coincide with the other capture.
+    """Return the true overlap of each pair: the share of centres that coincide with the other capture, the smaller of
+    both directions.
 
-    Only pairs whose boxes meet are searched, so the cost of a large place grows with its pairs that could overlap.
+    Only pairs whose boxes intersect are searched.
 
     Args:
         scenes: their ids.
@@ -39,11 +40,11 @@ def true_overlaps(
     """
     from scipy.spatial import cKDTree
 
-    @lru_cache(_KEPT)
+    @lru_cache(_CACHED_TREES)
     def tree_of(scene: str) -> Any:
         return cKDTree(centres(scene))
 
-    boxes = np.full((len(scenes), 2, 3), np.nan)  # of a scene without solid centres: meets nothing
+    boxes = np.full((len(scenes), 2, 3), np.nan)  # scenes without surface overlap nothing
     for row, scene in enumerate(scenes):
         points = tree_of(scene).data
         if len(points):
@@ -61,7 +62,7 @@ def true_overlaps(
 
 
 def _share(tree: Any, other: Any, radius_m: float) -> float:
-    """The share of one's points that lie within the radius of a point of the other."""
+    """Return the share of one capture's points within the radius of a point of the other."""
     points, low, high = tree.data, other.mins - radius_m, other.maxes + radius_m
     inside = points[((points >= low) & (points <= high)).all(1)]
     distance, _ = other.query(inside, distance_upper_bound=radius_m)

@@ -1,4 +1,4 @@
-"""How far an estimated similarity is from the true one: the field's figures, and metres where they matter."""
+"""Compute the errors of estimated similarities: RRE, RTE, RSE, ATE, and the error at the centroid."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class PoseError:
 
     Args:
         rre_deg: relative rotation error, the angle of ``R^T R_hat``.
-        rte: relative translation error as GaussReg defines it, ``|t/s - t_hat/s_hat| / |t/s|``: no unit, and smaller
-            the further apart the two frames' origins happen to be.
+        rte: relative translation error as GaussReg defines it, ``|t/s - t_hat/s_hat| / |t/s|``; it depends on
+            the distance of the frames' origins.
         rse: relative scale error ``|s - s_hat| / s``.
-        centroid_m: distance between where the two poses put the source scene's centre, in the target's unit. The
-            figure to trust: it does not depend on where a frame's origin lies.
+        centroid_m: distance between the source's centroid under both poses, in the target's unit; it does not depend
+            on the frames' origins.
     """
 
     rre_deg: float
@@ -34,7 +34,7 @@ class PoseError:
 
 
 def scene_centroid(gaussians: Gaussians, min_opacity: float = 0.3) -> np.ndarray:
-    """(3,) median of the opaque Gaussians' centres: the point at which translation errors are measured."""
+    """Return the (3,) median of the opaque Gaussians' centres, at which translation errors are measured."""
     opaque = gaussians.means[gaussians.opacities > min_opacity]
     if not len(opaque):
         raise InputError(
@@ -44,7 +44,7 @@ def scene_centroid(gaussians: Gaussians, min_opacity: float = 0.3) -> np.ndarray
 
 
 def pose_error(estimated: Sim3, true: Sim3, source_centroid: np.ndarray) -> PoseError:
-    """Errors of an estimated ``S_target_source``; ``source_centroid`` (3,) is in the source's frame."""
+    """Return the errors of an estimated ``S_target_source``; ``source_centroid`` (3,) is in the source's frame."""
     t_true, t_estimated = true.translation / true.scale, estimated.translation / estimated.scale
     length = float(np.linalg.norm(t_true))
     off = float(np.linalg.norm(t_true - t_estimated))
@@ -58,14 +58,14 @@ def pose_error(estimated: Sim3, true: Sim3, source_centroid: np.ndarray) -> Pose
 
 @dataclass(frozen=True)
 class RegistrationSummary:
-    """Figures over many pairs.
+    """Statistics of many pairs.
 
     Args:
-        num_pairs: pairs that had a pose to find.
-        num_estimated: pairs that got one.
+        num_pairs: pairs with a true pose.
+        num_estimated: pairs with an estimated pose.
         mean_rre_deg, mean_rte, mean_rse: plain means over the estimated pairs, bad ones included (GaussReg).
         median_rre_deg, median_centroid_m, worst_rre_deg, worst_centroid_m: over the estimated pairs.
-        recall: by threshold, the share of all pairs within it; a pair without an estimate counts as missed.
+        recall: share of all pairs within each threshold; pairs without an estimate count as missed.
     """
 
     num_pairs: int
@@ -81,7 +81,7 @@ class RegistrationSummary:
 
 
 def summarise(errors: Sequence[PoseError | None]) -> RegistrationSummary:
-    """Means, medians and recall of many pairs; None stands for a pair that got no pose.
+    """Compute means, medians and recall of many pairs; None stands for a pair without an estimate.
 
     Recall at RRE 5 and 10 degrees, RTE 0.1 and 0.2, RSE 0.1 and 0.2 (GaussReg), and for both angle and metres at once:
     ``coarse`` (5 degrees, 0.3 m), ``fine`` (1 degree, 5 cm).
@@ -122,15 +122,14 @@ def summarise(errors: Sequence[PoseError | None]) -> RegistrationSummary:
 def absolute_trajectory_error(
     estimated: np.ndarray, true: np.ndarray, *, align: str = "rigid", segments: Sequence[np.ndarray] | None = None
 ) -> float:
-    """ATE: root mean square distance of estimated positions from true ones after one alignment.
+    """Return the absolute trajectory error (ATE): root mean square distance of aligned estimated and true positions.
 
-    Graph-GSReg reports ATE without defining it; here it is the field's (Sturm et al. 2012) over the camera centres of
-    all scenes, moved into the map by their estimated poses.
+    As Sturm et al. 2012; Graph-GSReg reports ATE without a definition.
 
     Args:
         estimated, true: (N, 3) positions in their own frames.
         align: ``rigid``, ``similarity`` or ``none``.
-        segments: index arrays to align one by one (components share no frame); default all at once.
+        segments: index arrays of the positions to align together (components share no frame); default: all.
     """
     estimated, true = np.asarray(estimated, float), np.asarray(true, float)
     if estimated.shape != true.shape or estimated.ndim != 2 or estimated.shape[1] != 3 or not len(true):
@@ -147,6 +146,6 @@ def absolute_trajectory_error(
 
 
 def _align(true: np.ndarray, estimated: np.ndarray, with_scale: bool) -> np.ndarray:
-    if len(true) < 3:  # Fewer than three points fix no rotation: only their centres can be laid together.
+    if len(true) < 3:  # Fewer than three points fix no rotation, so only their centroids are aligned.
         return estimated - estimated.mean(0) + true.mean(0)
     return umeyama(true, estimated, with_scale=with_scale).apply(estimated)

@@ -1,4 +1,4 @@
-"""How well Gaussians reproduce pictures: a capture's own photographs, or renders of the capture itself."""
+"""Compare renders of Gaussians with reference images: photographs, or renders of the capture itself."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
 
 @dataclass(frozen=True, eq=False)
-class Likeness:
-    """Figures per picture, in the order of ``names``; a table's figure is their plain mean."""
+class ImageScores:
+    """Scores of each image, in the order of ``names``."""
 
     names: tuple[str, ...]
     psnr_db: np.ndarray
@@ -28,7 +28,7 @@ class Likeness:
     lpips: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def means(self) -> dict[str, float]:
-        """``{"psnr_db", "ssim", "lpips", "num_images"}``; lpips only where it was measured."""
+        """Return the means ``{"psnr_db", "ssim", "lpips", "num_images"}``; lpips only where it was measured."""
         out: dict[str, float] = {"num_images": len(self.names)}
         if self.names:
             out |= {"psnr_db": float(self.psnr_db.mean()), "ssim": float(self.ssim.mean())}
@@ -38,11 +38,11 @@ class Likeness:
 
 
 def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, Path]:
-    """Pictures of a folder (and those below it) by the index of the camera that has their name; suffixes may differ.
+    """Find the images of cameras by name in a folder and its subfolders, by camera index; suffixes may differ.
 
     Raises:
-        NotFoundError: no such folder, or no picture in it has the name of a camera.
-        InputError: two pictures answer to one camera.
+        NotFoundError: no such folder, or no image in it has the name of a camera.
+        InputError: two images match one camera.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -67,7 +67,7 @@ def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, P
 
 
 def read_image(path: str | os.PathLike[str]) -> np.ndarray:
-    """A picture as (H, W, 3) float32 in [0, 1]."""
+    """Read an image as (H, W, 3) float32 in [0, 1]."""
     with open_picture(path) as image:
         return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
 
@@ -79,17 +79,17 @@ def compare_renders(
     *,
     lpips: Callable[[np.ndarray, np.ndarray], float] | None = None,
     progress: Progress | None = None,
-) -> Likeness:
-    """Render the Gaussians at cameras and compare with pictures.
+) -> ImageScores:
+    """Render Gaussians by cameras and compare the renders with images.
 
     Args:
         gaussians, cameras: in one frame.
-        images: by camera index, (H, W, 3) in [0, 1] or paths; a picture of another size than its camera's is rendered
-            at its own size, if the shape agrees.
+        images: by camera index, (H, W, 3) in [0, 1] or paths; an image of another size than its camera's is compared
+            at its own size, if the aspect ratio agrees.
         lpips: such as `gsmap.evaluate.images.Lpips`.
 
     Raises:
-        InputError: a picture whose shape is not its camera's.
+        InputError: an image whose aspect ratio is not its camera's.
     """
     from gsmap.render import ChunkIndex, render
 
@@ -105,11 +105,11 @@ def compare_renders(
             progress((done + 1) / len(images), f"image {done + 1} of {len(images)}")
     table = np.array(figures).reshape(-1, 3)
     names = tuple(cameras.names[at] for at in sorted(images))
-    return Likeness(names, table[:, 0], table[:, 1], table[:, 2] if lpips else np.zeros(0))
+    return ImageScores(names, table[:, 0], table[:, 1], table[:, 2] if lpips else np.zeros(0))
 
 
 def _at_size(camera: Cameras, width: int, height: int) -> Cameras:
-    """The camera with its picture resampled to a size."""
+    """Return the camera for an image resampled to a size."""
     old = camera.sizes_px[0]
     ratio = np.array([width, height]) / old
     if abs(old[0] * ratio[1] - width) > 2:

@@ -23,7 +23,7 @@ from gsmap.formats.axes import GLTF, PLY, change_axes
 from gsmap.formats.quantise import check_size, opacity_bytes, require_writable
 from gsmap.geometry.boxes import box_around
 from gsmap.geometry.sh import rgb_of_sh0
-from gsmap.geometry.transforms import placed
+from gsmap.geometry.transforms import transform_with_origin
 from gsmap.types import Gaussians, Sim3
 
 VERSION = 2
@@ -366,7 +366,7 @@ def _placed(path: str | os.PathLike[str], local: Gaussians, world: np.ndarray) -
             f"{path}: a node or tile is placed by more than a turn, shift and scale: {error}",
             code="unsupported_transform",
         ) from error
-    return placed(local, S_world_local)
+    return transform_with_origin(local, S_world_local)
 
 
 def _require_inside(path: str | os.PathLike[str], gltf: dict[str, Any], view: dict[str, Any]) -> None:

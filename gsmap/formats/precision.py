@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.geometry.origins import float32_step, is_single, neighbour_distance, origin_of
+from gsmap.geometry.origins import float32_step, is_float32, neighbour_distance, origin_of
 from gsmap.stream import about
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.source import gathered, origin_of_source
@@ -52,7 +52,7 @@ def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> Gauss
 def rounded_to(source: GaussianSource) -> float:
     """The step that the positions of a source about an origin were rounded to by single precision; 0 by none."""
     first = next(source.chunks()).positions
-    return float32_step(first) if is_single(first) else 0.0
+    return float32_step(first) if is_float32(first) else 0.0
 
 
 def about_zero(
@@ -68,7 +68,7 @@ def about_zero(
     """
     positions = gaussians.positions
     step = (step_of or float32_step)(positions)
-    is_exact = is_single(positions) if step_of is None else not np.remainder(positions, step).any()
+    is_exact = is_float32(positions) if step_of is None else not np.remainder(positions, step).any()
     apart = np.inf if is_exact else neighbour_distance(gaussians)
     if apart < _FINE * step:
         raise InputError(

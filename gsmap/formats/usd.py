@@ -22,7 +22,7 @@ from gsmap.formats.quantise import check_size, require_writable
 from gsmap.formats.scans.limits import Params
 from gsmap.formats.scans.process import asked
 from gsmap.formats.tiles3d import box_of
-from gsmap.geometry.transforms import placed
+from gsmap.geometry.transforms import transform_with_origin
 from gsmap.types import Gaussians, Sim3
 
 VERSION = 2
@@ -154,7 +154,7 @@ def _splat(path: Path, told: dict[str, np.ndarray], i: int) -> Gaussians:
         log_scales = np.log(np.where(scales == 0, _TINY, scales))
     found = Gaussians(means, quats, log_scales, np.log(opacity / (1 - opacity)), sh)
     matrix = told[f"{i}.matrix"].astype(np.float64).T  # USD's vectors are rows
-    return found if np.array_equal(matrix, np.eye(4)) else placed(found, _similarity(path, matrix))
+    return found if np.array_equal(matrix, np.eye(4)) else transform_with_origin(found, _similarity(path, matrix))
 
 
 def _similarity(path: Path, matrix: np.ndarray) -> Sim3:

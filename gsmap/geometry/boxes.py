@@ -1,4 +1,4 @@
-"""Axis-aligned boxes, (2, 3): lowest and highest corner."""
+"""Compute axis-aligned boxes, (2, 3): lowest and highest corner."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ import numpy as np
 
 from gsmap.types import Sim3
 
-_SIZED = 4_000  # points are enough to measure a place by
+_MAX_SAMPLE = 4_000  # points that suffice for the size of a place
 
 
 def box_corners(bounds: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of a box; bit 0 of a corner's index tells whether its x is the high one, bit 1 y, bit 2 z."""
+    """Return the (8, 3) corners of a box; bits 0, 1, 2 of a corner's index are set where x, y, z is the high end."""
     return np.array([[bounds[i >> axis & 1][axis] for axis in range(3)] for i in range(8)], dtype=np.float64)
 
 
 def box_around(points: np.ndarray) -> np.ndarray:
-    """(2, 3) the smallest box around points (N, 3), of which there is one at least."""
-    columns = points.T  # one by one: twenty times as fast as min(0) and max(0) over rows of three
+    """Return the (2, 3) smallest box around points (N, 3), N > 0."""
+    columns = points.T  # twenty times as fast as min(0) and max(0) over rows of three
     return np.array([[column.min() for column in columns], [column.max() for column in columns]])
 
 
 def are_finite(points: np.ndarray) -> np.ndarray:
-    """(N,) which points (N, 3) have no NaN nor infinity."""
+    """Return the (N,) mask of points (N, 3) without NaN and infinity."""
     x, y, z = (np.isfinite(column) for column in points.T)
     result: np.ndarray = x & y & z
     return result
 
 
 def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -> np.ndarray:
-    """(N,) which points (N, 3) lie in bounds (2, 3) grown by a margin (``low <= x < high``); all if None."""
+    """Return the (N,) mask of points (N, 3) in bounds (2, 3) grown by a margin (``low <= x < high``); all if None."""
     if bounds is None:
         return np.ones(len(points), dtype=bool)
     low, high = bounds[0] - margin, bounds[1] + margin
@@ -40,17 +40,16 @@ def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -
 
 
 def moved_box(bounds: np.ndarray, S_a_b: Sim3) -> np.ndarray:
-    """(2, 3) the box of frame a around a box of frame b."""
+    """Return the (2, 3) box of frame a around a box of frame b."""
     return box_around(S_a_b.apply(box_corners(bounds)))
 
 
 def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: float = 0.01) -> np.ndarray:
-    """(2, 3) the box that a share of the points (N, 3), N > 0, lies below and as many lie above, axis by axis: a few
-    strays do not widen it.
+    """Return the (2, 3) box between two quantiles of points (N, 3), N > 0, along each axis, robust to outliers.
 
     Args:
-        weights: (N,) how much each counts; alike by default.
-        outside: that share, of the weight.
+        weights: (N,); equal by default.
+        outside: share of the weight on each side of the box.
     """
     weights = np.ones(len(points)) if weights is None else weights
     out = np.empty((2, 3))
@@ -63,14 +62,13 @@ def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: f
 
 
 def upright_size(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> tuple[float, float, float]:
-    """Length, width and height, in their unit, of points (N, 3), N > 0: of the upright box of the smallest floor,
-    whatever way their frame is turned.
+    """Return length, width and height of the upright box of smallest floor area around points (N, 3), N > 0.
 
     Args:
         up: (3,) unit vector.
-        outside: share of them that may lie beyond each side.
+        outside: share of the points beyond each side.
     """
-    points = points[np.linspace(0, len(points) - 1, min(len(points), _SIZED)).astype(int)]
+    points = points[np.linspace(0, len(points) - 1, min(len(points), _MAX_SAMPLE)).astype(int)]
     first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
@@ -84,13 +82,13 @@ def upright_size(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> t
 
 
 def cube_around(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Middle (3,) and edge of the smallest cube around points (N, 3), of which there is one at least."""
+    """Return the centre (3,) and edge of the smallest cube around points (N, 3), N > 0."""
     low, high = box_around(points).astype(np.float64)
     return (low + high) / 2, float(max((high - low).max(), 1e-6))
 
 
 def octants(points: np.ndarray, center: np.ndarray, side: float) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """The eighths of a cube that hold any of the points (N, 3): number, mask (N,) of what is inside, middle (3,)."""
+    """Yield the octants of a cube that hold any of the points (N, 3): number, mask (N,) and centre (3,)."""
     octant = ((points >= center) @ [1, 2, 4]).astype(int)
     for i in np.unique(octant).tolist():
         yield i, octant == i, center + side / 4 * np.where([i & 1, i & 2, i & 4], 1, -1)

@@ -1,4 +1,4 @@
-"""Cells of a regular grid: which points share one, and their means."""
+"""Group points by the cells of a regular grid, and average them."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from gsmap.geometry.boxes import box_around
 
 
 def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which rows of integer cell coordinates (N, 3) are equal.
+    """Label equal rows of integer cell coordinates (N, 3).
 
     Returns:
-        (N,) int64 label of each, counted from 0 in the order of the cells (x, then y, then z); and how many rows each
-        label has.
+        (N,) int64 labels from 0 in the order of the cells (x, then y, then z), and the number of rows per label.
     """
     cells = np.asarray(cells).astype(np.int64)
     if not len(cells):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     low, high = box_around(cells)
     cells, sides = cells - low, high - low + 1
-    if np.prod(sides, dtype=np.float64) >= 2.0**62:  # strays very far out: one number a cell would not hold them
+    if np.prod(sides, dtype=np.float64) >= 2.0**62:  # extreme outliers: one integer per cell would overflow
         _, label, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         return label.reshape(-1), counts
     key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
@@ -30,7 +29,7 @@ def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def group_means(values: np.ndarray, labels: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """(M, F) float64 means of the rows (N, F) of each of M labels; see `cell_labels`."""
+    """Return (M, F) float64 means of the rows (N, F) of each of M labels; see `cell_labels`."""
     sums = [np.bincount(labels, column, len(counts)) for column in values.T]
     return np.stack(sums, axis=1) / counts[:, None] if len(values) else np.zeros((0, values.shape[1]))
 
@@ -42,9 +41,9 @@ def cell_means(
     weights: np.ndarray | None = None,
     origin: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (N, 3) and values (N, 3) averaged over the cells of a grid: (M, 3), (M, 3) and the cells' weights (M,).
+    """Average points (N, 3) and values (N, 3) over the cells of a grid: (M, 3), (M, 3) and the cells' weights (M,).
 
-    The same as `group_means` over `cell_labels`, in one walk and without arrays for what lies between.
+    The same as `group_means` over `cell_labels`, in one pass without intermediate arrays.
 
     Args:
         cell: side of the cells.
@@ -59,7 +58,7 @@ def cell_means(
             points=points, values=values, weights=weights, origin=origin[None], cell=cell
         )
         return means
-    except OverflowError:  # strays very far out
+    except OverflowError:  # extreme outliers
         labels, counts = cell_labels(np.floor((points - origin) / cell))
         share = np.ones(len(points)) if weights is None else weights
         total = np.maximum(np.bincount(labels, share, len(counts)), 1e-300)

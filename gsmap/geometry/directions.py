@@ -1,4 +1,4 @@
-"""Directions: turning one to the vertical, and spreading many over a sphere."""
+"""Compute rotations between directions, and directions spread over a sphere."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """The shortest rotation (3, 3) that takes a unit vector (3,) to +z."""
+    """Return the shortest rotation (3, 3) that takes a unit vector (3,) to +z."""
     x, y, z = up
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
@@ -16,7 +16,7 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The shortest rotation (3, 3) that takes the direction of ``a`` (3,) to that of the unit vector ``b`` (3,).
+    """Return the shortest rotation (3, 3) that takes the direction of ``a`` (3,) to that of the unit vector ``b`` (3,).
 
     By axis and angle, so that it is a rotation to the last bits near opposite directions too, where `rotation_to_z`
     is not; the identity where ``a`` has no length.
@@ -41,7 +41,7 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """(count, 3) unit vectors spread evenly over the sphere (golden spiral), from +z down."""
+    """Return (count, 3) unit vectors spread evenly over the sphere (golden spiral), from +z down."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     turn = np.pi * (1 + np.sqrt(5)) * k
@@ -50,7 +50,7 @@ def fibonacci_sphere(count: int) -> np.ndarray:
 
 
 def level_frame(up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that takes ``up`` (3,) to +z; the turn about z is arbitrary but depends on ``up`` alone."""
+    """Return a rotation (3, 3) that takes ``up`` (3,) to +z; its rotation about z depends on ``up`` alone."""
     z = np.asarray(up, float) / np.linalg.norm(up)
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)

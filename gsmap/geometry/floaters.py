@@ -1,4 +1,4 @@
-"""Floaters: points that do not belong to the surface around them."""
+"""Detect floaters: points that do not belong to a surface."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ _FAR = 4.0  # times the median distance to the 8th neighbour
 
 
 def find_floaters(points: np.ndarray, colours: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which points float alone or have a foreign colour, and how far apart points lie.
+    """Detect points that are isolated or differ in colour from their surroundings.
 
-    A point floats alone when its 8th neighbour lies farther than 4 times the median such distance. Floaters that touch
-    a surface are told by their colour: at most one of the 8 neighbours has one like it.
+    A point is isolated when its 8th neighbour lies farther than 4 times the median such distance. Floaters that touch a
+    surface are detected by colour: at most one of the 8 neighbours has a similar one.
 
     Args:
         points: (N, 3), any unit.
-        colours: (N, 3) in any space where Euclidean distance means unlikeness.
-        max_difference: colours farther apart are unlike.
+        colours: (N, 3) in any colour space with a Euclidean distance.
+        max_difference: distance of similar colours.
 
     Returns:
-        (N,) bool, and the distance to the 8th neighbour (N,); nothing floats and distances are 0 below 9 points.
+        (N,) bool mask of floaters, and the (N,) distance to the 8th neighbour; none and 0 for fewer than 9 points.
     """
     if len(points) < 9:
         return np.zeros(len(points), bool), np.zeros(len(points))

@@ -1,4 +1,4 @@
-"""The nearest points of each point of a set."""
+"""Find nearest neighbours among points."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from gsmap._native import PointTree
 from gsmap.geometry.boxes import box_around
 from gsmap.geometry.cells import cell_labels
 
-_ACROSS = 64  # cells of the grid by whose order points are visited
-_CHUNK = 100_000  # points that are looked at together: memory stays bounded
+_ACROSS = 64  # grid cells along the longest side, by whose order points are visited
+_CHUNK = 100_000  # points per query, to bound memory
 
 
 def spatial_order(points: np.ndarray, across: int) -> np.ndarray:
-    """Rows of the points (N, 3), those in one cell of a grid together; so many cells along the longest side."""
+    """Return rows of the points (N, 3) sorted by the cells of a grid with ``across`` cells along the longest side."""
     low, high = box_around(points) if len(points) else np.zeros((2, 3))
     span = float((high - low).max())
     if span <= 0:
@@ -27,7 +27,7 @@ def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarra
     """Yield rows (M,) of the points (N, 3), and distances and rows (M, k) of the nearest of all points to each, itself
     first; every row once. Where there are fewer than k points, distances are infinite and rows N, as in a k-d tree.
 
-    Points are looked at in the order of a grid's cells, those near each other together: that is twice as fast.
+    Points are queried in the order of a grid's cells, which is twice as fast.
     """
     from scipy.spatial import cKDTree  # naming a recipe does without
 
@@ -40,15 +40,15 @@ def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarra
 
 
 def nearest_neighbours(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and rows (N, k) of the nearest of the points (N, 3) to each; see `chunks_of_neighbours`."""
+    """Return distances and rows (N, k) of the nearest of the points (N, 3) to each; see `chunks_of_neighbours`."""
     found: tuple[np.ndarray, np.ndarray] = PointTree(np.ascontiguousarray(points, np.float64)).neighbours(k)
     return found
 
 
 def neighbours_of(points: np.ndarray, at: np.ndarray, k: int, radius: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and rows (M, k) of those points (N, 3) nearest to each place (M, 3) that are nearer than a radius.
+    """Return distances and rows (M, k) of the points (N, 3) nearest to each query (M, 3) within a radius.
 
-    inf and N where there are fewer. Places in the order of a curve through them are looked at in half the time.
+    inf and N where there are fewer. Queries in the order of a space-filling curve take half the time.
     """
     tree = PointTree(np.ascontiguousarray(points, np.float64))
     found: tuple[np.ndarray, np.ndarray] = tree.neighbours(k, np.ascontiguousarray(at, np.float64), radius)
@@ -56,7 +56,7 @@ def neighbours_of(points: np.ndarray, at: np.ndarray, k: int, radius: float = np
 
 
 def nearest_of(points: np.ndarray, at: np.ndarray, radius: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to and row (M,) of the point (N, 3) nearest to each place (M, 3); inf and 0 where all are farther."""
+    """Return distances to and rows (M,) of the points (N, 3) nearest to queries (M, 3); inf and 0 beyond the radius."""
     tree = PointTree(np.ascontiguousarray(points, np.float64))
     found: tuple[np.ndarray, np.ndarray] = tree.nearest(np.ascontiguousarray(at, np.float64), radius)
     return found

@@ -1,4 +1,4 @@
-"""Origins of positions that float32 cannot hold, such as coordinates of a national grid or of the Earth's centre."""
+"""Choose origins for positions that float32 cannot represent, such as coordinates of a national grid."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ _QUERIES = 2_000
 
 
 def origin_of(positions: np.ndarray) -> np.ndarray:
-    """(3,) float64 origin for positions (N, 3): zeros where these lie near zero for their extent, so that float32 loses
-    less than half a thousandth of a unit or a millionth of the extent; else their middle in whole hundreds, which
-    float32 positions lose nothing by."""
+    """Return the (3,) float64 origin for positions (N, 3).
+
+    Zeros where float32 loses less than half a thousandth of a unit or a millionth of the extent; otherwise the centre
+    rounded to hundreds, which float32 represents exactly.
+    """
     found = positions[:: max(1, len(positions) // _SAMPLE)]
     found = found[np.isfinite(found).all(1)].astype(np.float64)
     if not len(found):
@@ -31,28 +33,28 @@ def origin_of(positions: np.ndarray) -> np.ndarray:
 
 
 def centred(positions: np.ndarray, origin: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 3) as float32 about an origin (3,), and the origin; `origin_of` them where None."""
+    """Return positions (N, 3) as float32 about an origin (3,), and the origin; default `origin_of`."""
     origin = origin_of(positions) if origin is None else origin
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, which validation names
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, which validation reports
         return (positions - origin).astype(np.float32), origin
 
 
 def float32_step(positions: np.ndarray) -> float:
-    """The step of float32 at the farthest of positions (N, 3) float64."""
+    """Return the spacing of float32 at the farthest of positions (N, 3) float64."""
     found = np.abs(positions[np.isfinite(positions).all(1)]).max(initial=0.0)
     return float(np.spacing(np.float32(found)))
 
 
-def is_single(positions: np.ndarray) -> bool:
-    """Whether float32 holds every one of positions (N, 3) float64 as it is: they were rounded to it before."""
+def is_float32(positions: np.ndarray) -> bool:
+    """Return whether float32 represents all positions (N, 3) float64 exactly, as they were rounded to it before."""
     found = positions[np.isfinite(positions).all(1)]
     return bool((found == found.astype(np.float32)).all())
 
 
 def neighbour_distance(source: GaussianSource) -> float:
-    """The median distance from a Gaussian of a source to its nearest neighbour; infinite where there is one Gaussian.
+    """Return the median distance from a Gaussian to its nearest neighbour; infinite for a single Gaussian.
 
-    Of a sample, to all others, of which a chunk at a time is in memory.
+    Of a sample, with one chunk of the source in memory at a time.
     """
     n = source.num_gaussians
     rows = np.unique(np.linspace(0, n - 1, min(n, _QUERIES)).astype(np.int64))

@@ -1,4 +1,4 @@
-"""Pinhole projection: the one place where points become pixels (the rasteriser's kernels have their own)."""
+"""Project points to pixels by a pinhole camera."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 
 
 def project(points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where points fall in an image.
+    """Project points to an image.
 
     Args:
-        points: (N, 3), in any floating type; the answer has the same.
+        points: (N, 3), in any floating type, which the result has as well.
         T_camera_frame: (4, 4) frame-to-camera (OpenCV axes: x right, y down, z forward).
         intrinsics_px: (4,) ``fx fy cx cy``.
 
     Returns:
-        (N, 2) pixel coordinates ``column row`` (the first pixel's centre is 0.5 0.5), which mean nothing where the
+        (N, 2) pixel coordinates ``column row`` (the first pixel's centre is 0.5 0.5), undefined where the
         depth is not positive; and (N,) depth along the camera's axis.
     """
     column, row, z = project_all(points, T_camera_frame, intrinsics_px)
@@ -24,7 +24,7 @@ def project(points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.nd
 def project_all(
     points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns, rows and depths (..., N) of points (N, 3), as `project` gives them, in one image or in many at once.
+    """Return columns, rows and depths (..., N) of points (N, 3), as `project`, in one image or in many at once.
 
     Args:
         T_camera_frame: (..., 4, 4).
@@ -39,7 +39,7 @@ def project_all(
 
 
 def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: float = 0.0) -> np.ndarray:
-    """(N,) bool: beyond ``near`` (the points' unit) and inside an image of ``size_px`` = ``width height``."""
+    """Return the (N,) mask of points beyond ``near`` and inside an image of ``size_px`` = ``width height``."""
     (column, row), (width, height) = pixels.T, np.asarray(size_px)
     with np.errstate(invalid="ignore"):
         inside: np.ndarray = (depth > near) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -49,13 +49,13 @@ def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: f
 def on_surface(
     points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray, depth: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which points lie on the surface that a depth image shows.
+    """Select the points on the surface of a depth image.
 
     Args:
         points, T_camera_frame, intrinsics_px: as in `project`.
         depth: (H, W) camera-space z, the points' unit, 0 where nothing is seen.
-        tolerance: largest difference of depths, as a share of the surface's; inf takes whatever is behind the surface
-            or before it as well.
+        tolerance: largest difference of depths, as a share of the surface's; inf selects points behind
+            and before the surface as well.
 
     Returns:
         (n,) rows of the points, and the pixels (n, 2) int64 ``column row`` they fall on.

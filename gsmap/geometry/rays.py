@@ -1,4 +1,4 @@
-"""Where a ray meets the surface that Gaussians make."""
+"""Intersect a ray with the surface of Gaussians."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.types import Gaussians
 
-_LEAST = 1 / 255  # of opacity, as the rasteriser cuts
+_LEAST = 1 / 255  # of opacity, as in the rasterizer
 _NEAR = 0.01
 _ALPHA_MAX = 0.99
 
@@ -15,19 +15,19 @@ _ALPHA_MAX = 0.99
 def surface_along(
     gaussians: Gaussians, origin: np.ndarray, direction: np.ndarray, min_opacity: float = 0.5
 ) -> tuple[float, float] | None:
-    """How far along a ray the surface lies, and how thick it is there; None where the ray meets too little.
+    """Return the distance of the surface along a ray, and its thickness; None where the ray meets too little.
 
-    Every Gaussian counts where the ray is deepest in it, with its opacity there; the surface is where half of the light
-    is gone. Centres, which a rendered depth averages, lie beside the ray, and nearer ones count for more: that is off
-    by the size of the Gaussians where they are seen at a slant.
+    Every Gaussian absorbs light at its peak along the ray, with its opacity there; the surface is where half of the
+    absorbed light is absorbed. A rendered depth averages the Gaussians' centres instead, which lie beside the ray, and
+    has an error of their size at a slant.
 
     Args:
         gaussians: in the ray's frame.
         origin, direction: (3,); distances are in lengths of the direction.
-        min_opacity: of all that the ray meets.
+        min_opacity: of all Gaussians along the ray together.
 
     Returns:
-        Distance, and half of the distance between where 16 % and 84 % of the light that stays are gone.
+        Distance, and half of the distance between the points where 16 % and 84 % of the absorbed light are absorbed.
     """
     o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
     to_centre = gaussians.means.astype(np.float64) - o

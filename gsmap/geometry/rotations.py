@@ -1,4 +1,4 @@
-"""Rotations: quaternions (``wxyz``), matrices, and the SO(3) and Sim(3) exponential."""
+"""Convert rotations between quaternions (``wxyz``) and matrices; SO(3) and Sim(3) exponentials."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
 
 
 def conjugate_quats(quats: np.ndarray) -> np.ndarray:
-    """(..., 4) the reverse rotations of unit ``wxyz`` quaternions."""
+    """Return the (..., 4) conjugates (inverse rotations) of unit ``wxyz`` quaternions."""
     out: np.ndarray = np.asarray(quats) * np.array([1.0, -1.0, -1.0, -1.0])
     return out
 

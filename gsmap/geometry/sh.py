@@ -1,4 +1,4 @@
-"""Spherical harmonics of degree 0: the colour that does not depend on the direction."""
+"""Convert between colours and spherical harmonics of degree 0."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ SH_C0 = 0.28209479177387814
 
 
 def rgb_of_sh0(sh0: np.ndarray) -> np.ndarray:
-    """(..., 3) colour of degree-0 coefficients (..., 3), in their precision; not clipped."""
+    """Return (..., 3) colours of degree-0 coefficients (..., 3), in their precision; not clipped."""
     return sh0 * SH_C0 + 0.5
 
 
 def sh0_of_rgb(rgb: np.ndarray) -> np.ndarray:
-    """(..., 3) degree-0 coefficients of colours (..., 3), in their precision."""
+    """Return (..., 3) degree-0 coefficients of colours (..., 3), in their precision."""
     return (rgb - 0.5) / SH_C0

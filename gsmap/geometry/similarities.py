@@ -1,4 +1,4 @@
-"""Many similarities at once: composition, the exact exponential and logarithm of Sim(3), and its adjoint.
+"""Compute with arrays of similarities: composition, exact exponential and logarithm of Sim(3), and adjoint.
 
 A tangent is ``xi = [rot_rad (3), trans (3), log_scale]``, rotation first. ``Exp(xi)`` is the matrix exponential of
 ``[[skew(rot) + log_scale I, trans], [0, 0]]`` read as ``[sR t; 0 1]``: the same map as gtsam's ``Similarity3.Expmap``
@@ -50,13 +50,13 @@ class Similarities:
         return Similarities(self.rotations[rows], self.translations[rows], self.log_scales[rows])
 
     def item(self, row: int) -> Sim3:
-        """One of them; its rotation is projected to SO(3)."""
+        """Return one similarity; its rotation is projected to SO(3)."""
         u, _, vt = np.linalg.svd(self.rotations[row])
         scale = 1.0 if self.log_scales[row] == 0 else float(np.exp(self.log_scales[row]))
         return Sim3(u @ vt, self.translations[row], scale)
 
     def replaced(self, rows: np.ndarray, values: Similarities) -> Similarities:
-        """A copy in which ``rows`` hold ``values``."""
+        """Return a copy in which ``rows`` are replaced by ``values``."""
         out = Similarities(self.rotations.copy(), self.translations.copy(), self.log_scales.copy())
         out.rotations[rows], out.translations[rows] = values.rotations, values.translations
         out.log_scales[rows] = values.log_scales
@@ -81,18 +81,18 @@ class Similarities:
         return moved
 
     def orthonormalised(self) -> Similarities:
-        """Rotations projected to SO(3): long products drift off it."""
+        """Project rotations to SO(3), from which long products drift."""
         u, _, vt = np.linalg.svd(self.rotations)
         return Similarities(u @ vt, self.translations, self.log_scales)
 
     def log(self) -> np.ndarray:
-        """(N, 7) tangents with ``Exp(log) == self``."""
+        """Return (N, 7) tangents with ``Exp(log) == self``."""
         omega = rotation_vectors(self.rotations)
         trans = np.linalg.solve(_left_factor(omega, self.log_scales), self.translations[:, :, None])[:, :, 0]
         return np.concatenate([omega, trans, self.log_scales[:, None]], axis=1)
 
     def adjoint(self) -> np.ndarray:
-        """(N, 7, 7) ``Ad`` with ``S Exp(xi) S^-1 = Exp(Ad xi)``."""
+        """Return (N, 7, 7) ``Ad`` with ``S Exp(xi) S^-1 = Exp(Ad xi)``."""
         out = np.zeros((len(self), 7, 7))
         out[:, :3, :3] = self.rotations
         out[:, 3:6, :3] = skew(self.translations) @ self.rotations
@@ -111,7 +111,7 @@ def exp(xi: np.ndarray) -> Similarities:
 
 
 def commutator(xi: np.ndarray) -> np.ndarray:
-    """(N, 7, 7) ``ad`` of tangents (N, 7): the derivative of the adjoint."""
+    """Return (N, 7, 7) ``ad`` of tangents (N, 7): the derivative of the adjoint."""
     out = np.zeros((len(xi), 7, 7))
     out[:, :3, :3] = skew(xi[:, :3])
     out[:, 3:6, :3] = skew(xi[:, 3:6])
@@ -139,12 +139,14 @@ def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
 
 
 def without_scale(information: np.ndarray) -> np.ndarray:
-    """(..., 6, 6) information on rotation and translation alone, whatever the scale is, of (..., 7, 7) on all three.
+    """Marginalize the scale out of (..., 7, 7) information: (..., 6, 6) on rotation and translation.
 
-    The Schur complement: what the scale is not known to is taken from the translation that hangs on it.
+    The Schur complement.
     """
-    tied = information[..., :6, 6]
-    out: np.ndarray = information[..., :6, :6] - tied[..., :, None] * tied[..., None, :] / information[..., 6:, 6:]
+    coupling = information[..., :6, 6]
+    out: np.ndarray = (
+        information[..., :6, :6] - coupling[..., :, None] * coupling[..., None, :] / information[..., 6:, 6:]
+    )
     return out
 
 

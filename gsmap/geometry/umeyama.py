@@ -1,4 +1,4 @@
-"""Closed-form similarity between corresponding points."""
+"""Fit a similarity to corresponding points in closed form (Umeyama 1991)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmap.types import Sim3
 def umeyama(
     target: np.ndarray, source: np.ndarray, *, with_scale: bool = False, weights: np.ndarray | None = None
 ) -> Sim3:
-    """``S_target_source`` that minimises the weighted squared distance between corresponding points.
+    """Return ``S_target_source`` that minimizes the weighted squared distance between corresponding points.
 
     Umeyama 1991 (eqs. 34-43); with ``with_scale=False`` it is the SVD solution of Arun/Kabsch. Always a proper
     rotation: for a mirrored set the best proper one is returned, and its residual shows it.

@@ -1,4 +1,4 @@
-"""How surely places are known."""
+"""Propagate pose covariances to points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsmap.types import ScenePose
 
 
 def middle_covariance_m2(pose: ScenePose, middle: np.ndarray, metres_per_unit: float) -> np.ndarray | None:
-    """(3, 3) covariance in square metres, axes of the component, of a point that is fixed to a scene.
+    """Return the (3, 3) covariance in square metres, in the component's axes, of a point that is fixed to a scene.
 
     To first order, ``S Exp(xi) m = S (m + rot x m + trans + log_scale m)`` of a tangent on the scene side
     (`gsmap.types.ScenePose`), so that the point moves by ``s R [-skew(m) | I | m] xi``.

@@ -1,4 +1,4 @@
-"""Grouping points by voxel, and replacing a group of Gaussians by one that looks like it."""
+"""Group points by voxel, and merge groups of Gaussians with their moments."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.types import Gaussians
 
-_MAX_OPACITY = 0.9999  # an optical depth of 9.2: finite, and beyond what any renderer tells from 1
+_MAX_OPACITY = 0.9999  # an optical depth of 9.2: finite, and opaque to any renderer
 _THOMSEN = 1.6075  # exponent of Thomsen's ellipsoid surface formula, error below 1.1 %
 
 
 def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
-    """(N,) int64 group of each point (N, 3): equal where points share a cell of the grid through the frame's origin.
+    """Return the (N,) int64 voxel of each point (N, 3), in a grid through the frame's origin.
 
     Labels count from 0 in the order of the cells (x, then y, then z), whatever the order of the points.
 
     Raises:
         ConfigError: a voxel size that is not positive.
-        InputError: points so far out that their cell cannot be counted.
+        InputError: outliers so far out that voxels cannot be numbered.
     """
     if not voxel_size > 0:
         raise ConfigError(f"voxel size must be positive, got {voxel_size}", code="out_of_range")
@@ -43,14 +43,14 @@ def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:
-    """(N, 3, 3) float64 covariance matrices, in the frame's unit squared."""
+    """Return (N, 3, 3) float64 covariance matrices, in the frame's unit squared."""
     axes = quats_to_matrices(gaussians.quats) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     out: np.ndarray = axes @ axes.transpose(0, 2, 1)
     return out
 
 
 def axis_deviations(gaussians: Gaussians) -> np.ndarray:
-    """(N, 3) float64 standard deviations along the axes: `covariances` has their squares on its diagonals."""
+    """Return (N, 3) float64 standard deviations along the frame's axes (roots of the diagonals of `covariances`)."""
     w, x, y, z = np.ascontiguousarray(gaussians.quats.T, dtype=np.float64)
     squared = w * w + x * x + y * y + z * z
     with np.errstate(divide="ignore"):
@@ -68,13 +68,13 @@ def axis_deviations(gaussians: Gaussians) -> np.ndarray:
 
 
 def reached_box(gaussians: Gaussians, sigmas: float) -> np.ndarray:
-    """(2, 3) float64 box around Gaussians, each widened by so many of its `axis_deviations`; inverted around none."""
+    """Return the (2, 3) float64 box around Gaussians, each extended by ``sigmas`` of its `axis_deviations`."""
     out: np.ndarray = native_box(gaussians.means, gaussians.quats, gaussians.log_scales, sigmas)
     return out
 
 
 def projected_areas(scales: np.ndarray) -> np.ndarray:
-    """(N,) mean area of the shadows of ellipsoids with semi-axes (N, 3): surface / 4 (Cauchy), surface by Thomsen."""
+    """Return (N,) mean projected areas of ellipsoids with semi-axes (N, 3): surface / 4 (Cauchy; Thomsen)."""
     a, b, c = np.asarray(scales, dtype=np.float64).T
     mean_power = ((a * b) ** _THOMSEN + (a * c) ** _THOMSEN + (b * c) ** _THOMSEN) / 3
     areas: np.ndarray = np.pi * mean_power ** (1 / _THOMSEN)
@@ -82,12 +82,12 @@ def projected_areas(scales: np.ndarray) -> np.ndarray:
 
 
 def optical_depths(gaussians: Gaussians) -> np.ndarray:
-    """(N,) float64 ``-ln(1 - opacity)``: what adds up where Gaussians lie behind one another."""
+    """Return (N,) float64 optical depths ``-ln(1 - opacity)``, which add along a ray."""
     return -np.log1p(-np.minimum(gaussians.opacities.astype(np.float64), _MAX_OPACITY))
 
 
 def merge_groups(gaussians: Gaussians, labels: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """One Gaussian per label, preserving moments and transmittance; and the row (M,) of each group's heaviest member.
+    """Merge the Gaussians of each label with their moments and transmittance; also return (M,) rows of the heaviest.
 
     A member's mass is its optical depth times its mean projected area: the light it stops. The group's Gaussian has
     the mass-weighted mean, the full covariance of the mixture (members' own and their spread), the mass-weighted SH,

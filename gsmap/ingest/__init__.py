@@ -1,6 +1,6 @@
 """Captures the way people have them -> Gaussians and cameras, checked."""
 
-from gsmap.geometry.vantage import synthesise_cameras
+from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.ingest.capture import Capture, check_scale, read_capture, read_captures, take_capture
 from gsmap.ingest.dates import CaptureDate, find_date, given_date, parse_date
 from gsmap.ingest.find import Found, LeftOut, Search, find_captures, search_captures

@@ -14,8 +14,8 @@ import numpy as np
 from gsmap import formats
 from gsmap.errors import ConfigError, NotPinholesError
 from gsmap.formats.precision import about_origin, rounded_to, told
+from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.transforms import transform_cameras
-from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.find import Found, find_captures
 from gsmap.ingest.validate import validate_cameras, validate_gaussians

@@ -22,7 +22,8 @@ MAX_POINTS = 250_000
 """Gaussians of a scan: of larger ones the cells grow until no more are left."""
 
 AGREE_SIGMAS = 5.0
-"""Poses of two scenes contradict each other from so many standard deviations on, beyond ``register.same_pose``."""
+"""Poses of two scenes contradict each other from so many standard deviations on, beyond the tolerances of one pose in
+`gsmap.register.pose_selection`."""
 
 _NEIGHBOURS = 10  # for the normal and the spacing of a point
 _RADIUS_FRACTION = 0.7  # standard deviation of a disc in its plane, per spacing of the points around it

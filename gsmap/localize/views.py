@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.projection import in_image, project
-from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.types import Cameras, Gaussians
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from gsmap import formats
 from gsmap.errors import MALFORMED, InputError, NotFoundError
 from gsmap.evaluate.images import Lpips
-from gsmap.evaluate.judge import JudgedScene, Params, judge
+from gsmap.evaluate.map_errors import EvaluatedScene, Params, evaluate_map
 from gsmap.evaluate.overlap import solid_centres, true_overlaps
 from gsmap.evaluate.registration import scene_centroid
 from gsmap.evaluate.renders import compare_renders, find_images
@@ -56,17 +56,17 @@ def poses(
             f"no truth for any scene in {truth}: it needs NAME.json with T_scene_world for each scene", code="no_truth"
         )
 
-    def judged(scene: Scene) -> JudgedScene:
+    def judged(scene: Scene) -> EvaluatedScene:
         if scene.id not in S_scene_world:
-            return JudgedScene(scene.id, scene.name, None, np.zeros(3), np.zeros((0, 3)))
+            return EvaluatedScene(scene.id, scene.name, None, np.zeros(3), np.zeros((0, 3)))
         centroid, centers = scene_centroid(store.scenes.gaussians(scene.id)), store.scenes.cameras(scene.id).centers
-        return JudgedScene(scene.id, scene.name, S_scene_world[scene.id], centroid, centers)
+        return EvaluatedScene(scene.id, scene.name, S_scene_world[scene.id], centroid, centers)
 
     params = params or Params()
     solid = partial(_solid, store, S_scene_world)
     overlaps = true_overlaps(list(S_scene_world), solid)
     of_scenes, edges, graph = [judged(s) for s in scenes], reports.edge_rows(store), store.revisions.get()
-    return judge(of_scenes, edges, graph, overlaps, params, metres)
+    return evaluate_map(of_scenes, edges, graph, overlaps, params, metres)
 
 
 def _solid(store: Store, S_scene_world: Mapping[str, Sim3], scene: str) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmap.errors import CorruptError, InputError
-from gsmap.geometry.metres import in_metres, resized
+from gsmap.geometry.metric_scale import in_metres, scale_gaussians
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.methods import family
 from gsmap.store import Store, branches, homes, sqlite
@@ -236,5 +236,5 @@ class TileMaker:
         )
         if metres == 1.0:
             return found
-        merged = resized(found.gaussians, 1 / metres)
+        merged = scale_gaussians(found.gaussians, 1 / metres)
         return replace(found, gaussians=replace(merged, means=clamp_inside(merged.means, bounds)))

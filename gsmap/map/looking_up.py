@@ -8,7 +8,7 @@ from gsmap import retrieve
 from gsmap.errors import CorruptError, NotFoundError
 from gsmap.map.indexing import AT_ONCE, PATIENCE, SceneIndex
 from gsmap.methods import RecipeKey
-from gsmap.retrieve import Voters
+from gsmap.retrieve import SceneNodes
 from gsmap.store import Store
 from gsmap.store.indexes import Lookup
 from gsmap.types import SceneGraph
@@ -34,7 +34,7 @@ def ask(
         graphs: the key of the graph of every scene that counts; they are put into the index where they are not.
         asking: ids of those that ask.
     """
-    mine: dict[str, Voters] = {}
+    mine: dict[str, SceneNodes] = {}
     index = _index(store, graphs, params, set(asking), mine)
     for left in reversed(range(PATIENCE)):
         try:
@@ -69,7 +69,7 @@ def ask_once(
             missing = index.missing(kept)
             parts = [missing[start : start + AT_ONCE] for start in range(0, len(missing), AT_ONCE)]
             segments: list[Segment] = [*kept, *(index.make(part) for part in parts)]
-            asking = retrieve.voters_of(graph, "", params.nodes_per_scene)
+            asking = retrieve.select_nodes(graph, "", params.nodes_per_scene)
             return retrieve.look_up([asking], segments, params)[0]
         except NotFoundError:  # another process made segments one while they were read
             if not left:
@@ -92,7 +92,7 @@ def _index(
     graphs: Mapping[str, RecipeKey],
     params: retrieve.Params,
     asking: Collection[str] = (),
-    read: dict[str, Voters] | None = None,
+    read: dict[str, SceneNodes] | None = None,
 ) -> SceneIndex:
     """The index of graphs.
 
@@ -113,12 +113,12 @@ def _index(
     return SceneIndex(store, retrieve.index_recipe(params), {localize.index_recipe()}, keys, make)
 
 
-def _voters(store: Store, key: RecipeKey, params: retrieve.Params) -> Voters:
+def _voters(store: Store, key: RecipeKey, params: retrieve.Params) -> SceneNodes:
     graph = store.graphs.load(key.inputs[0], key)
     assert graph is not None
-    return retrieve.voters_of(graph, key.digest, params.nodes_per_scene)
+    return retrieve.select_nodes(graph, key.digest, params.nodes_per_scene)
 
 
-def _lookup(voters: Voters, said: Sequence[Candidate], params: retrieve.Params) -> Lookup:
+def _lookup(voters: SceneNodes, said: Sequence[Candidate], params: retrieve.Params) -> Lookup:
     key = retrieve.recipe_key(params).of(voters.member.graph)
     return Lookup(voters.member.scene, key.digest, tuple(said[: KEPT * params.top_k]))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from gsmap.errors import NotFoundError
-from gsmap.geometry.metres import PLAUSIBLE_M, SceneUnit, metre_of
+from gsmap.geometry.metric_scale import PLAUSIBLE_M, SceneUnit, estimate_metric_scale
 from gsmap.store import Store
 from gsmap.types import PoseGraph, ScenePose
 from gsmap.types.metre import Metre
@@ -46,7 +46,7 @@ def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dic
         if guess is not None and not (math.isfinite(guess) and guess > 0):
             guess = None
         unit = SceneUnit(
-            told=told.get(pose.scene),
+            specified=told.get(pose.scene),
             in_metres=policy == "known",
             # As registration takes it (`gsmap.describe.unit.landmark_units`): metres, where that is plausible.
             may_be_metres=policy == "auto" and guess is not None and low < guess < high,
@@ -55,7 +55,8 @@ def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dic
         components.setdefault(pose.component, []).append((unit, pose))
     ties = {tie.component: tie for tie in (graph.world if graph else ()) if tie.metres_per_unit is not None}
     return {
-        component: metre_of(components[component], _surveyed(ties.get(component))) for component in sorted(components)
+        component: estimate_metric_scale(components[component], _surveyed(ties.get(component)))
+        for component in sorted(components)
     }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmap.durable import make_folder, open_file, remove_file, write_output, write_text_whole, write_whole
 from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
-from gsmap.geometry.metres import in_metres
+from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.changes import change_arrays, named
 from gsmap.map.metres import metres_of_scenes

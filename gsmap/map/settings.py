@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         view,
         world,
     )
-    from gsmap.evaluate import judge
+    from gsmap.evaluate import map_errors
     from gsmap.localize import scan
     from gsmap.map import visits
 
@@ -132,7 +132,7 @@ class Settings:
     objects: objects.Params = field(default=_params_of("gsmap.objects"))
     localize: localize.Params = field(default=_params_of("gsmap.localize"))
     scan: scan.Params = field(default=_params_of("gsmap.localize.scan"))
-    evaluate: judge.Params = field(default=_params_of("gsmap.evaluate.judge"))
+    evaluate: map_errors.Params = field(default=_params_of("gsmap.evaluate.map_errors"))
     report: report.Params = field(default=_params_of("gsmap.report"))
     view: view.Params = field(default=_params_of("gsmap.view"))
     engine: engine.Params = field(default=_params_of("gsmap.engine"))

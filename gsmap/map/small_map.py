@@ -25,7 +25,7 @@ from gsmap.errors import MALFORMED, ConfigError, CorruptError, GsmapError, NotFo
 from gsmap.export.levels import Params as LevelParams
 from gsmap.export.levels import make_level
 from gsmap.formats.quantise import check_size
-from gsmap.geometry.metres import in_metres
+from gsmap.geometry.metric_scale import in_metres
 from gsmap.localize import (
     PlacedFeatures,
     ViewIndex,

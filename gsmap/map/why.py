@@ -15,7 +15,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
 from gsmap.map.stages.register import placed_scenes
 from gsmap.register import verdict
-from gsmap.retrieve import Rounds, neighbours
+from gsmap.retrieve import PairSchedule, neighbours
 from gsmap.store import Store
 from gsmap.types import Scene
 from gsmap.types.rows import PairReport, WhyReport, WhyStep
@@ -67,7 +67,7 @@ def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[st
     if askers:
         return rank, f"left out to save time: both had {enough} by then, and these tied them over another scene"
     if neighbours({scene: at for scene, at in placed_scenes(store).items() if scene in names}, params):
-        if Rounds((), (), held, params).is_rigid(a.id, b.id):
+        if PairSchedule((), (), held, params).is_redundant(a.id, b.id):
             return rank, f"left out to save time: both have {enough}, and these tie them over another scene"
         return rank, "the map's poses let them touch, and gsmap update tries the nearest of such pairs"
     if listed or any(len(one.candidates) >= KEPT * params.top_k for one in lookups.values()):

@@ -73,14 +73,14 @@ class Surface(Protocol):
         """The cell means with covariances and normals, and their search tree, as small_gicp keeps them."""
 
     @property
-    def faces(self) -> np.ndarray | None:
+    def oriented_normals(self) -> np.ndarray | None:
         """(M, 3) float64 the normals turned to the side that the scene's own cameras saw, zeros where that is not
         known; None where it nowhere is."""
 
     def nearest(
-        self, points: np.ndarray, radius_m: float, faces: np.ndarray | None = None
+        self, points: np.ndarray, radius_m: float, normals: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Distance (P,) to and row (P,) of the cell mean nearest to each point (P, 3); inf and 0 beyond the radius.
 
-        Cells that face the other way than the points (``faces`` (P, 3), in this frame) are passed over.
+        Cells that face the other way than the points (``normals`` (P, 3), in this frame) are passed over.
         """

@@ -1,4 +1,4 @@
-"""Pairwise registration: where one scene lies in another, and how sure that is."""
+"""Pairwise registration: the pose of one scene in another, with its uncertainty and a verdict."""
 
 from gsmap.register.by_shape import register_by_shape
 from gsmap.register.pair import check_pose, register_pair

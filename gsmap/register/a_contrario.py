@@ -1,4 +1,4 @@
-"""Could a background model have made this many correspondences agree? A-contrario: the number of false alarms."""
+"""Compute the number of false alarms (NFA) of a pose: an a contrario test against random correspondences."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _CELL_M = 0.5
 _HEIGHT_BAND_M = 0.5  # where gravity is known, random partners lie within this of the candidate's height
 
 
-def agreeing(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarray:
-    """(M,) true for correspondences within the radius under the pose, one to one, nearest first."""
+def find_inliers(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarray:
+    """Return the (M,) mask of inliers: correspondences within the radius under a pose, one to one, nearest first."""
     distance = np.linalg.norm(pose.apply(matches.source) - matches.target, axis=1)
     keep = np.zeros(len(matches), dtype=bool)
     used_t, used_s = set(), set()
@@ -33,11 +33,11 @@ def agreeing(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarra
 
 
 class BackgroundModel:
-    """How well poses do at candidate correspondences, against partners drawn at random.
+    """Background model (null hypothesis) of candidate correspondences.
 
-    The background model (null hypothesis): each candidate's partner is any source node of its type (and of about its
-    height, where gravity is known), independently between cells. Rooms furnished alike repeat whole arrangements and
-    violate that independence, so the bar of the verdict lies lower than the theory's (`gsmap.register.verdict`).
+    Each candidate's partner is any source node of its type (and of about its height, where gravity is known),
+    independently between cells. Rooms with the same furniture repeat whole arrangements and violate that independence,
+    so the threshold of the verdict is lower than the theory's (`gsmap.register.verdict`).
 
     Args:
         target, source: the two layers.
@@ -74,11 +74,11 @@ class BackgroundModel:
         self._cell = cell.ravel()
 
     def log10_nfa(self, pose: Sim3, radius_m: float = 0.15) -> float:
-        """log10 of the number of false alarms: how many poses this good to expect of the background.
+        """Return log10 of the number of false alarms: the expected number of poses this good by chance.
 
-        With n cells that could agree, mean probability p each, and k that do, every triple of candidates fixing a pose:
-        ``log10 C(M, 3) + log10 P[Bin(n - 3, p) >= k - 3]`` (Desolneux, Moisan and Morel 2000; the triple itself agrees
-        by construction). Below -2 the background model is no explanation; inf where too little could agree.
+        With n cells that could hold an inlier, mean probability p each, and k that do, and a pose by every triple of
+        candidates: ``log10 C(M, 3) + log10 P[Bin(n - 3, p) >= k - 3]`` (Desolneux, Moisan and Morel 2000; the triple
+        itself agrees by construction). Below -2 chance is no explanation; inf for fewer than 4 cells.
         """
         m, cell = len(self.matches), self._cell
         if m < 4:
@@ -86,7 +86,7 @@ class BackgroundModel:
         predicted = np.column_stack([pose.inverse().apply(self.matches.target), self._layer])
         near = self._tree.query_ball_point(predicted, radius_m / pose.scale, return_length=True)
         probability = np.minimum(1.0, near / self._pool)
-        hits = agreeing(self.matches, pose, radius_m)
+        hits = find_inliers(self.matches, pose, radius_m)
         missed = np.bincount(cell, np.log1p(-np.minimum(probability, 1 - 1e-9)))
         possible = np.bincount(cell, probability > 0) > 0
         n, k = int(possible.sum()), int((np.bincount(cell, hits) > 0).sum())
@@ -98,7 +98,7 @@ class BackgroundModel:
 
 
 def _log10_binomial_tail(n: int, k: int, p: float) -> float:
-    """log10 P[Bin(n, p) >= k], exact far into the tail."""
+    """Return log10 P[Bin(n, p) >= k], exact far into the tail."""
     from scipy.special import gammaln, logsumexp
 
     if k <= 0 or p >= 1:

@@ -1,4 +1,4 @@
-"""The largest set of correspondences that all agree with each other."""
+"""Find the maximum clique of a compatibility graph."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmap.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Clique:
-    """A clique of a consistency graph.
+    """A clique of a compatibility graph.
 
     Args:
         members: indices of the correspondences, ascending.
@@ -28,12 +28,12 @@ class Clique:
 
 
 def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000, *, more_than: int = 0) -> Clique:
-    """Maximum clique of a graph given as symmetric bit rows (`consistency_graph`).
+    """Find the maximum clique of a graph of symmetric bit rows (`consistency_graph`).
 
     Exact branch and bound over a degeneracy order, bounded by greedy colouring with recolouring (San Segundo et al.
     2011; Tomita et al. 2010), starting from greedily grown cliques. The limit counts steps of work (about two
-    nanoseconds each), not seconds, so the answer is the same on every machine. Cliques of no ``more_than`` members do
-    not count: where none is larger the answer is empty.
+    nanoseconds each), not seconds, so the result is the same on every machine. It is empty where no clique has more
+    than ``more_than`` members.
 
     Raises:
         InputError: rows that are not (M, ceil(M / 64)) uint64.

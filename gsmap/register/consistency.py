@@ -1,4 +1,4 @@
-"""The compatibility graph of a pair of scenes: which correspondences one similarity could explain together."""
+"""Compute the compatibility graph of correspondences: edges join pairs that one similarity could explain."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Params:
     Args:
         test: Test of two correspondences: ``absolute`` (their distances in both scenes may differ by a fixed error) or
             ``ratio`` (by a share of the distance, as Graph-GSReg).
-        height_slope: Largest difference in height per metre of distance, at least 0, where both scenes know gravity;
-            a larger value tolerates tilted scenes and inf switches the test off.
+        height_slope: Largest difference in height per metre of distance, at least 0, where gravity is known in both
+            scenes; a larger value tolerates tilted scenes and inf switches the test off.
     """
 
     test: Test = "absolute"
@@ -49,15 +49,20 @@ def consistency_graph(
     sigma_m: float = SIGMA_M,
     min_distance_m: float = MIN_DISTANCE_M,
 ) -> np.ndarray:
-    """Graph whose vertices are correspondences and whose edges join those that one similarity could explain.
+    """Compute the compatibility graph of correspondences.
 
-    Two correspondences agree when the distances of their ends differ by less than ``6 sigma + relative * distance``
-    after scaling the source, they share no node (one-to-one), and, where both scenes know gravity, the differences in
-    height agree as well. The paper's test (`Params.test`) divides by the distance instead: measured, it drops true
-    pairs that are close together and passes wrong pairs that are far apart.
+    Two correspondences are compatible when the distances of their ends differ by less than ``6 sigma + relative *
+    distance`` after scaling the source, they share no node (one-to-one), and, where gravity is known in both, the
+    differences in height agree as well. The paper's test (`Params.test`) divides by the distance instead; it drops
+    right pairs that are close together and passes wrong pairs that are far apart.
+
+    Args:
+        scale: of the source.
+        sigma_m: standard deviation of a node's position.
+        min_distance_m: nearer nodes are not compatible, as they hardly constrain the pose.
 
     Returns:
-        (M, ceil(M / 64)) uint64 bit rows, symmetric, bit j of row i set where i and j agree.
+        (M, ceil(M / 64)) uint64 bit rows, symmetric, bit j of row i set where i and j are compatible.
     """
     from gsmap import _native
 
@@ -82,13 +87,13 @@ def consistency_graph(
 
 
 def unpack(rows: np.ndarray) -> np.ndarray:
-    """(M, M) boolean adjacency of bit rows."""
+    """Convert bit rows to an (M, M) boolean adjacency matrix."""
     count = len(rows)
     return np.unpackbits(rows.view(np.uint8), axis=1, bitorder="little")[:, :count].astype(bool)
 
 
 def pack(adjacency: np.ndarray) -> np.ndarray:
-    """Bit rows of an (M, M) boolean adjacency."""
+    """Convert an (M, M) boolean adjacency matrix to bit rows."""
     count = len(adjacency)
     padded = np.zeros((count, -(-count // 64) * 64), dtype=bool)
     padded[:, :count] = adjacency

@@ -1,6 +1,6 @@
-"""What stands around an object: a histogram of the features in its neighbourhood of the graph (Graph-GSReg).
+"""Add the context of objects to their embeddings: a histogram of the features in the neighbourhood (Graph-GSReg).
 
-The paper's local graph reaches three hops far; on made places one tells objects best apart (`docs/experiments.md`).
+The paper's local graph reaches three hops far; on synthetic places one distinguishes objects best.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmap.types import NodeLayer
 
-_LLOYD_STEPS = 10  # of spherical k-means; made places' recall is the same after 5 and after 20
+_LLOYD_STEPS = 10  # of spherical k-means; the recall on synthetic places is the same after 5 and after 20
 
 
 _MAX_DISTANCE_M = 1.5  # objects nearer to each other are joined in the local graph
@@ -32,7 +32,7 @@ class Params:
     hops: int = 1
 
 
-def with_context(
+def add_context(
     a: NodeLayer,
     b: NodeLayer,
     params: Params | None = None,
@@ -40,32 +40,34 @@ def with_context(
     weight: float = WEIGHT,
     max_distance_m: float = _MAX_DISTANCE_M,
 ) -> tuple[NodeLayer, NodeLayer]:
-    """Two layers of one descriptor with embeddings ``[feature, weight * context]`` of unit length.
+    """Return two layers of one descriptor with embeddings ``[feature, weight * context]`` of unit length.
 
-    The words that contexts are counted over are those of the two layers themselves (`word_shares`): an image encoder's
-    features all lie in one narrow cone, which a codebook that knows nothing of them cannot tell apart. Nothing of a
-    context is stored, so that layers compare whatever other scenes a map holds, and in whatever order they came.
+    The codebook is computed from the two layers themselves (`word_shares`): an image encoder's features all lie in one
+    narrow cone, which a general codebook does not resolve. No context is stored, so the result does not depend on the
+    other scenes of a map nor on their order.
     """
     hops = (params or Params()).hops
     if weight == 0 or not len(a) or not len(b):
         return a, b
     shares = word_shares(np.concatenate([a.features, b.features]), NUM_WORDS, SHARPNESS)
     return (
-        _joined(a, shares[: len(a)], hops, weight, max_distance_m),
-        _joined(b, shares[len(a) :], hops, weight, max_distance_m),
+        _with_embeddings(a, shares[: len(a)], hops, weight, max_distance_m),
+        _with_embeddings(b, shares[len(a) :], hops, weight, max_distance_m),
     )
 
 
-def _joined(layer: NodeLayer, shares: np.ndarray, hops: int, weight: float, max_distance_m: float) -> NodeLayer:
+def _with_embeddings(
+    layer: NodeLayer, shares: np.ndarray, hops: int, weight: float, max_distance_m: float
+) -> NodeLayer:
     reach = neighbourhood(layer.positions, max_distance_m / layer.unit_m, hops)
     both = np.concatenate([layer.features, weight * context_histograms(shares, reach)], axis=1)
     return replace(layer, embeddings=both / np.maximum(np.linalg.norm(both, axis=1, keepdims=True), 1e-12))
 
 
 def neighbourhood(positions: np.ndarray, max_distance: float, hops: int) -> np.ndarray:
-    """(M, M) bool: which nodes are within ``hops`` edges of which, itself left out.
+    """Return (M, M) bool: nodes within ``hops`` edges of each other in the paper's local graph, without themselves.
 
-    Edges join nodes nearer than ``max_distance``: the paper's local graph.
+    Edges join nodes nearer than ``max_distance``.
     """
     from scipy.spatial import cKDTree  # naming a recipe does without
 
@@ -80,33 +82,32 @@ def neighbourhood(positions: np.ndarray, max_distance: float, hops: int) -> np.n
 
 
 def word_shares(features: np.ndarray, num_words: int, sharpness: float) -> np.ndarray:
-    """(M, K) how each of M features is shared among K <= ``num_words`` words; rows sum to 1.
+    """Assign M features softly to K <= ``num_words`` visual words; rows (M, K) sum to 1.
 
-    Features are centred on their mean, which all have in common and which tells none from another, and brought to unit
-    length. Words are the centres of spherical k-means (Dhillon and Modha 2001) from seeds each farthest from those
-    before it, so that nothing is drawn at random. Centres are sums of features, so the products of features with each
-    other are all that is needed, however long the features are. A feature is shared by the softmax of its cosines.
+    Features are centred on their mean and normalized. Words are the centres of spherical k-means (Dhillon and Modha
+    2001) with farthest-point seeds, without randomness. Centres are sums of features, so the Gram matrix of the
+    features suffices, however long they are. The weights are the softmax of a feature's cosines.
 
     Args:
         features: (M, F).
         num_words: K at most; M where there are fewer features.
-        sharpness: of the softmax.
+        sharpness: inverse temperature of the softmax.
     """
     centred = features.astype(np.float64) - features.mean(0, dtype=np.float64)
     centred /= np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-12)
-    alike = centred @ centred.T
-    seeds = [int(alike.mean(0).argmax())]
-    nearest = alike[seeds[0]]
+    gram = centred @ centred.T
+    seeds = [int(gram.mean(0).argmax())]
+    nearest = gram[seeds[0]]
     for _ in range(min(num_words, len(features)) - 1):
         seeds.append(int(nearest.argmin()))
-        nearest = np.maximum(nearest, alike[seeds[-1]])
-    cosines = alike[:, seeds]
+        nearest = np.maximum(nearest, gram[seeds[-1]])
+    cosines = gram[:, seeds]
     for _ in range(_LLOYD_STEPS):
         members = np.zeros_like(cosines)
         members[np.arange(len(members)), cosines.argmax(1)] = 1
-        sums = alike @ members
+        sums = gram @ members
         lengths = np.sqrt((members * sums).sum(0))
-        some = lengths > 1e-9  # a word that lost all its features stays where it was
+        some = lengths > 1e-9  # a word without features keeps its centre
         cosines = np.where(some, sums / np.where(some, lengths, 1), cosines)
     shares = np.exp(sharpness * (cosines - cosines.max(1, keepdims=True)))
     out: np.ndarray = shares / shares.sum(1, keepdims=True)
@@ -114,13 +115,13 @@ def word_shares(features: np.ndarray, num_words: int, sharpness: float) -> np.nd
 
 
 def context_histograms(shares: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """(M, K) unit vectors: the root of how a node's neighbours spread over the words.
+    """Return (M, K) unit vectors: the square roots of the word histograms of each node's neighbours.
 
-    Cosines of roots compare histograms as Bhattacharyya coefficients. A node with no neighbour has the zero vector.
+    Cosines of square roots are Bhattacharyya coefficients. A node without neighbours has the zero vector.
 
     Args:
         shares: (M, K) of `word_shares`.
-        reach: (M, M) which nodes are each node's neighbours.
+        reach: (M, M) bool neighbours of each node.
     """
     total = reach.astype(np.float64) @ shares
     out: np.ndarray = np.sqrt(total / np.maximum(total.sum(1, keepdims=True), 1e-12))

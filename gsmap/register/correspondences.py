@@ -1,4 +1,4 @@
-"""Candidate correspondences between the nodes of two scene graphs."""
+"""Match the nodes of two scene graphs by their embeddings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Correspondences:
         target, source: (M, 3) float64 positions of the two ends, each in its own scene's frame, in metres.
         target_ids, source_ids: (M,) int32 rows of the two layers.
         similarity: (M,) float32 cosine of the embeddings.
-        target_heights, source_heights: (M,) float64 heights along gravity, or None where either scene does not know.
+        target_heights, source_heights: (M,) float64 heights along gravity, or None where it is unknown in either scene.
     """
 
     target: np.ndarray
@@ -46,7 +46,7 @@ class Correspondences:
         )
 
 
-def correspondences(
+def match_nodes(
     target: NodeLayer,
     source: NodeLayer,
     *,
@@ -56,17 +56,17 @@ def correspondences(
     units_m: tuple[float, float] = (1.0, 1.0),
     ups: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> Correspondences:
-    """Pairs of nodes of one type whose embeddings are alike: each node's ``top_k``, from both sides.
+    """Match nodes of one type with similar embeddings: each node's ``top_k``, from both sides.
 
     Args:
-        target, source: one layer of each scene, made by the same descriptor.
+        target, source: one layer of each scene, by the same descriptor.
         top_k: a pair is kept when either node is among the other's so many most similar nodes of its type.
         min_similarity: cosine of the embeddings.
         max_correspondences: number of the most similar pairs that are kept.
         units_m: metres per unit of the target's and of the source's frame.
         ups: unit vectors against gravity, or None.
     """
-    # Nodes of one type are brought together, so that each type's similarities are one product of two blocks.
+    # Sorted by type, so that each type's similarities are one product of two blocks.
     order_t, order_s = (np.argsort(layer.types, kind="stable") for layer in (target, source))
     types_t, types_s = target.types[order_t], source.types[order_s]
     embeddings_t, embeddings_s = target.embeddings[order_t], source.embeddings[order_s]
@@ -76,7 +76,7 @@ def correspondences(
     found = [np.zeros(0, np.float32)]
     for t0, t1, s0, s1 in zip(*bounds, strict=True):
         block = embeddings_t[t0:t1] @ embeddings_s[s0:s1].T
-        rows, columns = _alike(block, top_k, min_similarity)
+        rows, columns = _mutual_top_k(block, top_k, min_similarity)
         found_t.append(order_t[t0 + rows])
         found_s.append(order_s[s0 + columns])
         found.append(block[rows, columns])
@@ -88,7 +88,7 @@ def correspondences(
     return _between(target, source, t[order], s[order], similarity[order], units_m, ups)
 
 
-def as_similar(
+def similar_pairs(
     target: NodeLayer,
     source: NodeLayer,
     members: Correspondences,
@@ -98,13 +98,13 @@ def as_similar(
     units_m: tuple[float, float],
     ups: tuple[np.ndarray | None, np.ndarray | None],
 ) -> Correspondences:
-    """Every pair of an end of some correspondences and a node that is as similar to it as these are to each other.
+    """Match the ends of some match_nodes with all nodes that are as similar to them as their partners.
 
     Args:
-        members: the correspondences.
-        quantile: of their similarities, which a pair must reach.
-        count: the most similar pairs that are kept at most.
-        units_m, ups: as in `correspondences`.
+        members: the match_nodes.
+        quantile: of their similarities; the lower limit of the similarity of a pair.
+        count: largest number of the most similar pairs.
+        units_m, ups: as in `match_nodes`.
     """
     bar = float(np.quantile(members.similarity, quantile)) - 1e-6
     ends_t, ends_s = np.unique(members.target_ids), np.unique(members.source_ids)
@@ -120,7 +120,7 @@ def as_similar(
 def _similar_pairs(
     target: NodeLayer, source: NodeLayer, t: np.ndarray, s: np.ndarray, bar: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs among rows of both layers that are of one type and at least so similar."""
+    """Return pairs of rows of both layers that are of one type and at least so similar."""
     similar = target.embeddings[t] @ source.embeddings[s].T >= bar
     rows, columns = np.nonzero(similar & (target.types[t][:, None] == source.types[s]))
     return t[rows], s[columns]
@@ -135,7 +135,7 @@ def _between(
     units_m: tuple[float, float],
     ups: tuple[np.ndarray | None, np.ndarray | None],
 ) -> Correspondences:
-    """The correspondences of rows of both layers, in metres."""
+    """Return the match_nodes of rows of both layers, in metres."""
     points_t, points_s = target.positions[t] * units_m[0], source.positions[s] * units_m[1]
     level = ups[0] is not None and ups[1] is not None
     return Correspondences(
@@ -149,12 +149,12 @@ def _between(
     )
 
 
-def _alike(similarity: np.ndarray, top_k: int, min_similarity: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the entries that are among the ``top_k`` of their row or of their column."""
+def _mutual_top_k(similarity: np.ndarray, top_k: int, min_similarity: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns of the entries among the ``top_k`` of their row or column."""
     height, width = similarity.shape
     if top_k == 1:
         column, row = similarity.argmax(1), similarity.argmax(0)
-        once = np.flatnonzero(column[row] != np.arange(width))  # the others are in already, from their row
+        once = np.flatnonzero(column[row] != np.arange(width))  # mutual matches are there already, from their row
         rows, columns = np.concatenate([np.arange(height), row[once]]), np.concatenate([column, once])
     else:
         k, m = min(top_k, width), min(top_k, height)

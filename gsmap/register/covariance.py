@@ -1,4 +1,4 @@
-"""How well a refined pose is known."""
+"""Estimate the covariance of a refined pose."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from gsmap.geometry.rotations import retract, skew
 from gsmap.geometry.similarities import Similarities
 from gsmap.methods.refiner import Correspondences
 from gsmap.register import error_field
-from gsmap.register.degeneracy import held_motions, point_information
-from gsmap.register.metres import Belief
+from gsmap.register.degeneracy import constrained_motions, point_information
 from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import PLANE_NEIGHBOURS, Surface
+from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Sim3
 
 BLOCK_M = 0.3  # residuals within a cell of this size, on surfaces that face one way, are one measurement
@@ -28,76 +28,77 @@ _MAX_BLOCKS = 200  # larger cells are taken where there would be more
 # the residuals of this many cells pull back.
 _PROBE_M = 0.01
 _PROBE_POINTS = 6000
-_COLOUR_SWAY = colored_icp.Params(colour_weight=3.0)  # ten times that of refining
+_COLOUR_PARAMS = colored_icp.Params(colour_weight=3.0)  # ten times that of refining
 _COLOUR_PASS = colored_icp.Schedule((0.06,), (10_000,), last_tolerance=0.01)  # one radius; a tenth of a pair's cost
-_FEWEST = 20  # cells that coincide
-_FEWEST_OF_A_BLOCK = 3.0
-_LEAST_LOG_SCALE_SIGMA = 1e-6  # keeps the matrix regular
-_LEAST_HELD = 0.1  # of a motion, whatever the probe says: farther out than it reaches something holds
-# Pairs follow errors of the surfaces as they follow motions, which cancels; but then the residuals show less of the
-# errors than there is, which does not. Half of it, in made worlds whose errors are known.
-_CANCELS = 0.5
-_WIDTH = 0.3  # of the radius: pairs this far from the planes count a quarter, as in refining
-_CLIP = 3.0  # standard deviations: what moved between captures is no error of the surfaces
+_MIN_CELLS = 20  # cells that coincide
+_MIN_BLOCK_COUNT = 3.0
+_MIN_LOG_SCALE_SIGMA = 1e-6  # keeps the matrix regular
+_MIN_CONSTRAINED = 0.1  # share of the curvature of a motion, as surfaces constrain it beyond the probe
+# Pairs follow errors of the surfaces as they follow motions, which cancels, but residuals then understate the errors.
+# Half of it cancels in synthetic places whose errors are known.
+_CANCELLED_SHARE = 0.5
+_WIDTH = 0.3  # of the radius: pairs at this distance from the planes have a quarter of the weight, as in refining
+_CLIP = 3.0  # standard deviations: larger residuals are changes of the place, not errors
 
 
 @dataclass(frozen=True)
-class Hidden:
-    """How far poses are off by what leaves no residual (a trainer's bias, a sensor that bends what it measures).
+class UnobservedErrors:
+    """Standard deviations of pose errors that leave no residual (a trainer's bias, a sensor's bent depths).
 
-    A model, fitted on made places by ``tools/fit/covariance.py``. All are standard deviations.
+    A model fitted to synthetic places by ``tools/fit/covariance.py``, stored in ``covariance.json``. *Colour motion* is
+    the motion by which colours alone would move a pose, the *field* the correlated surface errors (`error_field`).
 
     Args:
-        shown: what residuals show of a pose's errors counts this many times (less than once where colours tell more).
-        by_colour: rotations and translations are off by this share of what colours would move them by ...
-        swell_by_colour: ... and the logarithm of the scale by this share.
-        shift_m: translations are off by this, where ``field_m`` is the errors that residuals show beyond a block ...
-        swell_m: ... and the logarithm of the scale, over the overlap's radius, by this, before it is measured ...
-        field_m: ... of errors that residuals show, from which both ...
-        field_power: ... grow with this power of them.
-        shift_by_swell: a sensor that swells what it measures also bends it: translations are off by this share of the
-            swelling over the overlap's radius ...
-        turn_by_shift: ... and rotations, over that radius, by this many times as much as those translations.
-        most_swell: no sensor's metre is off by more than about this (logarithm of a scale).
-        least_m: no translation is known better than this, and no rotation over the overlap's radius.
+        residual_factor: factor on the standard deviation that the residuals show.
+        colour_share: error of rotations and translations per unit of colour motion.
+        colour_scale_share: error of the log scale per unit of colour motion.
+        shift_m: error of translations where the field has the size ``field_m``.
+        scale_error_m: error of the log scale times the overlap's radius where the field has the size ``field_m``.
+        field_m: reference size of the field.
+        field_power: power of the field with which both errors grow.
+        shift_per_scale: error of translations per error of the scale over the overlap's radius: a sensor that scales
+            its depths also bends them.
+        rotation_per_shift: error of rotations over the overlap's radius per error of translations.
+        max_scale_sigma: upper limit of the error of the log scale: no sensor is off by much more.
+        min_shift_m: lower limit of the error of translations, and of rotations over the overlap's radius.
     """
 
-    shown: float
-    by_colour: float
-    swell_by_colour: float
+    residual_factor: float
+    colour_share: float
+    colour_scale_share: float
     shift_m: float
-    swell_m: float
+    scale_error_m: float
     field_m: float
     field_power: float
-    shift_by_swell: float
-    turn_by_shift: float
-    most_swell: float
-    least_m: float
+    shift_per_scale: float
+    rotation_per_shift: float
+    max_scale_sigma: float
+    min_shift_m: float
 
 
 @cache
-def fitted(*, coloured: bool) -> Hidden:
-    """The fitted model for surfaces with colours, and the one for surfaces without."""
+def load_model(*, coloured: bool) -> UnobservedErrors:
+    """Load the fitted model for surfaces with colours or for surfaces without."""
     stored = json.loads((files("gsmap.register") / "covariance.json").read_text())
-    return Hidden(**stored["coloured" if coloured else "grey"])
+    return UnobservedErrors(**stored["coloured" if coloured else "grey"])
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """How well a pose is known.
+class PoseUncertainty:
+    """The uncertainty of a pose.
 
     Args:
         covariance: (7, 7) over [rot_rad, trans_m, log_scale] applied on the source side.
-        sigmas: standard deviations (rad, metres, log scale) of the least known rotation, translation and scale at the
-            overlap's centroid.
+        sigmas: standard deviations (rad, metres, log scale) of rotation and translation, each in its least certain
+            direction at the overlap's centroid, and of the scale.
     """
 
     covariance: np.ndarray
     sigmas: tuple[float, float, float]
 
     @classmethod
-    def about(cls, covariance: np.ndarray, centroid: np.ndarray, scale: float) -> Known:
-        """Of a (7, 7) covariance about the overlap's centroid (3,), of a pose of some scale."""
+    def about(cls, covariance: np.ndarray, centroid: np.ndarray, scale: float) -> PoseUncertainty:
+        """Move the covariance (7, 7) of a pose from the overlap's centroid (3,) to the source's origin."""
         sigmas = (
             float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
             float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * scale,
@@ -110,82 +111,85 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Conditioning:
-    """How a pose that was refined with its scale hangs on the errors of the surfaces, and on its scale.
+    """Sensitivity of a refined pose to surface errors and to its scale.
 
     Args:
-        scaled: (7, 7) covariance about the overlap's centroid of the pose whose scale was refined along, as far as
-            residuals show errors.
-        rigid: (6, 6) the same of the pose that has the right scale.
-        tied: (7,) what a change of the scale by 1 (its logarithm) moves of a pose that is refined to it.
+        scaled: (7, 7) covariance about the overlap's centroid of the pose with a refined scale, by the residuals.
+        rigid: (6, 6) the same of the pose with the true scale.
+        scale_coupling: (7,) derivative of the refined pose by the logarithm of its scale.
         centroid: (3,) of the overlap, in the source's frame, metres.
-        field_m: standard deviation of the surfaces' errors that are alike beyond a block.
+        field_m: standard deviation of the surface errors that are correlated beyond a block.
         radius_m: of the overlap.
-        sway: (7,) motion about the centroid by which colours would move the pose; None where there are none.
-        hidden: the model of errors that leave no residual.
-        loose: (7, 7) and (6, 6) what is added to ``scaled`` and to ``rigid`` where planes leave a motion free: the
-            errors of colours and correspondences, which hold it then, or of nothing.
+        colour_motion: (7,) motion about the centroid by which colours would move the pose; None where there are none.
+        unobserved: the model of errors that leave no residual.
+        free_covariance: (7, 7) and (6, 6) covariances that are added to ``scaled`` and ``rigid`` along degenerate
+            directions, which colours and correspondences constrain, or nothing.
     """
 
     scaled: np.ndarray
     rigid: np.ndarray
-    tied: np.ndarray
+    scale_coupling: np.ndarray
     centroid: np.ndarray
     field_m: float
     radius_m: float
-    sway: np.ndarray | None
-    hidden: Hidden
-    loose: tuple[np.ndarray, np.ndarray]
+    colour_motion: np.ndarray | None
+    unobserved: UnobservedErrors
+    free_covariance: tuple[np.ndarray, np.ndarray]
 
     @property
     def log_scale_sigma(self) -> float:
-        """Standard deviation of the scale that was refined along."""
-        return float(np.sqrt(self.of_scaled(1.0)[6, 6]))
+        """Standard deviation of the logarithm of the refined scale."""
+        return float(np.sqrt(self.covariance_with_scale(1.0)[6, 6]))
 
-    def of_scaled(self, scale: float) -> np.ndarray:
-        """(7, 7) covariance about the overlap's centroid of the pose with the scale that was refined along."""
-        swell = hidden_log_scale(self.field_m, self.radius_m, self.sway, self.hidden)
-        hidden = np.r_[self._hidden(swell, scale, self.sway), swell]
-        return self.hidden.shown**2 * self.scaled + self.loose[0] + np.diag(hidden**2)
+    def covariance_with_scale(self, scale: float) -> np.ndarray:
+        """Return the (7, 7) covariance about the overlap's centroid of the pose with a refined scale."""
+        swell = unobserved_log_scale(self.field_m, self.radius_m, self.colour_motion, self.unobserved)
+        unobserved = np.r_[self._unobserved(swell, scale, self.colour_motion), swell]
+        return self.unobserved.residual_factor**2 * self.scaled + self.free_covariance[0] + np.diag(unobserved**2)
 
-    def of_rigid(self, scale: float, swell: float, log_scale_sigma: float, sway: np.ndarray | None) -> np.ndarray:
-        """(7, 7) the same of a pose whose scale is known otherwise.
+    def covariance_of_rigid(
+        self, scale: float, swell: float, log_scale_sigma: float, colour_motion: np.ndarray | None
+    ) -> np.ndarray:
+        """Return the (7, 7) covariance about the overlap's centroid of a pose whose scale is given.
 
         Args:
-            swell: logarithm of the scale that the surfaces were measured to have over the true one: so much do their
-                errors hide, or more.
-            log_scale_sigma: how well the scale is known.
-            sway: by which colours would move this pose; None where there are none.
+            swell: logarithm of the measured scale over the given one, which indicates unobserved errors.
+            log_scale_sigma: standard deviation of the given scale's logarithm.
+            colour_motion: by which colours would move this pose; None where there are none.
         """
         out = np.zeros((7, 7))
-        hidden = self._hidden(abs(swell), scale, sway)
-        out[:6, :6] = self.hidden.shown**2 * self.rigid + self.loose[1] + np.diag(hidden**2)
-        out += np.outer(self.tied, self.tied) * max(log_scale_sigma, _LEAST_LOG_SCALE_SIGMA) ** 2
+        unobserved = self._unobserved(abs(swell), scale, colour_motion)
+        out[:6, :6] = self.unobserved.residual_factor**2 * self.rigid + self.free_covariance[1] + np.diag(unobserved**2)
+        out += np.outer(self.scale_coupling, self.scale_coupling) * max(log_scale_sigma, _MIN_LOG_SCALE_SIGMA) ** 2
         return out
 
-    def known(self, pose: Sim3, belief: Belief | None = None, sway: np.ndarray | None = None) -> Known:
-        """How well a pose (metres) is known: the scaled one, or one whose scale is believed to be something else and
-        that colours would move by ``sway``."""
-        if belief is None or not belief.rigid:
-            covariance = self.of_scaled(pose.scale)
+    def uncertainty(
+        self, pose: Sim3, decision: ScaleDecision | None = None, colour_motion: np.ndarray | None = None
+    ) -> PoseUncertainty:
+        """Return the uncertainty of a pose (metres): of the scaled one, or of a rigid one by the scale decision that
+        colours would move by ``colour_motion``."""
+        if decision is None or not decision.rigid:
+            covariance = self.covariance_with_scale(pose.scale)
         else:
-            covariance = self.of_rigid(pose.scale, belief.log_scale, belief.log_scale_sigma, sway)
-        return Known.about(covariance, self.centroid, pose.scale)
+            covariance = self.covariance_of_rigid(
+                pose.scale, decision.log_scale, decision.log_scale_sigma, colour_motion
+            )
+        return PoseUncertainty.about(covariance, self.centroid, pose.scale)
 
     def rescaled(self, pose: Sim3, scale: float) -> Sim3:
-        """The pose with another scale, and moved as that moves it."""
-        step = np.log(scale / pose.scale) * self.tied
+        """Change the scale of a pose, and move it as refinement under that scale would."""
+        step = np.log(scale / pose.scale) * self.scale_coupling
         centre = Sim3(np.eye(3), self.centroid)
         return retract(pose @ centre, step) @ centre.inverse()
 
-    def _hidden(self, swell: float, scale: float, sway: np.ndarray | None) -> np.ndarray:
-        """(6,) of rotation and translation (the source's), by how much scale the surfaces' errors hide, and by what
-        colours say."""
-        turn, shift = hidden_motion(self.field_m, self.radius_m, swell, self.hidden)
+    def _unobserved(self, swell: float, scale: float, colour_motion: np.ndarray | None) -> np.ndarray:
+        """Return the (6,) standard deviations of rotation and translation (source's unit) by unobserved errors."""
+        turn, shift = unobserved_motion(self.field_m, self.radius_m, swell, self.unobserved)
         out = np.r_[np.full(3, turn), np.full(3, shift / scale)]
-        if sway is None:
+        if colour_motion is None:
             return out
-        told = np.sqrt([(sway[:3] ** 2).mean(), (sway[3:6] ** 2).mean()])
-        return np.hypot(out, self.hidden.by_colour * np.repeat(told, 3))
+        moved_by_colour = np.sqrt([(colour_motion[:3] ** 2).mean(), (colour_motion[3:6] ** 2).mean()])
+        return np.hypot(out, self.unobserved.colour_share * np.repeat(moved_by_colour, 3))
 
 
 def condition(
@@ -193,57 +197,60 @@ def condition(
     source: Surface,
     pose: Sim3,
     correspondences: Correspondences | None = None,
-    hidden: Hidden | None = None,
+    unobserved: UnobservedErrors | None = None,
 ) -> Conditioning | None:
-    """How well a refined pose (metres) is known with its scale and without; None where too little overlaps to tell.
+    """Compute the sensitivity of a refined pose (metres) to surface errors; None where too little overlaps.
 
     An ICP Hessian is overconfident 10 to 900 times on splats, for neighbouring points share their error. So the
-    point-to-plane residuals are averaged over blocks, `error_field` learns from them how far errors are alike, and the
-    covariance is that of the pose under such errors: ``A K A^T``, where A is the pose's change by each block's error
-    (implicit function theorem: the pull of the block over what a motion is pulled back by, `_pulled_back`). What leaves
-    no residual is added by a model (`hidden_motion`, `hidden_log_scale`).
+    point-to-plane residuals are averaged over blocks, `error_field` estimates their spatial correlation, and the
+    covariance is ``A K A^T`` for errors of covariance K, where A is the derivative of the pose by each block's error
+    (implicit function theorem). A fitted model adds the errors that leave no residual (`UnobservedErrors`).
 
-    Along motions that planes leave free (`degeneracy`) the pose is known as well as colours and the ``correspondences``
-    hold it, as in refining; where these do not either, the overlap may lie anywhere along itself.
+    Along degenerate directions (`degeneracy`) colours and the ``correspondences`` constrain the pose, as in refining;
+    where these do not either, its error is as large as the overlap.
     """
     blocks = _Blocks.of(target, source, pose)
     if blocks is None:
         return None
-    hessian = _pulled_back(target, source, pose, blocks)
+    hessian = _measured_hessian(target, source, pose, blocks)
     pull = (blocks.jacobian * blocks.weights[:, None]).T
-    loose = np.zeros((7, 7)), np.zeros((6, 6))
-    held = held_motions(blocks.hessian, blocks.points, blocks.noise_m, _resolution_m(target, source), PLANE_NEIGHBOURS)
-    if held is not None:
+    free_covariance = np.zeros((7, 7)), np.zeros((6, 6))
+    constrained = constrained_motions(
+        blocks.hessian, blocks.points, blocks.noise_m, _resolution_m(target, source), PLANE_NEIGHBOURS
+    )
+    if constrained is not None:
         others, errors_of_others = _other_information(target, source, pose, blocks, correspondences)
-        hessian, pull = held @ hessian @ held.T + others, held @ pull
+        hessian, pull = constrained @ hessian @ constrained.T + others, constrained @ pull
         inverse, rigid = np.linalg.inv(hessian), np.linalg.inv(hessian[:6, :6])
-        loose = inverse @ errors_of_others @ inverse, rigid @ errors_of_others[:6, :6] @ rigid
+        free_covariance = inverse @ errors_of_others @ inverse, rigid @ errors_of_others[:6, :6] @ rigid
     influence = np.concatenate([np.linalg.solve(hessian, pull), np.linalg.solve(hessian[:6, :6], pull[:6])])
     seen = error_field.Blocks(blocks.jacobian, blocks.residual, blocks.positions, blocks.directions, blocks.counts)
-    errors = error_field.judge_errors(seen, influence)
+    errors = error_field.estimate_errors(seen, influence)
     if errors is None:
         return None
-    sway = swayed(target, source, pose, blocks.centroid, with_scale=True)
+    colour_motion = find_colour_motion(target, source, pose, blocks.centroid, with_scale=True)
     return Conditioning(
         scaled=errors.covariance[:7, :7],
         rigid=errors.covariance[7:, 7:],
-        tied=np.r_[-np.linalg.solve(hessian[:6, :6], hessian[:6, 6]), 1.0],
+        scale_coupling=np.r_[-np.linalg.solve(hessian[:6, :6], hessian[:6, 6]), 1.0],
         centroid=blocks.centroid,
         field_m=errors.field_m,
         radius_m=blocks.radius_m,
-        sway=sway,
-        hidden=hidden or fitted(coloured=sway is not None),
-        loose=loose,
+        colour_motion=colour_motion,
+        unobserved=unobserved or load_model(coloured=colour_motion is not None),
+        free_covariance=free_covariance,
     )
 
 
-def known_by_correspondences(correspondences: Correspondences, pose: Sim3, block_m: float = BLOCK_M) -> Known:
-    """How well a pose (metres) is known that was fitted to correspondences alone, and not refined."""
+def uncertainty_of_correspondences(
+    correspondences: Correspondences, pose: Sim3, block_m: float = BLOCK_M
+) -> PoseUncertainty:
+    """Return the uncertainty of a pose (metres) that was fitted to correspondences alone."""
     target, source = correspondences
     centroid = source.mean(0)
     information = pose.scale**2 * point_information(source - centroid)
     variance = ((pose.apply(source) - target) ** 2).mean() * _repeats(target, block_m)
-    return Known.about(np.linalg.pinv(information, hermitian=True) * variance, centroid, pose.scale)
+    return PoseUncertainty.about(np.linalg.pinv(information, hermitian=True) * variance, centroid, pose.scale)
 
 
 def _resolution_m(target: Surface, source: Surface) -> float:
@@ -251,7 +258,7 @@ def _resolution_m(target: Surface, source: Surface) -> float:
 
 
 def _repeats(points: np.ndarray, block_m: float) -> float:
-    """How many of some points err together: those within a block."""
+    """Return the mean number of points per block: points within a block share their error."""
     return len(points) / len(np.unique(np.floor(points / block_m), axis=0))
 
 
@@ -262,27 +269,30 @@ def _other_information(
     blocks: _Blocks,
     correspondences: Correspondences | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(7, 7) what holds a pose beside planes, about the overlap's centroid in the weights of `_Blocks`, and the
-    covariance (7, 7) of its pull: of colours, of correspondences, and that the overlap lies within its own radius."""
+    """Return the (7, 7) information of colours, of correspondences and of a prior as wide as the overlap, about its
+    centroid in the weights of `_Blocks`, and the (7, 7) covariance of their gradients."""
     variance = max(blocks.noise_m, 1e-6) ** 2
     anywhere = blocks.points / blocks.points[3, 3] * variance / blocks.radius_m**2
-    held, errors = anywhere.copy(), variance * anywhere
+    constrained, errors = anywhere.copy(), variance * anywhere
     if all(np.ptp(surface.lightness) > 0 for surface in (target, source)):
         weight = colored_icp.Params().colour_weight
-        told = colored_icp.colour_information(target, source, pose, blocks.centroid, _COLOUR_PASS)
-        if told is not None:
-            # In these units a cell's colour is off by its weight; those of a block are, all together.
+        information = colored_icp.colour_information(target, source, pose, blocks.centroid, _COLOUR_PASS)
+        if information is not None:
+            # In these units the error of a cell's colour is its weight, and the cells of a block share it.
             together = max(1.0, weight**2 * float(blocks.counts.mean()))
-            told = told * blocks.points[3, 3]
-            held, errors = held + told, errors + told * variance * together
+            information = information * blocks.points[3, 3]
+            constrained, errors = constrained + information, errors + information * variance * together
     if correspondences is not None:
-        ties = colored_icp.Ties(correspondences)
-        told, _ = ties.equations(pose, blocks.centroid, blocks.noise_m)
-        held, errors = held + told, errors + told * variance * _repeats(correspondences[0], BLOCK_M)
-    return held, errors
+        points = colored_icp.PointConstraints(correspondences)
+        information, _ = points.equations(pose, blocks.centroid, blocks.noise_m)
+        constrained, errors = (
+            constrained + information,
+            errors + information * variance * _repeats(correspondences[0], BLOCK_M),
+        )
+    return constrained, errors
 
 
-def swayed(
+def find_colour_motion(
     target: Surface,
     source: Surface,
     pose: Sim3,
@@ -290,80 +300,86 @@ def swayed(
     *,
     with_scale: bool,
 ) -> np.ndarray | None:
-    """(7,) motion about the overlap's centroid by which colours would move a refined pose; None where there are none.
+    """Return the (7,) motion about the overlap's centroid by which colours would move a refined pose; None without
+    colours.
 
-    A sensor that bends what it measures, or whose colours and depths do not belong together, moves textures otherwise
-    than planes. So the pose that colours prefer lies about as far from that of the planes as both lie from the truth,
-    where the planes' own residuals show nothing.
+    A sensor that bends its depths, or whose colours and depths are misaligned, moves textures and planes differently.
+    So the poses by colours and by planes differ by about the error of both, which the planes' residuals do not show.
     """
     if not all(np.ptp(surface.lightness) > 0 for surface in (target, source)):
         return None
-    other = colored_icp.refine(target, source, pose, _COLOUR_SWAY, with_scale=with_scale, schedule=_COLOUR_PASS)
+    other = colored_icp.refine(target, source, pose, _COLOUR_PARAMS, with_scale=with_scale, schedule=_COLOUR_PASS)
     centre = Sim3(np.eye(3), centroid)
     there, here = (Similarities.stack([p @ centre]) for p in (other, pose))
     motion: np.ndarray = (here.inverse() @ there).log()[0]
     return motion
 
 
-def hidden_log_scale(field_m: float, radius_m: float, sway: np.ndarray | None, hidden: Hidden) -> float:
-    """Standard deviation of the scale's logarithm by what leaves no residual."""
-    told = 0.0 if sway is None else hidden.swell_by_colour * sway[6] * radius_m
-    swell = np.hypot(hidden.swell_m * (field_m / hidden.field_m) ** hidden.field_power, told)
-    return float(swell / np.hypot(radius_m, swell / hidden.most_swell))
+def unobserved_log_scale(
+    field_m: float, radius_m: float, colour_motion: np.ndarray | None, unobserved: UnobservedErrors
+) -> float:
+    """Return the standard deviation of the log scale by errors that leave no residual."""
+    moved_by_colour = 0.0 if colour_motion is None else unobserved.colour_scale_share * colour_motion[6] * radius_m
+    swell = np.hypot(
+        unobserved.scale_error_m * (field_m / unobserved.field_m) ** unobserved.field_power, moved_by_colour
+    )
+    return float(swell / np.hypot(radius_m, swell / unobserved.max_scale_sigma))
 
 
-def hidden_motion(field_m: float, radius_m: float, swell: float, hidden: Hidden) -> tuple[float, float]:
-    """Standard deviations (rad, metres) about the overlap's centroid by what leaves no residual, colours apart.
+def unobserved_motion(
+    field_m: float, radius_m: float, swell: float, unobserved: UnobservedErrors
+) -> tuple[float, float]:
+    """Return standard deviations (rad, metres) about the overlap's centroid by errors that leave no residual.
 
-    Errors that leave none still show where the scale is known: a sensor whose depths are a percent off swells its
-    surfaces by as much, and its bend turns and shifts them in proportion.
+    Such errors are observed where the scale is known: a sensor whose depths are a percent off scales its surfaces by as
+    much, and rotates and shifts them in proportion.
 
     Args:
-        swell: logarithm of the scale that such errors make, measured, or its standard deviation.
+        swell: logarithm of the scale by such errors: measured, or its standard deviation.
     """
-    own = hidden.shift_m * (field_m / hidden.field_m) ** hidden.field_power
-    shift = float(np.sqrt(own**2 + (hidden.shift_by_swell * swell * radius_m) ** 2 + hidden.least_m**2))
-    return hidden.turn_by_shift * shift / radius_m, shift
+    own = unobserved.shift_m * (field_m / unobserved.field_m) ** unobserved.field_power
+    shift = float(np.sqrt(own**2 + (unobserved.shift_per_scale * swell * radius_m) ** 2 + unobserved.min_shift_m**2))
+    return unobserved.rotation_per_shift * shift / radius_m, shift
 
 
-def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks) -> np.ndarray:
-    """(7, 7) Hessian about the overlap's centroid of the residuals' squares, the pairs found anew as the pose moves.
+def _measured_hessian(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks) -> np.ndarray:
+    """Return the (7, 7) Hessian of the squared residuals about the overlap's centroid, with new pairs at each probe.
 
-    The usual one takes the pairs as given. They follow a motion along a wall, though, and the noise of its normals then
-    seems to hold it where nothing does: of a street's far end that Hessian knew a pose to millimetres that was a
-    decimetre off. So the pose is moved each way, and of each motion (an eigenvector of both Hessians together) as much
-    is taken to be held as pulls back.
+    The Gauss-Newton Hessian keeps the pairs fixed. They follow a motion along a wall, though, and the noise of its
+    normals then seems to constrain it: at a street's far end that Hessian claimed millimetres for a pose that was a
+    decimetre off. So the pose is probed in both directions of each motion, and the gradients give the curvature along
+    each common eigenvector.
     """
     chosen = source.sample(_PROBE_POINTS)
     points, centre = source.coarse[0][chosen], Sim3(np.eye(3), blocks.centroid)
-    faces = _faces(source, pose)
-    faces = None if faces is None else faces[chosen]
+    oriented = _oriented_normals(source, pose)
+    oriented = None if oriented is None else oriented[chosen]
     spread = np.r_[np.full(3, 1 / blocks.radius_m), np.ones(3), 1 / blocks.radius_m]
-    pulled = np.empty((7, 7))
+    observed = np.empty((7, 7))
     for k, step in enumerate(_PROBE_M * np.diag(spread)):
-        ahead, behind = (_pull(target, points, faces, retract(pose @ centre, x), centre) for x in (step, -step))
-        pulled[k] = (ahead - behind) / (2 * step[k]) * len(source.coarse[0]) / len(chosen)
+        ahead, behind = (_pull(target, points, oriented, retract(pose @ centre, x), centre) for x in (step, -step))
+        observed[k] = (ahead - behind) / (2 * step[k]) * len(source.coarse[0]) / len(chosen)
     hessian = blocks.hessian + 1e-9 * np.trace(blocks.hessian) / 7 * np.eye(7)
     root = np.linalg.cholesky(hessian)
-    whitened = np.linalg.solve(root, np.linalg.solve(root, pulled).T)
-    held, motions = np.linalg.eigh(0.5 * (whitened + whitened.T))
-    held = np.clip(held, _LEAST_HELD, None)
-    held /= held.mean() ** _CANCELS
+    whitened = np.linalg.solve(root, np.linalg.solve(root, observed).T)
+    constrained, motions = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    constrained = np.clip(constrained, _MIN_CONSTRAINED, None)
+    constrained /= constrained.mean() ** _CANCELLED_SHARE
     rotated = root @ motions
-    measured: np.ndarray = (rotated * held) @ rotated.T
+    measured: np.ndarray = (rotated * constrained) @ rotated.T
     return measured
 
 
-def _faces(source: Surface, pose: Sim3) -> np.ndarray | None:
-    """(M, 3) which way the source's cells face in the target's frame, zeros where that is not known."""
-    return None if source.faces is None else source.faces @ pose.rotation.T
+def _oriented_normals(source: Surface, pose: Sim3) -> np.ndarray | None:
+    """Return the (M, 3) oriented normals of the source's cells in the target's frame, zeros where unknown."""
+    return None if source.oriented_normals is None else source.oriented_normals @ pose.rotation.T
 
 
-def _pull(target: Surface, points: np.ndarray, faces: np.ndarray | None, centred: Sim3, centre: Sim3) -> np.ndarray:
-    """(7,) gradient of the weighted squares of the distances to the planes, by a motion about a centre."""
+def _pull(target: Surface, points: np.ndarray, oriented: np.ndarray | None, centred: Sim3, centre: Sim3) -> np.ndarray:
+    """Return the (7,) gradient of the weighted squared point-to-plane distances by a motion about a centre."""
     pose = centred @ centre.inverse()
     moved = pose.apply(points)
-    distance, row = target.nearest(moved, RADIUS_M, faces)
+    distance, row = target.nearest(moved, RADIUS_M, oriented)
     hit = np.flatnonzero(np.isfinite(distance))
     normals = target.normals[row[hit]]
     residual = (normals * (moved[hit] - target.coarse[0][row[hit]])).sum(1)
@@ -373,30 +389,39 @@ def _pull(target: Surface, points: np.ndarray, faces: np.ndarray | None, centred
 
 
 def _weights(residual: np.ndarray) -> np.ndarray:
-    """Geman-McClure."""
+    """Return Geman-McClure weights."""
     weights: np.ndarray = 1.0 / (1.0 + (residual / (_WIDTH * RADIUS_M)) ** 2) ** 2
     return weights
 
 
 def in_scene_units(covariance: np.ndarray, source_unit_m: float) -> np.ndarray:
-    """The covariance with translations in the source's own unit instead of metres."""
+    """Convert translations of a covariance from metres to the source's own unit."""
     scale = np.r_[np.ones(3), np.full(3, 1.0 / source_unit_m), 1.0]
     return covariance * scale[:, None] * scale
 
 
 def point_to_plane_jacobian(pose: Sim3, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(N, 7) derivative of ``n . (S Exp(xi) p)`` at xi = 0; points in the source's frame, normals in the target's."""
+    """Return the (N, 7) derivative of ``n . (S Exp(xi) p)`` at xi = 0.
+
+    Args:
+        points: (N, 3) in the source's frame.
+        normals: (N, 3) in the target's frame.
+    """
     local = pose.scale * normals @ pose.rotation
     return np.concatenate([np.cross(points, local), local, (local * points).sum(1, keepdims=True)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Weighted means over B blocks of the pairs that a pose makes, their (7, 7) Hessian, that of pairs whose points are
-    held in all directions (``points``), and the pairs' distance from the planes (robust standard deviation).
+    """Weighted means over B blocks of the pairs under a pose.
 
-    ``radius_m`` is that of the overlap. Derivatives are about ``centroid``: rotation and translation then hardly mix,
-    and the matrices are well scaled.
+    Derivatives are about ``centroid``: rotation and translation then hardly mix, and the matrices are well scaled.
+
+    Args:
+        hessian: (7, 7) Gauss-Newton Hessian of the point-to-plane distances of all pairs.
+        points: (7, 7) the same of point-to-point distances.
+        noise_m: robust standard deviation of the point-to-plane distances.
+        radius_m: of the overlap.
     """
 
     jacobian: np.ndarray
@@ -415,9 +440,9 @@ class _Blocks:
     def of(cls, target: Surface, source: Surface, pose: Sim3) -> _Blocks | None:
         points, _ = source.coarse
         moved = pose.apply(points)
-        distance, row = target.nearest(moved, RADIUS_M, _faces(source, pose))
+        distance, row = target.nearest(moved, RADIUS_M, _oriented_normals(source, pose))
         hit = np.flatnonzero(np.isfinite(distance))
-        if len(hit) < _FEWEST:
+        if len(hit) < _MIN_CELLS:
             return None
         points, moved, normals = points[hit], moved[hit], target.normals[row[hit]]
         # Signs of normals mean nothing: those of a block are turned to face one way.
@@ -437,7 +462,7 @@ class _Blocks:
         def means(values: np.ndarray) -> np.ndarray:
             return np.stack([np.bincount(labels, weights * v) for v in values.T], axis=1) / total[:, None]
 
-        kept = counts >= _FEWEST_OF_A_BLOCK
+        kept = counts >= _MIN_BLOCK_COUNT
         if not kept.any():
             return None
         directions = means(normals)
@@ -466,7 +491,7 @@ def _labels(points: np.ndarray, axis: np.ndarray, size_m: float) -> np.ndarray:
 
 
 def _shift(centroid: np.ndarray) -> np.ndarray:
-    """(7, 7) map of a tangent at the source's origin to the same motion about ``centroid``.
+    """Return the (7, 7) map of a tangent at the source's origin to the same motion about ``centroid``.
 
     ``Exp(xi) p = p + w x p + v + l p``; about c: ``v_c = v + w x c + l c``.
     """

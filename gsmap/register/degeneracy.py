@@ -1,9 +1,9 @@
-"""Degenerate directions: motions of a pose that surfaces leave free, and only the noise of their normals seems to hold.
+"""Detect degenerate directions: motions of a pose that surfaces leave free and only noise of normals constrains.
 
-A plane lets what is laid on it slide. Normals are measured, though: each is off by some degrees, and so the normal
-equations of point-to-plane distances are never quite singular. Along a street's front, or a corridor, the pull of a few
-pairs at the overlap's ends is then divided by next to nothing. So every motion's information is set against what that
-noise alone would make of it (Zhang, Kaess and Singh 2016 set it against a fixed bar).
+A plane leaves motions along it free. Measured normals are off by some degrees, though, so the normal equations of
+point-to-plane distances are never quite singular. Along a street's front or a corridor, the gradient of a few pairs at
+the overlap's ends is then divided by next to nothing. So the information on every motion is compared with that
+which the noise alone would produce (Zhang, Kaess and Singh 2016 compare it with a fixed threshold).
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 from gsmap.geometry.rotations import skew
 
 MIN_SIGNAL = 8.0
-"""A motion is held where its information is this many times what the noise of normals makes by itself: bare fronts and
-corridors reach 5; noisy rooms 16 and more, and a front with a box every ten metres 50."""
+"""Smallest information on a constrained motion, in multiples of that which the noise of normals produces: bare
+fronts and corridors reach 5; noisy rooms 16 and more, and a front with a box every ten metres 50."""
 
 
 def point_information(levers: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """(7, 7) information over [rotation, translation, log scale] about a centre of pairs whose points are held in all
-    three directions, per square metre of their variance.
+    """Return the (7, 7) information of point-to-point pairs on [rotation, translation, log scale] about a centre, for
+    points of unit variance (1 square metre).
 
     Args:
         levers: (N, 3) points less the centre.
@@ -36,21 +36,22 @@ def point_information(levers: np.ndarray, weights: np.ndarray | None = None) -> 
     return out
 
 
-def held_motions(
+def constrained_motions(
     system: np.ndarray, points: np.ndarray, noise_m: float, resolution_m: float, neighbours: int
 ) -> np.ndarray | None:
-    """(D, D) projection ``P`` of point-to-plane equations on the motions that surfaces hold; None where they hold all.
+    """Return the (D, D) projection ``P`` of point-to-plane equations on the motions that surfaces constrain; None
+    where they constrain all.
 
-    ``P system P^T`` and ``P gradient`` neither hold nor move a pose along a degenerate direction. The normal of a plane
-    through n cells of side a, whose heights are off by ``noise_m / sqrt(2)``, is off by ``noise_m sqrt(2 pi) / (n a)``
-    about each axis (least squares over a disc): a point that slides seems to be held by as much of its weight, squared.
+    ``P system P^T`` and ``P gradient`` neither constrain nor move a pose along a degenerate direction. The normal of a
+    plane through n cells of side a, whose heights have the error ``noise_m / sqrt(2)``, has the error
+    ``noise_m sqrt(2 pi) / (n a)`` about each axis (least squares over a disc), whose square constrains the sliding.
 
     Args:
         system: (D, D) normal matrix of the plane distances over the first D motions (6: the scale is fixed).
         points: (7, 7) `point_information` of the same pairs, under the same weights.
         noise_m: standard deviation of the plane distances, errors of both surfaces together.
         resolution_m: side of a cell.
-        neighbours: cells that a plane is laid through.
+        neighbours: cells that a plane is fitted to.
     """
     from scipy.linalg import eigh
 

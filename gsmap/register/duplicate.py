@@ -1,4 +1,4 @@
-"""Whether two scenes that lie on each other are one capture: converted, thinned out or trained again."""
+"""Detect two scenes of one capture that was converted, thinned out or trained again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 SAME_CAPTURE = "the same capture"
-_MIN_OVERLAP = 0.5  # of the surface; below, neither scene is the other
+_MIN_OVERLAP = 0.5  # of the surface, of duplicates
 _MIN_SHARE = 0.9  # of the smaller scene's Gaussians, or of the fewer cameras
 _POINTS = 3000
 # Independent Gaussians of one surface lie half their spacing from the nearest of the other (2D Poisson: mean nearest
@@ -25,8 +25,8 @@ _CAMERA_SHARE = 0.005  # of the distance between camera and scene: no second vis
 _CAMERA_DEG = 1.0
 
 
-def same_capture(target: SceneView, source: SceneView, found: Registration) -> str:
-    """What says that an accepted pair is one capture twice; empty where nothing does."""
+def find_duplicate(target: SceneView, source: SceneView, found: Registration) -> str:
+    """Return a message if the scenes of an accepted pair are duplicates of one capture; empty if not."""
     S = found.S_target_source
     if found.status != "accepted" or S is None or found.overlap < _MIN_OVERLAP:
         return ""
@@ -40,7 +40,7 @@ def same_capture(target: SceneView, source: SceneView, found: Registration) -> s
 
 
 def _coinciding_gaussians(target: SceneView, source: SceneView, S_target_source: Sim3) -> float:
-    """The share of the smaller scene's Gaussians that lie where one of the other's does."""
+    """Return the share of the smaller scene's Gaussians that coincide with one of the other scene."""
     from scipy.spatial import cKDTree  # naming a recipe does without
 
     means, moved = target.gaussians.means.astype(float), S_target_source.apply(source.gaussians.means)
@@ -48,13 +48,13 @@ def _coinciding_gaussians(target: SceneView, source: SceneView, S_target_source:
     small = small[np.linspace(0, len(small) - 1, min(len(small), _POINTS)).astype(int)]
     tree = cKDTree(large, balanced_tree=False, compact_nodes=False)
     spacing = tree.query(large[np.linspace(0, len(large) - 1, len(small)).astype(int)], k=2)[0][:, 1]
-    distance, _ = _laid_exactly(tree, small)
+    distance, _ = _align_closely(tree, small)
     return float((distance < _SPACING_SHARE * np.median(spacing)).mean())
 
 
-def _laid_exactly(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances to and rows of the nearest points of a set, once the nearer half of the points is laid on it: the
-    refined pose is good to a millimetre, which may be the spacing."""
+def _align_closely(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances to and rows of the nearest points of a set after the nearer half of the points is aligned with
+    it: the refined pose is good to a millimetre, which may be the spacing."""
     for _ in range(4):
         distance, row = tree.query(points)
         near = np.argsort(distance)[: max(3, len(points) // 2)]
@@ -64,7 +64,7 @@ def _laid_exactly(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _coinciding_cameras(target: SceneView, source: SceneView, S_target_source: Sim3) -> tuple[int, int]:
-    """How many cameras of the scene with fewer stand and look as one of the other's, and how many those are."""
+    """Return how many cameras of the scene with fewer have the pose of a camera of the other, and their number."""
     from scipy.spatial import cKDTree
 
     ours, theirs = target.cameras, source.cameras
@@ -75,6 +75,6 @@ def _coinciding_cameras(target: SceneView, source: SceneView, S_target_source: S
     forward = poses[0][:, :3, 2], poses[1][:, :3, 2] @ S_target_source.rotation.T
     few, many = (0, 1) if len(centres[0]) < len(centres[1]) else (1, 0)
     away = np.median(np.linalg.norm(centres[0] - target.centre, axis=1))
-    distance, row = _laid_exactly(cKDTree(centres[many]), centres[few])
-    looks = (forward[few] * forward[many][row]).sum(1) > np.cos(np.radians(_CAMERA_DEG))
-    return int(np.sum((distance < _CAMERA_SHARE * away) & looks)), len(distance)
+    distance, row = _align_closely(cKDTree(centres[many]), centres[few])
+    same_direction = (forward[few] * forward[many][row]).sum(1) > np.cos(np.radians(_CAMERA_DEG))
+    return int(np.sum((distance < _CAMERA_SHARE * away) & same_direction)), len(distance)

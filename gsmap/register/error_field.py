@@ -1,4 +1,4 @@
-"""The errors of a pair's surfaces as a random field, from the residuals that a pose leaves."""
+"""Estimate the covariance of a pose under spatially correlated surface errors, from its residuals."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Blocks:
         residual: (B,) metres.
         positions: (B, 3) metres.
         directions: (B, 3) unit vectors along which the residuals are taken.
-        counts: (B,) how many residuals each mean is of.
+        counts: (B,) number of residuals in each mean.
     """
 
     jacobian: np.ndarray
@@ -36,46 +36,46 @@ class Blocks:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """What residuals show of errors.
+    """Errors of estimates.
 
     Args:
         covariance: (E, E) of the estimates.
-        field_m: standard deviation of the errors that are alike beyond a block.
+        field_m: standard deviation of the errors that are correlated beyond a block.
     """
 
     covariance: np.ndarray
     field_m: float
 
 
-def judge_errors(blocks: Blocks, influence: np.ndarray) -> Errors | None:
-    """The errors of estimates that are linear in those of the blocks, as the blocks' residuals show them.
+def estimate_errors(blocks: Blocks, influence: np.ndarray) -> Errors | None:
+    """Estimate the covariance of estimates that depend linearly on the errors of the blocks.
 
-    The errors are those of a displacement field (isotropic, stationary, with an exponential covariance), seen along the
-    blocks' directions, and independent noise of each block. Residuals are what D fitted parameters left of the errors,
-    so the field is judged by its restricted likelihood (Patterson and Thompson 1971), which does not count what the fit
-    took away: a long-waved field leaves little, and is still found possible. What few residuals cannot tell apart is
-    averaged over, weighted by likelihood (Harville 1974: flat priors), not chosen.
+    The errors are a displacement field (isotropic, stationary, with an exponential covariance) along the blocks'
+    directions, plus independent noise of each block. The fit of D parameters removes a part of the errors, so the
+    field is fitted by its restricted likelihood (Patterson and Thompson 1971), which accounts for the part that the fit
+    removed: a field of long wavelength leaves small residuals. Fields that few residuals cannot distinguish are
+    averaged, weighted by likelihood (Harville 1974: flat priors).
 
     Args:
         influence: (E, B) change of each estimate by the error of each block.
 
     Returns:
-        None where the blocks are hardly more than the parameters.
+        None where there are hardly more blocks than parameters.
     """
     count, dim = blocks.jacobian.shape
     free = count - dim
     if free < _FREE:
         return None
-    noise = np.sqrt(1.0 + SMALL_BLOCK / blocks.counts)  # in these units the noise of all blocks is alike
-    # An orthonormal basis of what no parameter explains.
+    noise = np.sqrt(1.0 + SMALL_BLOCK / blocks.counts)  # in these units all blocks have equal noise
+    # An orthonormal basis of the residuals that no parameter explains.
     rest = np.linalg.qr(blocks.jacobian / noise[:, None], mode="complete")[0][:, dim:]
     left = rest.T @ (blocks.residual / noise)
     distance = np.linalg.norm(blocks.positions[:, None] - blocks.positions[None], axis=2)
-    alike = (blocks.directions @ blocks.directions.T) / np.outer(noise, noise)
+    coupling = (blocks.directions @ blocks.directions.T) / np.outer(noise, noise)
     spread = influence * noise
     own, logs, outcomes, fields = spread @ spread.T, [], [], []
     for length in LENGTHS_M:
-        field = alike * np.exp(-distance / length)
+        field = coupling * np.exp(-distance / length)
         values, vectors = np.linalg.eigh(rest.T @ field @ rest)
         squares, shared = (vectors.T @ left) ** 2, spread @ field @ spread.T
         for share in SHARES:

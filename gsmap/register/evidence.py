@@ -1,4 +1,4 @@
-"""Evidence for a pose from renders of both scenes: free space, coinciding surfaces, local colours."""
+"""Measure evidence for a pose from renders of both scenes: free space, coinciding surfaces and local colours."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _MIN_PATTERN = 0.05
 _PATTERN_CORRELATION = 0.1
 _PATCH_PX = 16  # colours are compared after the mean over a patch of this size is removed ...
 _CELL_M = 0.4  # ... and over a cell of this size for scenes without cameras
-_MIN_SEEN = 100  # cameras of a scene that see fewer Gaussians of the other scene are ignored
-NUM_CAMERAS = 6  # of each scene, chosen to see most of the other scene
+_MIN_SEEN = 100  # cameras of a scene that add_pixels fewer Gaussians of the other scene are ignored
+NUM_CAMERAS = 6  # of each scene, chosen to add_pixels most of the other scene
 MAX_POINTS = 12_000  # of each scene that are tested for coinciding
 
 
@@ -39,21 +39,19 @@ class PoseEvidence:
     Args:
         overlap: share of surface cells that coincide, the smaller of both directions.
         num_coinciding: source cells that coincide with the target.
-        free_space_violation: of the surface Gaussians of one scene that the other's cameras could judge, the share that
-            stands in front of what these saw, and is on it in no view; the larger of both directions. NaN where no
-            cameras could judge. What lies behind is hidden, which proves nothing.
-        num_seen: Gaussians so judged, the smaller of both directions; 0 where one could not be asked.
-        num_judged: Gaussians so judged in the direction that ``free_space_violation`` is of.
+        free_space_violation: share of one scene's surface Gaussians observed by the other's cameras that stand in free
+            space and on no observed surface; the larger of both directions. NaN where no cameras observed any.
+            Gaussians behind a surface are occluded and not counted.
+        num_seen: number of Gaussians so observed, the smaller of both directions; 0 where one is missing.
+        num_judged: number of Gaussians so observed in the direction of ``free_space_violation``.
         colour_correlation: correlation of the colours of both scenes' renders where their depths agree, differences
-            within a patch only, so neither exposure nor "floors are dark, walls are bright" counts; mean over lightness
-            and two chromas, the smaller of both directions that could be asked. Where neither scene has cameras, that
-            of coinciding cells.
-        colour_t: its significance, in standard deviations over patches.
-        disagreement: of the surface that both scenes saw, as area, the share that is not the same in both: one has it
-            where the other looked through, or the two show another pattern on it. Both directions together; NaN where
-            no cameras could judge. One place captured twice within the hour has next to none, whatever the overlap; a
-            place that changed and a place that looks alike have some.
-        seen_m2: that surface, in square metres.
+            within a patch only, so neither exposure nor the brightness of whole surfaces counts; mean over lightness
+            and two chromas, the smaller of the available directions. Without cameras, that of coinciding cells.
+        colour_t: significance of the correlation, in standard deviations over patches.
+        disagreement: share of the surface area observed in both scenes that differs: it stands in free space or has
+            another pattern. Both directions together; NaN where no cameras observed any. One place captured twice
+            within the hour has next to none, whatever the overlap; changed and aliased places have some.
+        seen_m2: the surface area observed in both scenes, in square metres.
     """
 
     overlap: float = 0.0
@@ -68,7 +66,7 @@ class PoseEvidence:
 
 
 Views = tuple[ViewCache, float] | None
-"""A scene through its own cameras, and metres per unit of that scene; None for a scene without cameras."""
+"""A scene's cached renders and metres per unit of that scene; None for a scene without cameras."""
 
 
 def measure(
@@ -82,13 +80,13 @@ def measure(
 ) -> PoseEvidence:
     """Compare two scenes under ``S_target_source``.
 
-    A few cameras of each scene render both: their own scene whole, as the trainer saw it, and of the other its surface
-    alone, for from where its own cameras never stood its haze and floaters hide everything.
+    A few cameras of each scene render both: their own scene whole, and the other scene's surface alone, for seen from
+    elsewhere than its own cameras its haze and floaters occlude everything.
 
     Args:
         target, source: surfaces, in metres; so is the pose.
         views: the target's and the source's own.
-        num_cameras: of each scene, chosen to see most of the other scene.
+        num_cameras: of each scene, chosen to add_pixels most of the other scene.
         max_points: of each scene that are tested for coinciding.
     """
     rows_t, rows_s = target.sample(max_points), source.sample(max_points)
@@ -104,21 +102,23 @@ def measure(
             (views[1], target, pose.inverse(), back),
         )
     ]
-    judges = [stats for stats in both_ways if stats is not None and stats.num_seen >= _MIN_SEEN]
-    colours = [stats.colour() for stats in judges]
+    observers = [stats for stats in both_ways if stats is not None and stats.num_seen >= _MIN_SEEN]
+    colours = [stats.colour_correlation() for stats in observers]
     if views == (None, None):
         cells = np.floor(forward[hit] / _CELL_M).astype(int)
         cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
         camera_free = CrossViewStats.of(0)
-        camera_free.compare(_opponent(target.coarse[1][row[hit]]), _opponent(source.coarse[1][rows_s[hit]]), cell)
-        colours = [camera_free.colour()]
-    areas = np.sum([stats.areas_m2() for stats in judges], axis=0) if judges else np.zeros(3)
-    worst = max(judges, key=lambda stats: stats.free_space_violation, default=None)
+        camera_free.add_colours(
+            _opponent_colours(target.coarse[1][row[hit]]), _opponent_colours(source.coarse[1][rows_s[hit]]), cell
+        )
+        colours = [camera_free.colour_correlation()]
+    areas = np.sum([stats.areas_m2() for stats in observers], axis=0) if observers else np.zeros(3)
+    worst = max(observers, key=lambda stats: stats.free_space_violation, default=None)
     return PoseEvidence(
         overlap=overlap,
         num_coinciding=int(hit.sum()),
         free_space_violation=float("nan") if worst is None else worst.free_space_violation,
-        num_seen=min(stats.num_seen for stats in judges) if len(judges) == 2 else 0,
+        num_seen=min(stats.num_seen for stats in observers) if len(observers) == 2 else 0,
         colour_correlation=min((correlation for correlation, _ in colours), default=0.0),
         colour_t=min((t for _, t in colours), default=0.0),
         disagreement=float(areas[:2].sum() / areas[2]) if areas[2] > 0 else float("nan"),
@@ -129,14 +129,16 @@ def measure(
 
 @dataclass
 class CrossViewStats:
-    """What one scene's cameras say of the other: flags for each of its Gaussians, sums of colours over patches."""
+    """Comparison of a scene with renders by another's cameras: flags of its Gaussians, sums of colours over patches."""
 
     in_front: np.ndarray
     agrees: np.ndarray
     products: list[np.ndarray] = field(default_factory=list)  # (patches, 3) each
     squares: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
     area_m2: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of each Gaussian, where it was seen best
-    patterns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)  # as in `see`, a view each
+    patterns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(
+        default_factory=list
+    )  # as in `add_pixels`, one per view
 
     @classmethod
     def of(cls, count: int) -> CrossViewStats:
@@ -151,49 +153,49 @@ class CrossViewStats:
         return float((self.in_front & ~self.agrees).sum()) / self.num_seen
 
     def areas_m2(self) -> np.ndarray:
-        """(3,) surface that was seen through, that shows another pattern, and all that could be judged."""
+        """Return (3,) areas: surface in free space, surface with another pattern, all observed surface."""
         through = self.area_m2[self.in_front & ~self.agrees].sum()
-        judged = self.area_m2[self.in_front | self.agrees].sum()
+        observed = self.area_m2[self.in_front | self.agrees].sum()
         if not self.patterns:
-            return np.array([through, 0.0, judged])
+            return np.array([through, 0.0, observed])
         gaussian, area_m2, correlation = (np.concatenate(rows) for rows in zip(*self.patterns, strict=True))
-        # A noisy capture's patterns correlate badly everywhere; only what does worse than that noise is another one.
+        # A noisy capture's patterns correlate badly everywhere; only those below that noise differ.
         middle, upper = np.quantile(correlation, [0.5, 0.75])
-        unlike = correlation < min(_PATTERN_CORRELATION, middle - 3 * (upper - middle))
+        differs = correlation < min(_PATTERN_CORRELATION, middle - 3 * (upper - middle))
         other = np.zeros(len(self.area_m2))
-        np.maximum.at(other, gaussian[unlike], area_m2[unlike])
-        return np.array([through, np.minimum(other, self.area_m2)[self.agrees].sum(), judged])
+        np.maximum.at(other, gaussian[differs], area_m2[differs])
+        return np.array([through, np.minimum(other, self.area_m2)[self.agrees].sum(), observed])
 
-    def see(self, gaussian: np.ndarray, area_m2: np.ndarray, correlation: np.ndarray) -> None:
-        """Take the pixels of one view into account.
+    def add_pixels(self, gaussian: np.ndarray, area_m2: np.ndarray, correlation: np.ndarray) -> None:
+        """Add the pixels of one view.
 
         Args:
-            gaussian: (N,) whose they are.
-            area_m2: (N,) how much surface they show.
-            correlation: (N,) of the pattern around them with that of the other scene; NaN where there is none.
+            gaussian: (N,) Gaussian that dominates each pixel.
+            area_m2: (N,) surface area of each pixel.
+            correlation: (N,) of the pattern around each pixel in both scenes; NaN where there is none.
         """
         rows, which = np.unique(gaussian, return_inverse=True)
-        shown = np.bincount(which, area_m2)
-        self.area_m2[rows] = np.maximum(self.area_m2[rows], shown)
-        told = np.isfinite(correlation)
-        if told.any():
-            count = np.bincount(which[told], minlength=len(rows))
-            sums = np.bincount(which[told], correlation[told], minlength=len(rows))
+        area = np.bincount(which, area_m2)
+        self.area_m2[rows] = np.maximum(self.area_m2[rows], area)
+        finite = np.isfinite(correlation)
+        if finite.any():
+            count = np.bincount(which[finite], minlength=len(rows))
+            sums = np.bincount(which[finite], correlation[finite], minlength=len(rows))
             has = count > 0
             self.patterns.append(
-                (rows[has], np.bincount(which[told], area_m2[told], len(rows))[has], (sums[has] / count[has]))
+                (rows[has], np.bincount(which[finite], area_m2[finite], len(rows))[has], (sums[has] / count[has]))
             )
 
-    def compare(self, a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> None:
-        """Take lightness and chromas (N, 3) of the same places into account, in the patches of index ``patch`` (N,)."""
+    def add_colours(self, a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> None:
+        """Add lightness and chromas (N, 3) of the same pixels in both scenes, in patches of index ``patch`` (N,)."""
         if not len(a):
             return
-        a, b = _local(a, patch), _local(b, patch)
+        a, b = _subtract_means(a, patch), _subtract_means(b, patch)
         self.products.append(_sums(a * b, patch))
         self.squares += (a**2).sum(0), (b**2).sum(0)
 
-    def colour(self) -> tuple[float, float]:
-        """Correlation, and its t statistic over patches; 0 and 0 where nothing was compared."""
+    def colour_correlation(self) -> tuple[float, float]:
+        """Return the correlation and its t statistic over patches; 0 and 0 where nothing was compared."""
         norm = np.sqrt(self.squares.prod(0))
         if not self.products or not norm.all():
             return 0.0, 0.0
@@ -204,7 +206,11 @@ class CrossViewStats:
 def _cross_view(
     views: ViewCache, unit_m: float, other: Surface, pose: Sim3, points: np.ndarray, num_cameras: int
 ) -> CrossViewStats:
-    """The other scene, laid into one by ``pose`` (metres), through that one's cameras; ``points`` of it, so laid."""
+    """Compare a scene with the other, moved into it by ``pose`` (metres), through its cameras.
+
+    Args:
+        points: (N, 3) of the other scene, moved; the cameras are selected by these.
+    """
     if other.splats is None or not len(other):
         return CrossViewStats.of(0)
     stats = CrossViewStats.of(len(other))
@@ -227,14 +233,14 @@ def _compare(
     focal_px: float,
     reach_m: float,
 ) -> None:
-    """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres.
+    """Compare both renders of one view; ``unit_m`` and ``scale`` bring the two depths to the same metres.
 
     Args:
-        reach_m: what lies farther than this in front of the surface seen proves nothing.
+        reach_m: space farther than this in front of the surface is not known to be free.
     """
     depth, other_depth = own.depth[0] * unit_m, other.depth[0] * scale
     solid = own.alpha[0] > _MIN_ALPHA
-    near, far = _extremes(depth, solid)
+    near, far = _depth_range(depth, solid)
     tolerance = _DEPTH_TOLERANCE_M + _DEPTH_TOLERANCE * depth
     both = solid & (other.alpha[0] > _MIN_ALPHA)
     in_front = both & (other_depth < near - tolerance)
@@ -245,37 +251,37 @@ def _compare(
     stats.agrees[other.dominant_id[0][agrees]] = True
     rows, columns = np.nonzero(agrees)
     patch = rows // _PATCH_PX * -(-agrees.shape[1] // _PATCH_PX) + columns // _PATCH_PX
-    a, b = _opponent(own.colour[0][agrees]), _opponent(other.colour[0][agrees])
-    stats.compare(a, b, patch)
+    a, b = _opponent_colours(own.colour[0][agrees]), _opponent_colours(other.colour[0][agrees])
+    stats.add_colours(a, b, patch)
     pattern = np.full(agrees.shape, np.nan)
     patch = rows // _PATTERN_PX * -(-agrees.shape[1] // _PATTERN_PX) + columns // _PATTERN_PX
     pattern[agrees] = _pattern_correlation(a, b, patch)
-    judged = in_front | agrees
-    area_m2 = (other_depth[judged] / focal_px) ** 2
-    stats.see(other.dominant_id[0][judged], area_m2, pattern[judged])
+    observed = in_front | agrees
+    area_m2 = (other_depth[observed] / focal_px) ** 2
+    stats.add_pixels(other.dominant_id[0][observed], area_m2, pattern[observed])
 
 
 def _pattern_correlation(a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """(N,) correlation of lightness and chromas within the patch of each pixel; NaN where not both show a pattern."""
+    """Return the (N,) correlation of colours within each pixel's patch; NaN where not both show a pattern."""
     if not len(a):
         return np.zeros(0)
     count = np.bincount(patch)
-    a, b = _local(a, patch), _local(b, patch)
+    a, b = _subtract_means(a, patch), _subtract_means(b, patch)
     aa, bb, ab = (_sums(x * y, patch).sum(1) for x, y in ((a, a), (b, b), (a, b)))
     patterned = (np.minimum(aa, bb) > count * _MIN_PATTERN**2) & (count > _PATTERN_PX**2 // 2)
     out: np.ndarray = np.where(patterned, ab / np.sqrt(np.maximum(aa * bb, 1e-12)), np.nan)[patch]
     return out
 
 
-def _opponent(colours: np.ndarray) -> np.ndarray:
-    """(N, 3) lightness and two chromas of RGB."""
+def _opponent_colours(colours: np.ndarray) -> np.ndarray:
+    """Return (N, 3) lightness and two chromas of RGB."""
     opponent = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T
     out: np.ndarray = np.clip(colours, 0.0, 1.0) @ opponent
     return out
 
 
-def _local(values: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """Values (N, 3) less their means over patches."""
+def _subtract_means(values: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """Subtract the means over patches from values (N, 3)."""
     means = _sums(values, patch) / np.maximum(np.bincount(patch), 1)[:, None]
     return values - means[patch]
 
@@ -284,8 +290,8 @@ def _sums(values: np.ndarray, group: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(group, v) for v in values.T], axis=1)
 
 
-def _extremes(depth: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest depth over 3 x 3 pixels, so that a pixel off at an edge violates nothing."""
+def _depth_range(depth: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest depth over 3 x 3 pixels, so that a shift by a pixel at an edge is tolerated."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     low = minimum_filter(np.where(solid, depth, np.inf), 3, mode="nearest")

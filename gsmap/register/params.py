@@ -1,4 +1,4 @@
-"""How a pair is registered."""
+"""Settings of pairwise registration."""
 
 from __future__ import annotations
 

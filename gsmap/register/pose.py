@@ -1,4 +1,4 @@
-"""The similarity that a set of agreeing correspondences implies, or why it implies none."""
+"""Fit a similarity to a set of correspondences, or state the reason why they fit none."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _MAX_RMS_SIGMAS = 6.0
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A closed-form pose and how well it is known.
+    """A closed-form pose and its uncertainty.
 
     Args:
         S_target_source: the pose.
         rms_m: root mean square distance of the correspondences under it.
-        rotation_sigma_rad: standard deviation of the rotation about the axis the points constrain least.
-        flaw: empty when the pose may be used, else why not.
+        rotation_sigma_rad: standard deviation of the rotation about its least certain axis.
+        flaw: reason why the pose must not be used; empty if it may.
     """
 
     S_target_source: Sim3
@@ -39,11 +39,12 @@ def fit_pose(
     with_scale: bool = False,
     sigma_m: float = 0.03,
 ) -> PoseFit:
-    """Least-squares pose of (N, 3) corresponding points, refusing mirrored and near-collinear sets.
+    """Fit a least-squares pose to (N, 3) corresponding points; mirrored and near-collinear sets are flawed.
 
-    Distances cannot tell a set from its mirror image, so a clique may be mirrored: then an improper rotation fits, and
-    the best proper one does not. Points along a line leave the rotation about it free: with positions known to
-    ``sigma_m``, its standard deviation is the largest of ``F^-1/2``, ``F = sum(|x|^2 I - x x^T) / (2 sigma^2)``.
+    Distances do not distinguish a set from its mirror image, so a clique may be mirrored: then an improper rotation
+    fits, and the best proper one does not. Points along a line leave the rotation about it free: for positions with the
+    standard deviation ``sigma_m`` that of the rotation is the largest of ``F^-1/2``,
+    ``F = sum(|x|^2 I - x x^T) / (2 sigma^2)``.
     """
     if len(target) < 3:
         return PoseFit(Sim3.identity(), np.inf, np.inf, "fewer than 3 correspondences")

@@ -1,9 +1,8 @@
-"""How probable it is that a pose is right, of all its evidence together.
+"""Compute the probability that a pose is right from all its evidence.
 
-An additive model over log-odds: every piece of evidence is worth so much for or against, by a piecewise linear curve
-that only rises (or only falls) with it, and the sum passes through a logistic. The curves are fitted by
-``tools/fit/verdict.py`` on made places, with every fault that people's captures have, and stored beside this file; no
-real capture had a part in it.
+An additive logistic model: every piece of evidence adds log-odds along a monotone, piecewise linear curve. The curves
+are fitted by ``tools/fit/verdict.py`` on synthetic places with the defects of real captures, and stored beside this
+file; no real capture was used.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ _FILE = "probability.json"
 
 
 class Model(Odds):
-    """The fitted curves of each piece of evidence of `evidence_of`."""
+    """Fitted curves of the evidence that `evidence_of` returns."""
 
     @classmethod
     def load(cls) -> Model:
-        """The model that gsmap comes with."""
+        """Load the model that gsmap ships."""
         return _shipped()
 
 
@@ -39,14 +38,13 @@ def _shipped() -> Model:
 
 
 def evidence_of(proposal: Proposal, evidence: PoseEvidence) -> dict[str, float]:
-    """The pieces of evidence that have a curve, each such that one step of it means about the same everywhere.
+    """Return the evidence of a pose as the inputs of the curves, NaN where it is missing.
 
-    NaN where one could not be had.
+    Logarithms make equal steps about equally meaningful.
     """
     through_cameras = evidence.num_seen > 0
     nfa = proposal.log_nfa
     return {
-        # Chance makes cliques of ten to some power; beyond what any capture needs nothing is won.
         "log_nfa": float("nan") if np.isnan(nfa) else float(np.clip(nfa, -300, 30)),
         "runner_up": proposal.runner_up,
         "free_space_violation": float(np.log10(evidence.free_space_violation + 1e-3)),
@@ -59,21 +57,21 @@ def evidence_of(proposal: Proposal, evidence: PoseEvidence) -> dict[str, float]:
 
 
 def worth(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None) -> dict[str, float]:
-    """Log-odds that each piece of evidence adds, by its name."""
+    """Return the log-odds that each piece of evidence adds, by its name."""
     return (model or Model.load()).worth(evidence_of(proposal, evidence))
 
 
 def shortfalls(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None) -> list[str]:
-    """The names of the evidence that could be had, what lacks most of what it could be worth first."""
+    """Return the names of the available evidence, the farthest below its best log-odds first."""
     return (model or Model.load()).shortfalls(evidence_of(proposal, evidence))
 
 
 def probability(proposal: Proposal, evidence: PoseEvidence, prior: float = 0.5, model: Model | None = None) -> float:
-    """How probable it is that a pose is right, in (0, 1).
+    """Return the probability in (0, 1) that a pose is right.
 
     Args:
         proposal: with the refined pose.
         evidence: under that pose.
-        prior: share of judged poses that are right before anything is known of them.
+        prior: share of evaluated poses that are right before any evidence.
     """
     return (model or Model.load()).probability(evidence_of(proposal, evidence), prior)

@@ -1,4 +1,4 @@
-"""What names a stored registration."""
+"""Compute the recipe key that names a stored registration."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _RENDER_BACKEND = "native"  # the one that all renders of this room are pinned t
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
-    """The recipe of a pair: settings and versions of all that takes part under these parameters, and no others.
+    """Return the recipe of a pair: the settings and versions of the methods that these settings run, and no others.
 
-    The inputs, which the caller adds with `RecipeKey.of`, are the keys of the target's and of the source's graph.
+    The inputs, which the caller adds with `RecipeKey.of`, are the keys of the target's and of the source's scene graph.
     """
     params = params or Params()
     proposers = {params.proposer} | ({params.fallback_proposer} if params.fallback != "never" else set())
@@ -29,7 +29,7 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
         refiners |= {refiner_for(name, with_scale) for with_scale in (False, True)}
     families = {"proposers": proposers, "refiners": refiners}
     settings: dict[str, Any] = {
-        f.name: _chosen(getattr(params, f.name), families[f.name])
+        f.name: _settings_of(getattr(params, f.name), families[f.name])
         if f.name in families
         else plain(getattr(params, f.name))
         for f in fields(params)
@@ -47,12 +47,12 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
 
 
 def installed_version(package: str) -> str:
-    """The version of a package, or ``missing``."""
+    """Return the version of a package, or ``missing``."""
     try:
         return version(package)
     except PackageNotFoundError:
         return "missing"
 
 
-def _chosen(settings: MethodParams, names: set[str]) -> dict[str, Any]:
+def _settings_of(settings: MethodParams, names: set[str]) -> dict[str, Any]:
     return {name: plain(settings[name]) for name in sorted(names)}

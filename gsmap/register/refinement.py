@@ -1,11 +1,11 @@
-"""Which refiner refines a pose, by name."""
+"""Run the refiners that the settings name."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from gsmap.methods import family
-from gsmap.register.metric import MetricPair
+from gsmap.register.metric_scene import MetricPair
 from gsmap.register.params import Params
 from gsmap.types import Sim3
 
@@ -13,29 +13,31 @@ SCALE_REFINER = "colored_icp"
 """The refiner that replaces one that cannot refine the scale, for pairs of unknown scale."""
 
 
-def coarse(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) -> Sim3:
-    """The pose brought near enough to be looked at."""
-    return _refined(pair, pose, refiner_for(params.coarse_refiner, with_scale), params, with_scale, "coarse")
+def refine_coarse(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) -> Sim3:
+    """Refine a proposed pose until it is near enough to be verified."""
+    return _refine(pair, pose, refiner_for(params.coarse_refiner, with_scale), params, with_scale, "coarse")
 
 
-def fine(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) -> Sim3:
-    """The refined pose."""
-    return _refined(pair, pose, refiner_for(params.refiner, with_scale), params, with_scale, "fine")
+def refine_fine(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) -> Sim3:
+    """Refine a pose to its final accuracy."""
+    return _refine(pair, pose, refiner_for(params.refiner, with_scale), params, with_scale, "fine")
 
 
-def polished(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) -> Sim3:
-    """The pose by the polisher; the same object where it has nothing to say."""
-    return _refined(pair, pose, params.polisher, params, with_scale, "fine")
+def polish(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) -> Sim3:
+    """Run the polisher; the same object is returned where it changes nothing."""
+    return _refine(pair, pose, params.polisher, params, with_scale, "fine")
 
 
 def refiner_for(name: str, with_scale: bool) -> str:
-    """The refiner that is asked: that of the name, unless it cannot refine the scale and has to."""
+    """Return the name of the refiner to run: the given one, unless the scale is free and it cannot refine scales."""
     return SCALE_REFINER if with_scale and not family("refiner").get(name).SCALES else name
 
 
-def _refined(pair: MetricPair, pose: Sim3, name: str, params: Params, with_scale: bool, stage: str) -> Sim3:
+def _refine(pair: MetricPair, pose: Sim3, name: str, params: Params, with_scale: bool, stage: str) -> Sim3:
     refiner = family("refiner").get(name)
-    extra: dict[str, Any] = {"correspondences": pair.ties} if getattr(refiner, "USES_CORRESPONDENCES", False) else {}
+    extra: dict[str, Any] = (
+        {"correspondences": pair.correspondences} if getattr(refiner, "USES_CORRESPONDENCES", False) else {}
+    )
     if stage in getattr(refiner, "SCHEDULES", {}):
         extra["schedule"] = refiner.SCHEDULES[stage]
     found: Sim3 = refiner.refine(

@@ -1,4 +1,4 @@
-"""What registration is given of a scene."""
+"""A scene as the input of registration: Gaussians, cameras and scene graph."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from gsmap.types.scene import SCALE_POLICIES
 
 @dataclass(frozen=True, eq=False)
 class SceneView:
-    """One scene as `register_pair` takes it.
+    """A scene as the input of `register_pair`.
 
     Args:
         id: the scene's id.
-        gaussians, cameras: in the scene's frame; cameras may be None or empty, then nothing is checked through them.
-        graph: its nodes.
-        scale_policy: ``known`` (metres), ``unknown`` (any unit), or ``auto`` (metres if the match says so).
+        gaussians, cameras: in the scene's frame; without cameras free space is not verified.
+        graph: the scene graph.
+        scale_policy: ``known`` (metres), ``unknown`` (any unit), or ``auto`` (metres if the match confirms it).
     """
 
     id: str
@@ -41,11 +41,11 @@ class SceneView:
 
     @cached_property
     def centre(self) -> np.ndarray:
-        """(3,) middle of the scene's content, in its frame."""
+        """(3,) median of the Gaussians' centres, in the scene's frame."""
         return np.median(self.gaussians.means, axis=0) if len(self.gaussians) else np.zeros(3)
 
     def surface(self, unit_m: float = 1.0) -> Surface:
-        """The scene's surface in metres; the last two are kept, so a scene met by many others is prepared once."""
+        """Return the scene's surface in metres; the last two are cached, for a scene is registered with many others."""
         if unit_m not in self._surfaces:
             while len(self._surfaces) > 1:
                 self._surfaces.pop(next(iter(self._surfaces)))
@@ -54,7 +54,7 @@ class SceneView:
 
     @cached_property
     def views(self) -> ViewCache | None:
-        """Renders of the scene through its own cameras, each made once; None without cameras."""
+        """Renders of the scene through its own cameras, each computed once; None without cameras."""
         if not self.cameras or not len(self.gaussians):
             return None
         return ViewCache(self.gaussians, self.cameras)

@@ -1,4 +1,4 @@
-"""The surface points of a scene, as registration aligns and compares them."""
+"""Extract the surface points of a scene that registration aligns and compares."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from gsmap.geometry.cells import cell_means
 from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.sh import rgb_of_sh0
-from gsmap.register import facing
+from gsmap.register import visible_side
 from gsmap.register.view_cache import ViewCache
 from gsmap.types import Cameras, Gaussians
 
-PLANE_NEIGHBOURS = 20  # cells, itself included, that a plane is laid through, as small_gicp does
+PLANE_NEIGHBOURS = 20  # cells, itself included, that a plane is fitted to, as in small_gicp
 _GRADIENT_NEIGHBOURS = 10
 
 
@@ -41,7 +41,7 @@ class Surface:
         colours: (N, 3) float32 view-independent colour.
         resolution_m: cell size of the aligned cloud.
         splats: the N Gaussians themselves, in metres, with their mean colour alone; None where only points are known.
-        unit_m: metres per unit of the scene, under which the surface was made.
+        unit_m: metres per unit of the scene, of the surface.
         gaussians, cameras: the whole scene in its own unit; None where only points are known.
         views: the scene through its cameras, which orient its normals; None without.
     """
@@ -66,7 +66,7 @@ class Surface:
         cameras: Cameras | None = None,
         views: ViewCache | None = None,
     ) -> Surface:
-        """The surface of a scene whose unit is ``unit_m`` metres."""
+        """Extract the surface of a scene whose unit is ``unit_m`` metres."""
         largest = gaussians.log_scales.max(1, initial=-np.inf) + np.log(unit_m)
         opacities = gaussians.opacities
         bar = MIN_OPACITY
@@ -91,7 +91,7 @@ class Surface:
         return cls(points, colours, RESOLUTION_M, splats, unit_m, gaussians, cameras, views)
 
     def scaled(self, factor: float) -> Surface:
-        """The same surface in a unit ``factor`` times smaller."""
+        """Return the surface in a unit ``factor`` times smaller."""
         return self if factor == 1.0 else Surface(self.points * factor, self.colours, self.resolution_m)
 
     @cached_property
@@ -107,7 +107,7 @@ class Surface:
 
     @cached_property
     def cloud(self) -> tuple[Any, Any]:
-        """The cell means with covariances and normals, and their search tree, as small_gicp keeps them."""
+        """Point cloud of small_gicp: the cell means with covariances and normals, and their search tree."""
         import small_gicp
 
         cloud = small_gicp.PointCloud(self.coarse[0])
@@ -117,14 +117,14 @@ class Surface:
 
     @cached_property
     def tree(self) -> Any:
-        """The search tree of the cell means."""
+        """Search tree of the cell means."""
         from gsmap import _native
 
         return _native.PointTree(np.ascontiguousarray(self.coarse[0]))
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """(M, 3) unit normals at the cell means; signs mean nothing."""
+        """(M, 3) unit normals at the cell means, of arbitrary sign."""
         normals: np.ndarray = self.tree.normals(PLANE_NEIGHBOURS)
         return normals
 
@@ -142,25 +142,25 @@ class Surface:
         return gradients
 
     @cached_property
-    def faces(self) -> np.ndarray | None:
-        """(M, 3) the normals turned to the side that the scene's own cameras saw, zeros where that is not known; None
-        where it nowhere is."""
+    def oriented_normals(self) -> np.ndarray | None:
+        """(M, 3) normals towards the side that the scene's own cameras saw, zeros where unknown; None without any."""
         if self.views is None or not self.views.num_own or not len(self.coarse[0]):
             return None
-        found = facing.faces(self.coarse[0], self.normals, self.tree, self.views, self.unit_m)
+        found = visible_side.orient_normals(self.coarse[0], self.normals, self.tree, self.views, self.unit_m)
         return found if found.any() else None
 
     def nearest(
-        self, points: np.ndarray, radius_m: float, faces: np.ndarray | None = None
+        self, points: np.ndarray, radius_m: float, normals: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Distance to and row of the nearest cell mean of each point; inf and 0 where none lies within the radius.
+        """Return the distance to and row of the nearest cell mean of each point; inf and 0 beyond the radius.
 
         Args:
-            faces: (P, 3) of the points, in this surface's frame: cells that face the other way are passed over.
+            normals: (P, 3) oriented normals of the points, in this surface's frame; cells that face the opposite side
+                are skipped.
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
-        if faces is None or self.faces is None:
+        if normals is None or self.oriented_normals is None:
             distance, rows = self.tree.nearest(points, radius_m)
         else:
-            distance, rows = self.tree.nearest(points, radius_m, self.faces, np.ascontiguousarray(faces))
+            distance, rows = self.tree.nearest(points, radius_m, self.oriented_normals, np.ascontiguousarray(normals))
         return distance, rows

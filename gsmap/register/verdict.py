@@ -1,4 +1,4 @@
-"""Accept a pose, or say why not."""
+"""Accept or reject a pose by its evidence, with a reason."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_RUNNER_UP = 0.7  # size of a disagreeing clique, as a share of the best, up 
 # A free-space violation measured on few Gaussians contradicts a pose only where so many would violate free space with
 # less than this probability if the share were the allowed one (binomial test).
 _FREE_SPACE_LEVEL = 0.01
-PRIOR = 0.2  # share of verified poses that are right before anything is known of them
+PRIOR = 0.2  # share of evaluated poses that are right before any evidence
 # Prescreen of roughly refined poses.
 PRESCREEN_LOG_NFA = 6.0  # a clique with a larger log10 NFA is not refined at all
 PRESCREEN_CAMERAS = 3
@@ -59,21 +59,21 @@ class Params:
 
 
 def is_significant(proposal: Proposal, params: Params | None = None) -> bool:
-    """The correspondences alone rule out the background model, and no rival pose comes near."""
+    """Return whether chance does not explain the correspondences and no rival clique is nearly as large."""
     params = params or Params()
-    return is_rare(proposal, params) and bool(proposal.runner_up <= MAX_RUNNER_UP)
+    return has_low_nfa(proposal, params) and bool(proposal.runner_up <= MAX_RUNNER_UP)
 
 
-def is_rare(proposal: Proposal, params: Params) -> bool:
-    """The background model expects fewer false alarms than allowed; never where none were counted."""
+def has_low_nfa(proposal: Proposal, params: Params) -> bool:
+    """Return whether the number of false alarms is below the threshold; never where it was not computed."""
     return bool(proposal.log_nfa < params.max_log_nfa)
 
 
 def not_significant(proposal: Proposal, params: Params, besides: str = "") -> str:
-    """Why the correspondences alone do not carry the pose; ``besides`` is what else there is to say."""
+    """Return the reason why the correspondences alone are not significant; ``besides`` is appended."""
     if np.isnan(proposal.log_nfa):
         why = f"{proposal.proposer} counts no false alarms, log10 NFA needs < {params.max_log_nfa:.1f}"
-    elif not is_rare(proposal, params):
+    elif not has_low_nfa(proposal, params):
         why = f"log10 NFA {proposal.log_nfa:.1f}, needs < {params.max_log_nfa:.1f}"
     else:
         why = f"a rival clique has {proposal.runner_up:.0%} of its size, allowed {MAX_RUNNER_UP:.0%}"
@@ -83,7 +83,7 @@ def not_significant(proposal: Proposal, params: Params, besides: str = "") -> st
 
 
 def fails_prescreen(evidence: PoseEvidence) -> str:
-    """Why a roughly refined pose cannot come to be accepted; empty while it may."""
+    """Return the reason why a roughly refined pose is not refined further; empty if it is."""
     if evidence.num_coinciding < _PRESCREEN_MIN_COINCIDING:
         return _too_little(evidence, _PRESCREEN_MIN_COINCIDING)
     pale = evidence.colour_correlation < _PRESCREEN_COLOUR_CORRELATION
@@ -94,18 +94,18 @@ def fails_prescreen(evidence: PoseEvidence) -> str:
     return ""
 
 
-def judge(
+def decide(
     proposal: Proposal,
     evidence: PoseEvidence,
     sigmas: tuple[float, float, float] | None,
     params: Params | None = None,
 ) -> str:
-    """Empty when the pose is accepted, else the reason why not.
+    """Return the reason why a pose is not accepted; empty if it is.
 
     Args:
         proposal: with the refined pose.
         evidence: under that pose.
-        sigmas: standard deviations (rad, metres, log scale) of the least known directions; None without overlap.
+        sigmas: standard deviations (rad, metres, log scale) of the least certain directions; None without overlap.
     """
     params = params or Params()
     against = contradiction(proposal, evidence, params)
@@ -124,7 +124,7 @@ def judge(
 
 
 def contradiction(proposal: Proposal, evidence: PoseEvidence, params: Params) -> str:
-    """What contradicts a pose whatever else speaks for it; empty where nothing does."""
+    """Return the evidence that contradicts a pose whatever supports it; empty if there is none."""
     if proposal.flaw:
         return proposal.flaw
     if evidence.num_coinciding < params.min_coinciding:
@@ -137,11 +137,11 @@ def contradiction(proposal: Proposal, evidence: PoseEvidence, params: Params) ->
 
 
 def violates_free_space(share: float, num_judged: float, allowed: float) -> bool:
-    """Whether a share of Gaussians violates free space by more than is allowed, and than so few of them explain.
+    """Return whether free space is violated by more than is allowed and than a small sample explains.
 
     Args:
-        share: NaN where no cameras could judge.
-        num_judged: Gaussians that it is of; 0 or NaN where that is not known.
+        share: fraction of the Gaussians that violate free space; NaN where no camera observed them.
+        num_judged: number of these Gaussians; 0 or NaN where it is unknown.
     """
     from scipy.stats import binom
 
@@ -150,27 +150,27 @@ def violates_free_space(share: float, num_judged: float, allowed: float) -> bool
     return not num_judged > 0 or bool(binom.sf(round(share * num_judged) - 1, num_judged, allowed) < _FREE_SPACE_LEVEL)
 
 
-def is_believable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> bool:
-    """Nothing contradicts the pose and all evidence together carries it, however well it is known."""
+def is_acceptable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> bool:
+    """Return whether nothing contradicts a pose and it is probable, whatever its uncertainty."""
     return not contradiction(proposal, evidence, params) and not improbable(proposal, evidence, params)
 
 
 def improbable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> str:
-    """Why all evidence together does not carry a pose; empty where it does."""
+    """Return the reason why a pose is not probable enough by all evidence; empty if it is."""
     probable = probability(proposal, evidence, PRIOR)
-    # Where the cameras of one scene could not judge, nothing was learnt of what a clique beyond chance is worth.
+    # A significant clique is enough where the cameras of one scene observed too little to verify it.
     if probable >= params.min_probability or (not evidence.num_seen and is_significant(proposal, params)):
         return ""
     return f"not probable enough: {probable:.1%}, needs {params.min_probability:.0%}: {_weakest(proposal, evidence)}"
 
 
 def _weakest(proposal: Proposal, evidence: PoseEvidence) -> str:
-    """The two pieces of evidence that a sure pose would show otherwise, in words."""
+    """Describe the two pieces of evidence that lower the probability most."""
     words = {
         "log_nfa": f"chance explains the correspondences (log10 NFA {proposal.log_nfa:.1f})",
         "runner_up": f"a rival clique has {proposal.runner_up:.0%} of its size",
         "free_space_violation": f"free-space violation {evidence.free_space_violation:.0%}",
-        "disagreement": f"{evidence.disagreement:.0%} of what both saw differs",
+        "disagreement": f"{evidence.disagreement:.0%} of the surface seen in both scenes differs",
         "overlap": f"overlap {evidence.overlap:.0%}",
         "num_coinciding": f"{evidence.num_coinciding} cells coincide",
         "colour_correlation": f"colours disagree where surfaces coincide ({evidence.colour_correlation:.2f})",

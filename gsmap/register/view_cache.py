@@ -1,4 +1,4 @@
-"""What the cameras of a scene see of it: rendered once, kept, and chosen among."""
+"""Render a scene through its own cameras, cache the renders and select views."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
+from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.projection import in_image, project, project_all
-from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.render import Rendering, render
 from gsmap.types import Cameras, Gaussians
 
-_KEPT = 64  # renders of 128 x 96 pixels: 16 MB; bounds memory, changes no answer
+_MAX_CACHED = 64  # renders of 128 x 96 pixels: 16 MB; bounds memory, changes no answer
 
 
 IMAGE_SIZE_PX = 128  # longer side of the renders
@@ -27,36 +27,40 @@ _MIN_OWN_HALF = 0.5  # of the visible points; where its own cameras see less, sy
 
 
 class ViewCache:
-    """A scene through its own cameras, in its own frame and unit; where these are few, through made ones as well.
+    """Cached renders of a scene by its own cameras and, where these see little of it, by synthesized ones.
 
-    Few cameras see the overlap with another scene by chance, or from behind a wall; the Gaussians that all cameras left
-    behind show it all the same. These renders do not depend on any pose, so a scene that meets many others is rendered
-    once; the latest are kept.
+    Few cameras may see the overlap with another scene, or see it from behind a wall; the Gaussians show it all the
+    same. The renders do not depend on any pose, so they serve all pairs of the scene; the latest are cached.
+
+    Args:
+        gaussians, cameras: in the scene's frame and unit.
+        image_size_px: longer side of the renders.
+        synthesize: add synthesized cameras where the scene's own see too little.
     """
 
     def __init__(
         self, gaussians: Gaussians, cameras: Cameras, *, image_size_px: int = IMAGE_SIZE_PX, synthesize: bool = True
     ) -> None:
         g = gaussians
-        # The mean colour alone: the rest was fitted to directions from which the other scene's cameras do not look.
+        # The mean colour alone: other coefficients were fitted to the view directions of the own cameras.
         self.gaussians = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, g.sh[:, :1])
-        self.cameras = (self._with_made(cameras) if synthesize else cameras).resized(image_size_px)
-        self.num_own = 0 if cameras.synthesised else len(cameras)  # the first; those that follow are made
+        self.cameras = (self._with_synthesized(cameras) if synthesize else cameras).resized(image_size_px)
+        self.num_own = 0 if cameras.synthesised else len(cameras)  # synthesized cameras follow
         self._renders: OrderedDict[int, Rendering] = OrderedDict()
 
-    def _with_made(self, cameras: Cameras) -> Cameras:
-        """The scene's own cameras and, where they see too little of it, made ones."""
+    def _with_synthesized(self, cameras: Cameras) -> Cameras:
+        """Return the cameras and, where they see too little of the scene, synthesized ones."""
         if cameras.synthesised or self._share_seen(cameras) >= _MIN_OWN_SHARE:
             return cameras
-        made = synthesise_cameras(self.gaussians)
+        synthesized = synthesise_cameras(self.gaussians)
         return Cameras(
-            np.concatenate([cameras.T_frame_camera, made.T_frame_camera]),
-            np.concatenate([cameras.intrinsics_px, made.intrinsics_px]),
-            np.concatenate([cameras.sizes_px, made.sizes_px]),
+            np.concatenate([cameras.T_frame_camera, synthesized.T_frame_camera]),
+            np.concatenate([cameras.intrinsics_px, synthesized.intrinsics_px]),
+            np.concatenate([cameras.sizes_px, synthesized.sizes_px]),
         )
 
     def _share_seen(self, cameras: Cameras) -> float:
-        """The share of the sample of opaque centres that any camera sees."""
+        """Return the share of the sampled opaque centres that any camera sees."""
         coarse = cameras.resized(_SELECTION_PX)
         seen = np.zeros(len(self._sample), bool)
         for at, pixel, z, nearest in self._projected(coarse):
@@ -64,31 +68,32 @@ class ViewCache:
         return float(seen.mean()) if len(seen) else 1.0
 
     def render(self, row: int) -> Rendering:
-        """Colour, alpha and depth (1, H, W) of the view of one camera."""
+        """Return colour, alpha and depth (1, H, W) of one camera's view."""
         if row not in self._renders:
-            # On the CPU everywhere: a verdict is the same bits on every machine and in every run, and pictures this
-            # small gain nothing on a GPU (docs/how-to/gpu.md).
+            # On the CPU everywhere: verdicts are equal to the bit on every machine, and images this small gain nothing
+            # on a GPU (docs/how-to/gpu.md).
             self._renders[row] = render(self.gaussians, self.cameras[[row]], dominant_id=False, backend="native")
-            while len(self._renders) > _KEPT:
+            while len(self._renders) > _MAX_CACHED:
                 self._renders.popitem(last=False)
         self._renders.move_to_end(row)
         return self._renders[row]
 
     def select_views(self, points: np.ndarray, count: int) -> list[int]:
-        """The cameras to which most of some points (N, 3) are visible, or stand in the way; see `select_views`.
+        """Select the cameras that see most of some points (N, 3), or surfaces behind them; see `select_views`.
 
-        The scene's own, as long as they see enough: what they looked through was free, what a made view does may be.
+        The scene's own cameras, if they see enough: the space that they looked through is free, that of a synthesized
+        view may be unobserved.
         """
-        # A made view shows nothing where the scene has no surface: what is seen there judges nothing.
-        made = [np.where(np.isfinite(depth), depth, -np.inf) for depth in self._nearest[self.num_own :]]
-        inside = _visible(self._coarse, points, self._nearest[: self.num_own] + made)
+        # Points before the empty background of a synthesized view prove nothing.
+        synthesized = [np.where(np.isfinite(depth), depth, -np.inf) for depth in self._nearest[self.num_own :]]
+        inside = _visible(self._coarse, points, self._nearest[: self.num_own] + synthesized)
         own = inside[: self.num_own]
         if own.any(0).sum() >= _MIN_OWN_HALF * inside.any(0).sum():
             inside = own
         return _greedy(inside, count)
 
-    def views_of_sides(self, points: np.ndarray, normals: np.ndarray, count: int) -> list[int]:
-        """The scene's own cameras that together see most sides of some surface: points (N, 3), normals (N, 3)."""
+    def select_views_of_sides(self, points: np.ndarray, normals: np.ndarray, count: int) -> list[int]:
+        """Select own cameras that together see most sides of a surface of points (N, 3) with normals (N, 3)."""
         rows = np.linspace(0, len(points) - 1, min(len(points), 1000)).astype(int)
         points, normals = points[rows], normals[rows]
         seen = _visible(self._coarse[: self.num_own], points, self._nearest[: self.num_own])
@@ -102,18 +107,18 @@ class ViewCache:
 
     @cached_property
     def _nearest(self) -> list[np.ndarray]:
-        """Nearest depth of each coarse pixel of each camera, by a sample of opaque centres: enough to choose by."""
+        """Nearest depth of each coarse pixel of each camera, by a sample of opaque centres."""
         return [nearest for *_, nearest in self._projected(self._coarse)]
 
     @cached_property
     def _sample(self) -> np.ndarray:
-        """(N, 3) opaque centres that stand for the scene."""
+        """(N, 3) sample of opaque centres."""
         solid = np.flatnonzero(self.gaussians.logit_opacities > 0.0)
         rows = np.linspace(0, len(solid) - 1, min(len(solid), _SELECTION_POINTS)).astype(int)
         return self.gaussians.means[solid[rows]]
 
     def _projected(self, coarse: Cameras) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """For each camera the rows of the sample in its image, their pixels and depths, and the nearest per pixel."""
+        """Yield rows of the sample in each camera's image, their pixels and depths, and the nearest depth per pixel."""
         for view, intrinsics, size in zip(coarse.T_camera_frame, coarse.intrinsics_px, coarse.sizes_px, strict=True):
             pixel, z, at = _project(self._sample, view, intrinsics, size)
             nearest = np.full(int(size.prod()), np.inf, np.float32)
@@ -124,19 +129,19 @@ class ViewCache:
 def select_views(
     cameras: Cameras, points: np.ndarray, count: int, nearest: list[np.ndarray] | None = None
 ) -> list[int]:
-    """Greedy choice of the cameras with most of the points in front of them, each point counted once.
+    """Select greedily the cameras that together see most points.
 
     Args:
         cameras: in the points' frame.
-        points: (N, 3); an even sample of them is looked at.
-        count: how many cameras, at most.
-        nearest: flat depth image of each camera; points behind it are hidden and do not count.
+        points: (N, 3); an even sample of them is tested.
+        count: largest number of cameras.
+        nearest: flat depth image of each camera; points behind it are occluded.
     """
     return _greedy(_visible(cameras, points, nearest), count)
 
 
 def _visible(cameras: Cameras, points: np.ndarray, nearest: list[np.ndarray] | None) -> np.ndarray:
-    """(C, S) whether each camera sees each of an even sample of the points."""
+    """Return (C, S) bool: camera c sees point s of an even sample of the points."""
     sample = points[np.linspace(0, len(points) - 1, min(len(points), 1000)).astype(int)].astype(np.float32)
     column, row, z = project_all(sample, cameras.T_camera_frame, cameras.intrinsics_px)
     width, height = cameras.sizes_px.T[..., None]
@@ -150,7 +155,7 @@ def _visible(cameras: Cameras, points: np.ndarray, nearest: list[np.ndarray] | N
 
 
 def _greedy(inside: np.ndarray, count: int) -> list[int]:
-    """Rows that together hold most of the columns, each the one that adds most."""
+    """Select rows that together cover most columns, greedily."""
     left = np.ones(inside.shape[1], dtype=bool)
     chosen: list[int] = []
     for _ in range(min(count, len(inside))):
@@ -166,7 +171,7 @@ def _greedy(inside: np.ndarray, count: int) -> list[int]:
 def _project(
     points: np.ndarray, view: np.ndarray, intrinsics_px: np.ndarray, size_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flat pixel index, depth and row of the points (float32) that fall into an image."""
+    """Return flat pixel indices, depths and rows of the points (float32) inside an image."""
     pixels, depth = project(points, view, intrinsics_px)
     rows = np.flatnonzero(in_image(pixels, depth, size_px))
     column, row = np.floor(pixels[rows]).astype(np.int64).T

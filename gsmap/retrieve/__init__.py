@@ -1,20 +1,20 @@
-"""Retrieval: which of many scenes, views and objects are worth a closer look."""
+"""Retrieval: find the pairs of scenes, among many, that may overlap."""
 
 from gsmap.retrieve.index import new_segment
 from gsmap.retrieve.lookup import VERSION, look_up
-from gsmap.retrieve.neighbours import Placed, neighbours
+from gsmap.retrieve.neighbours import ScenePosition, neighbours
+from gsmap.retrieve.pair_schedule import PairSchedule, directed
 from gsmap.retrieve.pairs import candidate_pairs
 from gsmap.retrieve.params import Params
 from gsmap.retrieve.recipe import index_recipe, recipe_key
-from gsmap.retrieve.rounds import Rounds, directed
-from gsmap.retrieve.voters import Voters, voters_of
+from gsmap.retrieve.scene_nodes import SceneNodes, select_nodes
 
 __all__ = [
     "VERSION",
     "Params",
-    "Placed",
-    "Rounds",
-    "Voters",
+    "ScenePosition",
+    "PairSchedule",
+    "SceneNodes",
     "candidate_pairs",
     "directed",
     "index_recipe",
@@ -22,5 +22,5 @@ __all__ = [
     "neighbours",
     "new_segment",
     "recipe_key",
-    "voters_of",
+    "select_nodes",
 ]

@@ -1,6 +1,6 @@
-"""Vectors as an index keeps them: a few bytes each, compared by whole numbers, in lists by the signs of their axes.
+"""Quantize vectors to integer codes, and assign them to inverted lists by the signs of their first axes.
 
-Whole numbers of this size add up exactly in float32, in any order, so that every machine finds the same neighbours.
+Sums of integers of this size are exact in float32 in any order, so every machine finds the same neighbours.
 """
 
 from __future__ import annotations
@@ -12,28 +12,28 @@ from pathlib import Path
 import numpy as np
 
 AXES = Path(__file__).with_name("axes.npz")
-"""Mean and principal axes of the built-in descriptors' vectors, by dimension (`tools/fit/retrieve.py`)."""
+"""File of the mean and principal axes of the built-in descriptors, by dimension (`tools/fit/retrieve.py`)."""
 
 NUM_DIMS = 48  # of a code
-SCALE = 200  # of a unit vector's components; what is beyond 127 / 200 is cut off, which next to none is
-NUM_SIGNS = 6  # axes whose signs name a list: 64 lists for every type of node
+SCALE = 200  # of a unit vector's components; the few beyond 127 / 200 are clipped
+NUM_SIGNS = 6  # axes whose signs select a list: 64 lists for every type of node
 
 
 def encode(vectors: np.ndarray) -> np.ndarray:
-    """(M, NUM_DIMS) int8 codes of (M, D) unit vectors; distances of codes are those of the vectors times `SCALE`."""
+    """Return (M, NUM_DIMS) int8 codes of (M, D) unit vectors; distances grow by the factor `SCALE`."""
     mean, axes = _axes(vectors.shape[1])
     along = (vectors.astype(np.float64) - mean) @ axes
     return np.clip(np.rint(along * SCALE), -127, 127).astype(np.int8)
 
 
 def similarity(squared: np.ndarray) -> np.ndarray:
-    """Cosines of vectors by squared distances of their codes."""
+    """Return cosines of vectors from squared distances of their codes."""
     return 1.0 - squared / (2.0 * SCALE**2)
 
 
 @cache
 def _axes(dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """(dim,) mean and (dim, NUM_DIMS) axes: fitted ones, or seeded random ones; all of those that there are."""
+    """Return the (dim,) mean and (dim, NUM_DIMS) axes: fitted ones, the identity, or seeded random ones."""
     with np.load(AXES) as stored:
         if f"{dim}.mean" in stored:
             fitted = stored[f"{dim}.axes"].astype(np.float64)
@@ -45,29 +45,29 @@ def _axes(dim: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def space(descriptor_id: str, *, second: bool) -> int:
-    """What keys of lists begin with: 31 bits of a descriptor's digest.
+    """Return the prefix of the keys of lists: 31 bits of a descriptor's digest.
 
     Args:
-        second: vectors that a scene has besides its own, for scenes that know no up.
+        second: for gravity-free vectors that a scene with known gravity has besides its own.
     """
     digest = hashlib.sha256(f"{descriptor_id} {int(second)}".encode()).digest()
     return int.from_bytes(digest[:4], "little") >> 1
 
 
 def keys_of(space_number: int, types: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """(M,) int64 the list that each node lies in: of its descriptor, its type, and the signs of its first axes."""
+    """Return the (M,) int64 list of each node: of its descriptor, its type and the signs of its first axes."""
     return with_signs((np.int64(space_number) << 32) | ((types.astype(np.int64) & 0xFFFFFF) << 8), codes)
 
 
 def with_signs(keys: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Keys (M,) with the signs of these codes for those that they hold."""
+    """Replace the signs in keys (M,) by those of the codes."""
     signs = (codes[:, :NUM_SIGNS] >= 0) @ (1 << np.arange(NUM_SIGNS))
     return (keys & ~np.int64(0xFF)) | signs
 
 
-def probes(keys: np.ndarray, codes: np.ndarray, num_turned: int) -> np.ndarray:
-    """(M, 2 ** num_turned) int64 lists in which to look: with each of the least certain signs as it is and turned."""
-    unsure = np.argsort(np.abs(codes[:, :NUM_SIGNS].astype(np.int16)), axis=1, kind="stable")[:, :num_turned]
+def probes(keys: np.ndarray, codes: np.ndarray, num_flipped: int) -> np.ndarray:
+    """Return the (M, 2 ** num_flipped) int64 lists to search: with each of the least certain signs kept and flipped."""
+    unsure = np.argsort(np.abs(codes[:, :NUM_SIGNS].astype(np.int16)), axis=1, kind="stable")[:, :num_flipped]
     masks = np.zeros((len(keys), 1), dtype=np.int64)
     for column in range(unsure.shape[1]):
         masks = np.concatenate([masks, masks ^ (np.int64(1) << unsure[:, column : column + 1].astype(np.int64))], 1)

@@ -32,5 +32,6 @@ class Params:
             least = 1 if field.name in ("max_edges_per_scene", "nodes_per_scene") else 0
             if not getattr(self, field.name) >= least:
                 raise ConfigError(
-                    f"retrieve.{field.name} must be at least {least}, got {getattr(self, field.name)}", code="out_of_range"
+                    f"retrieve.{field.name} must be at least {least}, got {getattr(self, field.name)}",
+                    code="out_of_range",
                 )

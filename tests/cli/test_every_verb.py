@@ -319,7 +319,7 @@ def test_evaluate_says_plainly_that_a_map_failed(site: Path, captures: Path, cli
     cli("optimize", site)
     failed = cli("evaluate", site, *truth)
     assert failed.code == 0
-    assert "0 of 3 placed, no ATE: no two scenes are tied to each other" in failed.stdout
+    assert "0 of 3 placed, no ATE: no two scenes are connected by edges" in failed.stdout
     report = cli("evaluate", site, *truth, "--json").json
     assert (report["num_scenes"], report["num_placed"], report["ate_m"], report["edges"]) == (3, 0, None, [])
     for option in ("--tiles", "--lpips"):

@@ -17,7 +17,7 @@ from gsmap.describe.landmarks.context import METRICS, NUM_RINGS, NUM_SHELLS, emb
 from gsmap.describe.landmarks.layer import landmark_layer
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
 from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
-from gsmap.register.correspondences import correspondences
+from gsmap.register.correspondences import match_nodes
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
 
 LANDMARKS = Params(objects=False)
@@ -69,7 +69,7 @@ def test_another_white_balance_leaves_landmarks_alike():
         rgb = np.clip(rgb_of_sh0(g.sh), 0, 1)
         lit = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, sh0_of_rgb(light * rgb))
         layers.append(describe("room", lit, cameras, LANDMARKS, scale_policy="known").layers["landmarks"])
-    found = correspondences(*layers)
+    found = match_nodes(*layers)
     right = np.linalg.norm(found.target - found.source, axis=1) < 0.1
     assert right.sum() > 90
     assert right.mean() > 0.3
@@ -90,7 +90,7 @@ def test_floaters_of_any_colour_do_not_hide_the_landmarks():
         )
         both = Gaussians.concatenate([g, stray])
         layers.append(describe("room", both, cameras, LANDMARKS, scale_policy="known").layers["landmarks"])
-    found = correspondences(*layers)
+    found = match_nodes(*layers)
     right = np.linalg.norm(found.target - found.source, axis=1) < 0.1
     assert right.sum() > 70
 
@@ -102,7 +102,7 @@ def test_a_scene_that_knows_up_still_matches_one_that_does_not():
     other = landmark_layer(surface_cloud(turned), None, 1.0)
     assert other.descriptor_id != graph.layers["landmarks"].descriptor_id
     assert other.descriptor_id == graph.layers["landmarks_gravity_free"].descriptor_id
-    found = correspondences(graph.layers["landmarks_gravity_free"], other)
+    found = match_nodes(graph.layers["landmarks_gravity_free"], other)
     right = np.linalg.norm(found.target @ R.T - found.source, axis=1) < 0.1
     assert right.sum() > 60
     unknown = describe("upright", *room(1), LANDMARKS, scale_policy="unknown")

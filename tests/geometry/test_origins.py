@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsmap.geometry.origins import centred, float32_step, is_single, neighbour_distance, origin_of
+from gsmap.geometry.origins import centred, float32_step, is_float32, neighbour_distance, origin_of
 from gsmap.types import Gaussians
 
 PLACES = {
@@ -37,8 +37,8 @@ def test_float32_loses_nothing_by_an_origin(place: str) -> None:
     single = (cloud(5000, 300.0) + PLACES[place]).astype(np.float32)
     means, origin = centred(single)
     np.testing.assert_array_equal((means + origin).astype(np.float32), single)
-    assert is_single(means + origin)
-    assert not is_single(means + origin + 1e-3)
+    assert is_float32(means + origin)
+    assert not is_float32(means + origin + 1e-3)
 
 
 def test_what_lies_far_out_and_what_is_no_number_move_no_origin() -> None:

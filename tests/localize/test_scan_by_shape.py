@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.rotations import angle_between
-from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.localize.scan import as_gaussians
 from gsmap.register import SceneView, by_shape, register_by_shape
 from gsmap.register.evidence import PoseEvidence
@@ -77,14 +77,14 @@ def test_a_shape_that_fits_twice_is_ambiguous(
     target, source, _ = pair
     covariance = np.eye(7) * 1e-8
     twice = [SimpleNamespace(proposal=proposal(), evidence=SEEN, covariance=covariance) for _ in range(2)]
-    monkeypatch.setattr(by_shape, "judged_by_shape", lambda *_: twice)
+    monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: twice)
     assert "fits in two ways" in register_by_shape(target, source).reason
-    monkeypatch.setattr(by_shape, "judged_by_shape", lambda *_: twice[:1])
+    monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: twice[:1])
     assert register_by_shape(target, source).status == "accepted"
     wide = [SimpleNamespace(proposal=proposal(), evidence=SEEN, covariance=np.eye(7))]
-    monkeypatch.setattr(by_shape, "judged_by_shape", lambda *_: wide)
+    monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: wide)
     assert "fixes the pose only to" in register_by_shape(target, source).reason
-    monkeypatch.setattr(by_shape, "judged_by_shape", lambda *_: [])
+    monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: [])
     assert register_by_shape(target, source).status == "no_match"
 
 

@@ -124,7 +124,7 @@ def test_a_map_that_failed_says_so(copy: Path) -> None:
         ids = [scene.id for scene in m.scenes()]
         m.store.revisions.save(PoseGraph({s: ScenePose(s, Sim3.identity(), k, "isolated") for k, s in enumerate(ids)}))
         report = m.evaluate(copy / "truth")
-    assert report.verdict == "0 of 3 placed, no ATE: no two scenes are tied to each other"
+    assert report.verdict == "0 of 3 placed, no ATE: no two scenes are connected by edges"
     assert report.edges == ()
 
 

@@ -13,7 +13,7 @@ import gsmap.map
 from gsmap import formats
 from gsmap.cli.app import run
 from gsmap.errors import CorruptError, InputError
-from gsmap.geometry.metres import resized
+from gsmap.geometry.metric_scale import scale_gaussians
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
 from gsmap.store.schema import scene_facts
@@ -77,7 +77,7 @@ def exported(m: Map, out: Path, **options: object) -> tuple[Gaussians, list[np.n
     result = m.with_settings(QUICK).export(out, **options)  # type: ignore[arg-type]
     metres = next(iter(m.metres().values())).metres_per_unit
     parts = [formats.read(out / tile.path) for tile in result.tiles if tile.path]
-    return resized(Gaussians.concatenate(parts), metres), [tile.bounds * metres for tile in result.tiles]
+    return scale_gaussians(Gaussians.concatenate(parts), metres), [tile.bounds * metres for tile in result.tiles]
 
 
 @pytest.mark.parametrize("merge", ["tto", "voxel", "union", "distance"])

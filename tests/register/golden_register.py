@@ -16,7 +16,7 @@ from gsmap.errors import MissingDependencyError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.methods import family
 from gsmap.register import Params, register_pair
-from gsmap.register.metric import MetricScene
+from gsmap.register.metric_scene import MetricScene
 from gsmap.register.proposers import graph, kiss_matcher
 from gsmap.types import Proposal, Registration, Sim3
 

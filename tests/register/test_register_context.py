@@ -8,8 +8,8 @@ from register_worlds import layer
 
 from gsmap.geometry.rotations import exp_so3
 from gsmap.register import context
-from gsmap.register.context import Params, context_histograms, neighbourhood, with_context, word_shares
-from gsmap.register.correspondences import correspondences
+from gsmap.register.context import Params, add_context, context_histograms, neighbourhood, word_shares
+from gsmap.register.correspondences import match_nodes
 from gsmap.register.proposers.graph import propose_by_kind
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 
@@ -93,7 +93,7 @@ def test_embeddings_hold_the_feature_and_the_context_of_the_neighbours_within_ho
     a, b, _ = flat(count=60)
     for hops, weight in ((1, 0.5), (3, 1.5)):
         shares = word_shares(np.concatenate([a.features, b.features]), context.NUM_WORDS, context.SHARPNESS)
-        both = with_context(a, b, Params(hops), weight=weight, max_distance_m=1.0)
+        both = add_context(a, b, Params(hops), weight=weight, max_distance_m=1.0)
         for joined, plain, own in zip(both, (a, b), (shares[:60], shares[60:]), strict=True):
             apart = np.linalg.norm(plain.positions[:, None] - plain.positions[None], axis=2)
             graph = nx.Graph((i, j) for i, j in np.argwhere((apart < 1.0) & (apart > 0)))
@@ -108,19 +108,19 @@ def test_embeddings_hold_the_feature_and_the_context_of_the_neighbours_within_ho
 def test_lengths_are_metres_of_the_layers_own_unit():
     a, b, _ = flat(count=60)
     small = replace(b, positions=b.positions / 10, extents=b.extents / 10, unit_m=10.0)
-    np.testing.assert_array_equal(with_context(a, small)[1].embeddings, with_context(a, b)[1].embeddings)
+    np.testing.assert_array_equal(add_context(a, small)[1].embeddings, add_context(a, b)[1].embeddings)
 
 
 def test_what_is_compared_does_not_depend_on_which_layer_comes_first():
     a, b, _ = flat()
-    one, other = with_context(a, b), with_context(b, a)
+    one, other = add_context(a, b), add_context(b, a)
     alike = one[0].embeddings @ one[1].embeddings.T
     np.testing.assert_allclose(other[1].embeddings @ other[0].embeddings.T, alike, atol=1e-4)
 
 
 def test_contexts_of_objects_far_apart_differ():
     a, b, _ = flat()
-    joined, _ = with_context(a, b)
+    joined, _ = add_context(a, b)
     words = joined.embeddings[:, a.features.shape[1] :]
     words = words / np.maximum(np.linalg.norm(words, axis=1, keepdims=True), 1e-9)
     far = np.triu(np.linalg.norm(a.positions[:, None] - a.positions[None], axis=2) > 6, 1)
@@ -129,23 +129,23 @@ def test_contexts_of_objects_far_apart_differ():
 
 
 def right_share(a: NodeLayer, b: NodeLayer) -> float:
-    matches = correspondences(a, b)
+    matches = match_nodes(a, b)
     return float((matches.target_ids == matches.source_ids).mean())
 
 
 def test_things_of_one_kind_are_told_apart_by_what_stands_around_them():
     a, b, _ = flat()
-    without, with_ = right_share(a, b), right_share(*with_context(a, b))
+    without, with_ = right_share(a, b), right_share(*add_context(a, b))
     assert without < 0.15
     assert with_ > 3 * without
-    assert right_share(*with_context(a, b, weight=0.0)) == without
+    assert right_share(*add_context(a, b, weight=0.0)) == without
 
 
 def test_a_pose_by_objects_of_few_kinds_needs_their_context(monkeypatch):
     a, b, _ = flat()
     graphs = [SceneGraph(name, {"objects": nodes}) for name, nodes in (("a", a), ("b", b))]
     (best, *_) = propose_by_kind(*graphs, "objects")
-    monkeypatch.setattr(context, "with_context", lambda a, b, params: (a, b))
+    monkeypatch.setattr(context, "add_context", lambda a, b, params: (a, b))
     (blind, *_) = propose_by_kind(*graphs, "objects")
     assert np.linalg.norm(best.S_target_source.apply(b.positions) - a.positions, axis=1).max() < 0.15
     assert best.num_inliers > 2 * blind.num_inliers

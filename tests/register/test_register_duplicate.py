@@ -9,7 +9,7 @@ from register_worlds import splat_world
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import register_pair
-from gsmap.register.duplicate import SAME_CAPTURE, same_capture
+from gsmap.register.duplicate import SAME_CAPTURE, find_duplicate
 from gsmap.types import Sim3
 
 MOVED = Sim3(exp_so3([0.3, -0.2, 1.0]), np.array([3.0, -2.0, 1.0]))
@@ -57,5 +57,5 @@ def test_neighbours_and_refused_pairs_are_not_called_one_capture():
     assert found.notes == ()
     itself = again(world.target, world.target.gaussians, world.target.cameras)
     whole = register_pair(world.target, itself)
-    assert same_capture(world.target, itself, whole)
-    assert not same_capture(world.target, itself, replace(whole, status="rejected"))
+    assert find_duplicate(world.target, itself, whole)
+    assert not find_duplicate(world.target, itself, replace(whole, status="rejected"))

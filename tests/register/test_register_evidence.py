@@ -231,7 +231,7 @@ _SIGMAS = (0.003, 0.011, 1e-6)
     ],
 )
 def test_verdict(change, proposal, accepted):
-    reason = verdict.judge(proposal, replace(_GOOD, **change), _SIGMAS)
+    reason = verdict.decide(proposal, replace(_GOOD, **change), _SIGMAS)
     assert (reason == "") == accepted
 
 
@@ -268,9 +268,9 @@ def test_the_direction_that_is_violated_says_of_how_many_gaussians():
 
 
 def test_verdict_refuses_what_is_known_too_loosely():
-    assert "fixes the pose only" in verdict.judge(_SURE, _GOOD, (0.05, 0.011, 1e-6))
-    assert "too little surface" in verdict.judge(_SURE, _GOOD, None)
-    assert verdict.judge(replace(_SURE, flaw="mirrored"), _GOOD, _SIGMAS) == "mirrored"
+    assert "fixes the pose only" in verdict.decide(_SURE, _GOOD, (0.05, 0.011, 1e-6))
+    assert "too little surface" in verdict.decide(_SURE, _GOOD, None)
+    assert verdict.decide(replace(_SURE, flaw="mirrored"), _GOOD, _SIGMAS) == "mirrored"
 
 
 def test_what_disagrees_is_measured_as_area_however_it_was_seen():

@@ -8,7 +8,7 @@ from register_worlds import layer, splat_world
 
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import SceneView, register_pair
-from gsmap.register.metric import MetricPair
+from gsmap.register.metric_scene import MetricPair
 from gsmap.register.params import Params
 from gsmap.register.proposers.graph import comparable_layers
 from gsmap.types import SceneGraph, Sim3

@@ -8,7 +8,7 @@ from gsmap.geometry.rotations import angle_between, exp_so3
 from gsmap.register import consistency
 from gsmap.register.clique import maximum_clique
 from gsmap.register.consistency import consistency_graph, unpack
-from gsmap.register.correspondences import Correspondences, correspondences
+from gsmap.register.correspondences import Correspondences, match_nodes
 from gsmap.register.pose import fit_pose
 from gsmap.types import NodeLayer, Sim3
 
@@ -20,7 +20,7 @@ def _pairs(target, source, heights=None):
 
 def test_correspondences_stay_within_type_and_find_the_true_partners():
     world = node_world(seed=0, shared=120, extra=60)
-    found = correspondences(world.target, world.source)
+    found = match_nodes(world.target, world.source)
     assert (world.target.types[found.target_ids] == world.source.types[found.source_ids]).all()
     right = world.partner[found.target_ids] == found.source_ids
     assert right.sum() > 0.9 * 120
@@ -30,7 +30,7 @@ def test_correspondences_stay_within_type_and_find_the_true_partners():
 def test_correspondences_are_the_brute_force_top_k():
     rng = np.random.default_rng(1)
     a, b = layer(rng, 40, types=2), layer(rng, 50, types=2)
-    found = correspondences(a, b, min_similarity=-1, top_k=2)
+    found = match_nodes(a, b, min_similarity=-1, top_k=2)
     similarity = np.where(a.types[:, None] == b.types, a.embeddings @ b.embeddings.T, -np.inf)
     rows = similarity >= np.sort(similarity, 1)[:, [-2]]
     columns = similarity >= np.sort(similarity, 0)[[-2]]
@@ -42,10 +42,8 @@ def test_correspondences_are_the_brute_force_top_k():
 def test_correspondences_of_nothing_and_the_cap():
     rng = np.random.default_rng(2)
     empty = NodeLayer.empty("m", 8)
-    assert len(correspondences(layer(rng, 5, dim=8), empty)) == 0
-    assert (
-        len(correspondences(layer(rng, 50), layer(rng, 50), min_similarity=-1, top_k=5, max_correspondences=20)) == 20
-    )
+    assert len(match_nodes(layer(rng, 5, dim=8), empty)) == 0
+    assert len(match_nodes(layer(rng, 50), layer(rng, 50), min_similarity=-1, top_k=5, max_correspondences=20)) == 20
 
 
 @pytest.mark.parametrize("test", ["absolute", "ratio"])

@@ -8,14 +8,14 @@ from register_worlds import splat_world
 
 from gsmap.errors import ConfigError
 from gsmap.evaluate.registration import pose_error, scene_centroid
+from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
-from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.register import Params, SceneView, refinement, register_pair, verdict
 from gsmap.register import pair as pair_module
-from gsmap.register.conclusion import Judged, conclude
 from gsmap.register.evidence import PoseEvidence
-from gsmap.register.metric import MetricScene
+from gsmap.register.metric_scene import MetricScene
+from gsmap.register.pose_selection import EvaluatedPose, select_pose
 from gsmap.register.probability import probability
 from gsmap.register.proposers import graph
 from gsmap.types import Cameras, Gaussians, NodeLayer, Proposal, SceneGraph, Sim3
@@ -285,12 +285,12 @@ def test_a_refined_pose_that_leaves_its_clique_is_not_judged_for_it(away_m, monk
     """A refiner that slides by 80 cm, as along a front: what the clique proposed is judged, as it was proposed, and
     known as well as the clique knows it."""
     world = splat_world(0)
-    refine = refinement._refined
+    refine = refinement._refine
 
-    def slides(pair, pose, name, settings, with_scale):
-        return _moved(refine(pair, pose, name, settings, with_scale), away_m)
+    def slides(*args):
+        return _moved(refine(*args), away_m)
 
-    monkeypatch.setattr(refinement, "_refined", slides)
+    monkeypatch.setattr(refinement, "_refine", slides)
     found = register_pair(world.target, world.source)
     error = _error(world, found)
     assert found.status == "accepted"
@@ -303,9 +303,9 @@ def test_a_refined_pose_that_leaves_its_clique_is_not_judged_for_it(away_m, monk
 
 def test_a_refined_pose_that_leaves_correspondences_which_chance_explains_is_refused(monkeypatch):
     world = splat_world(0)
-    refine, judge = refinement._refined, pair_module._judge
-    monkeypatch.setattr(refinement, "_refined", lambda *args: _moved(refine(*args), 0.4))
-    monkeypatch.setattr(pair_module, "_judge", lambda p, *args, **kw: judge(replace(p, log_nfa=-1.0), *args, **kw))
+    refine, judge = refinement._refine, pair_module._evaluate
+    monkeypatch.setattr(refinement, "_refine", lambda *args: _moved(refine(*args), 0.4))
+    monkeypatch.setattr(pair_module, "_evaluate", lambda p, *args, **kw: judge(replace(p, log_nfa=-1.0), *args, **kw))
     found = register_pair(world.target, world.source, Params(fallback="never"))
     assert found.status != "accepted"
 
@@ -316,8 +316,8 @@ def test_false_alarms_are_those_of_the_pose_that_is_judged(monkeypatch):
     found = register_pair(world.target, world.source)
     (best, *_) = graph.propose(*(MetricScene(view, 1.0) for view in (world.target, world.source)))
     assert found.evidence["log_nfa"] == best.support.count(found.S_target_source)[1]
-    refine = refinement._refined
-    monkeypatch.setattr(refinement, "_refined", lambda *args: _moved(refine(*args), 0.12))
+    refine = refinement._refine
+    monkeypatch.setattr(refinement, "_refine", lambda *args: _moved(refine(*args), 0.12))
     worse = register_pair(world.target, world.source)
     assert worse.evidence["log_nfa"] > found.evidence["log_nfa"] + 1
 
@@ -325,16 +325,16 @@ def test_false_alarms_are_those_of_the_pose_that_is_judged(monkeypatch):
 def test_a_rival_that_is_known_too_loosely_to_be_an_edge_is_a_rival():
     world = splat_world(0)
     evidence = PoseEvidence(0.4, 3000, 0.01, 2000, 0.7, 8.0, disagreement=0.01, seen_m2=30.0, num_judged=2000)
-    best = Judged(
+    best = EvaluatedPose(
         Proposal("graph", world.S_target_source, False, 60, log_nfa=-7.0, runner_up=0.9), evidence, np.eye(7), ""
     )
     moved = replace(best.proposal, S_target_source=_moved(world.S_target_source, 3.0))
 
-    def status(rival: Judged) -> tuple[str, float]:
-        found = conclude(world.target, world.source, [best, rival], Params(), seconds={})
+    def status(rival: EvaluatedPose) -> tuple[str, float]:
+        found = select_pose(world.target, world.source, [best, rival], Params(), seconds={})
         return found.status, found.evidence["probability"]
 
-    alone = conclude(world.target, world.source, [best], Params(), seconds={}).evidence["probability"]
+    alone = select_pose(world.target, world.source, [best], Params(), seconds={}).evidence["probability"]
     loose = replace(best, proposal=moved, flaw="the overlap fixes the pose only to 8 cm")
     assert status(loose) == ("no_match", pytest.approx(0.5, abs=0.01))
     near = replace(loose, proposal=_nearly(best.proposal))

@@ -11,40 +11,40 @@ from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
-from gsmap.register import Params, covariance, degeneracy, error_field, metres, surface
-from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, agreeing
+from gsmap.register import Params, covariance, degeneracy, error_field, surface, unit_scale
+from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, find_inliers
 from gsmap.register.correspondences import Correspondences
 from gsmap.register.covariance import (
     RADIUS_M,
     condition,
-    fitted,
+    find_colour_motion,
     in_scene_units,
-    known_by_correspondences,
+    load_model,
     point_to_plane_jacobian,
-    swayed,
+    uncertainty_of_correspondences,
 )
-from gsmap.register.metric import MetricPair
+from gsmap.register.metric_scene import MetricPair
 from gsmap.register.refiners import colored_icp, gicp, icp
-from gsmap.register.scale import vote_scales
-from gsmap.register.scaling import scaled_or_rigid
+from gsmap.register.scale_selection import refine_and_select_scale
+from gsmap.register.scale_vote import vote_scales
 from gsmap.register.surface import Surface
 from gsmap.types import Gaussians, Proposal, Sim3
 
-NOTHING_HIDDEN = replace(
-    fitted(coloured=True),
-    shown=1.0,
-    by_colour=0.0,
-    swell_by_colour=0.0,
+NO_UNOBSERVED = replace(
+    load_model(coloured=True),
+    residual_factor=1.0,
+    colour_share=0.0,
+    colour_scale_share=0.0,
     shift_m=0.0,
-    swell_m=0.0,
-    shift_by_swell=0.0,
-    least_m=0.0,
+    scale_error_m=0.0,
+    shift_per_scale=0.0,
+    min_shift_m=0.0,
 )
 
 
-def believed(log_scale: float, sigma: float) -> metres.Belief:
+def believed(log_scale: float, sigma: float) -> unit_scale.ScaleDecision:
     """That the scale is 1 where another was measured."""
-    return metres.Belief(True, log_scale, 1e-3, sigma)
+    return unit_scale.ScaleDecision(True, log_scale, 1e-3, sigma)
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +171,9 @@ def test_covariance_is_as_large_as_the_errors_are(cut_m):
         target = _warped(Surface.of(world.target.gaussians), 0.01, seed)
         source = _warped(Surface.of(world.source.gaussians), 0.01, 99 + seed)
         pose = colored_icp.refine(target, source, world.S_target_source)
-        covariance = condition(target, source, pose, hidden=NOTHING_HIDDEN).known(pose, believed(0.0, 0.0)).covariance
+        covariance = (
+            condition(target, source, pose, unobserved=NO_UNOBSERVED).uncertainty(pose, believed(0.0, 0.0)).covariance
+        )
         off = (Similarities.stack([pose]).inverse() @ Similarities.stack([world.S_target_source])).log()[0, :6]
         errors.append(off @ np.linalg.solve(covariance[:6, :6], off))
     # Of a narrow strip residuals tell little, and fields that are alike all over it are still found possible.
@@ -192,8 +194,8 @@ def test_noise_of_walls_does_not_hold_what_slides_along_them():
         )
         return Surface(points + rng.normal(0, 0.006, points.shape), np.full(points.shape, 0.5), 0.05)
 
-    found = condition(corridor(0), corridor(1), Sim3.identity(), hidden=NOTHING_HIDDEN)
-    variances, axes = np.linalg.eigh(found.of_rigid(1.0, 0.0, 0.0, None)[3:6, 3:6])
+    found = condition(corridor(0), corridor(1), Sim3.identity(), unobserved=NO_UNOBSERVED)
+    variances, axes = np.linalg.eigh(found.covariance_of_rigid(1.0, 0.0, 0.0, None)[3:6, 3:6])
     assert np.sqrt(variances[1]) < 0.003
     assert np.sqrt(variances[2]) > 0.5  # anywhere within the overlap: nothing holds it
     assert abs(axes[0, 2]) > 0.99
@@ -225,7 +227,7 @@ def test_motions_that_planes_leave_free_are_told_from_those_that_they_hold():
         slope = point_to_plane_jacobian(Sim3.identity(), on, noisy / np.linalg.norm(noisy, axis=1, keepdims=True))
         for dim in (6, 7):
             system = (slope.T @ slope)[:dim, :dim]
-            held = degeneracy.held_motions(system, degeneracy.point_information(on), 0.004, 0.05, 20)
+            held = degeneracy.constrained_motions(system, degeneracy.point_information(on), 0.004, 0.05, 20)
             assert (held is not None) == free
             if free:
                 assert round(np.trace(held)) == 5
@@ -269,21 +271,21 @@ def test_what_planes_leave_free_is_known_as_well_as_correspondences_know_it():
     for _ in range(8):
         ties = _same_points(rng)
         pose = colored_icp.refine(target, source, Sim3.identity(), correspondences=ties)
-        found = condition(target, source, pose, ties, NOTHING_HIDDEN)
-        sigma = np.sqrt(found.of_rigid(1.0, 0.0, 0.0, None)[3, 3])
+        found = condition(target, source, pose, ties, NO_UNOBSERVED)
+        sigma = np.sqrt(found.covariance_of_rigid(1.0, 0.0, 0.0, None)[3, 3])
         ratios.append((pose.apply(found.centroid[None])[0] - found.centroid)[0] / sigma)
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 2.0
-    without = condition(target, source, pose, hidden=NOTHING_HIDDEN)
-    assert np.sqrt(without.of_rigid(1.0, 0.0, 0.0, None)[3, 3]) > 0.5 > 50 * sigma
+    without = condition(target, source, pose, unobserved=NO_UNOBSERVED)
+    assert np.sqrt(without.covariance_of_rigid(1.0, 0.0, 0.0, None)[3, 3]) > 0.5 > 50 * sigma
 
 
 def test_colours_hold_what_planes_leave_free():
     rng = np.random.default_rng(4)
     target, source = (_front(rng, along, textured=True) for along in ((-2.0, 6.0), (2.0, 10.0)))
     pose = colored_icp.refine(target, source, Sim3(np.eye(3), [0.03, 0.01, 0.0]))
-    found = condition(target, source, pose, hidden=NOTHING_HIDDEN)
+    found = condition(target, source, pose, unobserved=NO_UNOBSERVED)
     off = abs((pose.apply(found.centroid[None])[0] - found.centroid)[0])
-    sigma = np.sqrt(found.of_rigid(1.0, 0.0, 0.0, None)[3, 3])
+    sigma = np.sqrt(found.covariance_of_rigid(1.0, 0.0, 0.0, None)[3, 3])
     assert off < 0.01
     assert off / 3 < sigma < 0.05
 
@@ -293,11 +295,11 @@ def test_a_pose_of_correspondences_alone_is_known_as_well_as_they_fit():
     for _ in range(60):
         ties = _same_points(rng, 40)
         pose = umeyama(*ties)
-        covariance = known_by_correspondences(ties, pose, block_m=0.01).covariance
+        covariance = uncertainty_of_correspondences(ties, pose, block_m=0.01).covariance
         off = Similarities.stack([pose]).inverse().log()[0, :6]
         values.append(off @ np.linalg.solve(covariance[:6, :6], off))
     assert 5.35 / 1.5 < np.median(values) < 5.35 * 1.5  # a chi-square with 6 degrees of freedom
-    together = known_by_correspondences(ties, pose, block_m=100.0).covariance
+    together = uncertainty_of_correspondences(ties, pose, block_m=100.0).covariance
     assert np.allclose(together, 40 * covariance, rtol=1e-6)  # one block: one measurement
 
 
@@ -311,13 +313,13 @@ def _warped(surface: Surface, sigma_m: float, seed: int, cell_m: float = 1.0) ->
 
 def test_covariance_moves_with_the_source_frame(world, surfaces):
     target, source = surfaces
-    covariance = condition(target, source, world.S_target_source).known(world.S_target_source).covariance
+    covariance = condition(target, source, world.S_target_source).uncertainty(world.S_target_source).covariance
     assert np.linalg.eigvalsh(covariance).min() > 0
     # The same source with its origin 40 m away: the spread of any of its points in the target stays as it was.
     shift = np.array([40.0, 0, 0])
     moved = Surface(source.points + shift, source.colours, source.resolution_m)
     pose = world.S_target_source @ Sim3(np.eye(3), -shift)
-    other = condition(target, moved, pose).known(pose).covariance
+    other = condition(target, moved, pose).uncertainty(pose).covariance
     point = source.points.mean(0)
     a = point_to_plane_jacobian(world.S_target_source, np.tile(point, (3, 1)), np.eye(3))
     b = point_to_plane_jacobian(pose, np.tile(point + shift, (3, 1)), np.eye(3))
@@ -341,7 +343,7 @@ def test_errors_are_judged_by_the_restricted_likelihood_of_one_field(monkeypatch
     monkeypatch.setattr(error_field, "LENGTHS_M", (1.5,))
     monkeypatch.setattr(error_field, "SHARES", (0.3,))
     influence = rng.normal(size=(4, 150))
-    found = error_field.judge_errors(blocks, influence)
+    found = error_field.estimate_errors(blocks, influence)
     distance = np.linalg.norm(blocks.positions[:, None] - blocks.positions[None], axis=2)
     K = 0.3 * np.exp(-distance / 1.5) * (blocks.directions @ blocks.directions.T)
     K += np.diag(0.7 * (1 + error_field.SMALL_BLOCK / blocks.counts))
@@ -365,7 +367,7 @@ def test_errors_of_a_field_are_found_whatever_its_length(length_m):
     for _ in range(40):
         noise = root @ rng.normal(size=150)
         off = influence @ noise
-        found = error_field.judge_errors(replace(blocks, residual=noise - blocks.jacobian @ off), influence)
+        found = error_field.estimate_errors(replace(blocks, residual=noise - blocks.jacobian @ off), influence)
         values.append(off @ np.linalg.solve(found.covariance, off))
         fields.append(found.field_m)
     assert 6.35 / 2 < np.median(values) < 6.35 * 1.5
@@ -374,7 +376,7 @@ def test_errors_of_a_field_are_found_whatever_its_length(length_m):
 
 def test_too_few_blocks_say_nothing():
     blocks = _walls(np.random.default_rng(0), 9)
-    assert error_field.judge_errors(blocks, np.eye(9)) is None
+    assert error_field.estimate_errors(blocks, np.eye(9)) is None
 
 
 def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfaces):
@@ -382,19 +384,19 @@ def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfa
     target, source = surfaces
     pose = world.S_target_source
     hidden = replace(
-        NOTHING_HIDDEN,
-        shown=1.0,
-        by_colour=0.0,
-        swell_by_colour=0.0,
+        NO_UNOBSERVED,
+        residual_factor=1.0,
+        colour_share=0.0,
+        colour_scale_share=0.0,
         shift_m=0.02,
-        swell_m=0.03,
-        shift_by_swell=0.4,
-        turn_by_shift=0.5,
+        scale_error_m=0.03,
+        shift_per_scale=0.4,
+        rotation_per_shift=0.5,
         field_m=0.004,
         field_power=2.0,
-        least_m=0.003,
+        min_shift_m=0.003,
     )
-    bare, found = (condition(target, source, pose, hidden=h) for h in (NOTHING_HIDDEN, hidden))
+    bare, found = (condition(target, source, pose, unobserved=h) for h in (NO_UNOBSERVED, hidden))
     growth = (bare.field_m / 0.004) ** 2
     near = np.isfinite(target.nearest(pose.apply(source.coarse[0]), RADIUS_M)[0])
     inside = source.coarse[0][near]
@@ -402,13 +404,13 @@ def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfa
     swell = growth * 0.03 / radius
     swell = 1 / np.sqrt(1 / swell**2 + 1 / 0.02**2)  # no sensor is off by much more than 2 percent
     for told, added in (
-        (swell, found.of_scaled(1.0) - bare.of_scaled(1.0)),
-        (0.01, found.of_rigid(1.0, -0.01, 0.0, None) - bare.of_rigid(1.0, -0.01, 0.0, None)),
+        (swell, found.covariance_with_scale(1.0) - bare.covariance_with_scale(1.0)),
+        (0.01, found.covariance_of_rigid(1.0, -0.01, 0.0, None) - bare.covariance_of_rigid(1.0, -0.01, 0.0, None)),
     ):
         shift = np.sqrt((growth * 0.02) ** 2 + (0.4 * told * radius) ** 2 + 0.003**2)
         assert np.allclose(np.sqrt(np.diag(added)[:6]), np.r_[np.full(3, 0.5 * shift / radius), np.full(3, shift)])
     assert found.log_scale_sigma == pytest.approx(np.hypot(bare.log_scale_sigma, swell))
-    assert np.sqrt(found.of_scaled(1.0)[6, 6]) == pytest.approx(found.log_scale_sigma)
+    assert np.sqrt(found.covariance_with_scale(1.0)[6, 6]) == pytest.approx(found.log_scale_sigma)
 
 
 def _textured(surface: Surface, into: Sim3, shift_m: float = 0.0) -> Surface:
@@ -422,38 +424,38 @@ def test_colours_that_lie_otherwise_than_planes_widen_the_pose(world, surfaces):
     """Textures that lie 2 cm off on their surfaces, as where colours and depths do not belong together: planes fit as
     before, and nothing of their residuals tells."""
     pose = world.S_target_source
-    told = replace(NOTHING_HIDDEN, by_colour=0.5, swell_by_colour=0.7)
+    told = replace(NO_UNOBSERVED, colour_share=0.5, colour_scale_share=0.7)
     target = _textured(surfaces[0], Sim3.identity())
     right, off = (_textured(surfaces[1], pose, shift_m) for shift_m in (0.0, 0.02))
-    bare, found = condition(target, off, pose, hidden=NOTHING_HIDDEN), condition(target, off, pose, hidden=told)
-    still = swayed(target, right, pose, bare.centroid, with_scale=False)
-    sway = swayed(target, off, pose, bare.centroid, with_scale=False)
-    assert np.linalg.norm(still[3:6]) < 0.002 < 0.005 < np.linalg.norm(sway[3:6]) < 0.025
-    assert (pose.rotation @ sway[3:6])[0] < -0.9 * np.linalg.norm(sway[3:6])
-    assert sway[6] == 0.0
+    bare, found = condition(target, off, pose, unobserved=NO_UNOBSERVED), condition(target, off, pose, unobserved=told)
+    still = find_colour_motion(target, right, pose, bare.centroid, with_scale=False)
+    colour_motion = find_colour_motion(target, off, pose, bare.centroid, with_scale=False)
+    assert np.linalg.norm(still[3:6]) < 0.002 < 0.005 < np.linalg.norm(colour_motion[3:6]) < 0.025
+    assert (pose.rotation @ colour_motion[3:6])[0] < -0.9 * np.linalg.norm(colour_motion[3:6])
+    assert colour_motion[6] == 0.0
     # As much as they would move it, on average over axes, the pose is more uncertain about the overlap's middle.
-    rigid = [c.of_rigid(1.0, 0.0, 0.0, sway) for c in (found, bare)]
+    rigid = [c.covariance_of_rigid(1.0, 0.0, 0.0, colour_motion) for c in (found, bare)]
     added = np.diag(rigid[0] - rigid[1])
-    assert np.allclose(added[:3], 0.25 * (sway[:3] ** 2).mean())
-    assert np.allclose(added[3:6], 0.25 * (sway[3:6] ** 2).mean())
-    added = np.diag(found.of_scaled(1.0) - bare.of_scaled(1.0))
-    assert np.allclose(added[3:6], 0.25 * (found.sway[3:6] ** 2).mean())
-    told_swell = 0.7 * abs(found.sway[6])
+    assert np.allclose(added[:3], 0.25 * (colour_motion[:3] ** 2).mean())
+    assert np.allclose(added[3:6], 0.25 * (colour_motion[3:6] ** 2).mean())
+    added = np.diag(found.covariance_with_scale(1.0) - bare.covariance_with_scale(1.0))
+    assert np.allclose(added[3:6], 0.25 * (found.colour_motion[3:6] ** 2).mean())
+    told_swell = 0.7 * abs(found.colour_motion[6])
     assert added[6] == pytest.approx(1 / (1 / told_swell**2 + 1 / 0.02**2))
     # What the pair itself is said to know of the rigid pose rests on the motion of that pose.
-    wide, narrow = (found.known(pose, believed(0.0, 0.0), s).sigmas for s in (sway, still))
+    wide, narrow = (found.uncertainty(pose, believed(0.0, 0.0), s).sigmas for s in (colour_motion, still))
     assert wide[1] > 1.5 * narrow[1]
 
 
 def test_where_a_surface_has_no_colours_the_model_for_grey_ones_holds(world, surfaces):
     grey = [Surface(s.points, np.full(s.points.shape, 0.5, np.float32), s.resolution_m) for s in surfaces]
     pose = world.S_target_source
-    told = replace(NOTHING_HIDDEN, shift_m=0.02, field_power=0.0)
-    found = condition(*grey, pose, hidden=told)
-    bare = condition(*grey, pose, hidden=NOTHING_HIDDEN)
-    assert found.sway is None
-    assert swayed(grey[0], surfaces[1], pose, found.centroid, with_scale=False) is None
-    assert np.allclose(np.diag(found.of_scaled(1.0) - bare.of_scaled(1.0))[3:6], 0.02**2)
+    told = replace(NO_UNOBSERVED, shift_m=0.02, field_power=0.0)
+    found = condition(*grey, pose, unobserved=told)
+    bare = condition(*grey, pose, unobserved=NO_UNOBSERVED)
+    assert found.colour_motion is None
+    assert find_colour_motion(grey[0], surfaces[1], pose, found.centroid, with_scale=False) is None
+    assert np.allclose(np.diag(found.covariance_with_scale(1.0) - bare.covariance_with_scale(1.0))[3:6], 0.02**2)
 
 
 def test_what_a_known_scale_reveals_of_the_sensors_widens_the_pose(world, surfaces):
@@ -462,10 +464,14 @@ def test_what_a_known_scale_reveals_of_the_sensors_widens_the_pose(world, surfac
     target, source = surfaces
     pose = world.S_target_source
     found = condition(target, source, pose)
-    fits, swells = (found.known(pose, believed(off, 0.0)).sigmas for off in (0.0, 0.01))
-    assert swells[1] ** 2 - fits[1] ** 2 == pytest.approx((found.hidden.shift_by_swell * 0.01 * found.radius_m) ** 2)
+    fits, swells = (found.uncertainty(pose, believed(off, 0.0)).sigmas for off in (0.0, 0.01))
+    assert swells[1] ** 2 - fits[1] ** 2 == pytest.approx(
+        (found.unobserved.shift_per_scale * 0.01 * found.radius_m) ** 2
+    )
     assert swells[0] > fits[0]
-    hidden = [found.of_rigid(s, 0.01, 0.0, None) - found.of_rigid(s, 0.0, 0.0, None) for s in (1.0, 4.0)]
+    hidden = [
+        found.covariance_of_rigid(s, 0.01, 0.0, None) - found.covariance_of_rigid(s, 0.0, 0.0, None) for s in (1.0, 4.0)
+    ]
     assert np.allclose(hidden[1][3:6, 3:6], hidden[0][3:6, 3:6] / 16)
 
 
@@ -473,7 +479,7 @@ def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     """Refined under a scale that is 0.3 percent wrong, a pose moves as its covariance says of that much scale."""
     target, source = surfaces
     pose = world.S_target_source
-    conditioned = condition(target, source, pose, hidden=NOTHING_HIDDEN)
+    conditioned = condition(target, source, pose, unobserved=NO_UNOBSERVED)
     wrong = conditioned.rescaled(pose, 1.003)
     assert wrong.scale == pytest.approx(1.003)
     again = colored_icp.refine(target, source, wrong, schedule=colored_icp.Schedule((0.06,), (20_000,)))
@@ -481,7 +487,7 @@ def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     moved = [np.linalg.norm(again.apply(centre) - other.apply(centre)) for other in (wrong, pose)]
     assert moved[0] < 0.003
     assert moved[0] < 0.5 * moved[1]
-    sure, unsure = (conditioned.known(pose, believed(0.0, sigma)).covariance for sigma in (0.0, 0.003))
+    sure, unsure = (conditioned.uncertainty(pose, believed(0.0, sigma)).covariance for sigma in (0.0, 0.003))
     off = (Similarities.stack([pose]).inverse() @ Similarities.stack([again])).log()[0]
     assert off @ np.linalg.solve(sure, off) > 1e4
     assert off @ np.linalg.solve(unsure, off) < 7
@@ -489,9 +495,9 @@ def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     # Near a corner, growing moves: with nothing else uncertain, what the scale moved is one standard deviation.
     near = np.linalg.norm(pose.apply(source.points) - [3.0, 0.0, 0.3], axis=1) < 1.0
     corner = condition(
-        target, Surface(source.points[near], source.colours[near], source.resolution_m), pose, hidden=NOTHING_HIDDEN
+        target, Surface(source.points[near], source.colours[near], source.resolution_m), pose, unobserved=NO_UNOBSERVED
     )
-    alone = replace(corner, rigid=1e-9 * np.eye(6)).known(pose, believed(0.0, 0.003)).covariance
+    alone = replace(corner, rigid=1e-9 * np.eye(6)).uncertainty(pose, believed(0.0, 0.003)).covariance
     moved = corner.rescaled(pose, np.exp(0.003))
     off = (Similarities.stack([pose]).inverse() @ Similarities.stack([moved])).log()[0]
     assert off @ np.linalg.solve(alone, off) == pytest.approx(1.0, rel=0.05)
@@ -503,11 +509,11 @@ def test_a_scale_some_percent_off_is_reached_from_a_pose_that_it_put_off(factor)
     S, centre = world.S_target_source, np.median(world.source.gaussians.means, axis=0)
     start = Sim3(S.rotation, S.apply(centre) - S.rotation @ centre + [0.0, 0.15, 0.15])
     pair = MetricPair.of(world.target, world.source, Proposal("test", start, False, 50), Params())
-    pose, known, belief = scaled_or_rigid(pair, start, Params(), with_scale=False)
+    pose, known, decision = refine_and_select_scale(pair, start, Params(), with_scale=False)
     assert abs(pose.scale / factor - 1) < 0.002
-    assert not belief.rigid
-    assert known.sigmas[2] == pytest.approx(belief.measured_sigma)
-    assert belief.measured_sigma == belief.log_scale_sigma
+    assert not decision.rigid
+    assert known.sigmas[2] == pytest.approx(decision.measured_sigma)
+    assert decision.measured_sigma == decision.log_scale_sigma
 
 
 def test_an_edge_is_as_wide_as_its_colours_say(monkeypatch):
@@ -516,15 +522,15 @@ def test_an_edge_is_as_wide_as_its_colours_say(monkeypatch):
     pair = MetricPair.of(world.target, world.source, Proposal("test", world.S_target_source, False, 50), Params())
     sigmas = []
     for share in (0.0, 50.0):
-        model = replace(NOTHING_HIDDEN, by_colour=share)
-        monkeypatch.setattr(covariance, "fitted", lambda *, coloured, model=model: model)
-        pose, known, belief = scaled_or_rigid(pair, world.S_target_source, Params(), with_scale=False)
-        assert belief.rigid
+        model = replace(NO_UNOBSERVED, colour_share=share)
+        monkeypatch.setattr(covariance, "load_model", lambda *, coloured, model=model: model)
+        pose, known, decision = refine_and_select_scale(pair, world.S_target_source, Params(), with_scale=False)
+        assert decision.rigid
         sigmas.append(known.sigmas)
     surfaces = pair.target.surface(), pair.source.surface()
-    centroid = condition(*surfaces, pose, hidden=NOTHING_HIDDEN).centroid
-    sway = swayed(*surfaces, pose, centroid, with_scale=False)
-    told = 50 * np.sqrt((sway[3:6] ** 2).mean())
+    centroid = condition(*surfaces, pose, unobserved=NO_UNOBSERVED).centroid
+    colour_motion = find_colour_motion(*surfaces, pose, centroid, with_scale=False)
+    told = 50 * np.sqrt((colour_motion[3:6] ** 2).mean())
     assert np.sqrt(sigmas[1][1] ** 2 - sigmas[0][1] ** 2) == pytest.approx(told, rel=0.1)
 
 
@@ -540,7 +546,7 @@ def test_a_small_overlap_knows_angles_and_scale_less_well(world, surfaces):
     inside = pose.apply(source.points)
     near = np.linalg.norm(inside - [3.0, 0.0, 0.5], axis=1) < 0.8
     part = Surface(source.points[near], source.colours[near], source.resolution_m)
-    all_of_it, little = (condition(target, s, pose).known(pose).sigmas for s in (source, part))
+    all_of_it, little = (condition(target, s, pose).uncertainty(pose).sigmas for s in (source, part))
     assert little[0] > 2 * all_of_it[0]
     assert little[2] > 2 * all_of_it[2]
 
@@ -551,7 +557,7 @@ def test_a_measured_scale_is_one_or_what_was_measured():
     said = set()
     for log_scale, sigma in [(0.0, 0.001), (-0.0028, 0.001), (-0.0029, 0.001), (0.00034, 1e-4), (0.00037, 1e-4),
                              (0.0114, 0.005), (0.0118, 0.005), (0.02, 0.02), (0.0, 0.2), (-0.02, 0.0005)]:  # fmt: skip
-        found = metres.believe(log_scale, sigma)
+        found = unit_scale.decide_scale(log_scale, sigma)
         drifts = norm.pdf(grid, 0, 0.02) * norm.pdf(log_scale, grid, sigma)
         share = 3 * norm.pdf(log_scale, 0, sigma) / (drifts.sum() * (grid[1] - grid[0]))
         said.add(found.rigid)
@@ -559,12 +565,12 @@ def test_a_measured_scale_is_one_or_what_was_measured():
         if found.rigid:
             assert found.log_scale_sigma == pytest.approx(np.sqrt(drifts @ grid**2 / drifts.sum()), rel=1e-3)
         else:
-            assert found == metres.Belief(False, log_scale, sigma, sigma)
+            assert found == unit_scale.ScaleDecision(False, log_scale, sigma, sigma)
     assert said == {True, False}
 
 
 def test_sources_that_were_told_to_be_metric_stay_so_and_disagreement_is_said():
-    agrees, disagrees = (metres.believe(x, 0.001, told=True) for x in (0.003, -0.02))
+    agrees, disagrees = (unit_scale.decide_scale(x, 0.001, specified=True) for x in (0.003, -0.02))
     assert agrees.rigid
     assert not agrees.note
     assert disagrees.rigid
@@ -573,13 +579,13 @@ def test_sources_that_were_told_to_be_metric_stay_so_and_disagreement_is_said():
 
 
 def test_surfaces_that_measure_another_size_than_their_residuals_explain_are_said_to_bend():
-    rigid = metres.Belief(True, -0.008, 0.005, 0.008)
-    said = metres.bending(rigid, 0.0005, 6.0)
+    rigid = unit_scale.ScaleDecision(True, -0.008, 0.005, 0.008)
+    said = unit_scale.bending_note(rigid, 0.0005, 6.0)
     assert "the source measures +0.8% over 6.0 m, 16 times" in said
-    assert metres.bending(rigid, 0.003, 6.0) == ""  # residuals explain it
-    assert metres.bending(replace(rigid, log_scale=-0.0015), 0.0001, 6.0) == ""  # nobody needs to know
-    assert metres.bending(replace(rigid, rigid=False), 0.0005, 6.0) == ""  # the scale differs, and is measured
-    assert metres.bending(replace(rigid, note="disagrees"), 0.0005, 6.0) == ""  # was said
+    assert unit_scale.bending_note(rigid, 0.003, 6.0) == ""  # residuals explain it
+    assert unit_scale.bending_note(replace(rigid, log_scale=-0.0015), 0.0001, 6.0) == ""  # nobody needs to know
+    assert unit_scale.bending_note(replace(rigid, rigid=False), 0.0005, 6.0) == ""  # the scale differs, and is measured
+    assert unit_scale.bending_note(replace(rigid, note="disagrees"), 0.0005, 6.0) == ""  # was said
 
 
 def test_surface_leaves_out_what_is_faint_or_huge(monkeypatch):
@@ -625,7 +631,7 @@ def test_agreeing_is_one_to_one():
         np.zeros((3, 3)), np.array([[0.01, 0, 0], [0.0, 0, 0], [9.0, 0, 0]]),
         np.array([0, 0, 1], np.int32), np.array([0, 1, 2], np.int32), np.ones(3, np.float32),
     )  # fmt: skip
-    assert agreeing(m, Sim3.identity(), 0.1).tolist() == [False, True, False]
+    assert find_inliers(m, Sim3.identity(), 0.1).tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.0, 1.25])

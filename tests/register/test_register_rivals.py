@@ -7,7 +7,7 @@ from register_worlds import HALF_TURN, layer, splat_world, two_pose_world
 from gsmap.evaluate.registration import pose_error
 from gsmap.geometry.rotations import exp_so3
 from gsmap.register import Params, register_pair
-from gsmap.register.metric import MetricScene
+from gsmap.register.metric_scene import MetricScene
 from gsmap.register.proposers import graph
 from gsmap.types import SceneGraph, Sim3
 

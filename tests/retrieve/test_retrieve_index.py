@@ -8,7 +8,7 @@ from retrieve_worlds import UP, layer, turned, walk
 
 from gsmap._native import near_codes
 from gsmap.errors import CorruptError
-from gsmap.retrieve import Params, look_up, lookup, new_segment, voters_of
+from gsmap.retrieve import Params, look_up, lookup, new_segment, select_nodes
 from gsmap.retrieve import codes as coding
 from gsmap.types import SceneGraph
 from gsmap.types.retrieval import IndexArrays
@@ -16,7 +16,7 @@ from gsmap.types.segments import InMemory, merged, places_of, to_merge, write_pl
 
 
 def _voters(graphs):
-    return [voters_of(graph, f"{i:032x}", 400) for i, graph in enumerate(graphs)]
+    return [select_nodes(graph, f"{i:032x}", 400) for i, graph in enumerate(graphs)]
 
 
 def test_distances_of_codes_are_those_of_the_vectors():
@@ -96,7 +96,7 @@ def test_any_order_and_any_segments_say_the_same(monkeypatch):
     graphs = walk(40)
     graphs += [replace(graph, scene_id=f"x{graph.scene_id}") for graph in graphs[:6]]  # as alike as can be: ties
     voters = _voters(graphs)
-    monkeypatch.setattr(lookup, "CHECKED_SCENES", 3)  # where ties are cut, too
+    monkeypatch.setattr(lookup, "MAX_VERIFIED", 3)  # where ties are cut, too
     params = Params(top_k=5)
     first = look_up(voters, [new_segment(voters)], params)
     for count in (1, 2, 7):
@@ -300,9 +300,9 @@ def test_a_row_of_no_scene_is_refused():
     nearest = np.full((1, 4), 2**22, np.int32)
     at = np.array([0]), np.array([0]), np.array([len(strange)])
     with pytest.raises(ValueError, match="a scene that is not there"):
-        near_codes(voters[0].asking.codes[:1], *at, strange, none, nearest)
+        near_codes(voters[0].query_nodes.codes[:1], *at, strange, none, nearest)
     with pytest.raises(ValueError, match="outside of the rows"):
-        near_codes(voters[0].asking.codes[:1], *at[:2], at[2] + 1, good.arrays.nodes, none, nearest)
+        near_codes(voters[0].query_nodes.codes[:1], *at[:2], at[2] + 1, good.arrays.nodes, none, nearest)
 
 
 def test_scenes_without_a_node_are_no_trouble():

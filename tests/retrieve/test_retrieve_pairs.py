@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from retrieve_worlds import layer, walk
 
-from gsmap.retrieve import Params, Placed, candidate_pairs, neighbours
+from gsmap.retrieve import Params, ScenePosition, candidate_pairs, neighbours
 from gsmap.retrieve.neighbours import REACH_SIGMAS
 from gsmap.types import NodeLayer, SceneGraph
 
@@ -29,11 +29,11 @@ def test_any_order_of_scenes_gives_the_same_pairs():
     rng, params = np.random.default_rng(0), Params(top_k=2, num_neighbours=1)
     graphs = walk(30)
     graphs += [replace(graph, scene_id=f"x{graph.scene_id}") for graph in graphs[:6]]  # as alike as can be: ties
-    placed = {graph.scene_id: Placed(0, np.zeros(3), 1.0) for graph in graphs[:9]}
-    first = candidate_pairs(graphs, placed=placed, params=params)
+    placed = {graph.scene_id: ScenePosition(0, np.zeros(3), 1.0) for graph in graphs[:9]}
+    first = candidate_pairs(graphs, positions=placed, params=params)
     for _ in range(5):
         other = [graphs[k] for k in rng.permutation(len(graphs))]
-        assert candidate_pairs(other, placed=placed, params=params) == first
+        assert candidate_pairs(other, positions=placed, params=params) == first
     assert all(a < b for a, b in first)
 
 
@@ -47,12 +47,12 @@ def test_only_pairs_of_new_scenes_are_asked_for():
 def test_placed_neighbours_join_the_votes():
     rng = np.random.default_rng(1)
     graphs = [SceneGraph(f"s{i:02}", {"landmarks": layer(rng, 30)}) for i in range(40)]
-    placed = {f"s{i:02}": Placed(0, np.array([3.0 * i, 0, 0]), 2.0) for i in range(39)}
-    placed["s39"] = Placed(1, np.array([0.5, 0, 0]), 2.0)
-    pairs = set(candidate_pairs(graphs, placed=placed, params=Params(top_k=0)))
+    placed = {f"s{i:02}": ScenePosition(0, np.array([3.0 * i, 0, 0]), 2.0) for i in range(39)}
+    placed["s39"] = ScenePosition(1, np.array([0.5, 0, 0]), 2.0)
+    pairs = set(candidate_pairs(graphs, positions=placed, params=Params(top_k=0)))
     assert pairs == {(f"s{i:02}", f"s{i + 1:02}") for i in range(38)}
-    uncertain = {s: Placed(p.component, p.centre, p.radius, sigma=1.0) for s, p in placed.items()}
-    assert len(candidate_pairs(graphs, placed=uncertain, params=Params(top_k=0))) > 38
+    uncertain = {s: ScenePosition(p.component, p.centre, p.radius, sigma=1.0) for s, p in placed.items()}
+    assert len(candidate_pairs(graphs, positions=uncertain, params=Params(top_k=0))) > 38
 
 
 def test_layers_of_different_descriptors_never_vote_and_empty_graphs_are_fine():
@@ -79,8 +79,8 @@ def test_an_asked_scene_may_lack_a_type_of_node():
 def test_scenes_of_different_components_are_no_neighbours():
     rng = np.random.default_rng(4)
     graphs = [SceneGraph(f"s{i}", {"landmarks": layer(rng, 5)}) for i in range(4)]
-    placed = {f"s{i}": Placed(component=i // 2, centre=np.zeros(3), radius=1.0) for i in range(4)}
-    pairs = candidate_pairs(graphs, placed=placed, params=Params(top_k=0))
+    placed = {f"s{i}": ScenePosition(component=i // 2, centre=np.zeros(3), radius=1.0) for i in range(4)}
+    pairs = candidate_pairs(graphs, positions=placed, params=Params(top_k=0))
     assert pairs == [("s0", "s1"), ("s2", "s3")]
 
 
@@ -102,7 +102,7 @@ def test_neighbours_of_many_sizes_are_those_that_touch():
     rng = np.random.default_rng(7)
     params = Params(num_neighbours=1000)
     placed = {
-        f"s{i:03}": Placed(
+        f"s{i:03}": ScenePosition(
             int(rng.integers(2)), rng.uniform(0, 25, 3), float(np.exp(rng.normal())), rng.uniform(0, 0.3)
         )
         for i in range(200)

@@ -34,7 +34,7 @@ import gsmap.register.pair as pair_module
 from gsmap.evaluate.registration import pose_error
 from gsmap.map.stages.optimize import pose_inputs
 from gsmap.optimize import edge_likelihood, optimize
-from gsmap.register.conclusion import Judged
+from gsmap.register.pose_selection import EvaluatedPose
 from gsmap.types import Edge, Sim3
 from gsmap_synthetic.facade import front_captures, make_front
 from gsmap_synthetic.make import DemoCapture
@@ -112,10 +112,10 @@ def make(folder: Path, seed: int) -> None:
     captures = front_captures(front, starts, reach_m=REACH_M, num_gaussians=int(rng.integers(15_000, 25_000)))
     captures = [worse(capture, rng) for capture in captures]
     judged: list[list[object]] = []
-    conclude = pair_module.conclude
+    select_pose = pair_module.select_pose
 
-    def listening(target, source, poses: list[Judged], params, **others):  # type: ignore[no-untyped-def]
-        found = conclude(target, source, poses, params, **others)
+    def listening(target, source, poses: list[EvaluatedPose], params, **others):  # type: ignore[no-untyped-def]
+        found = select_pose(target, source, poses, params, **others)
         for one in poses:
             figures = {
                 name: float(getattr(one.evidence, name))
@@ -126,7 +126,7 @@ def make(folder: Path, seed: int) -> None:
                 judged.append([target.id, source.id, S, figures, one.evidence.overlap])
         return found
 
-    pair_module.conclude = listening
+    pair_module.select_pose = listening
     try:
         with gsmap.map.open_or_create(folder / "map.gsmap") as m:
             for capture in captures:
@@ -134,7 +134,7 @@ def make(folder: Path, seed: int) -> None:
             m.describe()
             m.register("all")
     finally:
-        pair_module.conclude = conclude
+        pair_module.select_pose = select_pose
     truth = {capture.name: capture.T_scene_world.tolist() for capture in captures}
     (folder / "judged.json").write_text(json.dumps({"truth": truth, "judged": judged}))
 

@@ -41,10 +41,10 @@ from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import skew
 from gsmap.geometry.similarities import Similarities, exp
 from gsmap.register import Params, refinement
-from gsmap.register.metric import MetricPair
+from gsmap.register.metric_scene import MetricPair
 from gsmap.register.pair import check_pose
 from gsmap.register.refiners import colored_icp
-from gsmap.register.refiners.colored_icp import _Laid
+from gsmap.register.refiners.colored_icp import _OneWayPairs
 from gsmap.register.surface import Surface
 from gsmap.types import Edge, Proposal, Registration, Sim3
 from tools.bench.refine import Capture, overlapping, perturbed, read_folder
@@ -194,7 +194,7 @@ def again(place: Place, start: dict[int, Sim3]) -> dict[int, Sim3]:
         if pair.target in start and pair.source in start:
             S = start[pair.target].inverse() @ start[pair.source]
         metric = MetricPair.of(a.view, b.view, Proposal("bench", S, False, 100), Params())
-        pose = refinement.fine(metric, metric.to_metres(S), Params(), with_scale=False)
+        pose = refinement.refine_fine(metric, metric.to_metres(S), Params(), with_scale=False)
         found.append(replace(pair.found, S_target_source=metric.to_scene_units(pose)))
     return solved(place, found)[0]
 
@@ -216,13 +216,15 @@ def by_cells(place: Place, start: dict[int, Sim3]) -> dict[int, Sim3]:
     return solved(place, found)[0]
 
 
-def _laid(pair: Pair) -> tuple[_Laid, _Laid]:
+def _laid(pair: Pair) -> tuple[_OneWayPairs, _OneWayPairs]:
     """The cells of each capture, to be laid on the other's."""
     count = colored_icp.FULL.max_points[-1] // 2
-    return _Laid(*pair.surfaces, count), _Laid(*pair.surfaces[::-1], count, backward=True)
+    return _OneWayPairs(*pair.surfaces, count), _OneWayPairs(*pair.surfaces[::-1], count, backward=True)
 
 
-def _equations(pair: Pair, laid: tuple[_Laid, _Laid], S: Sim3, radius: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _equations(
+    pair: Pair, laid: tuple[_OneWayPairs, _OneWayPairs], S: Sim3, radius: float
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Normal equations (6, 6), (6,) of a pair under a pose (working metres) about the source's origin, over the
     variance of the distances to the planes; and the standard deviation of these."""
     params, centre = colored_icp.Params(), pair.surfaces[1].coarse[0].mean(0)

@@ -49,7 +49,7 @@ from gsmap.map.stages.describe import graph_keys
 from gsmap.merge import merge
 from gsmap.register import SceneView, register_pair
 from gsmap.register.clique import maximum_clique
-from gsmap.register.metric import MetricPair
+from gsmap.register.metric_scene import MetricPair
 from gsmap.register.pose import fit_pose
 from gsmap.register.proposers import graph
 from gsmap.register.refiners import icp
@@ -216,15 +216,15 @@ def clique_stages(target: Capture, source: Capture, params: graph.Params, *, wit
     truth = target.S_scene_world @ source.S_scene_world.inverse()
     for kind in params.kinds:
         for a, b in graph.comparable_layers(target.graph, source.graph, kind, with_scale=with_scale):
-            matching = graph.Matching(a, b, target.graph, source.graph, kind, params, with_scale)
-            m, units = matching.matches, matching.units_m
+            matcher = graph.LayerMatcher(a, b, target.graph, source.graph, kind, params, with_scale)
+            m, units = matcher.matches, matcher.units_m
             if len(m) < 3:
                 continue
             metre = 1.0 / target.S_scene_world.scale  # of the target's unit, by the truth
             off = metre * np.linalg.norm(truth.apply(m.source / units[1]) - m.target / units[0], axis=1)
             right = off < RIGHT_M
-            for scale, _ in (matching.vote() if with_scale else []) or [(1.0, 1.0)]:
-                clique = maximum_clique(matching.compatibility_graph(m, scale), params.step_limit)
+            for scale, _ in (matcher.vote() if with_scale else []) or [(1.0, 1.0)]:
+                clique = maximum_clique(matcher.compatibility_graph(m, scale), params.step_limit)
                 if len(clique) < 3 or len(clique) <= best.clique:
                     continue
                 fit = fit_pose(m.target[clique.members], m.source[clique.members], with_scale=with_scale)

@@ -38,7 +38,7 @@ from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.ingest import read_captures
-from gsmap.register import SceneView, refinement, scaling
+from gsmap.register import SceneView, refinement, scale_selection
 from gsmap.register import pair as pair_module
 from gsmap.register.pair import check_pose
 from gsmap.types import NodeLayer, Proposal, SceneGraph, Sim3
@@ -186,9 +186,9 @@ def stages() -> Iterator[dict[str, Any]]:
 
     with ExitStack() as stack:
         for module, attribute, name in (
-            (refinement, "coarse", "coarse"),
-            (refinement, "fine", "fine"),
-            (scaling, "condition", "condition"),
+            (refinement, "refine_coarse", "coarse"),
+            (refinement, "refine_fine", "fine"),
+            (scale_selection, "condition", "condition"),
             (pair_module, "measure", "measure"),
         ):
             stack.enter_context(mock.patch.object(module, attribute, timed(name, getattr(module, attribute))))

@@ -48,7 +48,7 @@ from gsmap.map.stages.describe import graph_keys
 from gsmap.optimize.cycles import cycle_chi2, list_triangles
 from gsmap.optimize.measurements import measurements
 from gsmap.register import SceneView
-from gsmap.register.context import with_context
+from gsmap.register.context import add_context
 from gsmap.types import Cameras, Edge, Gaussians, Sim3
 from tools.bench.registration_methods import ABLATIONS, METHODS, Answer, Capture, Method
 
@@ -257,7 +257,7 @@ def contexts_apart(pairs: list[tuple[Capture, Capture, float]]) -> str:
     cosines = []
     for a, b, _ in pairs:
         layers = [capture.graph.layers["objects"] for capture in (a, b)]
-        for plain, joined in zip(layers, with_context(*layers), strict=True):
+        for plain, joined in zip(layers, add_context(*layers), strict=True):
             contexts = joined.embeddings[:, plain.features.shape[1] :].astype(np.float64)
             contexts /= np.maximum(np.linalg.norm(contexts, axis=1, keepdims=True), 1e-12)
             at = plain.positions * plain.unit_m

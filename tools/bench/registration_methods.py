@@ -14,14 +14,14 @@ import numpy as np
 
 from gsmap.methods import MethodParams
 from gsmap.register import Params, SceneView, register_pair
-from gsmap.register.a_contrario import BackgroundModel, agreeing
+from gsmap.register.a_contrario import BackgroundModel, find_inliers
 from gsmap.register.clique import maximum_clique
 from gsmap.register.consistency import SIGMA_M, consistency_graph, unpack
 from gsmap.register.consistency import Params as TestParams
 from gsmap.register.context import Params as ContextParams
-from gsmap.register.context import with_context
-from gsmap.register.correspondences import Correspondences, correspondences
-from gsmap.register.metric import MetricScene
+from gsmap.register.context import add_context
+from gsmap.register.correspondences import Correspondences, match_nodes
+from gsmap.register.metric_scene import MetricScene
 from gsmap.register.pose import fit_pose
 from gsmap.register.proposers import graph, kiss_matcher
 from gsmap.register.refiners import gicp
@@ -134,11 +134,11 @@ def _hypothesis(target: Capture, source: Capture, kind: str, change: str) -> tup
     a, b = _layer(target, kind, change), _layer(source, kind, change)
     if kind == "objects" and change not in ("no-context", "fpfh-nodes"):
         hops = {"3-hop": 3, "5-hop": 5}.get(change, ContextParams().hops)
-        a, b = with_context(a, b, ContextParams(hops))
+        a, b = add_context(a, b, ContextParams(hops))
     unit = float(np.sqrt(a.unit_m * b.unit_m))  # one metre for both: the pose is rigid
     ups = target.graph.up, source.graph.up
     top_k, sigma_m = (5, 0.05) if kind == "objects" else (1, SIGMA_M)  # as in `gsmap.register.proposers.graph`
-    m = correspondences(a, b, top_k=top_k, units_m=(unit, unit), ups=ups)
+    m = match_nodes(a, b, top_k=top_k, units_m=(unit, unit), ups=ups)
     if len(m) < 4:
         return None
     test, tolerances = TestParams(), {"sigma_m": sigma_m}
@@ -159,7 +159,7 @@ def _hypothesis(target: Capture, source: Capture, kind: str, change: str) -> tup
         return None
     pose = fit_pose(m.target[members], m.source[members]).S_target_source
     radius = max(4.0 * np.sqrt(2.0) * sigma_m, 0.15)
-    inliers = m[agreeing(m, pose, radius)]
+    inliers = m[find_inliers(m, pose, radius)]
     if len(inliers) > len(members):
         pose = fit_pose(inliers.target, inliers.source).S_target_source
     points = b.positions * unit

@@ -48,7 +48,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
 
-from gsmap.retrieve import Params, Voters, look_up, new_segment, voters_of
+from gsmap.retrieve import Params, SceneNodes, look_up, new_segment, select_nodes
 from gsmap.store import Store
 from gsmap.types import SceneGraph
 from gsmap.types.segments import merged, to_merge
@@ -71,7 +71,7 @@ def main() -> None:
     args.cache.mkdir(parents=True, exist_ok=True)
     params = Params()
     graphs = [described(args, k) for k in range(max([*args.scenes, *(n for n in args.cost if n <= 300), 0]))]
-    voters = [voters_of(graph, f"{k:032x}", params.nodes_per_scene) for k, graph in enumerate(graphs)]
+    voters = [select_nodes(graph, f"{k:032x}", params.nodes_per_scene) for k, graph in enumerate(graphs)]
     for count in args.scenes:
         report(graphs[:count], voters[:count], params, older=args.older)
     for count in args.cost:
@@ -113,7 +113,7 @@ def are_neighbours(a: str, b: str) -> bool:
     return floor == other and abs(k - m) == 1
 
 
-def report(graphs: Sequence[SceneGraph], voters: Sequence[Voters], params: Params, *, older: bool) -> None:
+def report(graphs: Sequence[SceneGraph], voters: Sequence[SceneNodes], params: Params, *, older: bool) -> None:
     names = [graph.scene_id for graph in graphs]
     index = [new_segment(voters)]
     rng = np.random.default_rng(0)
@@ -194,7 +194,7 @@ def votes_of_all(graphs: Sequence[SceneGraph], top_k: int = 10, most: int = 20) 
     }
 
 
-def cost(voters: Sequence[Voters], count: int, params: Params) -> None:
+def cost(voters: Sequence[SceneNodes], count: int, params: Params) -> None:
     """What an index of so many scenes costs the next one, as it lies in a map."""
     rng = np.random.default_rng(count)
     asking = _copy(voters[0], "f" * 32, rng)
@@ -226,7 +226,7 @@ def cost(voters: Sequence[Voters], count: int, params: Params) -> None:
         )
 
 
-def put(store: Store, key: str, new: Sequence[Voters]) -> None:
+def put(store: Store, key: str, new: Sequence[SceneNodes]) -> None:
     segments = store.indexes.segments(key)
     old = [segments[k] for k in to_merge([len(segment.members) for segment in segments], len(new))]
     whole = merged([*old, new_segment(new)])
@@ -234,15 +234,15 @@ def put(store: Store, key: str, new: Sequence[Voters]) -> None:
     store.indexes.put(key, members, whole.arrays, [segment.id for segment in old])
 
 
-def _copy(voters: Voters, scene: str, rng: np.random.Generator | None) -> Voters:
+def _copy(voters: SceneNodes, scene: str, rng: np.random.Generator | None) -> SceneNodes:
     """The same scene under another id; with noise where there is a generator."""
     member = replace(voters.member, scene=scene, graph=scene)
     if rng is None:
         return replace(voters, member=member)
-    kept = voters.kept
+    kept = voters.index_nodes
     codes = np.clip(kept.codes + rng.integers(-12, 13, kept.codes.shape), -127, 127).astype(np.int8)
     positions = (kept.positions + rng.normal(size=kept.positions.shape) * 0.3).astype(np.float16)
-    return replace(voters, member=member, kept=replace(kept, codes=codes, positions=positions))
+    return replace(voters, member=member, index_nodes=replace(kept, codes=codes, positions=positions))
 
 
 if __name__ == "__main__":

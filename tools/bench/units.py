@@ -29,7 +29,7 @@ import numpy as np
 import gsmap.map
 from gsmap import formats
 from gsmap.evaluate.renders import compare_renders, find_images
-from gsmap.geometry.metres import resized
+from gsmap.geometry.metric_scale import scale_gaussians
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import Capture, read_captures
 from gsmap.map import Map
@@ -157,7 +157,7 @@ def exported(m: Map, place: Place, true_m: float, out: Path, method: str, tile_s
     result = m.export(out, merge=method, tile_size_m=tile_size_m)
     cpu_s = time.process_time() - start
     files = [formats.read(out / tile.path) for tile in result.tiles if tile.path]
-    merged = resized(Gaussians.concatenate(files), true_m)
+    merged = scale_gaussians(Gaussians.concatenate(files), true_m)
     parts = []
     for capture in place.captures:
         cameras = transform_cameras(m.read(capture.name, frame="map")[1], Sim3(np.eye(3), np.zeros(3), true_m))

@@ -44,10 +44,17 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.ingest import read_captures
 from gsmap.register import SceneView
-from gsmap.register.covariance import RADIUS_M, Conditioning, Hidden, condition, fitted, swayed
-from gsmap.register.metres import believe
+from gsmap.register.covariance import (
+    RADIUS_M,
+    Conditioning,
+    UnobservedErrors,
+    condition,
+    find_colour_motion,
+    load_model,
+)
 from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import Surface
+from gsmap.register.unit_scale import decide_scale
 from gsmap.types import Cameras, Gaussians, SceneGraph, Sim3
 from gsmap_synthetic import make_captures, write_captures
 from gsmap_synthetic.capture import Frames, default_routes, film, unused_doors, walk
@@ -116,7 +123,7 @@ def main() -> None:
         for level, pairs in groups.items():
             report(f"{title}, " + KINDS.get(level, f"bent x {level:g}"), pairs, model)
         report(f"{title}, all", [pair for pairs in groups.values() for pair in pairs], model)
-    for name, told in (("as fitted", model), ("as shipped", Hidden())):
+    for name, told in (("as fitted", model), ("as shipped", load_model(coloured=True))):
         report(
             f"tested and drawn since, {name}", [p for g in (tested, drawn) for pairs in g.values() for p in pairs], told
         )
@@ -200,25 +207,25 @@ class Pair:
         scaled, rigid: (7,) and (6,) errors about the overlap's centroid of the pose with its scale, and without.
         scale: of the first pose.
         conditioned: of that.
-        sway: (7,) by which colours would move the second.
+        colour_motion: (7,) by which colours would move the second.
     """
 
     scaled: np.ndarray
     rigid: np.ndarray
     scale: float
     conditioned: Conditioning
-    sway: np.ndarray | None
+    colour_motion: np.ndarray | None
 
-    def told(self, hidden: Hidden) -> Conditioning:
-        """The conditioning, so much thought to be hidden."""
-        return replace(self.conditioned, hidden=hidden)
+    def told(self, unobserved: UnobservedErrors) -> Conditioning:
+        """The conditioning, so much thought to be unobserved."""
+        return replace(self.conditioned, unobserved=unobserved)
 
-    def under(self, hidden: Hidden) -> tuple[np.ndarray, np.ndarray]:
+    def under(self, unobserved: UnobservedErrors) -> tuple[np.ndarray, np.ndarray]:
         """(7, 7) and (6, 6) covariances of the two poses."""
-        told = self.told(hidden)
-        belief = believe(float(np.log(self.scale)), told.log_scale_sigma, told=True)
-        rigid = told.of_rigid(1.0, belief.log_scale, belief.log_scale_sigma, self.sway)
-        return told.of_scaled(self.scale), rigid[:6, :6]
+        told = self.told(unobserved)
+        decision = decide_scale(float(np.log(self.scale)), told.log_scale_sigma, specified=True)
+        rigid = told.covariance_of_rigid(1.0, decision.log_scale, decision.log_scale_sigma, self.colour_motion)
+        return told.covariance_with_scale(self.scale), rigid[:6, :6]
 
 
 def collect(places: dict[float, tuple[int, ...]], cache: Path) -> dict[float, list[Pair]]:
@@ -278,55 +285,57 @@ def _pair(target: Surface, S_target: Sim3, source: Surface, S_source: Sim3, righ
     errors = [(Similarities.stack([p @ centroid]).inverse() @ inverse).log()[0] for p in (scaled, rigid)]
     if np.linalg.norm(errors[1][3:6]) > right_m:
         return None
-    sway = swayed(target, source, rigid, conditioned.centroid, with_scale=False)
-    return Pair(errors[0], errors[1][:6], scaled.scale, conditioned, sway)
+    colour_motion = find_colour_motion(target, source, rigid, conditioned.centroid, with_scale=False)
+    return Pair(errors[0], errors[1][:6], scaled.scale, conditioned, colour_motion)
 
 
 # --- the models ----------------------------------------------------------------------------------------------------
 
-SCALE = ("swell_m", "field_power", "swell_by_colour")
+SCALE = ("scale_error_m", "field_power", "colour_scale_share")
 """Fitted to the poses with the scale that was measured."""
-MOTION = ("shown", "by_colour", "shift_by_swell")
+MOTION = ("residual_factor", "colour_share", "shift_per_scale")
 """Fitted to the rigid poses, their scale known."""
 ROUNDS = 2  # each of the two fits knows the other's outcome
 
 
-def fit(pairs: list[Pair]) -> Hidden:
+def fit(pairs: list[Pair]) -> UnobservedErrors:
     """The model of largest likelihood."""
 
-    def cost(hidden: Hidden, *, rigid: bool) -> float:
+    def cost(unobserved: UnobservedErrors, *, rigid: bool) -> float:
         total = 0.0
         for pair in pairs:
-            matrix, error = pair.under(hidden)[rigid], pair.rigid if rigid else pair.scaled
+            matrix, error = pair.under(unobserved)[rigid], pair.rigid if rigid else pair.scaled
             total += np.linalg.slogdet(matrix)[1] + error @ np.linalg.solve(matrix, error)
         return total
 
-    hidden = fitted(coloured=True)
+    unobserved = load_model(coloured=True)
     for names, rigid in ((SCALE, False), (MOTION, True)) * ROUNDS:
-        hidden = _largest(hidden, names, partial(cost, rigid=rigid))
-    return hidden
+        unobserved = _largest(unobserved, names, partial(cost, rigid=rigid))
+    return unobserved
 
 
-def _largest(hidden: Hidden, names: tuple[str, ...], cost: Callable[[Hidden], float]) -> Hidden:
+def _largest(
+    unobserved: UnobservedErrors, names: tuple[str, ...], cost: Callable[[UnobservedErrors], float]
+) -> UnobservedErrors:
     """The model with those of these parameters, all positive, at which a cost is least."""
 
-    def at(x: np.ndarray) -> Hidden:
-        return replace(hidden, **dict(zip(names, np.exp(x).tolist(), strict=True)))
+    def at(x: np.ndarray) -> UnobservedErrors:
+        return replace(unobserved, **dict(zip(names, np.exp(x).tolist(), strict=True)))
 
-    start = np.log([getattr(hidden, name) for name in names])
+    start = np.log([getattr(unobserved, name) for name in names])
     options = {"maxiter": 4000, "maxfev": 4000}
     found = [minimize(lambda x: cost(at(x)), start + off, method="Nelder-Mead", options=options) for off in (0.0, 0.7)]
     return at(min(found, key=lambda f: f.fun).x)
 
 
-def report(title: str, pairs: list[Pair], hidden: Hidden) -> None:
+def report(title: str, pairs: list[Pair], unobserved: UnobservedErrors) -> None:
     """Normalised squared errors (NEES) of poses with their scale, and of rigid ones.
 
     "Beyond 3 sigma" are those that a chi-square would exceed as rarely as a normal variable three standard deviations;
     "cost" is minus the mean log likelihood, less what no covariance changes. Taken for another scale should be none of
     the made pairs, which all are of one metre.
     """
-    both = [pair.under(hidden) for pair in pairs]
+    both = [pair.under(unobserved) for pair in pairs]
     said = []
     for dof, errors, k in ((7, [p.scaled for p in pairs], 0), (6, [p.rigid for p in pairs], 1)):
         values = [e @ np.linalg.solve(b[k], e) for e, b in zip(errors, both, strict=True)]
@@ -337,8 +346,8 @@ def report(title: str, pairs: list[Pair], hidden: Hidden) -> None:
             said.append(f"{dof} dof: median {middle:.1f} ({chi2.ppf(0.5, dof):.1f}), 95 % {high:.1f} "
                         f"({chi2.ppf(0.95, dof):.1f}), most {max(values):.0f}, beyond 3 sigma {out}, "
                         f"cost {cost:.2f}")  # fmt: skip
-    scales = [(float(np.log(pair.scale)), pair.told(hidden).log_scale_sigma) for pair in pairs]
-    others = sum(not believe(log_scale, sigma).rigid for log_scale, sigma in scales)
+    scales = [(float(np.log(pair.scale)), pair.told(unobserved).log_scale_sigma) for pair in pairs]
+    others = sum(not decide_scale(log_scale, sigma).rigid for log_scale, sigma in scales)
     print(f"{title}, {len(pairs)} pairs: NEES " + "; ".join(said) + f"; taken for another scale {others}")
     if len(pairs) > 2:
         print("    correlated with how far poses are shifted: " + ", ".join(
@@ -352,7 +361,9 @@ def foretold(pairs: list[Pair]) -> dict[str, float]:
     told = {
         "field": [pair.conditioned.field_m for pair in pairs],
         "swell": [abs(np.log(pair.scale)) * pair.conditioned.radius_m for pair in pairs],
-        "sway": [np.nan if pair.sway is None else np.linalg.norm(pair.sway[3:6]) for pair in pairs],
+        "colour_motion": [
+            np.nan if pair.colour_motion is None else np.linalg.norm(pair.colour_motion[3:6]) for pair in pairs
+        ],
     }
     return {name: float(np.corrcoef(shift, np.log(np.array(v) + 1e-6))[0, 1]) for name, v in told.items()}
 

@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 import gsmap.register
+from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.rotations import angle_between
-from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.localize.scan import as_gaussians
 from gsmap.register import Params, SceneView
-from gsmap.register.by_shape import _NAMES, PRIOR, doubts, judged_by_shape
+from gsmap.register.by_shape import _NAMES, PRIOR, evaluate_by_shape, shape_features
 from gsmap.types import NodeLayer, SceneGraph
 from gsmap.types.scan import Scan
 from gsmap_synthetic import DemoCapture, Place, film, make_captures, make_place, walk
@@ -102,13 +102,13 @@ def of_place(seed: int, place: Place, own: list[DemoCapture], others: list[DemoC
             source = view("scan", gaussians, synthesise_cameras(gaussians))
             for capture, same in targets:
                 target = view(capture.name, capture.gaussians, capture.cameras)
-                for judged in judged_by_shape(target, source, Params()):
+                for judged in evaluate_by_shape(target, source, Params()):
                     S, T = judged.proposal.S_target_source, capture.T_scene_world
                     middle = source.centre
                     off = float(np.linalg.norm(S.apply(middle) - T[:3, :3] @ middle - T[:3, 3]))
                     turned = float(np.degrees(angle_between(S.rotation, T[:3, :3])))
                     right = same and turned < _DEG and off < _M
-                    found.append((doubts(judged.proposal, judged.evidence), right))
+                    found.append((shape_features(judged.proposal, judged.evidence), right))
     return found
 
 

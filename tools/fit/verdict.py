@@ -40,10 +40,10 @@ from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
 from gsmap.ingest import read_captures
 from gsmap.register import Params, SceneView, verdict
-from gsmap.register.pair import measured
+from gsmap.register.pair import evaluate_pose
 from gsmap.register.probability import Curve, Model, evidence_of
-from gsmap.register.proposing import Proposing
-from gsmap.register.stopwatch import Stopwatch
+from gsmap.register.proposal_rounds import ProposalRounds
+from gsmap.register.timing import Stopwatch
 from gsmap.types import Sim3
 from gsmap.types.registration import Proposal
 from tools.make.verdict_places import SETS, twin_m
@@ -145,7 +145,7 @@ def judge_pair(
     """Every pose of a pair that is worth a look, by its evidence."""
     params, watch, found = Params(fallback="never"), Stopwatch(), []
     working_m = float(np.sqrt(a.graph.working_m * b.graph.working_m))
-    proposals = [("proposed", p) for round_ in Proposing(a, b, params, watch).rounds() for p in round_[:3]]
+    proposals = [("proposed", p) for round_ in ProposalRounds(a, b, params, watch).rounds() for p in round_[:3]]
     proposals = [(k, p) for k, p in proposals if not p.flaw and not p.with_scale and p.log_nfa < 12]
     if truth is not None and overlap > 0.02:
         off = exp_so3(rng.normal(size=3) * np.radians(rng.uniform(0.5, 4)))
@@ -154,7 +154,7 @@ def judge_pair(
     elif a.graph.up is not None and b.graph.up is not None and rng.random() < 0.25:
         proposals.append(("floor", Proposal("floor", floor_on_floor(a, b, rng), False, 0)))
     for kind, proposal in proposals:
-        judged = measured(a, b, proposal, params)
+        judged = evaluate_pose(a, b, proposal, params)
         error = None
         if truth is not None:
             e = pose_error(judged.proposal.S_target_source, truth, scene_centroid(b.gaussians))

@@ -34,7 +34,7 @@ from gsmap.map.looking_up import keys_of_lookups
 from gsmap.map.stages import describe, register
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
-from gsmap.retrieve import Voters, index_recipe, new_segment, voters_of
+from gsmap.retrieve import SceneNodes, index_recipe, new_segment, select_nodes
 from gsmap.retrieve.codes import with_signs
 from gsmap.store import recipes
 from gsmap.store.boxes import get_boxes, put_boxes
@@ -320,8 +320,8 @@ def _fill_index(one: Filled) -> None:
     note that each has asked it and found those before it, all of which were tried."""
     store, params = one.map.store, one.map.settings.retrieve
     keys, rng = one.keys(one.order), np.random.default_rng(1)
-    voters = voters_of(one.made.graph, "", params.nodes_per_scene)
-    lists = np.unique(voters.kept.keys >> 8, return_inverse=True)[1]  # without signs: of one descriptor and type
+    voters = select_nodes(one.made.graph, "", params.nodes_per_scene)
+    lists = np.unique(voters.index_nodes.keys >> 8, return_inverse=True)[1]  # without signs: of one descriptor and type
     for start in range(0, len(one.order), 512):
         some = one.order[start : start + 512]
         segment = new_segment([_alike(voters, lists, scene, keys[scene].digest, rng) for scene in some])
@@ -341,9 +341,9 @@ def _fill_index(one: Filled) -> None:
         store.indexes.note(said[start : start + 1000])
 
 
-def _alike(voters: Voters, lists: np.ndarray, scene: str, graph: str, rng: np.random.Generator) -> Voters:
+def _alike(voters: SceneNodes, lists: np.ndarray, scene: str, graph: str, rng: np.random.Generator) -> SceneNodes:
     """Another scene's nodes: each of these, moved by half the way between two others of its type."""
-    kept = voters.kept
+    kept = voters.index_nodes
     order = np.lexsort((rng.random(len(lists)), lists))  # within each list a random one
     step = np.zeros(kept.codes.shape)
     same = lists[order] == np.roll(lists[order], 1)
@@ -352,7 +352,7 @@ def _alike(voters: Voters, lists: np.ndarray, scene: str, graph: str, rng: np.ra
     keys = with_signs(kept.keys, codes)
     member = replace(voters.member, scene=scene, graph=graph)
     positions = (kept.positions + rng.normal(size=kept.positions.shape) * 0.3).astype(np.float16)
-    return replace(voters, member=member, kept=replace(kept, keys=keys, codes=codes, positions=positions))
+    return replace(voters, member=member, index_nodes=replace(kept, keys=keys, codes=codes, positions=positions))
 
 
 def _add_rows(one: Filled, count: int) -> None:

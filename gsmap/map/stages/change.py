@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from gsmap.change import recipe_key
 from gsmap.engine import run_jobs
 from gsmap.errors import InputError, NotFoundError
-from gsmap.geometry.metres import in_metres
+from gsmap.geometry.metric_scale import in_metres
 from gsmap.map.dates import NO_DATE, parsed
 from gsmap.map.jobs import compare_scenes
 from gsmap.map.metres import metres_of_scenes

@@ -15,7 +15,7 @@ from gsmap import localize as localizing
 from gsmap import retrieve
 from gsmap.engine import SetAside, run_jobs
 from gsmap.errors import ConfigError, CorruptError, GsmapError, NotFoundError, ReadOnlyError
-from gsmap.geometry.metres import in_metres
+from gsmap.geometry.metric_scale import in_metres
 from gsmap.localize import PlacedFeatures, ViewIndex, new_segment, view_index
 from gsmap.map import models
 from gsmap.map.indexing import AT_ONCE, PATIENCE, SceneIndex

@@ -14,7 +14,7 @@ from gsmap import describe, register
 from gsmap.describe.unit import estimate_unit_m
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.formats import scans
-from gsmap.geometry.vantage import synthesise_cameras
+from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.ingest import read_captures
 from gsmap.localize.scan import AGREE_SIGMAS, as_gaussians
 from gsmap.localize.scan_joining import Joined, OnePlace, Support, join
@@ -27,7 +27,7 @@ from gsmap.map.stages.localize import parse_near
 from gsmap.map.stages.register import placed_scenes
 from gsmap.methods import RecipeKey
 from gsmap.register import SceneView
-from gsmap.register.conclusion import SAME_DISTANCE_M, SAME_LOG_SCALE, SAME_ROTATION_DEG
+from gsmap.register.pose_selection import SAME_DISTANCE_M, SAME_LOG_SCALE, SAME_ROTATION_DEG
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Registration, Scene
 from gsmap.types.progress import StageProgress

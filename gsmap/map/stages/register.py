@@ -21,7 +21,7 @@ from gsmap.map.sharing import SharedJobs, noting
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
-from gsmap.retrieve import Placed, Rounds, directed, neighbours
+from gsmap.retrieve import PairSchedule, ScenePosition, directed, neighbours
 from gsmap.store import MANUAL, Store
 from gsmap.store.registrations import Standing
 from gsmap.store.scenes import BriefScene
@@ -234,14 +234,14 @@ def _register_candidates(work: _Work, known: Known) -> list[Registration]:
     # Next to all neighbours have been tried; a list with one that has not keeps them all, and so its order.
     proposed = [*lists.values(), *(pairs for pairs in beside.values() if not all(known.has(*pair) for pair in pairs))]
     tried = {pair for pairs in proposed for pair in pairs if known.has(*pair)}
-    rounds = Rounds(proposed, tried.union(known.stale), known.held.values(), params)
+    rounds = PairSchedule(proposed, tried.union(known.stale), known.held.values(), params)
     pairs, made = known.stale + rounds.next(), list[Registration]()
     while pairs:
         found = work.register(pairs, after=0)
         made += found
         for edge in found:
             if edge.status == "accepted" and not edge.evidence.get("disagreement", np.nan) > bar:
-                rounds.hold(edge.target, edge.source)
+                rounds.add_edge(edge.target, edge.source)
         pairs = rounds.next()
     if lists:
         store.indexes.leave({scene: len(set(mine) - rounds.tried) for scene, mine in lists.items()})
@@ -353,7 +353,7 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> lis
     return list(dict.fromkeys(chosen))
 
 
-def placed_scenes(store: Store) -> dict[str, Placed]:
+def placed_scenes(store: Store) -> dict[str, ScenePosition]:
     """Where scenes lie by the newest poses, for finding neighbours."""
     bounds, poses = store.scenes.bounds(), store.revisions.poses()
     scenes = [scene for scene in poses if scene in bounds]
@@ -372,4 +372,4 @@ def placed_scenes(store: Store) -> dict[str, Placed]:
         variances = np.array([pose.covariance for pose in found if pose.covariance is not None])
         sigmas[known] = scales[known] * np.sqrt(np.diagonal(variances, axis1=1, axis2=2)[:, 3:6].max(1))
     parts = zip(scenes, found, centres, radii.tolist(), sigmas.tolist(), strict=True)
-    return {scene: Placed(pose.component, centre, radius, sigma) for scene, pose, centre, radius, sigma in parts}
+    return {scene: ScenePosition(pose.component, centre, radius, sigma) for scene, pose, centre, radius, sigma in parts}

@@ -18,7 +18,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.register import SceneView, recipe_key
-from gsmap.register.metric import target_unit_m
+from gsmap.register.metric_scene import target_unit_m
 from gsmap.render import backend
 from gsmap.store import Store, scene_id
 from gsmap.store.registrations import StoredRegistration

@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 
 from gsmap.compare import CaptureViews
 from gsmap.errors import ConfigError, NotFoundError
-from gsmap.geometry.metres import in_metres
+from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings

@@ -1,1 +1,1 @@
-"""Ways to find poses of a pair of scenes without knowing any; the contract is `gsmap.methods.proposer`."""
+"""Proposers: methods that find poses of a pair without a start; the contract is `gsmap.methods.proposer`."""

@@ -1,4 +1,4 @@
-"""Graph-GSReg: correspondences of nodes, their compatibility graph, its maximum clique, the pose of that."""
+"""Propose poses by matching scene graphs (Graph-GSReg): the maximum clique of compatible correspondences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.methods.proposer import Proposal, Scene
-from gsmap.register import a_contrario, consistency, context, correspondences, pose, scale
+from gsmap.register import a_contrario, consistency, context, correspondences, pose, scale_vote
 from gsmap.register.clique import maximum_clique
 from gsmap.register.correspondences import Correspondences
 from gsmap.types import NodeLayer, SceneGraph, Sim3
@@ -43,7 +43,7 @@ _RIVAL_SEARCHES = 3  # cliques among them that are tried until one implies a pos
 
 @dataclass(frozen=True)
 class Params:
-    """Pose proposals by matching two scene graphs.
+    """Pose proposals by matcher two scene graphs.
 
     Args:
         kinds: Kinds of nodes that propose poses, each on its own: ``landmarks``, ``objects`` or both.
@@ -63,7 +63,7 @@ class Params:
 
 
 def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:
-    """The best pose by each kind of node and, where a rival comes near it, the rival; fewest false alarms first."""
+    """Propose the best pose by each kind of node and its rival, if there is one; fewest false alarms first."""
     params = params or Params()
     found: list[Proposal] = []
     for kind in params.kinds:
@@ -74,29 +74,29 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
 def propose_by_kind(
     target: SceneGraph, source: SceneGraph, kind: str, params: Params | None = None, *, with_scale: bool = False
 ) -> list[Proposal]:
-    """The best pose by one kind of node and its rival, if there is one; best first.
+    """Propose the best pose by one kind of node and its rival, if there is one; best first.
 
     Correspondences, compatibility graph, maximum clique, closed-form pose. With an unknown scale every pair of the
-    kind's layers (each made under another guess of the metre) votes, and the scales most voted for are tried.
+    kind's layers (each for another estimate of the metre) votes, and the scales with most votes are tried.
     """
     params = params or Params()
     pairs = comparable_layers(target, source, kind, with_scale=with_scale)
-    matchings = [Matching(a, b, target, source, kind, params, with_scale) for a, b in pairs]
-    matchings = [m for m in matchings if len(m.matches) >= _MIN_INLIERS]
-    trials = _voted(matchings) if with_scale else [(matching, 1.0) for matching in matchings]
+    matchers = [LayerMatcher(a, b, target, source, kind, params, with_scale) for a, b in pairs]
+    matchers = [m for m in matchers if len(m.matches) >= _MIN_INLIERS]
+    trials = _voted_scales(matchers) if with_scale else [(matcher, 1.0) for matcher in matchers]
     found = [(p, m, s) for m, s in trials if (p := m.pose_of_largest_clique(m.matches, s)) is not None]
     if not found:
         return []
-    best, matching, s = min(found, key=lambda f: (f[0].log_nfa, -f[0].num_inliers))
+    best, matcher, s = min(found, key=lambda f: (f[0].log_nfa, -f[0].num_inliers))
     if with_scale and not best.flaw:
-        # The vote is good to a percent; at the scale its own clique implies more correspondences agree.
-        s = best.S_target_source.scale * matching.units_m[0] / matching.units_m[1]
-        again = matching.pose_of_largest_clique(matching.matches, s)
+        # The vote is accurate to a percent; at the scale that the clique implies more correspondences are compatible.
+        s = best.S_target_source.scale * matcher.units_m[0] / matcher.units_m[1]
+        again = matcher.pose_of_largest_clique(matcher.matches, s)
         if again is not None and again.num_inliers > best.num_inliers:
             best = again
-    # The rival: the best clique once everything that agrees with this pose is out of the way.
+    # The rival: the largest clique of correspondences that do not agree with this pose.
     at_least = int(np.ceil(RIVAL_SHARE * best.num_inliers))
-    rival = matching.pose_of_largest_clique(matching.disagreeing(best.S_target_source, matching.matches), s, at_least)
+    rival = matcher.pose_of_largest_clique(matcher.disagreeing(best.S_target_source, matcher.matches), s, at_least)
     share = 0.0 if rival is None else rival.num_inliers / best.num_inliers
     assert best.support is not None
     twin = best.support.rival(best.S_target_source, best.log_nfa)
@@ -110,7 +110,7 @@ def propose_by_kind(
 def comparable_layers(
     target: SceneGraph, source: SceneGraph, kind: str, *, with_scale: bool
 ) -> list[tuple[NodeLayer, NodeLayer]]:
-    """Pairs of layers of one kind that may be compared: the metric ones, or all guesses of the metre."""
+    """Return pairs of layers of one kind that may be compared: metric ones, or those for estimates of the metre."""
 
     def of(graph: SceneGraph, other: SceneGraph) -> list[NodeLayer]:
         gravity_free = kind == "landmarks" and graph.up is not None and other.up is None
@@ -123,7 +123,7 @@ def comparable_layers(
     pairs = [(a, b) for a, b in compared if a.descriptor_id == b.descriptor_id and len(a) and len(b)]
     if not with_scale:
         return pairs if kind == "objects" else _of_working_size(pairs, target, source)
-    # Guesses come in fixed steps, so several pairs stand for one relative scale: keep the one with most nodes.
+    # Estimates come in fixed steps, so several pairs have one relative scale: keep the one with most nodes.
     chosen: dict[float, tuple[NodeLayer, NodeLayer]] = {}
     for a, b in sorted(pairs, key=lambda pair: -min(len(pair[0]), len(pair[1]))):
         chosen.setdefault(round(float(np.log(a.unit_m / b.unit_m)), 3), (a, b))
@@ -133,22 +133,22 @@ def comparable_layers(
 def _of_working_size(
     pairs: list[tuple[NodeLayer, NodeLayer]], target: SceneGraph, source: SceneGraph
 ) -> list[tuple[NodeLayer, NodeLayer]]:
-    """The pairs of layers of one size; of several, those within an octave of what both scenes are worked on at."""
+    """Return the pairs of layers of one size; of several, those within an octave of both scenes' working metres."""
     pairs = [(a, b) for a, b in pairs if a.unit_m == b.unit_m]
     middle = 0.5 * np.log2(target.working_m * source.working_m)
     near = [pair for pair in pairs if abs(np.log2(pair[0].unit_m) - middle) < 1.0]
     return near or pairs
 
 
-def _voted(matchings: list[Matching]) -> list[tuple[Matching, float]]:
-    """The scales most voted for over all pairs of layers, each with the pair that votes for it; best first."""
-    votes = [(score, i, s) for i, matching in enumerate(matchings) for s, score in matching.vote()]
+def _voted_scales(matchers: list[LayerMatcher]) -> list[tuple[LayerMatcher, float]]:
+    """Return the scales with most votes over all pairs of layers, each with its pair; best first."""
+    votes = [(score, i, s) for i, matcher in enumerate(matchers) for s, score in matcher.vote()]
     votes = sorted(votes, reverse=True)[:_NUM_SCALES]
-    return [(matchings[i], s) for score, i, s in votes if score > _MIN_VOTE_SHARE * votes[0][0]]
+    return [(matchers[i], s) for score, i, s in votes if score > _MIN_VOTE_SHARE * votes[0][0]]
 
 
-class Matching:
-    """Two layers, their candidate correspondences, and how a clique of those becomes a proposal.
+class LayerMatcher:
+    """Two layers, their candidate correspondences, and the search of cliques among these.
 
     Args:
         a, b: the layer of the target and that of the source.
@@ -165,15 +165,15 @@ class Matching:
         with_scale: bool,
     ) -> None:
         if kind == "objects":
-            a, b = context.with_context(a, b, params.context)
+            a, b = context.add_context(a, b, params.context)
         self.a, self.b, self.kind, self.params, self.with_scale = a, b, kind, params, with_scale
         self.sigma_m = _SIGMA_M.get(kind, consistency.SIGMA_M)
         self.radius_m = max(_INLIER_SIGMAS * np.sqrt(2.0) * self.sigma_m, _MIN_INLIER_RADIUS_M)
-        # A rigid pose needs one metre for both scenes, whatever each was guessed to be.
+        # A rigid pose needs one metre for both scenes.
         common = float(np.sqrt(a.unit_m * b.unit_m))
         self.units_m = (a.unit_m, b.unit_m) if with_scale else (common, common)
         self.ups = (target.up, source.up)
-        self.matches = correspondences.correspondences(
+        self.matches = correspondences.match_nodes(
             a,
             b,
             top_k=_TOP_K.get(kind, 1),
@@ -189,8 +189,8 @@ class Matching:
         return a_contrario.BackgroundModel(self.a, self.b, points, self.matches, source_heights=heights)
 
     def vote(self) -> list[tuple[float, float]]:
-        """Scales worth a trial and how far each stands out, best first."""
-        scales = scale.vote_scales(self.matches)
+        """Return scales to try and their significance, best first."""
+        scales = scale_vote.vote_scales(self.matches)
         if len(self.matches) < _NOISY_CANDIDATES or self.matches.target_heights is None:
             return scales
         min_vote = _MIN_VOTE_OBJECTS if self.kind == "objects" else _MIN_VOTE
@@ -201,7 +201,7 @@ class Matching:
         return consistency.consistency_graph(among, self.params.consistency, scale=at_scale, sigma_m=self.sigma_m)
 
     def pose_of_largest_clique(self, among: Correspondences, at_scale: float, at_least: int = 0) -> Proposal | None:
-        """The pose of the largest clique among some of the correspondences, if it has so many members."""
+        """Fit a pose to the largest clique among correspondences; None if it has fewer than ``at_least`` members."""
         params = self.params
         at_least = max(at_least, _MIN_INLIERS)
         if len(among) < at_least:
@@ -212,7 +212,7 @@ class Matching:
             return None
         fit = self._fit(among[clique.members])
         S = fit.S_target_source
-        inliers = among[a_contrario.agreeing(among, S, self.radius_m)]
+        inliers = among[a_contrario.find_inliers(among, S, self.radius_m)]
         if not fit.flaw and len(inliers) > len(clique):
             S = self._fit(inliers).S_target_source
         return Proposal(
@@ -227,11 +227,11 @@ class Matching:
             support=CliqueSupport(self, inliers if len(inliers) > len(clique) else among[clique.members], at_scale),
         )
 
-    def with_twins(self, members: Correspondences) -> Matching:
-        """The same layers with other candidates: all pairs as similar as some correspondences, that share an end."""
+    def with_similar_pairs(self, members: Correspondences) -> LayerMatcher:
+        """Return a matcher whose candidates are all pairs that share an end with members and are as similar."""
         out = copy(self)
         out.__dict__.pop("background", None)
-        out.matches = correspondences.as_similar(
+        out.matches = correspondences.similar_pairs(
             self.a,
             self.b,
             members,
@@ -243,7 +243,7 @@ class Matching:
         return out
 
     def disagreeing(self, S_target_source: Sim3, among: Correspondences) -> Correspondences:
-        """Those of some correspondences that a pose leaves farther apart than a rival's may be."""
+        """Return the correspondences that do not agree with a pose."""
         moved = S_target_source.apply(among.source / self.units_m[1]) * self.units_m[0]
         return among[np.linalg.norm(moved - among.target, axis=1) > _RIVAL_DISTANCE_M]
 
@@ -256,30 +256,30 @@ class Matching:
         )
 
     def in_metres(self, S_target_source: Sim3) -> Sim3:
-        """A pose between the scenes' own units as one between metres."""
+        """Convert a pose from the scenes' own units to metres."""
         target_m, source_m = self.units_m
         S = S_target_source
         return Sim3(S.rotation, S.translation * target_m, S.scale * target_m / source_m)
 
     def _in_scene_units(self, S: Sim3) -> Sim3:
-        """A pose between metres as one between the scenes' own units."""
+        """Convert a pose from metres to the scenes' own units."""
         own = S.scale * self.units_m[1] / self.units_m[0] if self.with_scale else 1.0
         return Sim3(S.rotation, S.translation / self.units_m[0], own)
 
 
 @dataclass(frozen=True, eq=False)
 class CliqueSupport:
-    """The correspondences that agree with a clique's pose, and the candidates that they were found among.
+    """The inliers of a clique's pose, and the matcher that found them.
 
     Implements `gsmap.types.registration.Support`.
 
     Args:
         scale: of the source, at which the clique was found.
-        equal: another pose's log10 number of false alarms and how many candidates agree with it, where the candidates
-            are pairs of nodes as similar as that pose's: chance explains as many of them as well.
+        equal: log10 NFA and number of inliers of the pose whose rival this is; its candidates are not independent, so
+            the NFA of the rival is derived from that of the pose.
     """
 
-    matching: Matching
+    matcher: LayerMatcher
     members: Correspondences
     scale: float
     equal: tuple[float, int] | None = None
@@ -287,35 +287,34 @@ class CliqueSupport:
     @property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """(K, 3) points of the target and (K, 3) of the source, each in its scene's own unit."""
-        target_m, source_m = self.matching.units_m
+        target_m, source_m = self.matcher.units_m
         return self.members.target / target_m, self.members.source / source_m
 
     def count(self, S_target_source: Sim3) -> tuple[int, float]:
-        """How many candidates agree with a pose (scenes' own units), and its log10 number of false alarms."""
-        matching, S = self.matching, self.matching.in_metres(S_target_source)
-        inliers = int(a_contrario.agreeing(matching.matches, S, matching.radius_m).sum())
+        """Return the number of inliers of a pose (scenes' own units), and its log10 number of false alarms."""
+        matcher, S = self.matcher, self.matcher.in_metres(S_target_source)
+        inliers = int(a_contrario.find_inliers(matcher.matches, S, matcher.radius_m).sum())
         if self.equal is None:
-            return inliers, matching.background.log10_nfa(S, matching.radius_m)
+            return inliers, matcher.background.log10_nfa(S, matcher.radius_m)
         log_nfa, others = self.equal
         return inliers, log_nfa * min(inliers / others, 1.0) if log_nfa < 0 else log_nfa
 
     def rival(self, S_target_source: Sim3, log_nfa: float, others: Sequence[Sim3] = ()) -> Proposal | None:
-        """The largest rival of a pose among its own nodes; its ``runner_up`` is one over its share of the pose's
-        correspondences.
+        """Return the largest rival of a pose among its own nodes; ``runner_up`` is the inverse of its relative size.
 
-        A scene that repeats itself (a front, a corridor, a stair) has many nodes that are alike. Candidates keep the
-        most similar of them alone, so a rival that is one period off has no correspondences among what the pose leaves.
-        So nodes of either end are paired anew with all that are as similar as they are to their partners.
+        A repetitive scene (a front, a corridor, a stair) has many similar nodes. Candidates are the most similar pairs
+        only, so a rival pose that is off by one period has no correspondences among the remaining candidates. So the
+        nodes of the pose's inliers are matched again, with all nodes that are as similar as their partners.
 
         Args:
             log_nfa: of the pose.
-            others: poses that are known already.
+            others: poses that were found before.
 
         Returns:
-            None where no rival has ``rival_share`` of the pose's correspondences.
+            None where no rival has `RIVAL_SHARE` of the pose's inliers.
         """
-        twins = self.matching.with_twins(self.members)
-        own = int(a_contrario.agreeing(twins.matches, twins.in_metres(S_target_source), twins.radius_m).sum())
+        twins = self.matcher.with_similar_pairs(self.members)
+        own = int(a_contrario.find_inliers(twins.matches, twins.in_metres(S_target_source), twins.radius_m).sum())
         left = twins.matches
         for S in (S_target_source, *others):
             left = twins.disagreeing(S, left)
@@ -333,6 +332,6 @@ class CliqueSupport:
                     if share >= RIVAL_SHARE
                     else None
                 )
-            # Fronts are flat, and a mirrored set of their nodes may be larger than one that implies a pose.
+            # Fronts are flat, and a mirrored clique of their nodes may be larger than a proper one.
             left = left[~np.isin(left.target_ids, members.target_ids)]
         return None

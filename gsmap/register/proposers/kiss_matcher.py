@@ -1,4 +1,4 @@
-"""KISS-Matcher on the surfaces' points alone, for scenes whose graphs are too poor."""
+"""Propose a pose by KISS-Matcher on surface points, for scene graphs with few nodes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ SCALES = False
 PACKAGES = ("kiss_matcher",)  # it has no wheel for Python 3.13
 
 
-_MIN_INLIERS = 5  # fewer agreeing features propose nothing
+_MIN_INLIERS = 5  # fewer matched features propose nothing
 _MIN_CELLS = 50  # of each surface
 
 
 @dataclass(frozen=True)
 class Params:
-    """Global matching of surfaces by KISS-Matcher.
+    """Global matcher of surfaces by KISS-Matcher.
 
     Args:
         voxel_m: Size of the cells at which features are computed, in metres, positive; a larger value is faster and
@@ -35,9 +35,9 @@ class Params:
 
 
 def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:
-    """At most one rigid pose, by features of the surfaces' points.
+    """Propose at most one rigid pose by features of the surfaces' points.
 
-    Its own confidence is worth little (measured: most of its wrong answers look sure), so it only proposes.
+    Its own confidence is not used: most of its wrong poses have a high one.
 
     Raises:
         MissingDependencyError: the package is not installed.
@@ -52,7 +52,7 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
     if min(len(points_t), len(points_s)) < _MIN_CELLS:
         return []
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(params.voxel_m))
-    # Frames may lie far from their content; float32 inside the matcher does not forgive that.
+    # Centred, for the matcher computes in float32.
     centre_t, centre_s = points_t.mean(0), points_s.mean(0)
     with _one_core():
         solution = matcher.estimate((points_s - centre_s).astype(np.float32), (points_t - centre_t).astype(np.float32))
@@ -69,10 +69,10 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
 
 @contextmanager
 def _one_core() -> Iterator[None]:
-    """The calling thread, and the threads that the library starts from it, on one core.
+    """Pin the calling thread, and the threads that the library starts from it, to one core.
 
-    The library adds up in the order in which its threads finish: on several cores its pose varies by centimetres
-    between runs. Systems that cannot pin a thread (macOS) have to live with that.
+    The library sums in the order in which its threads finish: on several cores its pose varies by centimetres between
+    runs. Systems that cannot pin a thread (macOS) are not reproducible.
     """
     if not hasattr(os, "sched_setaffinity"):
         yield

@@ -1,1 +1,1 @@
-"""Ways to sharpen a pose once it is nearly right; the contract is `gsmap.methods.refiner`."""
+"""Refiners: methods that refine an approximate pose; the contract is `gsmap.methods.refiner`."""

@@ -1,11 +1,11 @@
-"""What the refiners of the small_gicp library share."""
+"""Run an alignment of the small_gicp library at several correspondence distances."""
 
 from __future__ import annotations
 
 from gsmap.methods.refiner import Surface
 from gsmap.types import Sim3
 
-_FEWEST = 10  # points and pairs; fewer tell nothing of a pose
+_MIN_PAIRS = 10  # and points; fewer do not constrain a pose
 
 
 def align(
@@ -18,11 +18,12 @@ def align(
     max_iterations: int,
     every_point: bool = False,
 ) -> Sim3:
-    """Rigid pose by one run at each correspondence distance; the start where too little overlaps, its scale kept.
+    """Refine a rigid pose by one run at each correspondence distance; return the start where too little overlaps.
 
     Args:
-        kind: as small_gicp names it.
-        every_point: align the points themselves, not their means over cells; for kinds that need no normals.
+        kind: registration type of small_gicp.
+        start: its scale is kept.
+        every_point: align the points instead of their means over cells; for kinds that need no normals.
     """
     import small_gicp
 
@@ -32,7 +33,7 @@ def align(
         target_tree = small_gicp.KdTree(target_cloud, num_threads=1)
     else:
         (target_cloud, target_tree), (source_cloud, _) = target.cloud, source.cloud
-    if target_cloud.size() < _FEWEST or source_cloud.size() < _FEWEST:
+    if target_cloud.size() < _MIN_PAIRS or source_cloud.size() < _MIN_PAIRS:
         return start
     pose = Sim3(start.rotation, start.translation)
     for radius in radii_m:
@@ -46,7 +47,7 @@ def align(
             num_threads=1,
             max_iterations=max_iterations,
         )
-        if result.num_inliers < _FEWEST:
+        if result.num_inliers < _MIN_PAIRS:
             break
         pose = Sim3.from_matrix(result.T_target_source)
     return Sim3(pose.rotation, pose.translation, start.scale)

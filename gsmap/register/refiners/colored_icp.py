@@ -1,4 +1,4 @@
-"""Point-to-plane and colour together, over six or seven degrees of freedom: the refiner for unknown scale."""
+"""Refine a pose by colored ICP: point-to-plane and colour residuals, with six or seven degrees of freedom."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.rotations import retract
 from gsmap.geometry.umeyama import umeyama
 from gsmap.methods.refiner import Correspondences, Surface
-from gsmap.register.degeneracy import held_motions, point_information
+from gsmap.register.degeneracy import constrained_motions, point_information
 from gsmap.register.surface import PLANE_NEIGHBOURS
 from gsmap.types import Sim3
 
@@ -19,13 +19,11 @@ SCALES = True
 USES_CORRESPONDENCES = True
 
 _WIDTH = 0.3  # of the radius: distances to planes of this count a quarter
-_HARDLY_FINER = 0.9  # of the last radius: another pass would tell nothing new
-_FEWEST = 10  # cells and pairs; fewer tell nothing of a pose
-_GREY = 1e-3  # range of lightness, less than a step of 8 bits: rounding errors are no colours
-_LEAST_NOISE = 0.03  # of the radius: planes that fit better than this leave other terms their weight, as colours'
-
-
-_MIN_SIGMAS = 4.0  # of the distances between the planes: a smaller radius would cut off noise and hold the pose
+_MAX_RADIUS_SHARE = 0.9  # of the last radius: a pass at a larger share changes nothing
+_MIN_PAIRS = 10  # and cells; fewer do not constrain a pose
+_GREY = 1e-3  # largest range of lightness of a surface without colours: less than a step of 8 bits
+_MIN_NOISE = 0.03  # of the radius: smaller distances to the planes do not raise their weight further
+_MIN_SIGMAS = 4.0  # of the distances between the planes: a smaller radius would cut off noise and fix the pose
 _MAX_ITERATIONS = 20  # Gauss-Newton steps at each radius
 _COLOUR_RADIUS_M = 0.1  # at larger radii lightness extrapolated in a tangent plane means nothing
 _OVERSTEP = 1.5  # factor on steps: pairs follow the pose only in part, so steps fall short, most along the scale
@@ -86,50 +84,49 @@ def refine(
     correspondences: Correspondences | None = None,
     schedule: Schedule = FULL,
 ) -> Sim3:
-    """Similarity (or rigid) pose that lays the source's cells on the target's planes and colours (both in metres).
+    """Align the source's cells with the target's planes and colours (both in metres) by a similarity or rigid pose.
 
-    Iteratively reweighted Gauss-Newton (Geman-McClure over the radius) on the point-to-plane distance and, as in
-    Park et al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane; each in units
-    of its own spread, so that what is measured better counts more. The source's exposure (gain and offset) is fitted
-    along, so a change of it costs nothing. The target's cells are laid on the source's planes as well, half of
-    ``max_points`` each way: that averages the errors of both surfaces' planes, and one way alone prefers a source that
-    is too small, whose points all come nearer to some surface. A cell is not laid on one whose other side was seen.
+    Iteratively reweighted Gauss-Newton (Geman-McClure over the radius) on point-to-plane distances and, as in Park et
+    al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane; each in units of its
+    own spread. The source's exposure (gain and offset) is fitted as well. The target's cells are aligned with the
+    source's planes, too, half of the points each way: that averages the errors of both surfaces' planes, and one way
+    alone prefers a source that is too small, whose points all lie nearer to some surface. Cells that were seen from
+    opposite sides are not paired.
 
-    Planes move the pose along no motion that they leave free (`gsmap.register.degeneracy`): along a street's front,
-    pairs at the ends of the overlap would pull it by metres. Colours decide there and, at every radius, the
-    correspondences.
+    Planes do not move the pose along degenerate directions (`gsmap.register.degeneracy`): along a street's front, pairs
+    at the ends of the overlap would pull it by metres. There colours and the correspondences constrain the pose.
     """
     params = params or Params()
     pose = start
-    if len(source) < _FEWEST or len(target) < _FEWEST:
+    if len(source) < _MIN_PAIRS or len(target) < _MIN_PAIRS:
         return start
     centre = source.coarse[0].mean(0)
     last, noise, dim = np.inf, 0.0, 7 if with_scale else 6
-    ties = None if correspondences is None else Ties(correspondences)
+    constraints = None if correspondences is None else PointConstraints(correspondences)
     tolerances = (*[schedule.tolerance] * (len(schedule.radii_m) - 1), schedule.last_tolerance)
     for radius, count, tolerance in zip(schedule.radii_m, schedule.max_points, tolerances, strict=True):
         if last <= _COLOUR_RADIUS_M:
             radius = min(last, max(radius, _MIN_SIGMAS * noise))
-            if radius > _HARDLY_FINER * last:
+            if radius > _MAX_RADIUS_SHARE * last:
                 continue
         last = radius
         pairs, degenerate = _Pairs(target, source, count, pose, radius, params), False
         for iteration in range(_MAX_ITERATIONS):
-            # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
+            # About the centroid of the pairs rotation, translation and scale hardly mix.
             found = pairs.equations(pose, centre)
-            if found.count < _FEWEST:
+            if found.count < _MIN_PAIRS:
                 return pose
             if iteration == 0:
                 planes = pairs.equations(pose, centre, coloured=False) if pairs.coloured else found
-                degenerate = pairs.held(planes, centre, dim)[0] is not None
+                degenerate = pairs.constrained(planes, centre, dim)[0] is not None
             if degenerate:
-                found = pairs.without_degenerate_pull(found, pose, centre, dim, ties)
+                found = pairs.without_degenerate_pull(found, pose, centre, dim, constraints)
             system, gradient = found.system, found.gradient
             step = np.zeros(7)
             damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
             step[:dim] = -np.linalg.solve((system + damping)[:dim, :dim], gradient[:dim])
             step *= _OVERSTEP
-            # No single step goes farther than the correspondences reach.
+            # No step is longer than the correspondence distance.
             step *= min(1.0, 0.1 / max(np.abs(step[:3]).max(), 1e-12), radius / max(np.abs(step[3:6]).max(), 1e-12))
             step[6] = np.clip(step[6], -0.05, 0.05)
             centred = pose @ Sim3(np.eye(3), centre)
@@ -147,18 +144,25 @@ def refine(
 def colour_information(
     target: Surface, source: Surface, pose: Sim3, centre: np.ndarray, schedule: Schedule
 ) -> np.ndarray | None:
-    """(7, 7) information about ``centre`` that colours add to a pair's plane distance at the last radius, in units of
-    that distance's variance; None where too little overlaps."""
+    """Return the (7, 7) information about ``centre`` that colours add per pair at the last radius, in units of the
+    variance of the point-to-plane distances; None where too little overlaps."""
     pairs = _Pairs(target, source, schedule.max_points[-1], pose, schedule.radii_m[-1], Params())
     both, planes = (pairs.equations(pose, centre, coloured=c) for c in (True, False))
-    return None if both.count < _FEWEST else (both.system - planes.system) / (2 * both.pairs)
+    return None if both.count < _MIN_PAIRS else (both.system - planes.system) / (2 * both.pairs)
 
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Normal equations (7, 7), (7,) of some pairs, how many these are, how far from the planes (robust standard
-    deviation), their mean less the centre, (3,), and their root mean square distance from it; ``pairs``: how many of
-    the source there are, where ``count`` is the smaller of both ways."""
+    """Normal equations of pairs.
+
+    Args:
+        system, gradient: (7, 7) and (7,).
+        count: number of pairs, the smaller of both ways.
+        noise_m: robust standard deviation of the point-to-plane distances.
+        middle: (3,) mean of the points less the centre.
+        extent_m: root mean square distance of the points from the centre.
+        pairs: number of pairs of source cells.
+    """
 
     system: np.ndarray
     gradient: np.ndarray
@@ -170,62 +174,71 @@ class _Equations:
 
 
 class _Pairs:
-    """Pairs of two surfaces' cells within one radius, each surface laid on the other."""
+    """Pairs of two surfaces' cells within one radius, in both directions."""
 
     def __init__(
         self, target: Surface, source: Surface, count: int, start: Sim3, radius_m: float, params: Params
     ) -> None:
-        self._there = _Laid(target, source, count // 2, start)
-        self._back = _Laid(source, target, count // 2, start.inverse(), backward=True)
+        self._forward = _OneWayPairs(target, source, count // 2, start)
+        self._reverse = _OneWayPairs(source, target, count // 2, start.inverse(), backward=True)
         self._radius_m, self._params = radius_m, params
         grey = any(np.ptp(surface.lightness) < _GREY for surface in (target, source))
         self.coloured = params.colour_weight > 0 and radius_m <= _COLOUR_RADIUS_M and not grey
         self._resolution_m = max(target.resolution_m, source.resolution_m)
 
     def equations(self, pose: Sim3, centre: np.ndarray, *, coloured: bool = True) -> _Equations:
-        """Both ways together: either counts as much, however many cells found a partner.
+        """Return the normal equations of both directions, weighted equally whatever their numbers of pairs.
 
         Args:
             coloured: with colours, at radii at which they count.
         """
         coloured = coloured and self.coloured
-        there = self._there.equations(pose, centre, self._radius_m, self._params, coloured=coloured)
-        back = self._back.equations(pose.inverse(), centre, self._radius_m, self._params, coloured=coloured)
-        share = there.count / max(back.count, 1)
-        system, gradient = there.system + share * back.system, there.gradient + share * back.gradient
-        return replace(there, system=system, gradient=gradient, count=min(there.count, back.count), pairs=there.count)
+        forward = self._forward.equations(pose, centre, self._radius_m, self._params, coloured=coloured)
+        reverse = self._reverse.equations(pose.inverse(), centre, self._radius_m, self._params, coloured=coloured)
+        share = forward.count / max(reverse.count, 1)
+        system, gradient = (
+            forward.system + share * reverse.system,
+            forward.gradient + share * reverse.gradient,
+        )
+        return replace(
+            forward,
+            system=system,
+            gradient=gradient,
+            count=min(forward.count, reverse.count),
+            pairs=forward.count,
+        )
 
-    def held(self, planes: _Equations, centre: np.ndarray, dim: int) -> tuple[np.ndarray | None, np.ndarray]:
-        """(D, D) projection of the planes' equations on the motions that they hold, None where they hold all, and
-        (D, D) the information of points held in all directions."""
-        levers = self._there.paired_points() - centre
+    def constrained(self, planes: _Equations, centre: np.ndarray, dim: int) -> tuple[np.ndarray | None, np.ndarray]:
+        """Return the (D, D) projection of the planes' equations on the motions that they constrain, None where they
+        constrain all, and the (D, D) information of point-to-point pairs."""
+        levers = self._forward.paired_points() - centre
         points = point_information(levers) * (2 * planes.pairs / max(len(levers), 1))
         system = planes.system[:dim, :dim]
-        held = held_motions(system, points, planes.noise_m, self._resolution_m, PLANE_NEIGHBOURS)
-        return held, points[:dim, :dim]
+        constrained = constrained_motions(system, points, planes.noise_m, self._resolution_m, PLANE_NEIGHBOURS)
+        return constrained, points[:dim, :dim]
 
     def without_degenerate_pull(
-        self, found: _Equations, pose: Sim3, centre: np.ndarray, dim: int, ties: Ties | None
+        self, found: _Equations, pose: Sim3, centre: np.ndarray, dim: int, constraints: PointConstraints | None
     ) -> _Equations:
-        """Equations whose planes neither hold nor move a motion that they leave free, with the correspondences'."""
+        """Return equations in which planes have no effect on degenerate directions, and correspondences have."""
         planes = self.equations(pose, centre, coloured=False)
-        held, points = self.held(planes, centre, dim)
-        if held is None:
+        constrained, points = self.constrained(planes, centre, dim)
+        if constrained is None:
             return found
         system, gradient = found.system - planes.system, found.gradient - planes.gradient
-        # What nothing holds stays where it is.
-        system[:dim, :dim] += held @ planes.system[:dim, :dim] @ held.T + 1e-6 * points
-        gradient[:dim] += held @ planes.gradient[:dim]
-        if ties is not None:
-            noise_m = max(planes.noise_m, _LEAST_NOISE * self._radius_m)
+        # Motions without any constraint are damped to zero.
+        system[:dim, :dim] += constrained @ planes.system[:dim, :dim] @ constrained.T + 1e-6 * points
+        gradient[:dim] += constrained @ planes.gradient[:dim]
+        if constraints is not None:
+            noise_m = max(planes.noise_m, _MIN_NOISE * self._radius_m)
             system, gradient = (
-                a + b for a, b in zip((system, gradient), ties.equations(pose, centre, noise_m), strict=True)
+                a + b for a, b in zip((system, gradient), constraints.equations(pose, centre, noise_m), strict=True)
             )
         return replace(found, system=system, gradient=gradient)
 
 
-class Ties:
-    """Points of both surfaces that are the same, each known as well as all of them fit one similarity."""
+class PointConstraints:
+    """Corresponding points of both surfaces as constraints; their variance is that of the fit of one similarity."""
 
     def __init__(self, correspondences: Correspondences) -> None:
         self._target, self._source = correspondences
@@ -233,7 +246,7 @@ class Ties:
         self._variance = float(((fit.apply(self._source) - self._target) ** 2).mean())
 
     def equations(self, pose: Sim3, centre: np.ndarray, noise_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations (7, 7), (7,) about ``centre``, in units of the variance of the distances to the planes."""
+        """Return normal equations (7, 7), (7,) about ``centre`` in units of the variance ``noise_m**2``."""
         levers = self._source - centre
         apart = (pose.apply(self._source) - self._target) @ pose.rotation
         weight = noise_m**2 / max(self._variance, noise_m**2, 1e-12)
@@ -241,23 +254,23 @@ class Ties:
         return weight * pose.scale**2 * point_information(levers), weight * pose.scale * pulls.sum(0)
 
 
-class _Laid:
-    """Cells of one surface laid on another by a pose, each on the nearest within one radius; what is known is kept."""
+class _OneWayPairs:
+    """Pairs of one surface's cells with the nearest cells of another within one radius, with cached partners."""
 
     def __init__(self, onto: Surface, moving: Surface, count: int, start: Sim3, *, backward: bool = False) -> None:
         self._onto, self._moving, self._backward = onto, moving, backward
         self._rows = moving.sample(count)
         self._partners = np.full((len(self._rows), 5), -1.0)
-        # Turned once: from pose to pose faces turn by less than anything that is told by them.
-        known = onto.faces is not None and moving.faces is not None
-        self._faces = (onto.faces, moving.faces @ start.rotation.T) if known else (None, None)
+        # Rotated once: normals rotate little from pose to pose, and only their side matters.
+        known = onto.oriented_normals is not None and moving.oriented_normals is not None
+        self._faces = (onto.oriented_normals, moving.oriented_normals @ start.rotation.T) if known else (None, None)
 
     def equations(
         self, pose: Sim3, centre: np.ndarray, radius_m: float, params: Params, *, coloured: bool
     ) -> _Equations:
-        """Under a pose that takes what moves into the frame of the other, for a step about ``centre`` (source frame).
+        """Return normal equations for a step about ``centre`` (source frame) under a pose of the moving surface.
 
-        A step that moves the source forward moves what is laid on it (``backward``) back.
+        With ``backward`` the target is the moving surface, and a step of the source moves it back.
         """
         from gsmap import _native
 
@@ -283,6 +296,6 @@ class _Laid:
         return _Equations(*found)
 
     def paired_points(self) -> np.ndarray:
-        """(N, 3) points that found a partner."""
+        """Return the (N, 3) points that have a partner."""
         points: np.ndarray = self._moving.coarse[0][self._rows[self._partners[:, 4] >= 0]]
         return points

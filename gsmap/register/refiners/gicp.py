@@ -1,4 +1,4 @@
-"""Generalised ICP, coarse to fine: a refiner for scenes whose scale is known."""
+"""Refine a rigid pose by generalised ICP (Segal et al. 2009), coarse to fine."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Params:
 def refine(
     target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
 ) -> Sim3:
-    """Rigid pose of two surfaces by GICP (small_gicp) from a start within about 8 degrees.
+    """Align two surfaces (metres) by GICP (small_gicp) from a start within about 8 degrees.
 
-    Surfaces are in metres. A start that carries a scale keeps it. Returns the start where too little overlaps.
+    The scale of the start is kept. Returns the start where too little overlaps.
     """
     return align("GICP", target, source, start, radii_m=_RADII_M, max_iterations=_MAX_ITERATIONS)

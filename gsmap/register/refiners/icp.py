@@ -1,4 +1,4 @@
-"""Plain point-to-point ICP, as Graph-GSReg refines: a refiner for scenes whose scale is known."""
+"""Refine a rigid pose by point-to-point ICP, as Graph-GSReg."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Params:
 def refine(
     target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
 ) -> Sim3:
-    """Rigid pose of two surfaces by ICP on their cells' centres, or on all means (small_gicp).
+    """Align two surfaces (metres) by ICP on their cells' centres, or on all means (small_gicp).
 
-    Surfaces are in metres. A start that carries a scale keeps it. Returns the start where too little overlaps.
+    The scale of the start is kept. Returns the start where too little overlaps.
     """
     params = params or Params()
     return align(

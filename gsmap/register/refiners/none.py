@@ -1,4 +1,4 @@
-"""No refinement: the pose stays as it is."""
+"""No refinement: return the start."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ SCALES = True
 
 @dataclass(frozen=True)
 class Params:
-    """Nothing to set."""
+    """The method has no settings."""
 
 
 def refine(
     target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
 ) -> Sim3:
-    """The start."""
+    """Return the start."""
     return start

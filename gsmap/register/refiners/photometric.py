@@ -1,4 +1,4 @@
-"""Renders of the source laid over renders of the target: the last millimetres, where pictures say more than points."""
+"""Refine a pose by photometric alignment of renders of both scenes, for the last millimetres."""
 
 from __future__ import annotations
 
@@ -35,34 +35,34 @@ class Params:
 def refine(
     target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
 ) -> Sim3:
-    """The pose (metres) whose renders of the source match those of the target best, seen by the target's cameras.
+    """Align renders of the source with renders of the target, both by the target's cameras (pose in metres).
 
-    Gauss-Newton on robust colour differences; the derivative is taken by rendering the source from probed poses (a
-    view moves, not 10^5 Gaussians). The source's exposure per channel (gain, offset) is fitted along. A step that does
-    not lower the cost is not taken. Needs a start within a few pixels of the answer, both scenes' Gaussians and the
-    target's cameras; without them the start is given back.
+    Gauss-Newton on robust colour differences; the derivative is computed by rendering the source from probed poses (a
+    view moves, not the Gaussians). The source's exposure per channel (gain, offset) is fitted, too. A step that does
+    not lower the cost is not taken. Needs a start within a few pixels of the solution, both scenes' Gaussians and the
+    target's cameras; without them the start is returned.
     """
     if target.gaussians is None or source.gaussians is None or not target.cameras:
         return start
-    # Renders are of the scenes in their own units.
+    # Renders are of the scenes in their start_in_units units.
     unit_t, unit_s = target.unit_m, source.unit_m
-    own = Sim3(start.rotation, start.translation / unit_t, start.scale * (unit_s / unit_t))
-    found = _aligned(
+    start_in_units = Sim3(start.rotation, start.translation / unit_t, start.scale * (unit_s / unit_t))
+    aligned = _align(
         target.gaussians,
         source.gaussians,
         target.cameras,
-        own,
+        start_in_units,
         unit_m=unit_t,
         with_scale=with_scale,
     )
-    if found is own:
+    if aligned is start_in_units:
         return start
     return Sim3(
-        found.rotation, found.translation * unit_t, found.scale * (unit_t / unit_s) if with_scale else start.scale
+        aligned.rotation, aligned.translation * unit_t, aligned.scale * (unit_t / unit_s) if with_scale else start.scale
     )
 
 
-def _aligned(
+def _align(
     target: Gaussians,
     source: Gaussians,
     cameras: Cameras,
@@ -71,28 +71,28 @@ def _aligned(
     unit_m: float,
     with_scale: bool,
 ) -> Sim3:
-    """The same between the scenes' own units; ``unit_m`` metres per unit of the target."""
+    """Align renders under a pose between the scenes' start_in_units units; ``unit_m`` metres per unit of the target."""
     from gsmap.render import render
 
-    cameras = _most_seeing(cameras.resized(_IMAGE_SIZE_PX), source, start, _NUM_VIEWS)
+    cameras = _select_cameras(cameras.resized(_IMAGE_SIZE_PX), source, start, _NUM_VIEWS)
     if not len(cameras):
         return start
-    seen = render(target, cameras, backend="native")
+    rendered = render(target, cameras, backend="native")
     dim = 7 if with_scale else 6
     probes = np.r_[np.full(3, _STEP_RAD), np.full(3, _STEP_M / unit_m / start.scale), _STEP_LOG][:dim]
     centre = np.median(source.means, axis=0).astype(np.float64)
 
     def residual(pose: Sim3, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Colour differences of the pixels in the mask (P, 3), and the mask."""
-        shot = render(source, transform_cameras(cameras, pose.inverse()), backend="native")
+        """Return the colours (P, 3) of the pixels in the mask, and the mask (computed where None)."""
+        moved = render(source, transform_cameras(cameras, pose.inverse()), backend="native")
         if mask is None:
-            depth = shot.depth * pose.scale
-            mask = (seen.alpha > _MIN_ALPHA) & (shot.alpha > _MIN_ALPHA)
-            mask &= np.abs(depth - seen.depth) < _DEPTH_TOLERANCE * seen.depth
-        return shot.colour[mask].astype(np.float64), mask
+            depth = moved.depth * pose.scale
+            mask = (rendered.alpha > _MIN_ALPHA) & (moved.alpha > _MIN_ALPHA)
+            mask &= np.abs(depth - rendered.depth) < _DEPTH_TOLERANCE * rendered.depth
+        return moved.colour[mask].astype(np.float64), mask
 
-    def cost(colours: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        difference = _exposed(colours, wanted) - wanted
+    def cost(colours: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        difference = _match_exposure(colours, reference) - reference
         spread = 1.4826 * np.median(np.abs(difference)) + 1e-6
         weights = 1.0 / (1.0 + (difference / (2 * spread)) ** 2) ** 2
         return difference, weights, spread
@@ -102,9 +102,9 @@ def _aligned(
         colours, mask = residual(pose, None)
         if mask.sum() < _MIN_PIXELS:
             return start
-        wanted = seen.colour[mask].astype(np.float64)
-        difference, weights, spread = cost(colours, wanted)
-        gains = _gains(colours, wanted)
+        reference = rendered.colour[mask].astype(np.float64)
+        difference, weights, spread = cost(colours, reference)
+        gains = _gains(colours, reference)
         # About the source's centre, where rotation and translation hardly mix.
         centred = pose @ Sim3(np.eye(3), centre)
         back = Sim3(np.eye(3), -centre)
@@ -121,11 +121,11 @@ def _aligned(
             system + 1e-3 * np.diag(np.diag(system)) + 1e-12 * np.eye(dim), flat @ (w * difference.ravel())
         )
         step = np.clip(step, -3, 3) * probes
-        tried = retract(centred, step) @ back
-        after = _exposed(residual(tried, mask)[0], wanted) - wanted
+        candidate = retract(centred, step) @ back
+        after = _match_exposure(residual(candidate, mask)[0], reference) - reference
         if _robust(after, spread) >= _robust(difference, spread):
             break
-        pose = tried
+        pose = candidate
         if np.abs(step / probes).max() < 0.05:
             break
     return pose
@@ -136,20 +136,20 @@ def _robust(difference: np.ndarray, spread: float) -> float:
     return float((squares / (1.0 + squares)).sum())
 
 
-def _gains(colours: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    spread_w = np.median(np.abs(wanted - np.median(wanted, axis=0)), axis=0)
+def _gains(colours: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    spread_w = np.median(np.abs(reference - np.median(reference, axis=0)), axis=0)
     spread_c = np.median(np.abs(colours - np.median(colours, axis=0)), axis=0)
     return np.clip(spread_w / np.maximum(spread_c, 1e-6), 0.5, 2.0)
 
 
-def _exposed(colours: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Colours under the gain and offset per channel that bring their medians to the wanted ones'."""
-    gains = _gains(colours, wanted)
-    return (colours - np.median(colours, axis=0)) * gains + np.median(wanted, axis=0)
+def _match_exposure(colours: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Apply the gain and offset per channel that match the medians of the colours to those of the target."""
+    gains = _gains(colours, reference)
+    return (colours - np.median(colours, axis=0)) * gains + np.median(reference, axis=0)
 
 
-def _most_seeing(cameras: Cameras, source: Gaussians, pose: Sim3, count: int) -> Cameras:
-    """The cameras with most of the source's surface in view, each part counted once."""
+def _select_cameras(cameras: Cameras, source: Gaussians, pose: Sim3, count: int) -> Cameras:
+    """Select the cameras that together see most of the source's surface."""
     opaque = np.flatnonzero(source.opacities > 0.5)
     sample = opaque[:: max(1, len(opaque) // 2000)]
     return cameras[select_views(cameras, pose.apply(source.means[sample]), count)]

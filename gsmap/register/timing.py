@@ -1,4 +1,4 @@
-"""Wall seconds by step."""
+"""Measure wall seconds by step."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Adds up the wall seconds of each step by its name."""
+    """Wall seconds of each step by its name, summed."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"match": 0.0, "refine": 0.0, "verdict": 0.0}
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Everything inside counts as this step."""
+        """Add the wall seconds of a block to a step."""
         start = time.perf_counter()
         try:
             yield

@@ -74,7 +74,7 @@ def test_cells_face_the_cameras_that_saw_them(unit_m):
     S = Sim3(exp_so3([0.4, -1.0, 2.0]), [3.0, -20.0, 7.0], 1 / unit_m)
     surface = capture(1.0, 0, S).surface(unit_m)
     back = S.inverse()
-    points, faces = back.apply(surface.coarse[0] / unit_m), surface.faces @ S.rotation
+    points, faces = back.apply(surface.coarse[0] / unit_m), surface.oriented_normals @ S.rotation
     wall = (np.abs(points[:, 0] - THICK / 2) < 0.02) & (points[:, 1] < 0.3) & (points[:, 2] > 0.1)
     floor = (points[:, 2] < 0.02) & (points[:, 1] < 0.5) & (np.abs(points[:, 0] - 0.8) < 0.3)
     assert min(wall.sum(), floor.sum()) > 500
@@ -87,13 +87,13 @@ def test_cells_face_the_cameras_that_saw_them(unit_m):
 def test_what_no_camera_of_the_capture_saw_faces_nowhere():
     room = capture(1.0, 0)
     alone = SceneView("alone", room.gaussians, None, room.graph)
-    assert alone.surface().faces is None
+    assert alone.surface().oriented_normals is None
     # Cameras that look away from the wall leave it unknown, but for what lies level with what they see.
     away = np.flatnonzero(room.cameras.T_frame_camera[:, 0, 2] > 0)
     seen = SceneView("away", room.gaussians, room.cameras[away], room.graph).surface()
     wall = (np.abs(seen.coarse[0][:, 0] - THICK / 2) < 0.02) & (seen.coarse[0][:, 1] < -0.5)
-    assert not np.any(seen.faces[wall])
-    assert np.any(seen.faces)
+    assert not np.any(seen.oriented_normals[wall])
+    assert np.any(seen.oriented_normals)
 
 
 def test_a_wall_s_back_is_not_laid_on_its_front():
@@ -122,7 +122,7 @@ def test_a_wall_s_back_is_not_laid_on_its_front():
 
 def test_nearest_cells_are_those_of_brute_force_that_face_the_same_way():
     surface = capture(1.0, 0).surface()
-    points, faces = surface.coarse[0], surface.faces
+    points, faces = surface.coarse[0], surface.oriented_normals
     rng = np.random.default_rng(2)
     rows = rng.choice(len(points), 400, replace=False)
     asked, own = points[rows] + rng.normal(size=(400, 3)) * 0.03, faces[rows] * rng.choice([-1.0, 0.0, 1.0], (400, 1))

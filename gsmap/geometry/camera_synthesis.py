@@ -1,4 +1,4 @@
-"""Cameras for a scene that came without: placed in its free space, looking around."""
+"""Synthesize cameras in the free space of a scene without cameras."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from gsmap.types.source import gathered
 _POINTS = 20_000
 _PLACES = 256
 _GRID = 32
-_CLEARANCE = 0.03  # how far from every point a place is, in diagonals
+_CLEARANCE = 0.03  # smallest distance of a position from all points, in diagonals
 _PANORAMA = (16, 32)  # bins of latitude and longitude
-_ENCLOSED = 0.6  # share of directions that hit something: a room without a ceiling has more, the outside less
-_TIE = 0.02  # rooms of which nothing but bare walls is known look the same from both sides: stay inside
-_WORTH = 0.002  # share of the points that a further place must add
+_ENCLOSED = 0.6  # smallest share of directions that hit a surface, indoors; a room without a ceiling has more
+_TIE = 0.02  # bare walls look the same from both sides: positions indoors may see this share of the points less
+_MIN_GAIN = 0.002  # share of the points that a further position must add
 _SIDE_PX = 512
 
 
 def synthesise_cameras(gaussians: GaussianSource, *, num_positions: int = 16, seed: int = 0) -> Cameras:
-    """Cameras in the free space of a scene that together see its surfaces.
+    """Synthesize cameras in free space that together see a scene's surfaces.
 
-    Up to ``num_positions`` places, each the one that sees most of what those before did not, looking along the axes
-    with 90 degrees where something is to be seen. Places are indoors (most directions hit something) where such places
-    see as much as those outside do: true of rooms, not of the hollows of an object. Same input, same cameras.
+    Up to ``num_positions`` positions, each the one that sees most points not seen before, with views of 90 degrees
+    along the axes where there are points. Positions are indoors (most directions hit a surface) where such positions
+    see as much as those outside: true of rooms, not of hollow objects. The result is deterministic.
 
     Returns:
         Cameras in the scene's frame with ``synthesised=True``.
@@ -48,7 +48,7 @@ def synthesise_cameras(gaussians: GaussianSource, *, num_positions: int = 16, se
 
 
 def _solid_points(gaussians: GaussianSource, rng: np.random.Generator) -> np.ndarray:
-    """(N, 3) centres of a sample of the opaque Gaussians that are not huge; of all where none is."""
+    """Return (N, 3) centres of a sample of the opaque Gaussians that are not huge; of all where none is."""
     widest = np.concatenate([log_scales.max(1) for log_scales in gaussians.columns("log_scales")])
     opaque = np.concatenate([logits > -0.85 for logits in gaussians.columns("logit_opacities")])
     solid = np.flatnonzero(opaque & (widest <= np.percentile(widest, 98)))
@@ -60,7 +60,7 @@ def _solid_points(gaussians: GaussianSource, rng: np.random.Generator) -> np.nda
 
 
 def _free_places(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(M, 3) places in the box of the points, away from each, spread by farthest-point sampling."""
+    """Return (M, 3) free positions in the box of the points, spread by farthest-point sampling."""
     from scipy.spatial import cKDTree
 
     low, high = np.percentile(points, [1, 99], axis=0)
@@ -81,7 +81,7 @@ def _free_places(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _panorama(points: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarray]:
-    """Share of all directions (by solid angle) in which something lies, and the indices of the points seen."""
+    """Return the share of directions (by solid angle) that hit points, and the indices of the visible points."""
     rows, columns = _PANORAMA
     offset = points - position
     distance = np.linalg.norm(offset, axis=1)
@@ -98,12 +98,12 @@ def _panorama(points: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarr
 
 
 def _best(seen: list[np.ndarray], allowed: np.ndarray, num_points: int, count: int) -> list[int]:
-    """Up to ``count`` of the allowed places, greedily by how many points each adds; none that adds hardly any."""
+    """Select up to ``count`` allowed positions greedily by the number of points that each adds."""
     unseen = np.ones(num_points, bool)
     out: list[int] = []
     while len(out) < min(count, len(allowed)):
         gain = [int(unseen[seen[i]].sum()) for i in allowed]
-        if out and max(gain) < _WORTH * num_points:
+        if out and max(gain) < _MIN_GAIN * num_points:
             break
         out.append(int(allowed[int(np.argmax(gain))]))
         unseen[seen[out[-1]]] = False
@@ -111,12 +111,12 @@ def _best(seen: list[np.ndarray], allowed: np.ndarray, num_points: int, count: i
 
 
 def _coverage(seen: list[np.ndarray], places: list[int]) -> int:
-    """How many points these places see together."""
+    """Return the number of points that some positions see together."""
     return len(np.unique(np.concatenate([seen[i] for i in places]))) if places else -1
 
 
 def _look_around(place: np.ndarray, visible: np.ndarray) -> list[np.ndarray]:
-    """Poses at a place along the six axes, but only where at least 2 % of the visible points lie."""
+    """Return poses at a position along those of the six axes with at least 2 % of the visible points."""
     offset = visible - place
     reach = np.abs(offset).max(1)
     poses = []
@@ -128,7 +128,7 @@ def _look_around(place: np.ndarray, visible: np.ndarray) -> list[np.ndarray]:
 
 
 def _look(place: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """(4, 4) camera-to-frame pose with OpenCV axes, looking along a unit axis; image down is an axis of the frame."""
+    """Return the (4, 4) camera-to-frame pose (OpenCV axes) along a unit axis, image down along another axis."""
     down = np.array([0.0, 1, 0]) if forward[1] == 0 else np.array([0.0, 0, 1])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([np.cross(down, forward), down, forward], 1)

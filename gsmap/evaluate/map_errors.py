@@ -1,4 +1,4 @@
-"""A map's edges and poses against the truth, as one report that says plainly what failed."""
+"""Evaluate a map's edges and poses against the truth."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from gsmap.types.rows import (
     PoseErrorRow,
 )
 
-_METRIC = 1e-6  # a truth's scale this near to 1 says that the scene is in metres
+_METRIC = 1e-6  # largest log scale of a true pose of a scene in metres
 
 
 @dataclass(frozen=True)
 class Params:
-    """When an edge is wrong, and how edges are counted.
+    """Settings of the evaluation.
 
     Args:
         max_rre_deg: Largest rotation error of a right edge in degrees, positive; a larger value counts more edges as
@@ -74,14 +74,14 @@ class Params:
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedScene:
-    """A living scene of the map.
+class EvaluatedScene:
+    """A scene of the map with its truth.
 
     Args:
         id, name: of the scene.
-        S_scene_world: its truth, metres in the world; None where there is none.
-        centroid: (3,) where its errors are measured, scene frame; any where there is no truth.
-        centers: (C, 3) of its cameras, scene frame; any where there is no truth.
+        S_scene_world: true pose, metres in the world; None if unknown.
+        centroid: (3,) at which errors are measured, scene frame; arbitrary without a true pose.
+        centers: (C, 3) of its cameras, scene frame; arbitrary without a true pose.
     """
 
     id: str
@@ -91,30 +91,30 @@ class JudgedScene:
     centers: np.ndarray
 
 
-def judge(
-    scenes: Sequence[JudgedScene],
+def evaluate_map(
+    scenes: Sequence[EvaluatedScene],
     edges: Sequence[EdgeRow],
     graph: PoseGraph | None,
     overlaps: Mapping[frozenset[str], float],
     params: Params | None = None,
     metres: Mapping[int, Metre] | None = None,
 ) -> EvaluationReport:
-    """Everything that the truth says of a map's edges and newest poses.
+    """Evaluate the edges and the newest poses of a map.
 
     Args:
-        scenes: all living scenes, in the map's order.
-        edges: the current edge of every pair that was tried.
+        scenes: all scenes, in the map's order.
+        edges: the current edge of every registered pair.
         graph: the newest poses; None before the first.
-        overlaps: true overlap by pair, of all pairs of scenes that have a truth.
-        metres: what the map takes for a metre, by component; not judged where None.
+        overlaps: true overlap of all pairs of scenes with a true pose.
+        metres: metric scale of each component; not evaluated where None.
     """
-    return _Judge(scenes, edges, graph, overlaps, params or Params(), metres or {}).report()
+    return _MapErrors(scenes, edges, graph, overlaps, params or Params(), metres or {}).report()
 
 
-class _Judge:
+class _MapErrors:
     def __init__(
         self,
-        scenes: Sequence[JudgedScene],
+        scenes: Sequence[EvaluatedScene],
         edges: Sequence[EdgeRow],
         graph: PoseGraph | None,
         overlaps: Mapping[frozenset[str], float],
@@ -133,14 +133,14 @@ class _Judge:
         for pose in poses.values():
             if pose.status != "isolated":
                 sizes[pose.component] = sizes.get(pose.component, 0) + 1
-        # A scene whose every neighbour was removed since is tied to nothing any more.
-        self.tied = {
+        # A scene whose neighbours were all removed since is isolated.
+        self.connected = {
             s: poses[s]
             for s in self.scenes
             if s in poses and poses[s].status != "isolated" and sizes[poses[s].component] > 1
         }
         self.components: dict[int, list[str]] = {}
-        for s, pose in self.tied.items():
+        for s, pose in self.connected.items():
             self.components.setdefault(pose.component, []).append(s)
         self.nees = {component: self._nees_of_component(component) for component in sorted(self.components)}
 
@@ -149,13 +149,13 @@ class _Judge:
         known = [edge for edge in accepted if edge.target in self.truth and edge.source in self.truth]
         edges = tuple(self._edge(edge) for edge in known)
         pairs = tuple(
-            self._error(a, b, self.tied[a].S_map_scene.inverse() @ self.tied[b].S_map_scene)
+            self._error(a, b, self.connected[a].S_map_scene.inverse() @ self.connected[b].S_map_scene)
             for members in self.components.values()
             for a, b in combinations([s for s in members if s in self.truth], 2)
         )
         components = tuple(self._component(k, members) for k, members in sorted(self.components.items()))
         ate_m, ate_reason = self._ate(components)
-        statuses = [pose.status for pose in self.tied.values()]
+        statuses = [pose.status for pose in self.connected.values()]
         in_use = [edge for edge in edges if edge.used]
         return EvaluationReport(
             num_scenes=len(self.scenes),
@@ -189,8 +189,8 @@ class _Judge:
     def _true(self, target: str, source: str) -> Sim3:
         return self.truth[target] @ self.truth[source].inverse()
 
-    def _of_truth(self, source: str) -> np.ndarray | None:
-        """(7, 7) how well the truth of a pair is known, on the source's side; None where it is exact."""
+    def _truth_covariance(self, source: str) -> np.ndarray | None:
+        """Return the (7, 7) covariance of the truth of a pair on the source's side; None where it is exact."""
         params, scene = self.params, self.scenes[source]
         if not (params.truth_sigma_deg or params.truth_sigma_m):
             return None
@@ -215,7 +215,7 @@ class _Judge:
         error = self._error(edge.target, edge.source, edge.S_target_source)
         nees = None
         if edge.information is not None:
-            true, of_truth = self._true(edge.target, edge.source), self._of_truth(edge.source)
+            true, of_truth = self._true(edge.target, edge.source), self._truth_covariance(edge.source)
             nees = nees_of_edge(edge.S_target_source, edge.information, true, of_truth)
         return EdgeErrorRow(
             **vars(error),
@@ -227,7 +227,7 @@ class _Judge:
         )
 
     def _bands(self, edges: Sequence[EdgeErrorRow]) -> tuple[BandRow, ...]:
-        """Recall and precision by true overlap; a band's lower end belongs to it."""
+        """Compute recall and precision by bands of true overlap, each with its lower end."""
         ends = (0.0, *self.params.bands, 1.0)
         pairs = np.array([self.overlaps[frozenset(pair)] for pair in combinations(self.truth, 2)])
         pair_band = np.searchsorted(self.params.bands, pairs, side="right")
@@ -254,19 +254,19 @@ class _Judge:
 
     def _component(self, component: int, members: Sequence[str]) -> ComponentErrorRow:
         known = [s for s in members if s in self.truth]
-        # Where the truth says that captures are in metres, so must the map be: a scale that is off is an error then.
+        # Where captures are truly in metres the map must be, too, so a wrong scale counts as an error.
         metric = all(abs(self.truth[s].scale - 1) < _METRIC for s in known)
         alignment = "rigid" if metric else "similarity"
         reason, ate_m = "", None
         metre = self.metres.get(component)
-        true_logs = [-float(np.log(self.truth[s].scale * self.tied[s].S_map_scene.scale)) for s in known]
+        true_logs = [-float(np.log(self.truth[s].scale * self.connected[s].S_map_scene.scale)) for s in known]
         count = sum(len(self.scenes[s].centers) for s in known)
         if len(known) < 2:
-            reason = f"{len(known)} of its {len(members)} scenes has a truth: two are needed"
+            reason = f"{len(known)} of its {len(members)} scenes have a true pose: two are needed"
         elif count < 3:
             reason = f"{count} cameras fix no alignment: three are needed"
         else:
-            estimated = [self.tied[s].S_map_scene.apply(self.scenes[s].centers) for s in known]
+            estimated = [self.connected[s].S_map_scene.apply(self.scenes[s].centers) for s in known]
             true = [self.truth[s].inverse().apply(self.scenes[s].centers) for s in known]
             ate_m = absolute_trajectory_error(np.concatenate(estimated), np.concatenate(true), align=alignment)
         return ComponentErrorRow(
@@ -283,7 +283,7 @@ class _Judge:
         )
 
     def _ate(self, components: Sequence[ComponentErrorRow]) -> tuple[float | None, str]:
-        """Over all components that have one, and why there is none."""
+        """Return the ATE over all components that have one, and the reason if none has."""
         found = [(row.num_cameras, row.ate_m) for row in components if row.ate_m is not None]
         if found:
             squares = sum(count * ate_m**2 for count, ate_m in found)
@@ -291,7 +291,7 @@ class _Judge:
         if self.graph is None:
             return None, "the map has no poses yet: run gsmap optimize"
         if not components:
-            return None, "no two scenes are tied to each other"
+            return None, "no two scenes are connected by edges"
         return None, "; ".join(f"component {row.component}: {row.ate_reason}" for row in components)
 
     def _nees(self, edges: Sequence[EdgeErrorRow]) -> tuple[NeesRow, ...]:
@@ -300,54 +300,54 @@ class _Judge:
         return (*nees_rows("edges", of_edges), *nees_rows("poses", of_poses))
 
     def _nees_of_component(self, component: int) -> list[Nees] | None:
-        """Of each of its scenes relative to the one that holds its frame; None where its covariances do not say."""
+        """Return the NEES of each scene relative to the anchor of its component; None without usable covariances."""
         known = {
             s: covariance
             for s in self.components[component]
-            if s in self.truth and (covariance := self.tied[s].covariance) is not None
+            if s in self.truth and (covariance := self.connected[s].covariance) is not None
         }
         if len(known) < 2:
             return None
         anchor = min(known, key=lambda s: float(np.trace(known[s][:3, :3])))
-        inverse = self.tied[anchor].S_map_scene.inverse()
+        inverse = self.connected[anchor].S_map_scene.inverse()
         found = []
         for s in (s for s in known if s != anchor):
-            estimated = inverse @ self.tied[s].S_map_scene
+            estimated = inverse @ self.connected[s].S_map_scene
             covariance = relative_covariance(estimated, known[s], known[anchor])
             if covariance is None:
                 return None
-            found.append(nees_of_pose(estimated, covariance, self._true(anchor, s), self._of_truth(s)))
+            found.append(nees_of_pose(estimated, covariance, self._true(anchor, s), self._truth_covariance(s)))
         return found
 
     def _notes(self) -> tuple[str, ...]:
         notes = []
         lacking = [scene.name for scene in self.scenes.values() if scene.id not in self.truth]
         if lacking:
-            notes.append(f"without a truth, and so not judged: {_listed(lacking)}")
+            notes.append(f"not evaluated, as they have no true pose: {_join_names(lacking)}")
         if self.graph is not None:
             new = [scene.name for scene in self.scenes.values() if scene.id not in self.graph.poses]
             if new:
-                notes.append(f"newer than the newest poses: {_listed(new)}; run gsmap optimize")
-        silent = [str(component) for component, found in self.nees.items() if found is None]
-        if silent:
+                notes.append(f"newer than the newest poses: {_join_names(new)}; run gsmap optimize")
+        without_nees = [str(component) for component, found in self.nees.items() if found is None]
+        if without_nees:
             notes.append(
-                f"no NEES of poses in component {_listed(silent)}: covariances or a truth are missing, or priors hold "
-                "its frame"
+                f"no NEES of poses in component {_join_names(without_nees)}: covariances or true poses are missing, or "
+                "priors hold its frame"
             )
         stale = [edge.pair for edge in self.all_edges if edge.used and edge.status != "accepted"]
         if stale:
             notes.append(
-                f"the newest poses use edges that are no longer accepted: {_listed(stale)}; run gsmap optimize"
+                f"the newest poses use edges that are no longer accepted: {_join_names(stale)}; run gsmap optimize"
             )
         return tuple(notes)
 
 
-def _listed(names: Sequence[str], most: int = 10) -> str:
+def _join_names(names: Sequence[str], most: int = 10) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _summary(of: str, rows: Sequence[PoseErrorRow]) -> dict[str, Any]:
-    """The report's medians and worst of some rows; None where there are none."""
+    """Return medians and worst values of some rows; None without rows."""
 
     def over(function: Callable[[list[float]], Any], name: str) -> float | None:
         return float(function([getattr(row, name) for row in rows])) if rows else None

@@ -1,4 +1,4 @@
-"""The nodes of a scene that vote for other scenes, and are voted for, as an index keeps them."""
+"""Select and encode the nodes of a scene for an inverted index and for lookups in it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from gsmap.types import NodeLayer, SceneGraph
 from gsmap.types.retrieval import Member
 
 INDEX_VERSION = 2
-"""Of what an index holds of a scene; another one is made anew."""
+"""Version of the nodes in an index; an index of another version is rebuilt."""
 
 WIDTH = NUM_DIMS + 6 + 4
-"""Bytes of a node in an index: its code, its position as three float16, its scene's place among those of the index."""
+"""Bytes of a node in an index: its code, its position as three float16, and its scene's place in the index."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Nodes:
     """M nodes of a scene.
 
     Args:
-        keys: (M,) int64 the list that each lies in, or is looked for in; rising.
+        keys: (M,) int64 inverted list of each node, ascending.
         codes: (M, NUM_DIMS) int8.
         positions: (M, 3) float16 metres about their mean, level where the scene is upright.
     """
@@ -38,72 +38,72 @@ class Nodes:
 
 
 @dataclass(frozen=True, eq=False)
-class Voters:
-    """A scene as it is kept in an index, and as it asks one.
+class SceneNodes:
+    """Nodes of a scene to be indexed, and those of the scene as a query.
 
     Args:
-        kept: nodes that others find.
-        asking: nodes that look for others'. Landmarks of scenes that know up are found by each other; scenes that do
-            not know it, and those that do, find each other by what is the same in any frame.
+        index_nodes: nodes that queries find.
+        query_nodes: nodes that search the index. Scenes with known gravity match each other by their upright landmarks;
+            pairs with a scene of unknown gravity match by gravity-free landmarks.
     """
 
     member: Member
-    kept: Nodes
-    asking: Nodes
+    index_nodes: Nodes
+    query_nodes: Nodes
 
 
-def voters_of(graph: SceneGraph, key: str, nodes_per_scene: int) -> Voters:
-    """Select the strongest nodes of each layer of a graph that is kept under a key.
+def select_nodes(graph: SceneGraph, key: str, nodes_per_scene: int) -> SceneNodes:
+    """Select the strongest nodes of each layer of a scene graph, stored under a key.
 
-    The layers at guessed units are left out where the same landmarks have nodes at any size that takes the scene's unit
-    for a metre (``landmarks``, ``landmarks@K``). An empty layer counts as absent: the corners and patterns of a large,
-    coarse capture may all be larger than landmarks at the metre.
+    Layers for estimated units are skipped where a layer of metric size has nodes (``landmarks``, ``landmarks@K``). An
+    empty layer counts as missing: the corners and patterns of a large, coarse capture may all be larger than landmarks
+    of metric size.
     """
     upright = graph.up is not None
     metric = {name.split("@")[0] for name, layer in graph.layers.items() if ":" not in name and len(layer)}
     level = np.eye(3) if graph.up is None else level_frame(graph.up)
-    kept: list[Nodes] = []
-    asking: list[Nodes] = []
+    index_nodes: list[Nodes] = []
+    query_nodes: list[Nodes] = []
     for name, layer in sorted(graph.layers.items()):
         if not len(layer) or (":" in name and name.split(":")[0] in metric):
             continue
         other_frame = name.startswith("landmarks_gravity_free")
         unit_m = 1.0 if "landmarks" in metric else layer.unit_m  # the scene's unit, where that may be the metre
-        nodes = _strongest(layer, nodes_per_scene, unit_m * level)
-        kept.append(_in_space(nodes, layer.descriptor_id, second=other_frame))
-        asking.append(_in_space(nodes, layer.descriptor_id, second=False))
+        nodes = _select_strongest(layer, nodes_per_scene, unit_m * level)
+        index_nodes.append(_with_keys(nodes, layer.descriptor_id, second=other_frame))
+        query_nodes.append(_with_keys(nodes, layer.descriptor_id, second=False))
         if not upright:
-            asking.append(_in_space(nodes, layer.descriptor_id, second=True))
+            query_nodes.append(_with_keys(nodes, layer.descriptor_id, second=True))
     coarseness = 1.0 / graph.working_m if "landmarks" in metric else 1.0
     member = Member(graph.scene_id, key, upright, "landmarks" in metric, coarseness)
-    return Voters(member, *_centred(kept, asking))
+    return SceneNodes(member, *_join_groups(index_nodes, query_nodes))
 
 
 @dataclass(frozen=True, eq=False)
-class _Strongest:
+class _SelectedNodes:
     types: np.ndarray
     codes: np.ndarray
     positions: np.ndarray
 
 
-def _strongest(layer: NodeLayer, count: int, to_metres: np.ndarray) -> _Strongest:
+def _select_strongest(layer: NodeLayer, count: int, to_metres: np.ndarray) -> _SelectedNodes:
     rows = np.argsort(-layer.weights, kind="stable")[:count]
-    return _Strongest(layer.types[rows], codes.encode(layer.embeddings[rows]), layer.positions[rows] @ to_metres.T)
+    return _SelectedNodes(layer.types[rows], codes.encode(layer.embeddings[rows]), layer.positions[rows] @ to_metres.T)
 
 
-def _in_space(nodes: _Strongest, descriptor_id: str, *, second: bool) -> Nodes:
+def _with_keys(nodes: _SelectedNodes, descriptor_id: str, *, second: bool) -> Nodes:
     keys = codes.keys_of(codes.space(descriptor_id, second=second), nodes.types, nodes.codes)
     return Nodes(keys, nodes.codes, nodes.positions)
 
 
-def _centred(*groups: list[Nodes]) -> list[Nodes]:
-    """Each group as one, by key, about the mean of the first."""
+def _join_groups(*groups: list[Nodes]) -> list[Nodes]:
+    """Join each group, sorted by key, with positions about the mean of the first group."""
     first = [nodes.positions for nodes in groups[0]]
     centre = np.concatenate(first).mean(0) if first else np.zeros(3)
-    return [_joined(group, centre) for group in groups]
+    return [_join(group, centre) for group in groups]
 
 
-def _joined(parts: list[Nodes], centre: np.ndarray) -> Nodes:
+def _join(parts: list[Nodes], centre: np.ndarray) -> Nodes:
     if not parts:
         return Nodes(np.zeros(0, np.int64), np.zeros((0, NUM_DIMS), np.int8), np.zeros((0, 3), np.float16))
     keys = np.concatenate([nodes.keys for nodes in parts])

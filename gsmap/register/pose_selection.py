@@ -1,4 +1,4 @@
-"""What a registration answers, of the poses that were judged."""
+"""Select the pose of a registration among the evaluated poses."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from gsmap.geometry.rotations import angle_between
 from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
-from gsmap.register.metres import Belief
-from gsmap.register.metric import own_working_m
+from gsmap.register.metric_scene import own_working_m
 from gsmap.register.params import Params
 from gsmap.register.probability import probability
-from gsmap.register.proposing import num_nodes
+from gsmap.register.proposal_rounds import num_nodes
 from gsmap.register.scene_view import SceneView
+from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Registration, Sim3
 from gsmap.types.registration import Proposal
 
@@ -27,7 +27,7 @@ SAME_LOG_SCALE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class EvaluatedPose:
     """A proposal after refinement, with its evidence.
 
     Args:
@@ -35,52 +35,52 @@ class Judged:
         evidence: under that pose.
         covariance: (7, 7) of the pose, translations in the source's unit; None where it was not computed.
         flaw: why the pose is not accepted; empty where it is.
-        belief: what was measured of its scale; None where that was not, or where a source's unit is unknown.
+        decision: of the scale; None where it was not measured, or where a source's unit is unknown.
     """
 
     proposal: Proposal
     evidence: PoseEvidence
     covariance: np.ndarray | None
     flaw: str
-    belief: Belief | None = None
+    decision: ScaleDecision | None = None
 
 
-def conclude(
+def select_pose(
     target: SceneView,
     source: SceneView,
-    judged: Sequence[Judged],
+    evaluated: Sequence[EvaluatedPose],
     params: Params,
     *,
     seconds: dict[str, float],
     notes: Sequence[str] = (),
 ) -> Registration:
-    """The answer: one accepted pose, the best one with what speaks against it, or nothing."""
+    """Return the accepted pose, or the best pose with the evidence against it, or the reason why there is none."""
     common: dict[str, Any] = {"target": target.id, "source": source.id, "seconds": seconds}
-    if not judged:
-        poorer = num_nodes(target, source)
-        reason = f"no pose proposed that the background model does not explain (the poorer graph has {poorer} nodes)"
+    if not evaluated:
+        fewest = num_nodes(target, source)
+        reason = f"no pose proposed that chance does not explain (the smaller scene graph has {fewest} nodes)"
         return Registration(status="no_match", reason=reason, notes=tuple(notes), **common)
-    accepted = [j for j in judged if not j.flaw]
-    best = accepted[0] if accepted else min(judged, key=_rank)
+    accepted = [j for j in evaluated if not j.flaw]
+    best = accepted[0] if accepted else min(evaluated, key=_sort_key)
     status, reason = ("accepted", "") if accepted else ("rejected", best.flaw)
-    # A pose that is known too badly to be an edge is no less a rival.
-    others = [j for j in judged if not verdict.contradiction(j.proposal, j.evidence, params.verdict)]
+    # A pose that is too uncertain to be an edge is a rival all the same.
+    others = [j for j in evaluated if not verdict.contradiction(j.proposal, j.evidence, params.verdict)]
     others = [j for j in others if not _same(best, j, target, source)]
-    rivals = [j for j in others if verdict.is_believable(j.proposal, j.evidence, params.verdict)]
+    rivals = [j for j in others if verdict.is_acceptable(j.proposal, j.evidence, params.verdict)]
     probable = _probability_among(best, others)
     if probable < params.verdict.min_probability:
-        rivals = rivals or sorted(others, key=lambda j: -_odds(j))
+        rivals = rivals or sorted(others, key=lambda j: -_odds_of(j))
     if accepted and rivals:
-        apart = _apart(best, rivals[0], target, source)
-        status, reason = "no_match", f"ambiguous: {apart}, and the first is right with {probable:.0%}"
-    elif not accepted and not verdict.is_rare(best.proposal, params.verdict):
+        apart = _describe_distance(best, rivals[0], target, source)
+        status, reason = "no_match", f"ambiguous: {apart}, and the first is right with a probability of {probable:.0%}"
+    elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
         status, reason = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
     information = None
     if status == "accepted" and best.covariance is not None:
         information = np.linalg.inv(best.covariance)
         information = 0.5 * (information + information.T)
-        if best.belief is not None and best.belief.note:
-            notes = (*notes, best.belief.note)
+        if best.decision is not None and best.decision.note:
+            notes = (*notes, best.decision.note)
     return Registration(
         status=status,
         reason=reason,
@@ -91,15 +91,19 @@ def conclude(
         overlap=best.evidence.overlap,
         proposer=best.proposal.proposer,
         exact=best.proposal.exact,
-        evidence=_figures(best, probable),
+        evidence=_evidence_figures(best, probable),
         notes=tuple(notes),
         **common,
     )
 
 
 def is_same_pose(a: Sim3, b: Sim3, centre: np.ndarray, unit_m: float) -> bool:
-    """Both would be refined to one answer; ``centre`` is that of the source's content, ``unit_m`` working
-    metres per unit of the target."""
+    """Return whether two poses would be refined to the same pose.
+
+    Args:
+        centre: (3,) of the source's content, in the source's frame.
+        unit_m: working metres per unit of the target.
+    """
     return bool(
         abs(np.log(a.scale / b.scale)) < SAME_LOG_SCALE
         and np.degrees(angle_between(a.rotation, b.rotation)) < SAME_ROTATION_DEG
@@ -107,12 +111,12 @@ def is_same_pose(a: Sim3, b: Sim3, centre: np.ndarray, unit_m: float) -> bool:
     )
 
 
-def _same(a: Judged, b: Judged, target: SceneView, source: SceneView) -> bool:
+def _same(a: EvaluatedPose, b: EvaluatedPose, target: SceneView, source: SceneView) -> bool:
     poses = a.proposal.S_target_source, b.proposal.S_target_source
     return is_same_pose(*poses, source.centre, own_working_m(target))
 
 
-def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:
+def _describe_distance(a: EvaluatedPose, b: EvaluatedPose, target: SceneView, source: SceneView) -> str:
     S, Q = a.proposal.S_target_source, b.proposal.S_target_source
     centre = source.centre
     degrees = np.degrees(angle_between(S.rotation, Q.rotation))
@@ -120,26 +124,26 @@ def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:
     return f"two poses lie {degrees:.0f} deg and {metres:.1f} m apart"
 
 
-def _odds(judged: Judged) -> float:
-    """That a pose is right, by its own evidence."""
-    p = probability(judged.proposal, judged.evidence, verdict.PRIOR)
+def _odds_of(evaluated: EvaluatedPose) -> float:
+    """Return the odds that a pose is right, by its own evidence."""
+    p = probability(evaluated.proposal, evaluated.evidence, verdict.PRIOR)
     return p / (1.0 - p)
 
 
-def _probability_among(best: Judged, others: Sequence[Judged]) -> float:
-    """That a pose is right where one of the others may be instead: at most one of them all is."""
-    odds = _odds(best)
-    return odds / (1.0 + odds + sum(_odds(j) for j in others))
+def _probability_among(best: EvaluatedPose, others: Sequence[EvaluatedPose]) -> float:
+    """Return the probability that a pose is right, given that at most one of all poses is."""
+    odds = _odds_of(best)
+    return odds / (1.0 + odds + sum(_odds_of(j) for j in others))
 
 
-def _figures(judged: Judged, probable: float) -> dict[str, float]:
-    """The evidence as it is stored; `gsmap.types.Registration` explains each name."""
-    p, e = judged.proposal, judged.evidence
+def _evidence_figures(evaluated: EvaluatedPose, probable: float) -> dict[str, float]:
+    """Return the evidence as it is stored; see `gsmap.types.Registration`."""
+    p, e = evaluated.proposal, evaluated.evidence
     log_scale = log_scale_sigma = float("nan")
-    if judged.belief is not None:
-        log_scale, log_scale_sigma = judged.belief.log_scale, judged.belief.measured_sigma
-    elif judged.covariance is not None:
-        log_scale, log_scale_sigma = float(np.log(p.S_target_source.scale)), float(np.sqrt(judged.covariance[6, 6]))
+    if evaluated.decision is not None:
+        log_scale, log_scale_sigma = evaluated.decision.log_scale, evaluated.decision.measured_sigma
+    elif evaluated.covariance is not None:
+        log_scale, log_scale_sigma = float(np.log(p.S_target_source.scale)), float(np.sqrt(evaluated.covariance[6, 6]))
     return {
         "log_nfa": p.log_nfa,
         "runner_up": p.runner_up,
@@ -157,6 +161,6 @@ def _figures(judged: Judged, probable: float) -> dict[str, float]:
     }
 
 
-def _rank(judged: Judged) -> tuple[float, float]:
-    """Rejected poses by how much speaks for them."""
-    return (-judged.evidence.colour_correlation * judged.evidence.num_coinciding, judged.proposal.log_nfa)
+def _sort_key(evaluated: EvaluatedPose) -> tuple[float, float]:
+    """Return the sort key of rejected poses: the most evidence first."""
+    return (-evaluated.evidence.colour_correlation * evaluated.evidence.num_coinciding, evaluated.proposal.log_nfa)

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from gsmap.errors import ConfigError
 from gsmap.evaluate.calibration import nees_of_edge, nees_of_pose, nees_rows, relative_covariance, truth_covariance
-from gsmap.evaluate.judge import JudgedScene, Params, judge
+from gsmap.evaluate.map_errors import EvaluatedScene, Params, evaluate_map
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities, exp
 from gsmap.types import PoseGraph, ScenePose, Sim3
@@ -26,9 +26,9 @@ def at(x: float, y: float = 0.0, z: float = 0.0, scale: float = 1.0, turn: float
     return Sim3(exp_so3([0, 0, turn]), [x, y, z], scale)
 
 
-def scene(name: str, truth: Sim3 | None) -> JudgedScene:
+def scene(name: str, truth: Sim3 | None) -> EvaluatedScene:
     """A scene whose middle is its origin."""
-    return JudgedScene(f"id-{name}", name, truth, np.zeros(3), CENTERS)
+    return EvaluatedScene(f"id-{name}", name, truth, np.zeros(3), CENTERS)
 
 
 def edge(a: str, b: str, pose: Sim3 | None, status: str = "accepted", used: bool | str = True, **more) -> EdgeRow:
@@ -56,7 +56,7 @@ def graph(*placed: tuple[str, Sim3, int, str], covariances: dict[str, np.ndarray
     return PoseGraph({f"id-{n}": ScenePose(f"id-{n}", S, k, status, known.get(n)) for n, S, k, status in placed})
 
 
-def overlaps(scenes: list[JudgedScene], **known: float) -> dict[frozenset[str], float]:
+def overlaps(scenes: list[EvaluatedScene], **known: float) -> dict[frozenset[str], float]:
     """Those of pairs named like ``ab``; 0 for all others."""
     pairs = combinations([s.name for s in scenes if s.S_scene_world is not None], 2)
     return {frozenset((f"id-{a}", f"id-{b}")): known.get(a + b, 0.0) for a, b in pairs}
@@ -70,10 +70,10 @@ def test_isolated_scenes_have_no_ate() -> None:
     scenes = [scene(n, at(x)) for n, x in zip("abc", (0, 5, 10), strict=True)]
     edges = [edge("a", "b", at(-5), status="rejected", used=False), edge("b", "c", None, "no_match", used=False)]
     poses = graph(*((n, at(7, 7, 7), k, "isolated") for k, n in enumerate("abc")))
-    report = judge(scenes, edges, poses, overlaps(scenes, ab=0.6, bc=0.3))
+    report = evaluate_map(scenes, edges, poses, overlaps(scenes, ab=0.6, bc=0.3))
     assert (report.num_scenes, report.num_placed, report.num_tentative) == (3, 0, 0)
     assert report.ate_m is None
-    assert report.verdict == "0 of 3 placed, no ATE: no two scenes are tied to each other"
+    assert report.verdict == "0 of 3 placed, no ATE: no two scenes are connected by edges"
     assert (report.edges, report.pairs, report.components, report.nees) == ((), (), (), ())
     assert [(b.num_pairs, b.recall, b.precision) for b in report.bands] == [
         (1, 0.0, None),
@@ -86,7 +86,7 @@ def test_isolated_scenes_have_no_ate() -> None:
 
 def test_a_map_without_poses_says_so() -> None:
     scenes = [scene("a", at(0)), scene("b", at(5))]
-    report = judge(scenes, [edge("a", "b", at(-5), used=False)], None, overlaps(scenes, ab=0.6))
+    report = evaluate_map(scenes, [edge("a", "b", at(-5), used=False)], None, overlaps(scenes, ab=0.6))
     assert report.verdict == "0 of 2 placed, no ATE: the map has no poses yet: run gsmap optimize"
     assert report.bands[3].recall == 1.0
     assert report.edges_verdict == "none that the truth could judge"
@@ -95,7 +95,7 @@ def test_a_map_without_poses_says_so() -> None:
 def test_a_scene_whose_neighbours_are_gone_is_not_placed() -> None:
     scenes = [scene("a", at(0)), scene("c", at(5))]
     poses = graph(("a", at(0), 0, "placed"), ("b", at(2), 0, "placed"), ("c", at(5), 1, "isolated"))
-    report = judge(scenes, [], poses, overlaps(scenes))
+    report = evaluate_map(scenes, [], poses, overlaps(scenes))
     assert report.num_placed == 0
     assert report.ate_m is None
 
@@ -109,7 +109,7 @@ def test_only_what_counts_as_accepted_is_scored() -> None:
         edge("a", "c", at(90), status="rejected", used=False),
     ]
     poses = graph(("a", at(0), 0, "placed"), ("b", at(-5), 0, "placed"), ("c", at(-10), 0, "placed"))
-    report = judge(scenes, edges, poses, overlaps(scenes))
+    report = evaluate_map(scenes, edges, poses, overlaps(scenes))
     assert [row.pair for row in report.edges] == ["b:c"]
     assert "the newest poses use edges that are no longer accepted: a:b; run gsmap optimize" in report.notes
 
@@ -125,7 +125,7 @@ def test_wrong_edges_in_use_are_named() -> None:
         edge("c", "d", at(-5, turn=np.radians(1.1))),
         edge("a", "c", at(90), used=False),  # wrong, but nothing rests on it
     ]
-    report = judge(scenes, edges, None, overlaps(scenes, ab=0.6, bc=0.25, cd=0.1, ac=0.099))
+    report = evaluate_map(scenes, edges, None, overlaps(scenes, ab=0.6, bc=0.25, cd=0.1, ac=0.099))
     assert [row.right for row in report.edges] == [True, False, False, False]
     assert [row.pair for row in report.false_edges] == ["b:c", "c:d"]
     assert report.edges_verdict == "2 of 3 false, beyond 1 deg or 0.05 m: b:c, c:d"
@@ -137,7 +137,7 @@ def test_wrong_edges_in_use_are_named() -> None:
     ]
     assert [b.precision for b in report.bands] == [0, 0, 0, 1]
     assert report.edges[2].rre_deg == pytest.approx(1.1)
-    wider = judge(scenes, edges, None, overlaps(scenes), Params(max_rre_deg=1.2, max_rte_m=0.07))
+    wider = evaluate_map(scenes, edges, None, overlaps(scenes), Params(max_rre_deg=1.2, max_rte_m=0.07))
     assert wider.false_edges == ()
     assert (wider.max_rre_deg, wider.max_rte_m) == (1.2, 0.07)
 
@@ -152,7 +152,7 @@ def test_metres_are_the_truths() -> None:
     scenes = [scene("a", at(0, scale=0.1)), scene("b", at(5, scale=10.0))]
     true = scenes[0].S_scene_world @ scenes[1].S_scene_world.inverse()
     off = Sim3(true.rotation, true.translation + np.array([0.004, 0, 0]), true.scale * 1.01)
-    (row,) = judge(scenes, [edge("a", "b", off)], None, overlaps(scenes, ab=0.6)).edges
+    (row,) = evaluate_map(scenes, [edge("a", "b", off)], None, overlaps(scenes, ab=0.6)).edges
     assert row.centroid_m == pytest.approx(0.04)
     assert row.rse == pytest.approx(0.01)
     assert row.right
@@ -162,16 +162,16 @@ def test_what_has_no_truth_is_not_judged_and_said() -> None:
     scenes = [scene("a", at(0)), scene("b", at(5)), scene("c", None)]
     edges = [edge("a", "b", at(-5)), edge("b", "c", at(1))]
     poses = graph(("a", at(0), 0, "placed"), ("b", at(-5), 0, "placed"))
-    report = judge(scenes, edges, poses, overlaps(scenes, ab=0.6))
+    report = evaluate_map(scenes, edges, poses, overlaps(scenes, ab=0.6))
     assert (len(report.edges), report.edges_without_truth) == (1, 1)
-    assert report.notes[0] == "without a truth, and so not judged: c"
+    assert report.notes[0] == "not evaluated, as they have no true pose: c"
     assert report.notes[1] == "newer than the newest poses: c; run gsmap optimize"
 
 
 # --- poses ----------------------------------------------------------------------------------------------------------
 
 
-def two_components(scale: float = 1.0) -> tuple[list[JudgedScene], PoseGraph]:
+def two_components(scale: float = 1.0) -> tuple[list[EvaluatedScene], PoseGraph]:
     """Two pairs, each in a frame of its own; the second scene of the first one is 1 cm off."""
     scenes = [scene(n, at(x, scale=scale)) for n, x in zip("abcd", (0, 5, 0, 5), strict=True)]
 
@@ -204,7 +204,7 @@ def expected_ate(off: float, scale: float) -> float:
 
 def test_ate_is_of_each_component_in_its_own_frame() -> None:
     scenes, poses = two_components()
-    report = judge(scenes, [], poses, overlaps(scenes))
+    report = evaluate_map(scenes, [], poses, overlaps(scenes))
     assert (report.num_placed, report.num_tentative) == (2, 2)
     first, second = report.components
     assert first.scene_names == ("a", "b")
@@ -221,7 +221,7 @@ def test_ate_is_of_each_component_in_its_own_frame() -> None:
 
 def test_a_map_in_another_unit_is_aligned_with_scale_and_judged_in_metres() -> None:
     scenes, poses = two_components(scale=0.2)
-    first = judge(scenes, [], poses, overlaps(scenes)).components[0]
+    first = evaluate_map(scenes, [], poses, overlaps(scenes)).components[0]
     assert first.alignment == "similarity"
     assert first.ate_m == pytest.approx(expected_ate(0.01, scale=0.2), rel=1e-6)
 
@@ -230,17 +230,17 @@ def test_a_metric_map_of_the_wrong_size_is_wrong() -> None:
     """Captures in metres must stay in metres: no alignment may take the error away."""
     scenes = [scene("a", at(0)), scene("b", at(5))]
     poses = graph(("a", at(0, scale=1.02), 0, "placed"), ("b", at(-5.1, scale=1.02), 0, "placed"))
-    assert judge(scenes, [], poses, overlaps(scenes)).ate_m > 0.03
+    assert evaluate_map(scenes, [], poses, overlaps(scenes)).ate_m > 0.03
 
 
 def test_a_component_that_the_truth_cannot_judge_says_why() -> None:
     scenes = [scene("a", at(0)), scene("b", None)]
     poses = graph(("a", at(0), 0, "placed"), ("b", at(5), 0, "placed"))
-    report = judge(scenes, [], poses, {})
-    assert report.components[0].ate_reason == "1 of its 2 scenes has a truth: two are needed"
-    assert report.verdict == "2 of 2 placed, no ATE: component 0: 1 of its 2 scenes has a truth: two are needed"
-    few = [JudgedScene(f"id-{n}", n, at(0), np.zeros(3), CENTERS[:1]) for n in "ab"]
-    report = judge(few, [], poses, overlaps(few))
+    report = evaluate_map(scenes, [], poses, {})
+    assert report.components[0].ate_reason == "1 of its 2 scenes have a true pose: two are needed"
+    assert report.verdict == "2 of 2 placed, no ATE: component 0: 1 of its 2 scenes have a true pose: two are needed"
+    few = [EvaluatedScene(f"id-{n}", n, at(0), np.zeros(3), CENTERS[:1]) for n in "ab"]
+    report = evaluate_map(few, [], poses, overlaps(few))
     assert report.ate_m is None
     assert report.ate_reason == "component 0: 2 cameras fix no alignment: three are needed"
 
@@ -284,14 +284,14 @@ def test_an_exact_truth_judges_information_as_it_is() -> None:
     nothing_along_x = INFORMATION.copy()
     nothing_along_x[3, 3] = 0.0
     edges = [replace(edge("a", "b", at(-9, y=0.02)), information=nothing_along_x)]
-    assert judge(scenes, edges, None, overlaps(scenes)).nees[0].median == pytest.approx(4.0)
+    assert evaluate_map(scenes, edges, None, overlaps(scenes)).nees[0].median == pytest.approx(4.0)
 
 
 def test_a_report_says_how_exact_its_truth_is_taken_to_be() -> None:
     scenes = [scene("a", at(0)), scene("b", at(5))]
     edges = [replace(edge("a", "b", at(-5.1)), information=INFORMATION)]
-    exact = judge(scenes, edges, None, overlaps(scenes))
-    loose = judge(scenes, edges, None, overlaps(scenes), Params(truth_sigma_deg=0.5, truth_sigma_m=0.1))
+    exact = evaluate_map(scenes, edges, None, overlaps(scenes))
+    loose = evaluate_map(scenes, edges, None, overlaps(scenes), Params(truth_sigma_deg=0.5, truth_sigma_m=0.1))
     assert (loose.truth_sigma_deg, loose.truth_sigma_m) == (0.5, 0.1)
     assert loose.nees[0].median < 0.1 * exact.nees[0].median
     with pytest.raises(ConfigError, match="not be negative"):
@@ -313,7 +313,7 @@ def sampled_poses(scale_sigma: float, count: int) -> EvaluationReport:
         carry = Similarities.stack([relative.inverse()]).adjoint()[0]
         placed.append((name, anchor @ relative, 0, "placed"))
         covariances[name] = own + carry @ gauge @ carry.T
-    return judge(scenes, [], graph(*placed, covariances=covariances), overlaps(scenes))
+    return evaluate_map(scenes, [], graph(*placed, covariances=covariances), overlaps(scenes))
 
 
 @pytest.mark.parametrize(("scale_sigma", "dof"), [(0.0, 6), (0.003, 7)])
@@ -331,7 +331,7 @@ def test_poses_whose_frame_priors_hold_are_not_judged() -> None:
     root = rng.normal(size=(7, 7)) * 0.01
     covariances = {"a": root @ root.T + np.eye(7) * 1e-6, "b": np.eye(7)}
     poses = graph(("a", at(0), 0, "placed"), ("b", at(-5), 0, "placed"), covariances=covariances)
-    report = judge(scenes, [], poses, overlaps(scenes))
+    report = evaluate_map(scenes, [], poses, overlaps(scenes))
     assert report.nees == ()
     assert "priors hold its frame" in report.notes[-1]
     assert relative_covariance(at(1), covariances["b"], covariances["a"]) is None

@@ -1,9 +1,8 @@
-"""Which side of its surface a capture has seen.
+"""Orient the normals of a surface towards the side that the capture's own cameras saw.
 
-A wall is two surfaces some centimetres apart. A capture that walked through one room has its front, one from the next
-room its back; nearest points would lay the one on the other, and a pose so refined is off by the wall's thickness with
-residuals that look like any others. So each cell of a surface faces the side from which the capture's own cameras saw
-it, and a cell is not laid on one that faces the other way.
+A wall is two surfaces some centimetres apart. A capture of one room shows its front, one of the next room its back;
+nearest neighbours would pair the two, and the refined pose would be off by the wall's thickness with inconspicuous
+residuals. So cells whose oriented normals are opposite are not paired.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from gsmap.geometry.projection import in_image, project
 from gsmap.register.view_cache import ViewCache
 
 NUM_CAMERAS = 16  # of the capture's own cameras, chosen to see most sides
-_REACH_M = 0.08  # a cell farther than this from a camera's depth is not what the camera sees (Tukey's biweight)
+_REACH_M = 0.08  # cells farther than this from a camera's depth are not seen by it (Tukey's biweight)
 _MIN_CLEAR = 0.5  # a side is known where at least this share of the weight is not contradicted
 _FILL_ROUNDS = 2  # times that cells without a side take that of their coplanar neighbours
 _MIN_ALPHA = 0.5  # a fainter pixel shows no surface
@@ -25,8 +24,8 @@ _MIN_COPLANAR_COSINE = 0.8  # of the normals of coplanar neighbours
 _MAX_COPLANAR_M = 0.03  # distance of a coplanar neighbour from the cell's plane
 
 
-def faces(points: np.ndarray, normals: np.ndarray, tree: Any, views: ViewCache, unit_m: float) -> np.ndarray:
-    """The normals turned to where the capture's own cameras saw the cells from.
+def orient_normals(points: np.ndarray, normals: np.ndarray, tree: Any, views: ViewCache, unit_m: float) -> np.ndarray:
+    """Orient normals towards the capture's own cameras.
 
     Args:
         points: (M, 3) cell means, metres in the scene's axes.
@@ -35,25 +34,27 @@ def faces(points: np.ndarray, normals: np.ndarray, tree: Any, views: ViewCache, 
         views: the scene through its cameras, in its own unit of ``unit_m`` metres.
 
     Returns:
-        (M, 3) unit vectors, zeros where no side is known: seen by no camera, or from both sides, as what is thinner
+        (M, 3) unit vectors, zeros where the side is unknown: seen by no camera, or from both sides, as objects thinner
         than a cell may be.
     """
-    front, back = _seen(points, normals, views, unit_m)
-    side = _decided(front, back)
+    front, back = _weights_of_sides(points, normals, views, unit_m)
+    side = _sides(front, back)
     for _ in range(_FILL_ROUNDS):
-        side = _filled(side, points, normals, tree)
+        side = _fill_unknown(side, points, normals, tree)
     found: np.ndarray = normals * side[:, None]
     return found
 
 
-def _seen(points: np.ndarray, normals: np.ndarray, views: ViewCache, unit_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """(M,) how much the cameras saw of each cell's front (where its normal points) and of its back."""
+def _weights_of_sides(
+    points: np.ndarray, normals: np.ndarray, views: ViewCache, unit_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (M,) weights with which cameras saw each cell's front (where its normal points) and back."""
     front, back = np.zeros((2, len(points)))
     own = points / unit_m
-    for row in views.views_of_sides(own, normals, NUM_CAMERAS):
+    for row in views.select_views_of_sides(own, normals, NUM_CAMERAS):
         camera = views.cameras[[row]]
-        shown = views.render(row)
-        depth = np.where(shown.alpha[0] > _MIN_ALPHA, shown.depth[0], np.inf) * unit_m
+        rendered = views.render(row)
+        depth = np.where(rendered.alpha[0] > _MIN_ALPHA, rendered.depth[0], np.inf) * unit_m
         pixels, z = project(own, camera.T_camera_frame[0], camera.intrinsics_px[0])
         at = np.flatnonzero(in_image(pixels, z, camera.sizes_px[0]))
         column, line = np.floor(pixels[at]).astype(np.int64).T
@@ -62,20 +63,20 @@ def _seen(points: np.ndarray, normals: np.ndarray, views: ViewCache, unit_m: flo
         at, weight = at[near], (1 - off[near] ** 2) ** 2
         towards = camera.T_frame_camera[0, :3, 3] * unit_m - points[at]
         towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-        slant = (normals[at] * towards).sum(1)  # what is seen at a grazing angle hardly tells its side
+        slant = (normals[at] * towards).sum(1)  # views at a grazing angle hardly determine the side
         front[at] += weight * np.maximum(slant, 0.0)
         back[at] += weight * np.maximum(-slant, 0.0)
     return front, back
 
 
-def _decided(front: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """(M,) 1, -1, or 0 where nothing or too little speaks for one side."""
+def _sides(front: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Return the (M,) side: 1, -1, or 0 where the weights of both sides are too similar."""
     decided: np.ndarray = np.sign(front - back) * (np.abs(front - back) > _MIN_CLEAR * (front + back))
     return decided
 
 
-def _filled(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: Any) -> np.ndarray:
-    """(M,) sides, those not known taken from level neighbours."""
+def _fill_unknown(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: Any) -> np.ndarray:
+    """Return the (M,) sides, unknown ones taken from coplanar neighbours."""
     unknown = np.flatnonzero(side == 0)
     if not len(unknown) or len(unknown) == len(side):
         return side
@@ -85,8 +86,8 @@ def _filled(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: Any
     near = np.where(there, near, 0)
     along = (normals[near] * normals[unknown][:, None]).sum(2)
     rise = ((points[near] - points[unknown][:, None]) * normals[unknown][:, None]).sum(2)
-    level = there & (np.abs(along) > _MIN_COPLANAR_COSINE) & (np.abs(rise) < _MAX_COPLANAR_M)
-    said = np.where(level, side[near] * np.sign(along), 0.0)
+    coplanar = there & (np.abs(along) > _MIN_COPLANAR_COSINE) & (np.abs(rise) < _MAX_COPLANAR_M)
+    votes = np.where(coplanar, side[near] * np.sign(along), 0.0)
     out = side.copy()
-    out[unknown] = _decided((said > 0).sum(1), (said < 0).sum(1))
+    out[unknown] = _sides((votes > 0).sum(1), (votes < 0).sum(1))
     return out

@@ -1,8 +1,8 @@
-"""Scenes in metres: what each unit is taken for, and what is computed under it.
+"""Scale a scene, or a pair of scenes, to the working metres in which poses are refined and verified.
 
-These metres are *working metres*: under them both scenes look like rooms do, for which all lengths of refinement,
-evidence and covariance are meant. Where scenes in metres are seen from as near as rooms are, they are metres; where a
-court is seen from 7 m, one is four, whether or not the scenes' unit is known.
+*Working metres* make both scenes look like rooms, for which all lengths of refinement, evidence and covariance are
+meant. For scenes that are viewed from as near as rooms they equal metres; for a courtyard that is viewed from 7 m one
+working metre is four metres, whether or not the scenes' unit is known.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gsmap.types.registration import Proposal
 
 @dataclass(frozen=True, eq=False)
 class MetricScene:
-    """One scene with its unit taken for ``unit_m`` metres."""
+    """A scene whose unit is ``unit_m`` working metres."""
 
     view: SceneView
     unit_m: float
@@ -33,75 +33,81 @@ class MetricScene:
         return self.view.graph
 
     def surface(self) -> Surface:
-        """The scene's surface in metres."""
+        """Return the scene's surface in working metres."""
         return self.view.surface(self.unit_m)
 
     def views(self) -> Views:
-        """The scene through its own cameras, and metres per unit; None without cameras."""
+        """Return the scene's views and working metres per unit; None without cameras."""
         cache = self.view.views
         return None if cache is None else (cache, self.unit_m)
 
 
 @dataclass(frozen=True, eq=False)
 class MetricPair:
-    """Both scenes in the target's metres, the source with the proposed scale: what remains is nearly rigid.
+    """Both scenes in the target's working metres, the source by the proposed scale: the pose left is nearly rigid.
 
-    ``ties``: the correspondences that the proposal rests on, in these metres; None where chance explains them.
+    Args:
+        scale: of the proposed pose.
+        correspondences: of the proposal, in working metres; None where chance explains them.
     """
 
     target: MetricScene
     source: MetricScene
     scale: float
-    ties: Correspondences | None = None
+    correspondences: Correspondences | None = None
 
     @classmethod
     def of(cls, target: SceneView, source: SceneView, proposal: Proposal, params: Params) -> MetricPair:
-        """The frames in which a proposal is refined and judged."""
+        """Scale two scenes for the refinement and verification of a proposal."""
         scale = proposal.S_target_source.scale
         unit_m = working_unit_m(target, source, with_scale=proposal.with_scale)
         if proposal.with_scale and source.scale_policy == "known":
-            unit_m = source.graph.working_m / scale  # the source knows what a metre is, the target only guesses
+            unit_m = source.graph.working_m / scale  # the source is in metres, the target's unit is estimated
         pair = cls(MetricScene(target, unit_m), MetricScene(source, unit_m * scale), scale)
-        return replace(pair, ties=pair.tied(proposal)) if verdict.is_rare(proposal, params.verdict) else pair
+        return (
+            replace(pair, correspondences=pair.correspondences_of(proposal))
+            if verdict.has_low_nfa(proposal, params.verdict)
+            else pair
+        )
 
     @property
     def policies(self) -> set[str]:
-        """How the units of both are known: `SceneView.scale_policy`."""
+        """Scale policies of both scenes (`SceneView.scale_policy`)."""
         return {self.target.view.scale_policy, self.source.view.scale_policy}
 
-    def tied(self, proposal: Proposal) -> Correspondences | None:
-        """The correspondences that a proposal rests on, in metres; None where there are none."""
+    def correspondences_of(self, proposal: Proposal) -> Correspondences | None:
+        """Return the correspondences of a proposal in working metres; None where it has none."""
         if proposal.support is None:
             return None
         target, source = proposal.support.points
         return target * self.target.unit_m, source * self.source.unit_m
 
     def to_metres(self, S_target_source: Sim3) -> Sim3:
-        """A pose of the proposed scale, between the scenes' own units, as one between metres."""
+        """Convert a pose of the proposed scale from the scenes' own units to working metres."""
         return Sim3(S_target_source.rotation, S_target_source.translation * self.target.unit_m)
 
     def to_scene_units(self, pose: Sim3) -> Sim3:
-        """A pose between metres as one between the scenes' own units."""
+        """Convert a pose from working metres to the scenes' own units."""
         return Sim3(pose.rotation, pose.translation / self.target.unit_m, pose.scale * self.scale)
 
 
 def working_unit_m(target: SceneView, source: SceneView, *, with_scale: bool) -> float:
-    """Working metres per target unit; scenes that have one unit have one working metre, between both of theirs."""
+    """Return working metres per target unit; for scenes of one unit the geometric mean of both scenes' values."""
     if _is_metre(target, with_scale) or (target.scale_policy == source.scale_policy == "known"):
         return float(np.sqrt(target.graph.working_m * source.graph.working_m))
     return target.graph.working_m if target.scale_policy == "known" else target.graph.unit_m
 
 
 def own_working_m(view: SceneView) -> float:
-    """Working metres per unit of a scene by itself: of a guess where the scale is not known."""
+    """Return working metres per unit of a single scene; those of the estimated unit where the scale is not known."""
     return view.graph.working_m if view.scale_policy == "known" else view.graph.unit_m
 
 
 def target_unit_m(target: SceneView, *, with_scale: bool) -> float:
-    """Metres per target unit: 1 where metres are plausible and nothing else is asked for, else the guess."""
+    """Return metres per target unit: 1 where the unit may be the metre, else the estimated value."""
     return 1.0 if _is_metre(target, with_scale) or target.scale_policy == "known" else target.graph.unit_m
 
 
 def _is_metre(target: SceneView, with_scale: bool) -> bool:
-    """Whether the target's own unit is taken for the metre: its graph holds landmarks made under it."""
+    """Return whether the target's unit may be the metre: its graph has landmarks of metric size."""
     return not with_scale and "landmarks" in target.graph.layers

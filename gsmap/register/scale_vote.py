@@ -1,4 +1,4 @@
-"""Which scales could lay one set of nodes on the other: votes of distance ratios."""
+"""Estimate the scale between two sets of nodes by a vote of distance ratios."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmap.register.correspondences import Correspondences
 
-# Largest scale between two layers once both are in (guessed) metres; graphs hold a layer for every factor of 1.45, so
+# Largest scale between two layers once both are in (estimated) metres; graphs have a layer for every factor of 1.45, so
 # that some two are always nearer than this.
 _MAX_FACTOR = 1.35
 _BIN_WIDTH = 0.01  # of the histogram over the logarithm of the ratio
@@ -17,10 +17,10 @@ _NUM_PEAKS = 3
 
 
 def vote_scales(matches: Correspondences) -> list[tuple[float, float]]:
-    """Scales (source to target) most voted for by pairs of candidates, and how far each stands out; best first.
+    """Return the scales (source to target) with most votes of pairs of candidates, and their significance; best first.
 
-    Two right correspondences a distance d apart give the ratio ``|dq| / |dp|`` within ``sigma / d``; wrong ones spread
-    over everything. The smooth background is taken off before peaks are ranked by their significance.
+    Two right correspondences at a distance d give the ratio ``|dq| / |dp|`` within ``sigma / d``; wrong ones are spread
+    over all ratios. The smooth background is subtracted before peaks are ranked by their significance.
     """
     from scipy.ndimage import gaussian_filter1d
 
@@ -29,7 +29,7 @@ def vote_scales(matches: Correspondences) -> list[tuple[float, float]]:
     matches = matches[np.arange(min(len(matches), _MAX_CORRESPONDENCES))]
     limit, margin = np.log(_MAX_FACTOR), 0.3
     bins = int(np.ceil(2 * (limit + margin) / _BIN_WIDTH))
-    # Where gravity is known a right pair of pairs also rises alike, whatever the scale.
+    # Where gravity is known both distances of a right pair also have the same slope, whatever the scale.
     counts = _native.ratio_histogram(
         target=matches.target,
         source=matches.source,
