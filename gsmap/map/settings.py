@@ -192,7 +192,7 @@ def _combined(folder: Path, preset: str, values: Mapping[str, Any], more: Mappin
         try:
             settings_of(values, preset)
         except ConfigError as error:
-            raise ConfigError(f"{folder / FILE_NAME}: {error}", code="invalid_settings_file") from error
+            raise ConfigError(f"{folder / FILE_NAME}: {error}", code=error.code) from error
         raise
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from raising import raises
 
 from gsmap.describe.objects.layer import Params, object_layer
 from gsmap.describe.onnx.check import check_model
@@ -61,7 +62,7 @@ def spec_of(path: Path, limits: ModelLimits) -> ModelSpec:
 def test_a_model_without_end_is_ended(tmp_path):
     before = children()
     start = time.monotonic()
-    with pytest.raises(InputError, match=r"took more than 1 s.*model_time_s"):
+    with raises(InputError, code="model_timeout"):
         check_model("clip", networks.endless(tmp_path / "m.onnx"), "unit", ModelLimits(time_s=1))
     assert time.monotonic() - start < 20
     assert children() <= before
@@ -71,7 +72,7 @@ def test_a_model_without_end_is_ended(tmp_path):
 @pytest.mark.parametrize("network", [lambda p: networks.endless(p, grows=True), networks.enormous])
 def test_a_model_that_takes_all_memory_is_ended(tmp_path, network):
     before = children()
-    with pytest.raises(InputError, match="memory"):
+    with raises(InputError, code="model_out_of_memory"):
         check_model("clip", network(tmp_path / "m.onnx"), "unit", ModelLimits(time_s=60, memory_mb=300))
     assert children() <= before
 
@@ -84,11 +85,11 @@ def test_memory_is_held_to_the_limit_and_what_fits_runs(tmp_path):
     np.testing.assert_allclose(endless.run(None, PICTURE)[0], 1)
     pictures = np.ones((60, 3, 512, 512), np.float32)  # 189 MB
     assert large.run(None, {"pixels": pictures})[0].shape == (60, 3)
-    with pytest.raises(InputError, match=r"more than 100 MB with --set describe\.object\.model_memory_mb"):
+    with raises(InputError, code="model_out_of_memory"):
         small.run(None, {"pixels": pictures})
     inside = str(networks.enormous(tmp_path / "e.onnx", 100_000_000))  # 400 MB that nobody sends
     np.testing.assert_allclose(ModelProcess(inside, ModelLimits(60, 2000)).run(None, PICTURE)[0], 1)
-    with pytest.raises(InputError, match="more than 100 MB"):
+    with raises(InputError, code="model_out_of_memory"):
         ModelProcess(inside, ModelLimits(60, 100)).run(None, PICTURE)
 
 
@@ -106,7 +107,7 @@ def test_numbers_are_those_of_the_model_whatever_their_size_and_kind(tmp_path):
     for found, true in kept:  # none is overwritten by a later run
         np.testing.assert_allclose(found, true, atol=1e-5)
     assert run(encoder, model, None, {"pixels": np.zeros((0, 3, 8, 8), np.float32)})[0].shape == (0, 3)
-    with pytest.raises(InputError, match="does not run on pixels"):
+    with raises(InputError, code="model_failed"):
         run(encoder, model, None, {"pixels": np.zeros((1, 3, 8), np.float32)})
     np.testing.assert_allclose(run(encoder, model, None, PICTURE)[0], 1)  # that did it no harm
 
@@ -116,7 +117,7 @@ def test_after_a_process_has_ended_the_model_is_loaded_again(tmp_path):
     model = open_session(encoder)
     assert open_session(encoder) is model
     model._process.kill()
-    with pytest.raises(InputError, match=r"SIGKILL|lack of memory"):
+    with raises(InputError, code="model_out_of_memory"):
         run(encoder, model, None, PICTURE)
     again = open_session(encoder)
     np.testing.assert_allclose(run(encoder, again, None, PICTURE)[0], 1)
@@ -178,11 +179,11 @@ def test_the_settings_of_a_map_hold_when_a_model_is_added(tmp_path):
     path = networks.endless(tmp_path / "m.onnx")
     with create(tmp_path / "a.gsmap") as m:
         m.with_settings({"describe.object.model_time_s": 1.0})
-        with pytest.raises(InputError, match="took more than 1 s"):
+        with raises(InputError, code="model_timeout"):
             m.add_model("clip", path)
         assert m.model_rows() == []
     for name in ("model_time_s", "model_memory_mb"):
-        with pytest.raises(ConfigError, match="positive"):
+        with raises(ConfigError, code="out_of_range"):
             Params(**{name: 0})
 
 
@@ -192,6 +193,6 @@ def test_the_settings_hold_when_a_scene_is_described(tmp_path):
     cloud = Cloud(np.zeros((1, 3)), np.zeros((1, 3), np.float32), np.ones(1), np.zeros(1, np.int64))
     context = SceneContext(cloud, 1, None, 1.0, {"clip": spec})
     cameras = Cameras(np.eye(4)[None], [[100.0, 100, 50, 50]], [[100, 100]])
-    with pytest.raises(InputError, match="took more than 1 s"):
+    with raises(InputError, code="model_timeout"):
         object_layer(one, cameras, context, Params(model_time_s=1.0))
     assert "limits" not in spec.to_json()

@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from PIL import Image
+from raising import raises
 
 from gsmap.describe import Params, recipe_key
 from gsmap.describe.embedders import clip
@@ -126,18 +127,18 @@ def test_crop_is_square_centred_and_keeps_the_mask():
 
 @pytest.mark.parametrize("preset", ["clp", "mean=1,2;std=1,1,1", "mean=0,0,0;std=0,1,1", "mean=0,0,0", ""])
 def test_unknown_pixel_scaling_is_refused(preset):
-    with pytest.raises(ConfigError, match="pixel scaling"):
+    with raises(ConfigError, code="invalid_choice"):
         parse_preset(preset)
 
 
 def test_what_is_not_a_model_is_refused(tmp_path):
     picture = tmp_path / "picture.onnx"
     Image.new("RGB", (20, 20)).save(picture, format="PNG")
-    with pytest.raises(InputError, match="not an ONNX model"):
+    with raises(InputError, code="not_a_model"):
         check_model("clip", picture)
     empty = tmp_path / "empty.onnx"
     empty.write_bytes(b"")
-    with pytest.raises(InputError, match="not an ONNX model"):
+    with raises(InputError, code="not_a_model"):
         check_model("clip", empty)
     whole = networks.image_encoder(tmp_path / "whole.onnx").read_bytes()
     for cut in (1, len(whole) // 2, len(whole) - 1):
@@ -147,7 +148,7 @@ def test_what_is_not_a_model_is_refused(tmp_path):
             check_model("clip", part)
     with pytest.raises(NotFoundError):
         check_model("clip", tmp_path / "absent.onnx")
-    with pytest.raises(ConfigError, match="kind"):
+    with raises(ConfigError, code="invalid_choice"):
         check_model("dino", picture)
 
 
@@ -177,29 +178,29 @@ def test_kinds_are_those_that_methods_name():
 
 
 def test_weights_in_other_files_are_refused(tmp_path):
-    with pytest.raises(InputError, match="other files"):
+    with raises(InputError, code="model_has_external_data"):
         check_model("clip", networks.external(tmp_path / "outside.onnx"))
 
 
 def test_models_of_another_kind_are_refused(tmp_path):
     encoder = networks.image_encoder(tmp_path / "m.onnx")
-    with pytest.raises(InputError, match=r"not a sam-decoder model.*image_embeddings"):
+    with raises(InputError, code="model_misfit"):
         check_model("sam-decoder", encoder)
-    with pytest.raises(InputError, match="sam-encoder"):
+    with raises(InputError, code="model_misfit"):
         check_model("sam-encoder", encoder)
-    with pytest.raises(InputError, match="not a clip model"):
+    with raises(InputError, code="model_misfit"):
         check_model("clip", networks.sam_decoder(tmp_path / "d.onnx"))
 
 
 def test_models_that_fit_on_paper_only_are_refused(tmp_path):
-    with pytest.raises(InputError, match="1024 x 1024"):
+    with raises(InputError, code="model_misfit"):
         check_model("sam-encoder", networks.sam_encoder(tmp_path / "small.onnx", side=512))
-    with pytest.raises(InputError, match=r"does not run on pixels \[1, 3, 224, 224\]"):
+    with raises(InputError, code="model_failed"):
         check_model("clip", networks.fixed_inside(tmp_path / "fixed.onnx"))
     # An encoder and a decoder of different models: each is one, together they do not run.
     encoder = check_model("sam-encoder", networks.sam_encoder(tmp_path / "coarse.onnx", cell=32))
     decoder = check_model("sam-decoder", networks.sam_decoder(tmp_path / "decoder.onnx"))
-    with pytest.raises(InputError, match=r"model sam-decoder .* does not run"):
+    with raises(InputError, code="model_failed"):
         sam.SamSegmenter(sam.Params(), encoder, decoder).segment(view_of(np.zeros((60, 80, 3), np.uint8)))
 
 
@@ -207,7 +208,7 @@ def test_a_model_that_changed_after_it_was_added_is_refused(tmp_path):
     path = networks.image_encoder(tmp_path / "m.onnx")
     spec = check_model("clip", path)
     networks.image_encoder(path, side=16)
-    with pytest.raises(InputError, match="has changed"):
+    with raises(InputError, code="model_changed"):
         open_session(spec)
     path.unlink()
     with pytest.raises(NotFoundError):

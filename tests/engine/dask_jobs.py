@@ -14,7 +14,7 @@ def square(x: int) -> int:
 
 
 def refuse(x: int) -> int:
-    raise InputError(f"no {x}")
+    raise InputError(f"no {x}", code="out_of_range")
 
 
 def die_of_three(x: int, tries: str) -> int:

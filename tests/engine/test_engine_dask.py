@@ -15,6 +15,7 @@ from typing import Any
 
 import dask_jobs
 import pytest
+from raising import raises
 
 import gsmap.map
 from gsmap import engine
@@ -55,7 +56,7 @@ def test_jobs_give_what_they_give_here(workers: Any) -> None:
 
 
 def test_a_job_s_own_error_comes_through(workers: Any) -> None:
-    with pytest.raises(GsmapError, match="no 1") as error:
+    with raises(GsmapError, code="out_of_range", match="no 1") as error:
         list(workers.run(dask_jobs.refuse, [(1,), (2,)]))
     assert type(error.value).__name__ == "InputError"
     assert "in refuse" in "".join(error.value.__notes__)
@@ -95,12 +96,12 @@ def test_nothing_is_lost_with_a_worker(workers: Any, cluster: Any) -> None:
 
 def test_no_scheduler_is_an_error_that_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GSMAP_SCHEDULER", raising=False)
-    with pytest.raises(ConfigError, match="--scheduler"):
+    with raises(ConfigError, code="missing_option", match="--scheduler"):
         start(Params())
-    with pytest.raises(GsmapError, match="no Dask scheduler answers"):
+    with raises(GsmapError, code="scheduler_unreachable"):
         list(start(Params(scheduler="tcp://127.0.0.1:9", timeout_s=2)).run(dask_jobs.square, [(1,)]))
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingDependencyError, match=r"gsmap\[cluster\]"):
+    with raises(MissingDependencyError, code="missing_dependency"):
         list(start(Params(scheduler="tcp://127.0.0.1:9")).run(dask_jobs.square, [(1,)]))
 
 
@@ -142,7 +143,7 @@ def test_a_map_made_on_a_cluster_is_the_same_to_the_bit(cluster: Any, tmp_path: 
 def test_a_map_s_own_settings_choose_no_cluster(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A map may come from a stranger: nothing is connected to unasked."""
     with gsmap.map.create(tmp_path / "site.gsmap") as site:
-        with pytest.raises(ConfigError, match="not kept with a map"):
+        with raises(ConfigError, code="setting_of_run"):
             site.change_settings({"engine.executor": "dask"})
         (tmp_path / "site.gsmap" / "settings.toml").write_text(
             '[engine]\nexecutor = "dask"\n[engine.executors.dask]\nscheduler = "tcp://stranger:8786"\n'

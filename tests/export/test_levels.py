@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from raising import raises
 
 from gsmap.errors import ConfigError
 from gsmap.export import levels
@@ -99,7 +100,7 @@ def test_the_same_comes_out_again():
 
 @pytest.mark.parametrize("wrong", [{"views": -1}, {"steps": -1}])
 def test_settings_are_checked(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
+    with raises(ConfigError, code="out_of_range", match=next(iter(wrong))):
         Params(**wrong)
 
 

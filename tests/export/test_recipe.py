@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from raising import raises
 
 from gsmap.errors import ConfigError
 from gsmap.export import TileRecipe, dirty_reason, export_tiles, plan_tiles
@@ -158,9 +159,9 @@ def test_format_packed_provenance_and_budget_are_part_of_what_a_tile_is(row):
     for options in ({"provenance": True}, {"budget_s": 60.0}, {"format": "glb"}, plain, tileset):
         assert row.export(**options).recomputed == count
         assert row.export(**options).recomputed == 0
-    with pytest.raises(ConfigError, match="provenance"):
+    with raises(ConfigError, code="unsupported_output"):
         TileRecipe(recipe_key("voxel"), "spz", provenance=True)
-    with pytest.raises(ConfigError, match="uncompressed"):
+    with raises(ConfigError, code="unsupported_output"):
         TileRecipe(recipe_key("voxel"), "spz", uncompressed=True)
 
 
@@ -202,7 +203,7 @@ def test_a_folder_of_an_older_gsmap_is_made_again_and_says_so(row):
     assert [t.sha256 for t in result.tiles] == [t.sha256 for t in first.tiles]
     assert row.export().notes == ()
     path.write_text(json.dumps(content | {"version": 3}))
-    with pytest.raises(ConfigError, match="version 3"):
+    with raises(ConfigError, code="export_version"):
         row.export()
 
 
@@ -256,9 +257,9 @@ def test_a_merger_of_another_package_merges_exports_and_has_settings(added, row)
 
 def test_steps_are_the_setting_that_the_contract_names():
     assert with_steps("tto", tto.Params(kept_fraction=0.5), 7) == tto.Params(kept_fraction=0.5, steps=7)
-    with pytest.raises(ConfigError, match="takes no steps"):
+    with raises(ConfigError, code="option_not_applicable"):
         with_steps("voxel", None, 7)
-    with pytest.raises(ConfigError, match="negative"):
+    with raises(ConfigError, code="out_of_range"):
         with_steps("tto", None, -1)
 
 

@@ -4,6 +4,7 @@ import struct
 import numpy as np
 import pycolmap
 import pytest
+from raising import raises
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -78,7 +79,7 @@ def test_damaged_colmap_is_refused(tmp_path):
         folder.mkdir()
         for other, content in files.items():
             (folder / other).write_bytes(data if other == name else content)
-        with pytest.raises(InputError, match=str(folder)):
+        with raises(InputError, code=("file_truncated", "no_cameras", "file_damaged"), match=str(folder)):
             read_cameras(folder)
 
 
@@ -88,7 +89,7 @@ def test_damaged_colmap_is_refused(tmp_path):
 def test_damaged_colmap_text_is_refused(tmp_path, line):
     write_colmap(tmp_path / "model", some(), text=True)
     (tmp_path / "model" / "cameras.txt").write_text(line + "\n")
-    with pytest.raises(InputError, match="model"):
+    with raises(InputError, code="file_truncated"):
         read_cameras(tmp_path / "model")
 
 
@@ -138,35 +139,35 @@ def test_blender_angle_and_image_size(tmp_path):
 
 
 BAD = {
-    "not json": ("{", "not JSON"),
-    "deep": ("[" * 100_000, "not JSON"),
-    "empty list": ("[]", "empty"),
-    "number": ("3", "does not hold cameras"),
-    "no frames": ("{}", "lacks 'frames'"),
-    "empty frames": ('{"frames": []}', "empty"),
-    "strings": ('["a"]', "does not hold cameras"),
-    "lacks": ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]]}]', "lacks 'position'"),
+    "not json": ("{", "not_json"),
+    "deep": ("[" * 100_000, "not_json"),
+    "empty list": ("[]", "no_cameras"),
+    "number": ("3", "invalid_cameras"),
+    "no frames": ("{}", "invalid_cameras"),
+    "empty frames": ('{"frames": []}', "no_cameras"),
+    "strings": ('["a"]', "invalid_cameras"),
+    "lacks": ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]]}]', "invalid_cameras"),
     "nan": (
         '[{"rotation": [[1,0,0],[0,1,0],[0,0,NaN]], "position": [0,0,0], "width": 1, "height": 1, "fx": 1, "fy": 1}]',
-        "NaN",
+        "invalid_cameras",
     ),
     "mirrored": (
         '[{"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "position": [0,0,0], "width": 1, "height": 1, "fx": 1, "fy": 1}]',
-        "rigid",
+        "invalid_cameras",
     ),
     "no focal": (
         '{"w": 4, "h": 4, "frames": [{"file_path": "a", "transform_matrix": '
         "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}",
-        "focal",
+        "incomplete_camera",
     ),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_files(tmp_path, case):
-    text, message = BAD[case]
+    text, code = BAD[case]
     (tmp_path / "c.json").write_text(text)
-    with pytest.raises(InputError, match=message) as caught:
+    with raises(InputError, code=code) as caught:
         read_cameras(tmp_path / "c.json")
     assert "c.json" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -175,7 +176,7 @@ def test_bad_files(tmp_path, case):
 def test_missing(tmp_path):
     with pytest.raises(NotFoundError):
         read_cameras(tmp_path / "none.json")
-    with pytest.raises(InputError, match="no COLMAP model"):
+    with raises(InputError, code="no_cameras"):
         read_cameras(tmp_path)
 
 
@@ -188,7 +189,7 @@ def test_a_camera_without_a_focal_length_is_refused(tmp_path, text):
         (folder / "cameras.txt").write_text("7 EQUIRECTANGULAR 640 480 640 480\n")
     else:
         (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 7, 17, 640, 480, 640, 480))
-    with pytest.raises(InputError, match="EQUIRECTANGULAR"):
+    with raises(InputError, code="not_pinholes"):
         read_cameras(folder)
 
 
@@ -255,7 +256,7 @@ def test_what_no_pinhole_stands_for_is_left_out_by_camera(tmp_path, model):
     assert len(cameras.notes) == 1
     assert f"({model}): undistort" in cameras.notes[0]
     write_text_model(tmp_path / "alone", [(model, WIDE[model])])
-    with pytest.raises(NotPinholesError, match=model):
+    with raises(NotPinholesError, code="not_pinholes", match=model):
         read_cameras(tmp_path / "alone")
 
 

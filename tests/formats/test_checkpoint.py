@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from formats_cases import random_gaussians
+from raising import raises
 
 from gsmap import formats
 from gsmap.errors import InputError
@@ -71,37 +72,37 @@ class Evil:
 def test_no_code_of_a_file_is_run(tmp_path, monkeypatch, legacy):
     monkeypatch.chdir(tmp_path)
     torch.save({**gsplat(random_gaussians(3, 0)), "x": Evil()}, "a.pt", _use_new_zipfile_serialization=not legacy)
-    with pytest.raises(InputError, match="no code" if not legacy else "not a ZIP"):
+    with raises(InputError, code="wrong_file_type" if legacy else "unsupported_pickle"):
         formats.read("a.pt")
     (tmp_path / "b.pt").write_bytes(pickle.dumps(Evil()))
-    with pytest.raises(InputError, match="not a ZIP"):
+    with raises(InputError, code="wrong_file_type"):
         formats.read("b.pt")
     assert not (tmp_path / "owned").exists()
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "code"),
     [
-        (lambda s: s.pop("means"), "lacks means"),
-        (lambda s: s.clear(), "none of what a splat has"),
-        (lambda s: s.update(scales=torch.zeros(7, 3)), "scales|log_scales"),
-        (lambda s: s.update(quats=torch.zeros(20, 3)), "quats has the shape"),
-        (lambda s: s.update(means=torch.zeros(20, 3, dtype=torch.int32)), "not numbers"),
-        (lambda s: s.update(means=torch.zeros(20, 3).to_sparse()), "not numbers"),
-        (lambda s: s.update(shN=torch.zeros(20, 4, 3)), "4 SH coefficients"),
-        (lambda s: s.update({name: value[:0] for name, value in s.items()}), "no Gaussians"),
-        (lambda s: s.update(other={"means": torch.zeros(20, 3)}), "twice"),
+        (lambda s: s.pop("means"), "not_gaussians"),
+        (lambda s: s.clear(), "not_gaussians"),
+        (lambda s: s.update(scales=torch.zeros(7, 3)), "count_mismatch"),
+        (lambda s: s.update(quats=torch.zeros(20, 3)), "count_mismatch"),
+        (lambda s: s.update(means=torch.zeros(20, 3, dtype=torch.int32)), "wrong_tensor_type"),
+        (lambda s: s.update(means=torch.zeros(20, 3).to_sparse()), "wrong_tensor_type"),
+        (lambda s: s.update(shN=torch.zeros(20, 4, 3)), "unsupported_sh_degree"),
+        (lambda s: s.update({name: value[:0] for name, value in s.items()}), "no_gaussians"),
+        (lambda s: s.update(other={"means": torch.zeros(20, 3)}), "unsupported_feature"),
         (
             lambda s: s.update({n: v[:1].expand(10**7, *v.shape[1:]) for n, v in s.items()}),
-            "hostile|more than the file",
+            "decompression_bomb",
         ),
     ],
 )
-def test_what_does_not_fit_is_named(tmp_path, change, says):
+def test_what_does_not_fit_is_named(tmp_path, change, code):
     splats = tensors(random_gaussians(20, 1))
     change(splats)
     torch.save({"splats": splats}, tmp_path / "a.pt")
-    with pytest.raises(InputError, match=says):
+    with raises(InputError, code=code):
         formats.read(tmp_path / "a.pt")
 
 
@@ -113,11 +114,11 @@ def test_a_compressed_archive_is_refused_before_it_expands(tmp_path):
     ):
         for entry in old.infolist():
             new.writestr(entry.filename, old.read(entry))
-    with pytest.raises(InputError, match="compressed"):
+    with raises(InputError, code="file_damaged"):
         formats.read(tmp_path / "b.pt")
     with zipfile.ZipFile(tmp_path / "c.pt", "w") as archive:
         archive.writestr("a/data.pkl", bytes(40 << 20))
-    with pytest.raises(InputError, match="32 MiB"):
+    with raises(InputError, code="file_too_large"):
         formats.read(tmp_path / "c.pt")
 
 
@@ -131,5 +132,5 @@ def test_truncated_and_other_files(tmp_path):
             formats.read(tmp_path / "a.pt")
     with zipfile.ZipFile(tmp_path / "a.pt", "w") as archive:
         archive.writestr("readme.txt", "hello")
-    with pytest.raises(InputError, match=r"no data\.pkl"):
+    with raises(InputError, code="wrong_file_type"):
         formats.read(tmp_path / "a.pt")

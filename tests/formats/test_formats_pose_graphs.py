@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from raising import raises
 from scipy.spatial.transform import Rotation
 
 from gsmap.errors import InputError, NotFoundError
@@ -63,29 +64,29 @@ def test_whole_number_ids_are_kept(tmp_path, poses):
 
 def test_g2o_refuses_what_it_cannot_say(tmp_path, poses, edges):
     scaled = Sim3(np.eye(3), np.zeros(3), 2.0)
-    with pytest.raises(InputError, match="scene a has scale 2"):
+    with raises(InputError, code="unsupported_output"):
         write_graph(tmp_path / "a.g2o", {"a": scaled}, [])
-    with pytest.raises(InputError, match="edge k0:k1"):
+    with raises(InputError, code="unsupported_output"):
         write_graph(tmp_path / "a.g2o", {"k0": poses[0]}, edges[:1])
     both = {"k0": poses[0], "k1": poses[1]}
-    with pytest.raises(InputError, match="edge k0:k1 has scale"):
+    with raises(InputError, code="unsupported_output"):
         write_graph(tmp_path / "a.g2o", both, [replace(edges[0], S_target_source=scaled)])
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "code"),
     [
-        ("VERTEX_SE2 0 1 2 3", "line 1: VERTEX_SE2 is not"),
-        ("VERTEX_SE3:QUAT 0 1 2 3", "needs 8 values"),
-        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 0", "not a rotation"),
-        ("VERTEX_SE3:QUAT 0 nan 0 0 0 0 0 1", "NaN"),
-        ("VERTEX_SE3:QUAT 0 x 0 0 0 0 0 1", "line 1"),
-        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", "line 2: vertex 0 is given twice"),
+        ("VERTEX_SE2 0 1 2 3", "invalid_line"),
+        ("VERTEX_SE3:QUAT 0 1 2 3", "invalid_line"),
+        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 0", "not_a_rotation"),
+        ("VERTEX_SE3:QUAT 0 nan 0 0 0 0 0 1", "not_finite"),
+        ("VERTEX_SE3:QUAT 0 x 0 0 0 0 0 1", "invalid_line"),
+        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", "duplicate"),
     ],
 )
-def test_a_bad_g2o_line_is_named(tmp_path, text, message):
+def test_a_bad_g2o_line_is_named(tmp_path, text, code):
     (tmp_path / "bad.g2o").write_text(text)
-    with pytest.raises(InputError, match=message):
+    with raises(InputError, code=code):
         read_graph(tmp_path / "bad.g2o")
 
 
@@ -106,5 +107,5 @@ def test_tum_survives_a_round_trip(tmp_path, poses):
 @pytest.mark.parametrize("line", ["1 2 3", "0 0 0 0 0 0 0 0", "0 0 0 nan 0 0 0 1", "a b c d e f g h"])
 def test_a_bad_tum_line_is_named(tmp_path, line):
     (tmp_path / "bad.txt").write_text(f"# time\n\n{line}\n")
-    with pytest.raises(InputError, match="line 3"):
+    with raises(InputError, code=("invalid_line", "not_a_rotation"), match="line 3"):
         read_trajectory(tmp_path / "bad.txt")

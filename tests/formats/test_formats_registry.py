@@ -3,6 +3,7 @@ import sys
 
 import numpy as np
 import pytest
+from raising import raises
 
 import gsmap
 from gsmap import formats
@@ -73,7 +74,7 @@ def test_another_package_adds_a_format(added, tmp_path):
     assert len(formats.read(tmp_path / "b.ply")) == 3
     assert ".list.ply" in formats.known("read")
     assert ".torn" not in formats.known("read")
-    with pytest.raises(ConfigError, match=r"package lists cannot be loaded.*no_such_module"):
+    with raises(ConfigError, code="method_not_loadable"):
         formats.read(tmp_path / "a.torn")
 
 
@@ -95,17 +96,17 @@ def test_built_in_formats_keep_their_contract():
 
 def test_unknown_suffix_lists_what_is_known(tmp_path):
     for call in (lambda p: formats.read(p), lambda p: formats.write(p, one())):
-        with pytest.raises(InputError, match=r"\.xyz.*\.ply"):
+        with raises(InputError, code="unsupported_format"):
             call(tmp_path / "a.xyz")
 
 
 def test_missing_file_and_folder(tmp_path):
-    with pytest.raises(NotFoundError, match="no such file"):
+    with raises(NotFoundError, code="file_not_found"):
         gsmap.read(tmp_path / "a.ply")
-    with pytest.raises(NotFoundError, match="no such folder"):
+    with raises(NotFoundError, code="file_not_found"):
         gsmap.write(tmp_path / "none" / "a.ply", one())
     (tmp_path / "d.ply").mkdir()
-    with pytest.raises(InputError, match="directory"):
+    with raises(InputError, code="file_unreadable"):
         gsmap.read(tmp_path / "d.ply")
 
 
@@ -118,7 +119,7 @@ def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", replace)
-    with pytest.raises(InputError, match="No space left"):
+    with raises(InputError, code="file_unreadable"):
         formats.write(path, one(5))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

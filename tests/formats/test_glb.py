@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from formats_cases import angles_rad, colours_along, covariances, directions, gaussians, random_gaussians
 from hypothesis import given, settings
+from raising import raises
 
 from gsmap import formats
 from gsmap.errors import InputError
@@ -154,55 +155,55 @@ def attr(gltf, name="KHR_gaussian_splatting:SCALE"):
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    ("damage", "code"),
     [
-        (lambda d: d["buffers"][0].update(uri="../../etc/passwd"), "outside the file"),
-        (lambda d: d["buffers"][0].update(uri="data:;base64,AAAA"), "outside the file"),
-        (lambda d: d["bufferViews"][2].update(byteOffset=2**40), "damaged"),
-        (lambda d: d["bufferViews"][2].update(byteOffset=-8), "impossible"),
-        (lambda d: d["bufferViews"][2].update(byteStride=2**40), "impossible"),
-        (lambda d: d["bufferViews"][2].update(byteStride=0), "impossible"),
-        (lambda d: attr(d).update(byteOffset=4), "damaged"),
-        (lambda d: attr(d).update(count=11), "values for"),
-        (lambda d: [a.update(count=2**60) for a in d["accessors"]], "hostile"),
-        (lambda d: [a.update(count=1000) for a in d["accessors"]], "damaged"),
+        (lambda d: d["buffers"][0].update(uri="../../etc/passwd"), "content_outside_folder"),
+        (lambda d: d["buffers"][0].update(uri="data:;base64,AAAA"), "content_outside_folder"),
+        (lambda d: d["bufferViews"][2].update(byteOffset=2**40), "data_outside_buffer"),
+        (lambda d: d["bufferViews"][2].update(byteOffset=-8), "invalid_accessor"),
+        (lambda d: d["bufferViews"][2].update(byteStride=2**40), "invalid_accessor"),
+        (lambda d: d["bufferViews"][2].update(byteStride=0), "invalid_accessor"),
+        (lambda d: attr(d).update(byteOffset=4), "data_outside_buffer"),
+        (lambda d: attr(d).update(count=11), "count_mismatch"),
+        (lambda d: [a.update(count=2**60) for a in d["accessors"]], "decompression_bomb"),
+        (lambda d: [a.update(count=1000) for a in d["accessors"]], "data_outside_buffer"),
         (
             lambda d: d["scenes"][0].update(nodes=[0] * 9000) or [a.update(count=10**6) for a in d["accessors"]],
-            "hostile",
+            "decompression_bomb",
         ),
-        (lambda d: [a.update(count=0) for a in d["accessors"]], "impossible"),
-        (lambda d: attr(d).update(componentType=5125), "kind"),
-        (lambda d: attr(d).update(type="MAT4"), "kind"),
-        (lambda d: attr(d).update(sparse={}), "sparse"),
-        (lambda d: prim(d)["attributes"].pop("KHR_gaussian_splatting:OPACITY"), "lacks"),
-        (lambda d: prim(d)["attributes"].pop("KHR_gaussian_splatting:SH_DEGREE_1_COEF_1"), "lacks"),
-        (lambda d: prim(d)["extensions"].clear(), "no Gaussian splats"),
-        (lambda d: prim(d)["extensions"]["KHR_gaussian_splatting"].pop("kernel"), "kernel None"),
+        (lambda d: [a.update(count=0) for a in d["accessors"]], "invalid_accessor"),
+        (lambda d: attr(d).update(componentType=5125), "invalid_accessor"),
+        (lambda d: attr(d).update(type="MAT4"), "invalid_accessor"),
+        (lambda d: attr(d).update(sparse={}), "invalid_accessor"),
+        (lambda d: prim(d)["attributes"].pop("KHR_gaussian_splatting:OPACITY"), "missing_attribute"),
+        (lambda d: prim(d)["attributes"].pop("KHR_gaussian_splatting:SH_DEGREE_1_COEF_1"), "missing_attribute"),
+        (lambda d: prim(d)["extensions"].clear(), "not_gaussians"),
+        (lambda d: prim(d)["extensions"]["KHR_gaussian_splatting"].pop("kernel"), "unsupported_version"),
         (
             lambda d: prim(d)["extensions"]["KHR_gaussian_splatting"].update(colorSpace="lin_rec709_display"),
-            "lin_rec709",
+            "unsupported_version",
         ),
         (
             lambda d: prim(d)["extensions"]["KHR_gaussian_splatting"].update(extensions={"KHR_x_compression": {}}),
-            "KHR_x_compression",
+            "unsupported_feature",
         ),
-        (lambda d: d["nodes"][0].update(children=[0]), "circle"),
-        (lambda d: d["nodes"][0].update(scale=[1, 1, -1]), "placed by more"),
-        (lambda d: d["nodes"][0].update(scale=[1, 1, 2]), "placed by more"),
-        (lambda d: d["nodes"][0].update(matrix=[1, 2]), "not valid glTF"),
-        (lambda d: d["nodes"][0].update(matrix=[1e308] * 16), "placed by more"),
-        (lambda d: d["nodes"][0].update(mesh=7), "not valid glTF"),
-        (lambda d: d.update(nodes="x"), "not valid glTF"),
-        (lambda d: d.pop("accessors"), "not valid glTF"),
+        (lambda d: d["nodes"][0].update(children=[0]), "nested_too_deeply"),
+        (lambda d: d["nodes"][0].update(scale=[1, 1, -1]), "unsupported_transform"),
+        (lambda d: d["nodes"][0].update(scale=[1, 1, 2]), "unsupported_transform"),
+        (lambda d: d["nodes"][0].update(matrix=[1, 2]), "not_json"),
+        (lambda d: d["nodes"][0].update(matrix=[1e308] * 16), "unsupported_transform"),
+        (lambda d: d["nodes"][0].update(mesh=7), "not_json"),
+        (lambda d: d.update(nodes="x"), "not_json"),
+        (lambda d: d.pop("accessors"), "not_json"),
     ],
 )
-def test_damage_is_named(tmp_path, damage, says):
+def test_damage_is_named(tmp_path, damage, code):
     path = tmp_path / "a.glb"
     formats.write(path, random_gaussians(10, degree=1))
     gltf, binary = container(path)
     damage(gltf)
     put(path, gltf, binary)
-    with pytest.raises(InputError, match=says):
+    with raises(InputError, code=code):
         formats.read(path)
 
 
@@ -211,26 +212,26 @@ def packing(d):
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    ("damage", "code"),
     [
-        (lambda d: packing(d).update(bufferView=3), "not valid glTF"),
-        (lambda d: packing(d).pop("bufferView"), "not valid glTF"),
-        (lambda d: d["bufferViews"][0].update(byteLength=10**9), "damaged"),
-        (lambda d: d["bufferViews"][0].update(byteOffset=-4), "damaged"),
-        (lambda d: d["bufferViews"][0].update(byteOffset=4, byteLength=40), "not an SPZ"),
-        (lambda d: d["bufferViews"][0].update(buffer=1), "outside the file"),
-        (lambda d: d["buffers"][0].update(uri="other.bin"), "outside the file"),
-        (lambda d: [a.update(count=11) for a in d["accessors"]], "accessors do not"),
-        (lambda d: [a.update(count=2**60) for a in d["accessors"]], "hostile"),
+        (lambda d: packing(d).update(bufferView=3), "not_json"),
+        (lambda d: packing(d).pop("bufferView"), "not_json"),
+        (lambda d: d["bufferViews"][0].update(byteLength=10**9), "data_outside_buffer"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=-4), "data_outside_buffer"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=4, byteLength=40), "wrong_file_type"),
+        (lambda d: d["bufferViews"][0].update(buffer=1), "content_outside_folder"),
+        (lambda d: d["buffers"][0].update(uri="other.bin"), "content_outside_folder"),
+        (lambda d: [a.update(count=11) for a in d["accessors"]], "count_mismatch"),
+        (lambda d: [a.update(count=2**60) for a in d["accessors"]], "decompression_bomb"),
     ],
 )
-def test_damage_of_what_is_packed_is_named(tmp_path, damage, says):
+def test_damage_of_what_is_packed_is_named(tmp_path, damage, code):
     path = tmp_path / "a.glb"
     formats.write(path, random_gaussians(10, degree=1), compressed=True)
     gltf, binary = container(path)
     damage(gltf)
     put(path, gltf, binary)
-    with pytest.raises(InputError, match=says):
+    with raises(InputError, code=code):
         formats.read(path)
 
 
@@ -241,7 +242,7 @@ def test_a_draft_with_logarithmic_scales_is_recognised(tmp_path):
     gltf, binary = container(path)
     at = gltf["bufferViews"][attr(gltf)["bufferView"]]["byteOffset"]
     put(path, gltf, binary[:at] + g.log_scales.tobytes() + binary[at + g.log_scales.nbytes :])
-    with pytest.raises(InputError, match="draft"):
+    with raises(InputError, code="unsupported_version"):
         formats.read(path)
 
 
@@ -256,18 +257,18 @@ def test_every_truncation_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "code"),
     [
-        (b"", "empty"),
-        (b"glTF" + struct.pack("<IIII", 1, 20, 0, 0), "version 1"),
-        (b"glTF" + struct.pack("<IIII", 2, 2**32 - 1, 2**31, 0x4E4F534A), "promises"),
-        (b"glTF" + struct.pack("<IIII", 2, 22, 2, 0x4E4F534A) + b"[]", "not an object"),
-        (b"glTF" + struct.pack("<IIII", 2, 22, 2, 0x4E4F534A) + b"{]", "JSON"),
-        (b"glTF" + struct.pack("<IIII", 2, 20020, 20000, 0x4E4F534A) + b"[" * 20000, "JSON"),
-        (b"glTF" + struct.pack("<IIII", 2, 22, 2, 0x4E4F534A) + b"{}", "no Gaussian splats"),
+        (b"", "wrong_file_type"),
+        (b"glTF" + struct.pack("<IIII", 1, 20, 0, 0), "unsupported_version"),
+        (b"glTF" + struct.pack("<IIII", 2, 2**32 - 1, 2**31, 0x4E4F534A), "file_truncated"),
+        (b"glTF" + struct.pack("<IIII", 2, 22, 2, 0x4E4F534A) + b"[]", "not_json"),
+        (b"glTF" + struct.pack("<IIII", 2, 22, 2, 0x4E4F534A) + b"{]", "not_json"),
+        (b"glTF" + struct.pack("<IIII", 2, 20020, 20000, 0x4E4F534A) + b"[" * 20000, "not_json"),
+        (b"glTF" + struct.pack("<IIII", 2, 22, 2, 0x4E4F534A) + b"{}", "not_gaussians"),
     ],
 )
-def test_bad_containers(tmp_path, data, says):
+def test_bad_containers(tmp_path, data, code):
     (tmp_path / "a.glb").write_bytes(data)
-    with pytest.raises(InputError, match=says):
+    with raises(InputError, code=code):
         formats.read(tmp_path / "a.glb")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from raising import raises
 
 from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
@@ -64,7 +65,7 @@ def test_points_that_are_not_finite_are_left_out_and_told(tmp_path: Path) -> Non
     found = scans.read(write_ply(tmp_path / "a.ply", points, None))
     assert len(found) == len(points) - 1
     assert "not finite" in found.notes[0]
-    with pytest.raises(InputError, match="no point with finite"):
+    with raises(InputError, code="empty_scan"):
         scans.read(write_ply(tmp_path / "b.ply", np.full((5, 3), np.inf), None))
 
 
@@ -79,7 +80,7 @@ def test_of_many_points_an_even_share_is_taken(tmp_path: Path, monkeypatch: pyte
 def test_a_ply_that_promises_more_than_it_holds(tmp_path: Path) -> None:
     path = write_ply(tmp_path / "a.ply", *cloud())
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(InputError, match="truncated"):
+    with raises(InputError, code="file_truncated"):
         scans.read(path)
 
 
@@ -108,7 +109,7 @@ def test_text(tmp_path: Path, text: str, colours: list[list[float]] | None) -> N
 def test_text_that_is_no_cloud(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.xyz"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"a\.xyz"):
+    with raises(InputError, code=("wrong_file_type", "invalid_line", "invalid_row")):
         scans.read(path)
 
 
@@ -139,22 +140,22 @@ def test_las_without_colours_has_none_and_a_damaged_one_is_refused(tmp_path: Pat
     assert scans.read(tmp_path / "a.las").colours is None
     whole = (tmp_path / "a.las").read_bytes()
     (tmp_path / "b.las").write_bytes(whole[:-1000])
-    with pytest.raises(InputError, match="truncated"):
+    with raises(InputError, code="file_truncated"):
         scans.read(tmp_path / "b.las")
     (tmp_path / "c.las").write_bytes(whole[:100])
-    with pytest.raises(InputError, match=r"c\.las"):
+    with raises(InputError, code="wrong_file_type"):
         scans.read(tmp_path / "c.las")
     for at, count in ((100, 1 << 31), (96, 1 << 31), (243, 1 << 31), (105, 0)):  # records, where points begin, ...
         lying = bytearray(whole)
         lying[at : at + 4] = count.to_bytes(4, "little") if count else b"\0\0" + bytes(lying[at + 2 : at + 4])
         (tmp_path / "e.las").write_bytes(lying)
-        with pytest.raises(InputError, match="does not fit the file"):
+        with raises(InputError, code="file_truncated"):
             scans.read(tmp_path / "e.las")
     las.write(tmp_path / "d.laz")
     packed = bytearray((tmp_path / "d.laz").read_bytes())
     packed[247:255] = (1 << 13).to_bytes(8, "little")  # the number of points, LAS 1.4: 400 are there
     (tmp_path / "d.laz").write_bytes(packed)
-    with pytest.raises(InputError, match=r"d\.laz"):
+    with raises(InputError, code="reader_failed"):
         scans.read(tmp_path / "d.laz")
 
 
@@ -234,13 +235,13 @@ def test_meshes_and_clouds_that_open3d_reads(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize("name", ["a.obj", "a.stl", "a.pcd", "a.glb"])
 def test_what_no_library_reads_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"nothing of the kind" * 10)
-    with pytest.raises(InputError, match=name):
+    with raises(InputError, code="wrong_file_type"):
         scans.read(tmp_path / name)
 
 
 def test_a_mesh_that_takes_too_long_is_given_up(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nf 1 2 3\n")
-    with pytest.raises(InputError, match="takes longer than"):
+    with raises(InputError, code="file_too_large"):
         scans.read(tmp_path / "a.obj", Params(max_seconds=0.01))
 
 
@@ -251,11 +252,11 @@ def test_splats_are_told_from_scans(tmp_path: Path) -> None:
         formats.write(tmp_path / name, splat)
         assert scans.holds_splat(tmp_path / name)
     assert not scans.holds_splat(write_ply(tmp_path / "b.ply", points, None))
-    with pytest.raises(NotFoundError, match="no such file"):
+    with raises(NotFoundError, code="file_not_found"):
         scans.holds_splat(tmp_path / "c.ply")
     other = write_ply(tmp_path / "a.dat", points, None)
     for read in (scans.read, scans.holds_splat):
-        with pytest.raises(InputError, match="suffix"):
+        with raises(InputError, code="unsupported_format"):
             read(other)
     assert [scans.is_scan(name) for name in ("a.LAS", "a.compressed.ply", "a.sog", "a.jpg", "a")] == [True] * 3 + [
         False,
@@ -288,17 +289,17 @@ def test_a_depth_picture_is_points_in_the_camera_s_frame(tmp_path: Path) -> None
 
 def test_depth_pictures_that_make_no_sense(tmp_path: Path) -> None:
     path = depth_picture(tmp_path / "d.png", np.full((48, 64), 2.0))
-    with pytest.raises(InputError, match="intrinsics are"):
+    with raises(InputError, code="invalid_intrinsics"):
         scans.read_depth(path, (50, 0, 32, 24))
-    with pytest.raises(InputError, match="depth scale"):
+    with raises(InputError, code="invalid_depth_scale"):
         scans.read_depth(path, (50, 50, 32, 24), units_per_m=1.0)
     Image.new("RGB", (64, 64)).save(tmp_path / "c.png")
-    with pytest.raises(InputError, match="one channel"):
+    with raises(InputError, code="not_a_depth_picture"):
         scans.read_depth(tmp_path / "c.png", (50, 50, 32, 24))
-    with pytest.raises(InputError, match="not of one view"):
+    with raises(InputError, code="size_mismatch"):
         scans.read_depth(path, (50, 50, 32, 24), colour=tmp_path / "c.png")
     (tmp_path / "e.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match="picture"):
+    with raises(InputError, code="picture_unreadable"):
         scans.read_depth(tmp_path / "e.png", (50, 50, 32, 24))
-    with pytest.raises(ConfigError, match="max_memory_mb"):
+    with raises(ConfigError, code="out_of_range", match="max_memory_mb"):
         Params(max_memory_mb=0)

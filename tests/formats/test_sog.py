@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from formats_cases import angles_rad, random_gaussians
 from PIL import Image
+from raising import raises
 
 from gsmap import formats
 from gsmap.errors import ConfigError, InputError
@@ -117,32 +118,32 @@ def test_real_files_hold_what_their_meta_says(shared_data):
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    ("damage", "code"),
     [
-        (lambda m, f: m.update(version=1), "version 1"),
-        (lambda m, f: m.pop("version"), "version 1"),
-        (lambda m, f: m.update(count=10**12), "count"),
-        (lambda m, f: m.update(count=-1), "count"),
-        (lambda m, f: m.update(count=9), "8 texels for 9"),
-        (lambda m, f: m["means"].update(files=["../../etc/passwd", "means_u.webp"]), "lacks"),
-        (lambda m, f: m["means"].update(files=[]), "meta.json"),
-        (lambda m, f: m.update(means=3), "meta.json"),
-        (lambda m, f: m["scales"].update(codebook=[1, 2]), "codebook"),
-        (lambda m, f: m["scales"].update(codebook=["x"] * 256), "meta.json"),
-        (lambda m, f: m["shN"].update(bands=7), "7 bands"),
-        (lambda m, f: m["shN"].update(bands=2), "palette"),
-        (lambda m, f: m["shN"].update(count=64), "label"),
-        (lambda m, f: f.pop("quats.webp"), "lacks"),
-        (lambda m, f: f.update({"quats.webp": b"not an image"}), "WebP"),
-        (lambda m, f: f.update({"quats.webp": f["quats.webp"][:40]}), "WebP"),
-        (lambda m, f: f.update({"quats.webp": texture(np.full((8, 4), 128))}), "unknown tag"),
+        (lambda m, f: m.update(version=1), "unsupported_version"),
+        (lambda m, f: m.pop("version"), "unsupported_version"),
+        (lambda m, f: m.update(count=10**12), "count_mismatch"),
+        (lambda m, f: m.update(count=-1), "count_mismatch"),
+        (lambda m, f: m.update(count=9), "count_mismatch"),
+        (lambda m, f: m["means"].update(files=["../../etc/passwd", "means_u.webp"]), "content_missing"),
+        (lambda m, f: m["means"].update(files=[]), "not_json"),
+        (lambda m, f: m.update(means=3), "not_json"),
+        (lambda m, f: m["scales"].update(codebook=[1, 2]), "invalid_codebook"),
+        (lambda m, f: m["scales"].update(codebook=["x"] * 256), "not_json"),
+        (lambda m, f: m["shN"].update(bands=7), "unsupported_sh_degree"),
+        (lambda m, f: m["shN"].update(bands=2), "invalid_palette"),
+        (lambda m, f: m["shN"].update(count=64), "invalid_palette"),
+        (lambda m, f: f.pop("quats.webp"), "content_missing"),
+        (lambda m, f: f.update({"quats.webp": b"not an image"}), "picture_unreadable"),
+        (lambda m, f: f.update({"quats.webp": f["quats.webp"][:40]}), "picture_unreadable"),
+        (lambda m, f: f.update({"quats.webp": texture(np.full((8, 4), 128))}), "not_a_rotation"),
     ],
 )
-def test_damage_is_named(tmp_path, damage, says):
+def test_damage_is_named(tmp_path, damage, code):
     meta, files = sog()
     damage(meta, files)
     save(tmp_path / "a.sog", meta, files)
-    with pytest.raises(InputError, match=says):
+    with raises(InputError, code=code):
         formats.read(tmp_path / "a.sog")
 
 
@@ -150,7 +151,7 @@ def test_bombs_are_refused_before_they_expand(tmp_path):
     meta, files = sog(with_sh=False)
     with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.json", b" " * (5 << 20) + json.dumps(meta).encode())
-    with pytest.raises(InputError, match="more than"):
+    with raises(InputError, code="file_too_large"):
         formats.read(tmp_path / "a.sog")
     # A WebP of a few hundred bytes whose header claims 9000 x 9000 pixels, within what Pillow itself would allow.
     image = bytearray(webp(np.zeros((1, 1, 4))))
@@ -158,7 +159,7 @@ def test_bombs_are_refused_before_they_expand(tmp_path):
     bits = int.from_bytes(image[at : at + 4], "little") | 8999 | 8999 << 14
     image[at : at + 4] = bits.to_bytes(4, "little")
     save(tmp_path / "b.sog", meta, files | {"quats.webp": bytes(image)})
-    with pytest.raises(InputError, match="9000 x 9000 pixels"):
+    with raises(InputError, code="picture_too_large"):
         formats.read(tmp_path / "b.sog")
 
 
@@ -168,10 +169,10 @@ def test_an_image_much_larger_than_its_gaussians_is_not_decoded(tmp_path):
     out = io.BytesIO()
     Image.new("RGBA", (8192, 8192)).save(out, "WEBP", lossless=True)
     save(tmp_path / "a.sog", meta, files | {"scales.webp": out.getvalue()})
-    with pytest.raises(InputError, match=r"8192 x 8192 pixels, more than 65,546"):
+    with raises(InputError, code="picture_too_large"):
         formats.read(tmp_path / "a.sog")
     save(tmp_path / "b.sog", meta | {"count": 1 << 20}, files)
-    with pytest.raises(InputError, match="hostile"):
+    with raises(InputError, code="decompression_bomb"):
         formats.read(tmp_path / "b.sog")
 
 
@@ -190,7 +191,7 @@ def test_damage_within_a_member_is_an_input_error(tmp_path, method):
     locked[6] |= 1
     locked[whole.index(b"PK\1\2") + 8] |= 1
     (tmp_path / "a.sog").write_bytes(locked)
-    with pytest.raises(InputError, match="encrypted"):
+    with raises(InputError, code="wrong_file_type"):
         formats.read(tmp_path / "a.sog")
 
 
@@ -281,27 +282,32 @@ def test_writing_again_leaves_an_older_folder_whole_until_the_end(tmp_path):
 
 
 def test_what_a_sog_cannot_hold_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no Gaussians"):
+    with raises(InputError, code="no_gaussians"):
         formats.write(tmp_path / "a.sog", formats.Gaussians.empty())
-    with pytest.raises(ConfigError, match="palette_size"):
+    with raises(ConfigError, code="out_of_range", match="palette_size"):
         formats.write(tmp_path / "a.sog", random_gaussians(2), palette_size=1 << 17)
-    with pytest.raises(ConfigError, match="turns"):
+    with raises(ConfigError, code="out_of_range"):
         formats.write(tmp_path / "a.sog", random_gaussians(2), turns=0)
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
-    ("file", "says"),
-    [("../a.webp", "outside"), ("/etc/passwd", "outside"), ("none.webp", "missing"), ("a\0b", "outside|no name")],
+    ("file", "code"),
+    [
+        ("../a.webp", "content_outside_folder"),
+        ("/etc/passwd", "content_outside_folder"),
+        ("none.webp", "content_missing"),
+        ("a\0b", "content_invalid"),
+    ],
 )
-def test_a_folder_names_no_file_elsewhere(tmp_path, file, says):
+def test_a_folder_names_no_file_elsewhere(tmp_path, file, code):
     folder = tmp_path / "scene"
     formats.write(folder / "meta.json", random_gaussians(10, 0))
     (tmp_path / "a.webp").write_bytes(webp(np.zeros((4, 4, 4))))
     meta = json.loads((folder / "meta.json").read_text())
     meta["scales"]["files"] = [file]
     (folder / "meta.json").write_text(json.dumps(meta))
-    with pytest.raises(InputError, match=says):
+    with raises(InputError, code=code):
         formats.read(folder / "meta.json")
 
 

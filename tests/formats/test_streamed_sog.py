@@ -4,6 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from formats_cases import random_gaussians
+from raising import raises
 
 from gsmap import formats
 from gsmap.errors import ConfigError, InputError
@@ -113,26 +114,26 @@ def test_a_leaf_without_its_finest_level_gives_the_next(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    ("damage", "code"),
     [
-        (lambda m: m.update(version=2), "version 2"),
-        (lambda m: m.pop("tree"), "version 1"),
-        (lambda m: m.update(tree=3), "not a streamed SOG"),
-        (lambda m: m.update(filenames=["../../etc/passwd"] * 99), "outside"),
-        (lambda m: m.update(filenames=["none/meta.json"] * 99), "missing"),
-        (lambda m: m.update(filenames=[]), "no such run"),
-        (lambda m: leaves(m["tree"])[0]["lods"]["0"].update(offset=-1), "no such run"),
-        (lambda m: leaves(m["tree"])[0]["lods"]["0"].update(count=10**9), "not there"),
-        (lambda m: leaves(m["tree"])[0]["lods"].update({"0": leaves(m["tree"])[1]["lods"]["0"]}), "another leaf's"),
-        (lambda m: leaves(m["tree"])[0].update(lods={"0": 5}), "not a streamed SOG"),
-        (lambda m: [leaf.update(lods={}) for leaf in leaves(m["tree"])], "no Gaussians"),
+        (lambda m: m.update(version=2), "unsupported_version"),
+        (lambda m: m.pop("tree"), "unsupported_version"),
+        (lambda m: m.update(tree=3), "wrong_file_type"),
+        (lambda m: m.update(filenames=["../../etc/passwd"] * 99), "content_outside_folder"),
+        (lambda m: m.update(filenames=["none/meta.json"] * 99), "content_missing"),
+        (lambda m: m.update(filenames=[]), "rows_outside_file"),
+        (lambda m: leaves(m["tree"])[0]["lods"]["0"].update(offset=-1), "rows_outside_file"),
+        (lambda m: leaves(m["tree"])[0]["lods"]["0"].update(count=10**9), "rows_outside_file"),
+        (lambda m: leaves(m["tree"])[0]["lods"].update({"0": leaves(m["tree"])[1]["lods"]["0"]}), "rows_outside_file"),
+        (lambda m: leaves(m["tree"])[0].update(lods={"0": 5}), "wrong_file_type"),
+        (lambda m: [leaf.update(lods={}) for leaf in leaves(m["tree"])], "no_gaussians"),
     ],
 )
-def test_damage_is_named(tmp_path, damage, says):
+def test_damage_is_named(tmp_path, damage, code):
     meta = written(tmp_path, count=600, degree=0, max_per_leaf=200)
     damage(meta)
     (tmp_path / "lod-meta.json").write_text(json.dumps(meta))
-    with pytest.raises(InputError, match=says):
+    with raises(InputError, code=code):
         formats.read(tmp_path / "lod-meta.json")
 
 
@@ -141,14 +142,14 @@ def test_a_tree_without_end_is_refused(tmp_path):
     for _ in range(100):
         meta["tree"] = {"bound": meta["tree"]["bound"], "children": [meta["tree"]]}
     (tmp_path / "lod-meta.json").write_text(json.dumps(meta))
-    with pytest.raises(InputError, match="nested deeper"):
+    with raises(InputError, code="nested_too_deeply"):
         formats.read(tmp_path / "lod-meta.json")
 
 
 def test_what_makes_no_sense_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="max_per_leaf"):
+    with raises(ConfigError, code="out_of_range", match="max_per_leaf"):
         formats.write(tmp_path / "lod-meta.json", random_gaussians(3), max_per_leaf=0)
-    with pytest.raises(InputError, match="no Gaussians"):
+    with raises(InputError, code="no_gaussians"):
         formats.write(tmp_path / "lod-meta.json", formats.Gaussians.empty())
 
 

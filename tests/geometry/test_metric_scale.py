@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from raising import raises
 
 from gsmap.errors import InputError
 from gsmap.geometry.metric_scale import SceneUnit, _majority, estimate_metric_scale, in_metres, scale_gaussians
@@ -103,7 +104,7 @@ def test_people_can_read_it():
     assert Metre(0.25, 0.01, "told").text() == "0.25 m a unit, told, to 1 %"
     assert Metre(0.25, float(np.log(2)), "guessed").text() == "0.25 m a unit, guessed, to a factor of 2"
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match="positive"):
+        with raises(InputError, code="invalid_metre"):
             Metre(wrong, 0.01, "told")
 
 

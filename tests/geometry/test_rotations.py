@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from raising import raises
 from scipy.spatial.transform import Rotation
 
 from gsmap import Sim3
@@ -101,9 +102,9 @@ def test_umeyama_weights_leave_outliers_out() -> None:
 
 
 def test_umeyama_refuses_what_has_no_answer() -> None:
-    with pytest.raises(InputError, match="N >= 3"):
+    with raises(InputError, code="degenerate_points"):
         umeyama(np.zeros((2, 3)), np.zeros((2, 3)))
-    with pytest.raises(InputError, match="coincide"):
+    with raises(InputError, code="degenerate_points"):
         umeyama(RNG.normal(size=(5, 3)), np.ones((5, 3)), with_scale=True)
 
 

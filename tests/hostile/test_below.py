@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile_world import everything_in, make_cameras, make_gaussians
+from raising import raises
 
 from gsmap import durable
 from gsmap.errors import ConfigError, CorruptError, StoreError
@@ -39,9 +40,9 @@ def test_deleting_follows_no_link(home, root):
     (root / "a" / "inner").symlink_to(home / "photos")
     (root / "out").symlink_to(home)
     for function in (durable.remove_tree, durable.remove_file):
-        with pytest.raises(CorruptError, match=r"out is a link"):
+        with raises(CorruptError, code="link_refused"):
             function(root, "out", "photos", "1.jpg")
-        with pytest.raises(CorruptError, match=r"is a link"):
+        with raises(CorruptError, code="link_refused"):
             function(root, "a", "inner", "1.jpg")
     durable.remove_empty_folder(root, "a", "b")
     assert (root / "a" / "b" / "c").exists()
@@ -60,7 +61,7 @@ def test_a_root_that_is_a_link_is_the_persons_own_doing(root, tmp_path):
 @pytest.mark.parametrize("name", ["..", ".", "", "a/b", "/etc", "a\0b"])
 def test_a_name_is_one_part_of_a_path(root, name):
     for function in (durable.remove_tree, durable.remove_file, durable.refuse_links):
-        with pytest.raises(CorruptError, match="not the name"):
+        with raises(CorruptError, code="invalid_stored_name"):
             function(root, "a", name)
     assert (root / "a" / "b" / "c").exists()
 
@@ -78,7 +79,7 @@ def test_only_plain_files_are_opened(home, root):
     (root / "link").symlink_to(home / "photos" / "1.jpg")
     os.mkfifo(root / "pipe")
     for name in ("link", "pipe", "a"):
-        with pytest.raises(CorruptError, match="no plain file"):
+        with raises(CorruptError, code="not_a_plain_file"):
             durable.open_file(root / name)
     with pytest.raises(FileNotFoundError):
         durable.open_file(root / "none")
@@ -93,7 +94,7 @@ def test_a_group_has_a_kind_and_a_digest(tmp_path, kind, name):
         lambda *at: arrays.read(*at, ()),
         lambda *at: arrays.problems(*at, ()),
     ):
-        with pytest.raises(CorruptError, match="not the name of a group"):
+        with raises(CorruptError, code="invalid_stored_name"):
             call(kind, name)
 
 
@@ -112,7 +113,7 @@ def test_a_group_is_laid_out_as_it_is_checked(tmp_path, monkeypatch):
         read = arrays.read("scenes", name, staged.files, shapes={"x": (n, 3), "none": (None, 0)})
         assert all((read[key] == made[key]).all() for key in made)
         if n:
-            with pytest.raises(CorruptError, match="the catalog says"):
+            with raises(CorruptError, code="arrays_corrupt"):
                 arrays.read("scenes", name, staged.files, shapes={"x": (n + 1, 3)})
 
 
@@ -172,7 +173,7 @@ def test_whom_the_user_trusts_is_the_users_own_file(tmp_path, monkeypatch):
     assert stat.S_IMODE(trust.config_file().stat().st_mode) == 0o600
     for text in ("[]", '{"catalogs": {"0": 5}}', '{"catalogs": {"0": [5]}}'):
         trust.config_file().write_text(text)
-        with pytest.raises(StoreError, match="mend it"):
+        with raises(StoreError, code="trust_file_unreadable"):
             trust.trusted()
 
 
@@ -197,7 +198,7 @@ def test_where_a_remembered_catalog_lies(tmp_path):
 
 
 def test_only_postgresql_holds_a_catalog(tmp_path):
-    with pytest.raises(ConfigError, match="PostgreSQL"):
+    with raises(ConfigError, code="invalid_catalog_url"):
         Store.create(tmp_path / "m", catalog_url=f"sqlite:///{tmp_path}/other.sqlite")
     assert list(tmp_path.iterdir()) == []
 
@@ -209,7 +210,7 @@ def test_sqlite_opens_no_link(tmp_path, home, ending):
     file = tmp_path / f"map.sqlite{ending}"
     file.unlink(missing_ok=True)
     file.symlink_to(home / "photos" / "1.jpg")
-    with pytest.raises(CorruptError, match="is a link"):
+    with raises(CorruptError, code="link_refused"):
         sqlite.engine(tmp_path / "map.sqlite", writable=False)
 
 
@@ -228,5 +229,5 @@ def test_a_link_is_refused_in_a_map_and_not_as_a_map(tmp_path):
         assert len(store.scenes.gaussians("a")) == 300
         assert store.check().ok
     (tmp_path / "m" / "notes").symlink_to(tmp_path)
-    with pytest.raises(CorruptError, match="is a link"):
+    with raises(CorruptError, code="not_a_plain_file"):
         Store.open(tmp_path / "m")

@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+from raising import raises
 
 import gsmap.formats
 from gsmap.errors import ConfigError, InputError, NotFoundError, NotPinholesError
@@ -127,16 +128,16 @@ def test_cameras_may_lie_elsewhere(tmp_path):
 
 
 def test_what_is_no_capture(tmp_path):
-    with pytest.raises(NotFoundError, match="no such file"):
+    with raises(NotFoundError, code="file_not_found"):
         read_captures(tmp_path / "none.ply")
-    with pytest.raises(InputError, match=r"holds no captures.*\.ply"):
+    with raises(InputError, code="no_captures"):
         read_captures(tmp_path)
     (tmp_path / "a.xyz").touch()
-    with pytest.raises(InputError, match=r"unknown suffix '\.xyz'.*\.ply"):
+    with raises(InputError, code="unsupported_format"):
         read_captures(tmp_path / "a.xyz")
     (tmp_path / "ckpt_29999_rank0.pt").touch()
-    for given in (tmp_path / "ckpt_29999_rank0.pt", tmp_path):
-        with pytest.raises(InputError, match=r"export a \.ply"):
+    for given, code in ((tmp_path / "ckpt_29999_rank0.pt", "wrong_file_type"), (tmp_path, "no_captures")):
+        with raises(InputError, code=code):
             read_captures(given)
 
 
@@ -159,7 +160,7 @@ def test_the_newest_checkpoint_of_a_trainer_where_there_is_nothing_else(tmp_path
         (tmp_path / "room" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "room" / name).touch()
     if newest is None:
-        with pytest.raises(InputError, match="checkpoints"):
+        with raises(InputError, code="no_captures"):
             find_captures([tmp_path / "room"])
         return
     (found,) = find_captures([tmp_path / "room"])
@@ -191,11 +192,11 @@ def test_options(tmp_path):
     write(tmp_path / "a.ply", box())
     write(tmp_path / "b.ply", box())
     for wrong in ({"name": "x"}, {"cameras": tmp_path}):
-        with pytest.raises(ConfigError, match="one capture"):
+        with raises(ConfigError, code="many_captures"):
             read_captures(tmp_path, **wrong)
-    with pytest.raises(ConfigError, match="ISO 8601"):
+    with raises(ConfigError, code="invalid_date"):
         read_captures(tmp_path / "a.ply", captured_at="yesterday")
-    with pytest.raises(ConfigError, match="auto, known, unknown"):
+    with raises(ConfigError, code="invalid_choice"):
         read_captures(tmp_path / "a.ply", scale_policy="metres")
     (capture,) = read_captures(tmp_path / "a.ply", captured_at="2026-05-31T14:00:00", scale_policy="known")
     assert capture.captured_at == "2026-05-31T14:00:00+00:00"
@@ -258,10 +259,10 @@ VALID = {("logit_opacities", np.inf), ("logit_opacities", -np.inf), ("log_scales
 def test_nan_and_infinity_are_refused_with_their_row(name, value):
     array = getattr(box(), name).copy()
     array.reshape(len(array), -1)[17, -1] = value
-    with pytest.raises(InputError, match=rf"a\.ply holds NaN or infinity in {name} in row 17: "):
+    with raises(InputError, code="invalid_gaussians", match=rf"a\.ply.*{name}.*row 17"):
         validate(replaced(box(), **{name: array}), where="a.ply")
     array.reshape(len(array), -1)[40, -1] = value
-    with pytest.raises(InputError, match=r"row 17 \(2 such rows\)"):
+    with raises(InputError, code="invalid_gaussians", match="row 17"):
         validate(replaced(box(), **{name: array}))
 
 
@@ -296,15 +297,15 @@ def test_infinities_that_are_values_are_clamped_at_every_door(tmp_path, suffix):
 def test_absurd_values_are_refused_with_their_row():
     scales = box().log_scales.copy()
     scales[3, 1] = np.log(1e6)
-    with pytest.raises(InputError, match=r"scale.*row 3"):
+    with raises(InputError, code="invalid_gaussians", match="row 3"):
         validate(replaced(box(), log_scales=scales))
     scales[3, 1] = np.log(100)  # a far background is no mistake
     validate(replaced(box(), log_scales=scales))
     quats = box().quats.copy()
     quats[5] = 0
-    with pytest.raises(InputError, match="zero in row 5"):
+    with raises(InputError, code="invalid_gaussians", match="row 5"):
         validate(replaced(box(), quats=quats))
-    with pytest.raises(InputError, match="no Gaussians"):
+    with raises(InputError, code="no_gaussians"):
         validate(Gaussians.empty())
 
 
@@ -319,7 +320,7 @@ def test_cameras_of_impossible_images_are_refused():
     c = looking()
     sizes = c.sizes_px.copy()
     sizes[2] = 2_000_000_000
-    with pytest.raises(InputError, match=r"2000000000 x 2000000000 pixels"):
+    with raises(InputError, code="invalid_camera"):
         validate(box(), Cameras(c.T_frame_camera, c.intrinsics_px, sizes))
 
 
@@ -327,11 +328,11 @@ def test_cameras_of_another_scene_are_refused():
     c = looking()
     away = c.T_frame_camera.copy()
     away[:, 2, 3] = 50  # behind the room, looking on
-    with pytest.raises(InputError, match="none of its 4 cameras sees"):
+    with raises(InputError, code="cameras_see_nothing"):
         validate(box(), Cameras(away, c.intrinsics_px, c.sizes_px))
     away[1:, 2, 3] = 0
     assert validate(box(), Cameras(away, c.intrinsics_px, c.sizes_px)) == ("1 of 4 cameras see no Gaussian",)
-    with pytest.raises(InputError, match="empty list"):
+    with raises(InputError, code="no_cameras"):
         validate(box(), c[:0])
 
 
@@ -339,5 +340,5 @@ def test_bad_file_is_refused_by_name(tmp_path):
     means = box().means.copy()
     means[9] = np.nan
     write(tmp_path / "bad.ply", replaced(box(), means=means))
-    with pytest.raises(InputError, match=r"bad\.ply holds NaN or infinity in means in row 9"):
+    with raises(InputError, code="invalid_gaussians", match="row 9"):
         read_captures(tmp_path / "bad.ply")

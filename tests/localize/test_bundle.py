@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from raising import raises
 
 from gsmap.errors import ConfigError
 from gsmap.geometry.projection import in_image, project
@@ -221,5 +222,5 @@ def test_an_unknown_focal_length_is_adjusted_for_all_that_one_lens_took() -> Non
 
 @pytest.mark.parametrize("wrong", [{"loose": ()}, {"loose": (1.0, 0.0)}, {"doubt": 0.0}, {"alike": -0.1}])
 def test_settings_that_cannot_be_are_told(wrong) -> None:
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
+    with raises(ConfigError, code="out_of_range", match=next(iter(wrong))):
         bundle.Params(**wrong)

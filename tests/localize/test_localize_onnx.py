@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+from raising import raises
 
 from gsmap.describe.onnx.check import check_model
 from gsmap.errors import InputError
@@ -61,7 +62,7 @@ def test_pixels_are_those_of_the_picture_whatever_its_size(tmp_path) -> None:
 
 
 def test_other_networks_are_refused(tmp_path) -> None:
-    with pytest.raises(InputError, match="extractor"):
+    with raises(InputError, code="model_misfit"):
         check_model("extractor", network(tmp_path / "e.onnx", channels=7), "unit")
-    with pytest.raises(InputError, match="keypoints"):
+    with raises(InputError, code="model_misfit"):
         check_model("extractor", network(tmp_path / "f.onnx", points=np.zeros((3, 5), np.float32)), "unit")

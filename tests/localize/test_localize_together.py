@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from raising import raises
 from test_localize_verdict import BAD, GOOD
 
 from gsmap.errors import InputError, NotFoundError
@@ -211,7 +212,7 @@ def test_what_is_no_clip_is_refused(tmp_path) -> None:
     with pytest.raises(NotFoundError):
         read_clip(tmp_path / "none.mp4")
     (tmp_path / "text.mp4").write_text("no clip")
-    with pytest.raises(InputError, match="not a clip"):
+    with raises(InputError, code="clip_unreadable"):
         read_clip(tmp_path / "text.mp4")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raising import raises
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.rotations import exp_so3, quats_to_matrices
@@ -48,9 +49,9 @@ def test_without_colours_it_is_grey() -> None:
 def test_few_points_and_none() -> None:
     assert len(as_gaussians(Scan(np.zeros((1, 3))), 0.02)) == 1
     assert np.isfinite(as_gaussians(Scan(np.arange(9.0).reshape(3, 3)), 0.02).log_scales).all()
-    with pytest.raises(InputError, match="at least one point"):
+    with raises(InputError, code="empty_scan"):
         Scan(np.zeros((0, 3)))
-    with pytest.raises(InputError, match="has colours"):
+    with raises(InputError, code="shape_mismatch"):
         Scan(np.zeros((2, 3)), np.zeros((1, 3)))
-    with pytest.raises(ConfigError, match="cell_m"):
+    with raises(ConfigError, code="out_of_range", match="cell_m"):
         Params(cell_m=0)

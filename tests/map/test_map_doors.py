@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from raising import raises
 
 import gsmap.map
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, StoreError
@@ -105,7 +106,7 @@ def test_a_scene_that_is_named_gets_its_damaged_graph_again(site: Map, monkeypat
     monkeypatch.setattr("gsmap.map.stages.describe.run_jobs", jobs)
     hall, stairs, _ = (scene.id for scene in site.scenes())
     spoil()
-    with pytest.raises(CorruptError, match="gsmap describe MAP SCENE"):
+    with raises(CorruptError, code="arrays_missing"):
         site.describe()  # it reads none of them before it says what they hold
     assert described == []
     row = site.describe("hall")[0]
@@ -158,7 +159,7 @@ def test_jobs_see_the_map_that_lies_at_a_path_now(tmp_path: Path) -> None:
 
 def test_pairs_of_a_removed_scene_are_refused(site: Map, tried: list[tuple[str, str]]) -> None:
     gone = site.remove("stairs").id
-    with pytest.raises(NotFoundError, match="stairs was removed"):
+    with raises(NotFoundError, code="scene_removed"):
         site.register([("hall", gone)])
     assert tried == []
 
@@ -170,10 +171,10 @@ def test_a_file_of_pairs_takes_names_with_spaces_and_colons(site: Map, tmp_path:
     found = [(a.name, b.name) for a, b in read_pairs(site.store, path)]
     assert found == [("the hall", "attic:east"), ("stairs", "attic:east"), ("stairs", "the hall")]
     path.write_text("stairs attic:east\nstairs nowhere\n")
-    with pytest.raises(NotFoundError, match="line 2: no two scenes are called 'stairs nowhere'"):
+    with raises(NotFoundError, code="invalid_pairs_file"):
         read_pairs(site.store, path)
     path.write_text("stairs\n")
-    with pytest.raises(InputError, match="line 1: a pair is written A B or A:B, got 'stairs'"):
+    with raises(InputError, code="invalid_pairs_file"):
         read_pairs(site.store, path)
 
 
@@ -218,7 +219,7 @@ def test_a_lone_measurement_that_is_withdrawn_leaves_no_edge(site: Map) -> None:
     assert (row.status, row.S_target_source) == ("never registered", None)
     report = site.show_pair("hall:stairs")
     assert [event.what for event in report.history] == ["accepted", "withdraw"]
-    with pytest.raises(NotFoundError, match="hall and stairs were never registered"):
+    with raises(NotFoundError, code="registration_not_found"):
         site.confirm("hall:stairs")
 
 
@@ -256,14 +257,14 @@ def test_a_map_can_be_looked_at_whatever_its_settings_say(
         m.edit("hall", note="wet")
         m.remove("attic:east")
         for door in (m.status, m.update, m.setting_rows, lambda: m.export(tmp_path / "out")):
-            with pytest.raises(ConfigError, match=r"settings\.toml"):
+            with raises(ConfigError, code="invalid_setting_value", match=r"settings\.toml"):
                 door()  # type: ignore[operator]
 
 
 def test_settings_that_cannot_be_are_named_and_taken_back(site: Map) -> None:
     path = site.store.folder / "settings.toml"
     path.write_text("[register]\nmax_poses = 'many'\n")
-    with pytest.raises(ConfigError, match=r"settings\.toml: register\.max_poses takes int"):
+    with raises(ConfigError, code="invalid_setting_value", match="max_poses"):
         site.change_settings({"retrieve.top_k": 3})
     assert "top_k" not in path.read_text()
     assert site.with_settings({"register.max_poses": 2}).settings.register.max_poses == 2  # this run says otherwise
@@ -294,7 +295,7 @@ def test_a_map_that_is_read_only_is_shown_and_exported(
         assert made.recomputed == 1
         assert "read-only" in caplog.text
         assert m.export(tmp_path / "out", merge="union", tile_size_m=0).reused == 1
-        with pytest.raises(StoreError, match="reading"):
+        with raises(StoreError, code="catalog_refused"):
             m.remove("hall")
     assert site.tile_rows() == []
 
@@ -312,7 +313,7 @@ def test_status_names_the_export_that_brings_a_folder_up_to_date(
     assert verb == (
         f"gsmap export {site.store.folder} '{out}' --format splat --tile-size 2.0 --bbox -3 -3 -3 3 3 3 --merge union"
     )
-    with pytest.raises(NotFoundError, match="no revision 0"):
+    with raises(NotFoundError, code="revision_not_found"):
         site.export(tmp_path / "none", revision=0)
 
 
@@ -350,13 +351,13 @@ def test_a_prior_is_answered_without_settings(site: Map) -> None:
     ],
 )
 def test_a_method_that_does_not_exist_is_refused_when_it_is_set(site: Map, name: str, kind: str) -> None:
-    with pytest.raises(ConfigError, match=f"there is no {kind} 'nope'"):
+    with raises(ConfigError, code="unknown_method"):
         site.change_settings({name: "nope"})
     assert not (site.store.folder / "settings.toml").exists()
 
 
 def test_a_preset_that_does_not_exist_is_not_blamed_on_the_file(site: Map) -> None:
-    with pytest.raises(ConfigError, match=r"^there is no preset 'napkin'"):
+    with raises(ConfigError, code="unknown_preset"):
         site.change_settings(preset="napkin")
 
 
@@ -364,21 +365,21 @@ def test_what_cannot_be_asked_for_changes_nothing(
     site: Map, tried: list[tuple[str, str]], tmp_path: Path, recwarn: pytest.WarningsRecorder
 ) -> None:
     site.update()
-    with pytest.raises(ConfigError, match="must not be negative, got -1"):
+    with raises(ConfigError, code="out_of_range"):
         site.prune(-1)
     assert site.revision_rows()[-1].dropped_at is None
-    with pytest.raises(ConfigError, match="use larger tiles"):
+    with raises(ConfigError, code="too_many_tiles"):
         site.export(tmp_path / "out", tile_size_m=1e-300)
-    with pytest.raises(
+    with raises(
         ConfigError,
-        match=r"choose one of compressed\.ply, glb, ply, .*sog, splat, .*3dtiles, streamed-sog",
+        code="unsupported_output",
     ):
         site.export(tmp_path / "out", format="doc")
     assert not (tmp_path / "out").exists()
     for door in (site.confirm, site.show_pair, site.register):
-        with pytest.raises(ConfigError, match="hall with itself is no pair"):
+        with raises(ConfigError, code="same_scene"):
             door("hall:hall")  # type: ignore[operator]
-    with pytest.raises(ConfigError, match=r"\.png"):
+    with raises(ConfigError, code="wrong_suffix"):
         site.draw_graph("hall", tmp_path / "hall.doc")
     assert not list(tmp_path.glob("hall*"))
     assert [str(warning.message) for warning in recwarn] == []

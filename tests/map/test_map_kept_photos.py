@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from raising import raises
 
 import gsmap.map
 from gsmap.errors import GsmapError
@@ -158,12 +159,12 @@ def test_of_an_earlier_day_later_photographs_know_nothing(site: Map, tmp_path: P
 
 def test_a_picture_that_is_damaged_says_so_and_how_to_go_on(site: Map, tmp_path: Path) -> None:
     site.store.photos.add(sighting(site, 1, "may", POSE, None), b"\xff\xd8\xff\xe0 and no more")
-    with pytest.raises(GsmapError, match=r"photo p1 is no picture.*gsmap remove MAP p1 --photo"):
+    with raises(GsmapError, code="photo_damaged"):
         export(site, tmp_path / "out")
     site.store.photos.remove(1)
     assert export(site, tmp_path / "out").recomputed == 1
     vast = io.BytesIO()
     Image.new("L", (5000, 4000)).save(vast, "JPEG")
     site.store.photos.add(sighting(site, 2, "may", POSE, None), vast.getvalue())
-    with pytest.raises(GsmapError, match=r"photo p2 is no picture.*5000 x 4000 pixels"):
+    with raises(GsmapError, code="photo_damaged"):
         export(site, tmp_path / "out")

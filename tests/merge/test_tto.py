@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from raising import raises
 from scipy.spatial import cKDTree
 from synthetic_walls import cameras_facing, two_scenes, wall
 
@@ -243,7 +244,7 @@ def test_few_passes_come_nearer_by_huber_s_loss_and_less_momentum(watched, monke
 
 
 def test_a_momentum_that_never_forgets_is_refused():
-    with pytest.raises(ConfigError, match="momentum"):
+    with raises(ConfigError, code="out_of_range", match="momentum"):
         Params(momentum=1.0)
 
 
@@ -290,5 +291,5 @@ def test_where_both_are_preferred_dates_decide_nothing():
     ],
 )
 def test_settings_that_make_no_sense_are_refused_by_name(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
+    with raises(ConfigError, code="out_of_range", match=next(iter(wrong))):
         Params(**wrong)

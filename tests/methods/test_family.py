@@ -4,6 +4,7 @@ import logging
 import sys
 
 import pytest
+from raising import raises
 
 from gsmap.errors import ConfigError
 from gsmap.methods import Family, MethodParams, families
@@ -28,16 +29,16 @@ def test_nothing_is_imported_before_it_is_asked_for(toys):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
+    ("name", "code"),
     [
-        ("wod", "there is no toy 'wod' .did you mean 'wood'.*bare, glass"),
-        ("bare", "lacks Params, build: see the contract in gsmap.methods.toy"),
-        ("loose", "its Params must be a frozen dataclass"),
-        ("torn", "package toys cannot be loaded .ModuleNotFoundError"),
+        ("wod", "unknown_method"),
+        ("bare", "invalid_method"),
+        ("loose", "invalid_method"),
+        ("torn", "method_not_loadable"),
     ],
 )
-def test_what_does_not_keep_the_contract_is_named(toys, name, message):
-    with pytest.raises(ConfigError, match=message):
+def test_what_does_not_keep_the_contract_is_named(toys, name, code):
+    with raises(ConfigError, code=code):
         toys.get(name)
 
 
@@ -71,7 +72,7 @@ def test_any_way_to_fail_of_another_package_is_a_clear_error(toys, tmp_path, old
     text = added.read_text()
     assert old in text
     added.write_text("from __future__ import annotations\n" + text.replace(old, new))
-    with pytest.raises(ConfigError, match="toy 'glass'"):
+    with raises(ConfigError, code=("invalid_method", "method_not_loadable")):
         toys.get("glass")
     assert toys.usable() == ("stone", "wood")
 
@@ -79,14 +80,14 @@ def test_any_way_to_fail_of_another_package_is_a_clear_error(toys, tmp_path, old
 def test_a_method_without_a_version_is_refused(toys, tmp_path):
     wood = tmp_path / "site" / "toy_blocks" / "wood.py"
     (wood.parent / "clay.py").write_text(wood.read_text().replace("VERSION = 3", ""))
-    with pytest.raises(ConfigError, match="toy 'clay' lacks VERSION: see the contract"):
+    with raises(ConfigError, code="invalid_method"):
         toys.get("clay")
 
 
 def test_a_table_lists_built_in_methods_that_need_no_params(toys):
     table = Family("toy", "toy_blocks", (), (("a", "toy_blocks.bare"),), any_of=("build", "wreck"), has_params=False)
     assert table.names() == ("a", "glass", "torn", "wood")
-    with pytest.raises(ConfigError, match="lacks build or wreck"):
+    with raises(ConfigError, code="invalid_method"):
         table.get("a")
     assert table.get("glass").VERSION == 12
 
@@ -100,7 +101,7 @@ def test_params_of_a_family_hold_what_was_changed_and_defaults_for_the_rest(toys
     assert hash(changed) == hash(params.with_params("wood", wood(size_m=0.25)))
     assert changed.with_params("wood", wood()) == params
     assert list(params) == ["glass", "stone", "wood"]
-    with pytest.raises(ConfigError, match=r"toy 'wood' takes toy_blocks.wood.Params, got toy_blocks.stone.Params"):
+    with raises(ConfigError, code="invalid_method"):
         params.with_params("wood", toys.params_type("stone")())
 
 

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_worlds import information, poses_at, true_edges
+from raising import raises
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.optimize import Params, optimize
@@ -36,26 +37,26 @@ def lopsided():
 
 
 @pytest.mark.parametrize(
-    ("edges", "message"),
+    ("edges", "code"),
     [
-        (broken(np.full((7, 7), np.nan)), "NaN or infinity"),
-        (broken(singular()), "not positive definite"),
-        (broken(indefinite()), "not positive definite"),
-        (broken(lopsided()), "not symmetric"),
-        (broken(np.eye(6)), r"needs a \(7, 7\)"),
-        ([*GOOD, replace(GOOD[3], target="c", source="zz")], "'zz', which is not in the map"),
-        ([*GOOD, replace(GOOD[3], target="c", source="c")], "ties a scene to itself"),
-        ([*GOOD, GOOD[3]], "given twice"),
+        (broken(np.full((7, 7), np.nan)), "not_finite"),
+        (broken(singular()), "invalid_information"),
+        (broken(indefinite()), "invalid_information"),
+        (broken(lopsided()), "invalid_information"),
+        (broken(np.eye(6)), "invalid_information"),
+        ([*GOOD, replace(GOOD[3], target="c", source="zz")], "unknown_scene"),
+        ([*GOOD, replace(GOOD[3], target="c", source="c")], "self_edge"),
+        ([*GOOD, GOOD[3]], "duplicate"),
     ],
 )
-def test_an_unusable_edge_is_named(edges, message):
-    with pytest.raises(InputError, match=message) as caught:
+def test_an_unusable_edge_is_named(edges, code):
+    with raises(InputError, code=code) as caught:
         optimize(IDS, edges)
     assert "edge c:" in str(caught.value)
 
 
 def test_not_a_rotation_cannot_become_an_edge():
-    with pytest.raises(InputError, match="orthonormal"):
+    with raises(InputError, code="invalid_pose"):
         Sim3(1.5 * np.eye(3), np.zeros(3))
 
 
@@ -70,7 +71,7 @@ def test_not_a_rotation_cannot_become_an_edge():
     ],
 )
 def test_an_unusable_prior_is_named(prior):
-    with pytest.raises(InputError, match=f"'{prior.scene}'"):
+    with raises(InputError, code=("unknown_scene", "invalid_sigma", "invalid_prior"), match=prior.scene):
         optimize(IDS, GOOD, [prior])
 
 
@@ -78,7 +79,7 @@ def test_contradictory_confirmations_are_named():
     shifted = GOOD[2].S_target_source @ Sim3(np.eye(3), np.array([5.0, 0, 0]))
     edges = [replace(GOOD[0], confirmed=True), replace(GOOD[1], confirmed=True)]
     edges.append(replace(GOOD[2], confirmed=True, S_target_source=shifted))
-    with pytest.raises(InputError, match=r"confirmed edge \w:\w contradicts"):
+    with raises(InputError, code="confirmed_edges_contradict"):
         optimize(IDS, edges)
 
 
@@ -91,7 +92,7 @@ def test_a_confirmed_edge_outvotes_edges_nobody_confirmed():
 
 
 def test_a_scene_listed_twice_and_odd_parameters():
-    with pytest.raises(InputError, match="listed twice"):
+    with raises(InputError, code="duplicate"):
         optimize(["a", "a"], [])
     with pytest.raises(ConfigError):
         Params(gate_probability=1.0)

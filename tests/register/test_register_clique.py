@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from raising import raises
 
 from gsmap.errors import InputError
 from gsmap.register.clique import maximum_clique
@@ -93,9 +94,9 @@ def test_limit_gives_a_clique_that_is_not_called_exact():
 def test_empty_edgeless_and_malformed_graphs():
     assert len(maximum_clique(np.zeros((0, 0), np.uint64))) == 0
     assert len(maximum_clique(np.zeros((5, 1), np.uint64))) == 1
-    with pytest.raises(InputError, match="bit rows"):
+    with raises(InputError, code="shape_mismatch"):
         maximum_clique(np.zeros((100, 1), np.uint64))
-    with pytest.raises(InputError, match="uint64"):
+    with raises(InputError, code="shape_mismatch"):
         maximum_clique(np.zeros((5, 1), np.int32))
 
 

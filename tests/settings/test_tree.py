@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from raising import raises
 from settings_tree import Tree
 
 from gsmap.errors import ConfigError
@@ -50,34 +51,34 @@ def test_a_setting_is_changed_and_nothing_else(tree, name, value, kept):
 def test_a_method_that_cannot_be_loaded_does_not_hinder_the_settings_of_another(toys):
     new = changed(Tree(), {"toys.stone.size_m": 3.0})
     assert new.toys["stone"].size_m == 3.0
-    with pytest.raises(ConfigError, match="torn"):
+    with raises(ConfigError, code="method_not_loadable"):
         changed(Tree(), {"toys.torn.size_m": 3.0})
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "message"),
+    ("name", "value", "code"),
     [
-        ("bars.neer_m", 1.0, r"no setting 'bars.neer_m': did you mean bars.near_m\?"),
-        ("near_m", 1.0, r"did you mean bars.near_m\?"),
-        ("toys.wood.size", 1.0, r"did you mean toys.wood.size_m\?"),
-        ("count.more", 1, "no setting 'count.more'"),
-        ("qqq", 1, "no setting 'qqq': gsmap settings MAP lists them all"),
-        ("bars", 1, "bars holds several settings: set one of them, such as bars.near_m"),
-        ("toys.wood", 1, "such as toys.wood.size_m"),
-        ("count", 1.5, "count takes int, got 1.5"),
-        ("count", True, "count takes int, got True"),
-        ("loud", 1, "loud takes bool, got 1"),
-        ("bars.near_m", "wide", "bars.near_m takes float, got 'wide'"),
-        ("bars.near_m", None, "bars.near_m takes float, got None"),
-        ("budget_s", "long", "budget_s takes float | None, got 'long'"),
-        ("mode", "quick", "mode must be one of slow, fast, got 'quick'"),
-        ("weights", [1.0], "weights takes"),
-        ("weights", [1.0, "a"], "weights takes float, got 'a'"),
-        ("names", "xy", "names takes"),
+        ("bars.neer_m", 1.0, "unknown_setting"),
+        ("near_m", 1.0, "unknown_setting"),
+        ("toys.wood.size", 1.0, "unknown_setting"),
+        ("count.more", 1, "unknown_setting"),
+        ("qqq", 1, "unknown_setting"),
+        ("bars", 1, "setting_not_a_leaf"),
+        ("toys.wood", 1, "setting_not_a_leaf"),
+        ("count", 1.5, "invalid_setting_value"),
+        ("count", True, "invalid_setting_value"),
+        ("loud", 1, "invalid_setting_value"),
+        ("bars.near_m", "wide", "invalid_setting_value"),
+        ("bars.near_m", None, "invalid_setting_value"),
+        ("budget_s", "long", "invalid_setting_value"),
+        ("mode", "quick", "invalid_choice"),
+        ("weights", [1.0], "invalid_setting_value"),
+        ("weights", [1.0, "a"], "invalid_setting_value"),
+        ("names", "xy", "invalid_setting_value"),
     ],
 )
-def test_what_is_wrong_is_refused_with_its_name(tree, name, value, message):
-    with pytest.raises(ConfigError, match=message.replace(" | ", r" \| ")):
+def test_what_is_wrong_is_refused_with_its_name(tree, name, value, code):
+    with raises(ConfigError, code=code):
         changed(tree, {name: value})
 
 
@@ -114,5 +115,5 @@ def test_settings_on_the_command_line(text, name, value):
 
 @pytest.mark.parametrize("text", ["a.b", "=3", ""])
 def test_what_sets_nothing_is_refused(text):
-    with pytest.raises(ConfigError, match="name=value"):
+    with raises(ConfigError, code="invalid_assignment"):
         parse(text)

@@ -7,6 +7,7 @@ import shutil
 import threading
 
 import pytest
+from raising import raises
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import ConfigError, NotFoundError, StoreError
@@ -73,11 +74,11 @@ def test_a_tag_cannot_be_written(store):
     store.branches.make("v1", tag=True)
     add(store, 1)
     before = bytes_of(store.home / "branches" / "v1")
-    with pytest.raises(StoreError, match="is a tag, which does not change"):
+    with raises(StoreError, code="place_failed"):
         Store.open(at(store, "v1"))
     with Store.open(at(store, "v1"), "r") as tag:
         assert [s.name for s in tag.scenes.list()] == ["scene0"]
-        with pytest.raises(StoreError, match="is a tag, which does not change"):
+        with raises(StoreError, code="place_failed"):
             tag.scenes.edit("scene0", name="x")
         tag.branches.make("of-v1")
     with Store.open(at(store, "of-v1")) as branch:
@@ -94,27 +95,27 @@ def test_a_path_that_exists_wins(store, tmp_path):
     with Store.open(tmp_path / "other@b", "r") as other:
         assert other.home == other.folder == tmp_path / "other@b"
     (tmp_path / "site.gsmap@c").mkdir()
-    with pytest.raises(ConfigError, match="exists already"):
+    with raises(ConfigError, code="branch_exists"):
         store.branches.make("c")
 
 
 def test_names_become_paths(store, tmp_path):
     for bad in ("", ".", "..", ".x", "a/b", "../x", "a b", "a\n", "ä", "x" * 65, "-" * 65):
-        with pytest.raises(ConfigError, match="is called by up to 64"):
+        with raises(ConfigError, code="invalid_name"):
             store.branches.make(bad)
     store.branches.make("x" * 64)
     store.branches.make("good")
-    with pytest.raises(ConfigError, match="exists already"):
+    with raises(ConfigError, code="branch_exists"):
         store.branches.make("good", tag=True)
-    with pytest.raises(NotFoundError, match=r"no branch or tag 'bad': it has good, x"):
+    with raises(NotFoundError, code="branch_not_found"):
         Store.open(at(store, "bad"))
-    with pytest.raises(NotFoundError, match="no branch or tag 'bad'"):
+    with raises(NotFoundError, code="branch_not_found"):
         Store.create(at(store, "bad"))
-    with pytest.raises(StoreError, match="is a map already"):
+    with raises(StoreError, code="already_exists"):
         Store.create(at(store, "good"))
     with pytest.raises(ConfigError):
         Store.open(f"{store.home}@b d")
-    with pytest.raises(NotFoundError, match="gsmap init"):
+    with raises(NotFoundError, code="map_not_found"):
         Store.open(tmp_path / "nothing@good")
 
 
@@ -223,9 +224,9 @@ def test_nothing_that_a_branch_needs_is_reclaimed_whatever_became_of_its_files(s
         assert other == "b.old" or not store.check().ok
         reclaimed(f"called {other}")
     folder.rename(store.home / "branches" / "b~")
-    with pytest.raises(StoreError, match="b~ is no branch"):
+    with raises(StoreError, code="stray_branch"):
         store.prune()
-    with pytest.raises(StoreError, match="b~ is no branch"):
+    with raises(StoreError, code="stray_branch"):
         purging.begin(store, add(store, 1))
     assert store.scenes.get("scene1")
     (store.home / "branches" / "b~").rename(folder)

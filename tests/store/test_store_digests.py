@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import store_children
 from page_samples import PAGE, fill, flip
+from raising import raises
 from store_children import messages
 
 from gsmap.errors import CorruptError, DiskError
@@ -31,13 +32,13 @@ def test_a_flip_in_each_page_and_in_its_digest_is_named(closed):
     for number in range(1, noted.count + 1):
         at = (number - 1) * PAGE + 100 + number
         flip(file, at)
-        with pytest.raises(CorruptError, match=rf"page {number} of map.sqlite differs.*restore"):
+        with raises(CorruptError, code="catalog_damaged", match=f"page {number} "):
             Store.open(closed, "r")
         flip(file, at)
     side = digests.digests_of(file)
     for at in range(0, side.stat().st_size, 31):
         flip(side, at)
-        with pytest.raises(CorruptError, match=r"map.sqlite.digests is damaged"):
+        with raises(CorruptError, code="catalog_damaged"):
             Store.open(closed, "r")
         flip(side, at)
     Store.open(closed, "r").close()
@@ -61,7 +62,7 @@ def test_damage_that_comes_while_a_map_is_open_is_not_blessed(closed):
     noted = digests.load(file)
     flip(file, file.stat().st_size - 50)
     store.scenes.edit("monday", note="seen")  # in the log
-    with pytest.raises(CorruptError, match=f"page {noted.count} of map.sqlite differs.*is kept"):
+    with raises(CorruptError, code="catalog_damaged", match=f"page {noted.count} "):
         store.close()
     assert digests.load(file) == noted
     for mode in "rw":
@@ -131,7 +132,7 @@ def test_killed_anywhere_in_a_fold(closed, tmp_path, monkeypatch):
         # What no fold was about to change is verified all the same.
         spare = next(n for n in range(1, noted.count + 1) if n not in noted.next)
         flip(stage / sqlite.FILE, spare * PAGE - 9)
-        with pytest.raises(CorruptError, match=f"page {spare} of"):
+        with raises(CorruptError, code="catalog_damaged", match=f"page {spare} "):
             Store.open(stage)
         flip(stage / sqlite.FILE, spare * PAGE - 9)
         with Store.open(stage) as store:
@@ -179,7 +180,7 @@ def test_a_page_that_was_folded_in_is_verified_without_the_log(closed, tmp_path,
     assert not log_of(stage / sqlite.FILE).exists() or not log_of(stage / sqlite.FILE).stat().st_size
     for number in digests.load(stage / sqlite.FILE).next:
         flip(stage / sqlite.FILE, number * PAGE - 9)
-        with pytest.raises(CorruptError, match=f"page {number} of"):
+        with raises(CorruptError, code="catalog_damaged", match=f"page {number} "):
             Store.open(stage, "r")
         flip(stage / sqlite.FILE, number * PAGE - 9)
 
@@ -306,7 +307,7 @@ def test_a_long_catalog_is_verified_by_check_alone(closed, monkeypatch):
     store.scenes.edit("monday", note="a write there")
     number = min(read_log(log_of(file)).frames)
     flip(file, number * PAGE - 50)
-    with pytest.raises(CorruptError, match=f"page {number} of"):
+    with raises(CorruptError, code="catalog_damaged", match=f"page {number} "):
         store.close()
     flip(file, number * PAGE - 50)
     with Store.open(closed) as store:
@@ -333,7 +334,7 @@ def test_a_catalog_in_another_journal_mode_is_refused_until_it_is_accepted(close
         assert connection.execute("PRAGMA journal_mode = DELETE").fetchone() == ("delete",)
     connection.close()
     digests.note(file)
-    with pytest.raises(CorruptError, match=r"journal mode.*--accept-catalog"):
+    with raises(CorruptError, code="catalog_damaged"):
         Store.open(closed)
     Store.accept_catalog(closed)
     with Store.open(closed) as store:

@@ -5,6 +5,7 @@ import os
 import sqlite3
 
 import pytest
+from raising import raises
 from sqlalchemy.exc import DBAPIError, StatementError
 from store_samples import make_cameras, make_gaussians
 
@@ -136,14 +137,14 @@ def test_codes_of_the_system(tmp_path, code):
     assert type(found) is CODES[code] is of_system(OSError(code, ""))
     assert os.strerror(code) in str(found)
     assert NOT_KEPT in str(found)
-    with pytest.raises(StoreError, match=r"^/some/file: "), explained(tmp_path):
+    with raises(StoreError, code=found.code, match=r"^/some/file: "), explained(tmp_path):
         raise OSError(code, os.strerror(code), "/some/file")
 
 
 def test_our_own_errors_pass(tmp_path):
-    ours = InputError("a name with a line break")
+    ours = InputError("a name with a line break", code="invalid_name")
     for error in (ours, StatementError("", "SELECT 1", {}, ours)):
-        with pytest.raises(InputError, match="line break"), explained(tmp_path):
+        with raises(InputError, code="invalid_name"), explained(tmp_path):
             raise error
     with pytest.raises(ZeroDivisionError), explained(tmp_path):
         raise ZeroDivisionError
@@ -210,7 +211,7 @@ def test_a_disk_that_cannot_read_is_no_damage(store, two_scenes, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(arrays.os, "pread", refuse)
-        with pytest.raises(DiskError, match="Input/output error"):
+        with raises(DiskError, code="disk_failed"):
             store.scenes.gaussians("scene0")
     with monkeypatch.context() as patch:
         patch.setattr(arrays.hashlib, "file_digest", refuse)

@@ -1,4 +1,5 @@
 import pytest
+from raising import raises
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import InputError, NotFoundError, StoreError
@@ -40,7 +41,7 @@ def test_edit_and_its_history(store, two_scenes):
     with Store.open(store.folder, "r") as reader:
         assert [(s.name, s.tags) for s in reader.scenes.list()] == [("kitchen", ("day", "winter")), ("scene1", ())]
         assert reader.scenes.get(scene.id).tags == ("day", "winter")
-        with pytest.raises(StoreError, match="opened for reading"):
+        with raises(StoreError, code="catalog_refused"):
             reader.scenes.edit("kitchen", name="x")
 
 
@@ -54,24 +55,24 @@ def test_saying_the_same_again_writes_nothing(store, two_scenes):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "code"),
     [
-        ({"name": ""}, "empty"),
-        ({"name": "  "}, "empty"),
-        ({"name": "a\nb"}, "control character"),
-        ({"name": "a\x1b[31mb"}, "control character"),
-        ({"name": "scene1"}, "another scene is called"),
-        ({"captured_at": "yesterday"}, "ISO 8601"),
-        ({"note": "bell\x07"}, "control character"),
-        ({"note": ""}, "empty"),
-        ({"tags_add": ["good", "a\tb"]}, "control character"),
-        ({"tags_add": [""]}, "empty"),
-        ({"name": "fine", "author": "a\x00b"}, "control character"),
+        ({"name": ""}, "invalid_name"),
+        ({"name": "  "}, "invalid_name"),
+        ({"name": "a\nb"}, "invalid_name"),
+        ({"name": "a\x1b[31mb"}, "invalid_name"),
+        ({"name": "scene1"}, "name_taken"),
+        ({"captured_at": "yesterday"}, "invalid_date"),
+        ({"note": "bell\x07"}, "invalid_name"),
+        ({"note": ""}, "invalid_name"),
+        ({"tags_add": ["good", "a\tb"]}, "invalid_name"),
+        ({"tags_add": [""]}, "invalid_name"),
+        ({"name": "fine", "author": "a\x00b"}, "invalid_name"),
     ],
 )
-def test_what_is_refused_changes_nothing(store, two_scenes, change, message):
+def test_what_is_refused_changes_nothing(store, two_scenes, change, code):
     before = store.scenes.list(), said(store, "scene0")
-    with pytest.raises(InputError, match=message) as caught:
+    with raises(InputError, code=code) as caught:
         store.scenes.edit("scene0", **change)
     assert "\x1b" not in str(caught.value)
     assert (*[s.name for s in store.scenes.list()],) == (*[s.name for s in before[0]],)
@@ -79,10 +80,10 @@ def test_what_is_refused_changes_nothing(store, two_scenes, change, message):
 
 
 def test_unknown_scenes_and_tags(store, two_scenes):
-    with pytest.raises(NotFoundError, match="no tag 'a'"):
+    with raises(NotFoundError, code="tag_not_found"):
         store.scenes.edit("scene0", tags_remove=["a"])
     store.scenes.remove("scene0")
-    with pytest.raises(NotFoundError, match="was removed"):
+    with raises(NotFoundError, code="scene_removed"):
         store.scenes.edit(two_scenes[0].id, name="x")
     assert said(store, two_scenes[0].id) == [("name", "scene0", "")]  # its history stays
     assert store.scenes.edit("scene1", name="scene0").name == "scene0"  # the name is free
@@ -90,9 +91,9 @@ def test_unknown_scenes_and_tags(store, two_scenes):
 
 def test_names_of_new_scenes_are_checked_too(store):
     for bad in ("", "a\rb"):
-        with pytest.raises(InputError, match="the name of a scene"):
+        with raises(InputError, code="invalid_name"):
             store.scenes.add(make_gaussians(), make_cameras(), name=bad)
-    with pytest.raises(InputError, match="ISO 8601"):
+    with raises(InputError, code="invalid_date"):
         store.scenes.add(make_gaussians(), make_cameras(), name="a", captured_at="soon")
     assert store.scenes.list() == []
     assert store.scenes.add(make_gaussians(), make_cameras(), name="a:b")[0].name == "a:b"

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 
 import pytest
+from raising import raises
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.cli import app
@@ -93,7 +94,7 @@ def test_a_full_map_is_read_after_its_writer_was_killed(disk):
     with Store.open(disk / "killed.gsmap") as store:
         assert [s.name for s in store.scenes.list()] == ["renamed"]
         assert store.check().problems == ()
-        with pytest.raises(DiskFullError, match="not kept"):
+        with raises(DiskFullError, code="disk_full"):
             store.scenes.edit("renamed", name="again")
         store.prune()
     (disk / "filler").unlink()
@@ -111,7 +112,7 @@ def test_writing_to_a_full_map_says_so_and_keeps_what_was(full):
             lambda: store.scenes.remove("kept"),
             lambda: store.exports.begin("/out", revision=1),
         ):
-            with pytest.raises(DiskFullError, match=r"the disk is full.*not kept.*prune"):
+            with raises(DiskFullError, code="disk_full"):
                 change()
         assert [s.name for s in store.scenes.list()] == ["kept"]
         assert store.check().problems == ()

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from raising import raises
 from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 from store_swift import BUCKET, ENVIRONMENT, Wire
 
@@ -58,19 +59,19 @@ def same(a, b):
 
 
 def test_a_map_is_made_once_and_needs_a_server(bucket, postgres_database):
-    with pytest.raises(NotFoundError, match="gsmap init s3://"):
+    with raises(NotFoundError, code="map_not_found"):
         Store.open(bucket)
     assert not Store.exists(bucket)
-    with pytest.raises(ConfigError, match="--catalog postgresql"):
+    with raises(ConfigError, code="bucket_needs_catalog"):
         Store.create(bucket)
     with Store.create(bucket, catalog_url=postgres_database) as made:
         assert made.location == bucket
     assert Store.exists(bucket)
-    with pytest.raises(StoreError, match="is a map already"):
+    with raises(StoreError, code="already_exists"):
         Store.create(bucket, catalog_url=postgres_database)
     place = place_of(f"{bucket} other")
     place.put("x", [b"1"], 1)
-    with pytest.raises(StoreError, match="is not empty"):
+    with raises(StoreError, code="folder_not_empty"):
         Store.create(place.url, catalog_url=postgres_database)
 
 
@@ -88,7 +89,7 @@ def test_what_is_kept_is_read_by_another_machine(home, bucket, tmp_path, monkeyp
         m.change_settings({"register.verdict.max_log_nfa": -6})
     monkeypatch.setenv("GSMAP_CACHE", str(tmp_path / "elsewhere"))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "nobody"))
-    with pytest.raises(StoreError, match="gsmap trust s3://"):
+    with raises(StoreError, code="untrusted_catalog"):
         Store.open(bucket, "r")
     monkeypatch.setenv("GSMAP_CATALOG", postgres_database)
     with gsmap.map.open(bucket) as m:
@@ -106,7 +107,7 @@ def test_what_is_kept_is_read_by_another_machine(home, bucket, tmp_path, monkeyp
 def test_trust_is_asked_for_and_given(home, bucket, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "nobody"))
     assert not gsmap.map.catalog_of(bucket).trusted
-    with pytest.raises(StoreError, match="not trusted yet"):
+    with raises(StoreError, code="untrusted_catalog"):
         Store.open(bucket)
     assert gsmap.map.trust(bucket).trusted
     Store.open(bucket).close()
@@ -124,7 +125,7 @@ def test_what_is_missing_or_differs_is_told_and_mended(home, tmp_path):
         spoil()
         (problem,) = home.check().problems
         assert f"{home.location}/{name}" in problem
-        with pytest.raises(CorruptError, match=r"ingest the scene again|differs"):
+        with raises(CorruptError, code=("arrays_corrupt", "bytes_differ")):
             home.scenes.gaussians("a")
         home.scenes.add(g, c, name="a")
         assert home.check().ok
@@ -260,11 +261,11 @@ def test_what_is_kept_is_bounded(tmp_path, monkeypatch):
         if i == 2:
             assert cache.find(digests[1]) is not None  # used last
     assert [cache.find(digest) is not None for digest in digests] == [False, True, False, True]
-    with pytest.raises(CorruptError, match="it differs"):
+    with raises(CorruptError, code="bytes_differ"):
         cache.keep(digests[0], [b"x"], "it")
     assert cache.find(digests[0]) is None
     monkeypatch.setenv("GSMAP_CACHE_MB", "much")
-    with pytest.raises(ConfigError, match="GSMAP_CACHE_MB"):
+    with raises(ConfigError, code="invalid_environment"):
         cache.keep(digests[0], [content[0]], "it")
 
 
@@ -298,7 +299,7 @@ def test_a_map_is_merged_into_a_bucket(home, tmp_path):
 
 def test_what_a_bucket_cannot_do_is_refused(home):
     for tag in (False, True):
-        with pytest.raises(ConfigError, match="gsmap clone"):
+        with raises(ConfigError, code="no_branches_in_bucket"):
             home.branches.make("b", tag=tag)
     assert home.branches.list() == []
 
@@ -309,24 +310,20 @@ def test_a_folder_may_be_named_by_a_url(tmp_path):
     with Store.open(f"file://localhost{tmp_path}/a%20map") as store:
         assert store.check().ok
     assert (tmp_path / "a map" / "map.sqlite").is_file()
-    for bad, what in (
-        ("file://elsewhere/x", "another machine"),
-        ("http://x/y", "not at http"),
-        ("gs://b", "not at gs"),
-    ):
-        with pytest.raises(ConfigError, match=what):
+    for bad in ("file://elsewhere/x", "http://x/y", "gs://b"):
+        with raises(ConfigError, code="invalid_location"):
             Store.open(bad)
 
 
 def test_a_bucket_named_with_a_password_is_refused(tmp_path):
     for bad in ("s3://user:secret@bucket/site", "s3://bucket/site?key=1", "s3:///site"):
-        with pytest.raises(ConfigError, match=r"password|bucket"):
+        with raises(ConfigError, code="invalid_location"):
             Store.exists(bad)
 
 
 def test_nothing_is_brought_from_or_to_elsewhere(home):
     for name in ("../x", "models/../x", "/etc/passwd", "models/", "models"):
-        with pytest.raises(CorruptError, match="no file called"):
+        with raises(CorruptError, code="invalid_stored_name"):
             homes.Home(home.location).bring(name)
 
 
@@ -334,7 +331,7 @@ def test_a_home_that_names_no_database_is_refused(bucket):
     place = place_of(bucket)
     for content in (b"x" * 2_000_000, b"mysql://h/db\n", b"\xff"):
         place.put("catalog.url", [content], len(content))
-        with pytest.raises(CorruptError, match=r"far too long|does not name a PostgreSQL"):
+        with raises(CorruptError, code=("file_too_large", "catalog_invalid")):
             Store.open(bucket)
 
 
@@ -345,7 +342,7 @@ def test_one_writes_at_a_time_and_no_folder_is_locked(home, bucket):
     with Store.open(bucket) as other:
         other.catalog.patience_s = 0.2
         with home.catalog.write():
-            with pytest.raises(BusyError, match="others have been writing"), other.catalog.write():
+            with raises(BusyError, code="lock_busy"), other.catalog.write():
                 pass
             with pytest.raises(BusyError), other.catalog.lock(patience_s=0.0):
                 pass

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from raising import raises
 from sqlalchemy import text
 from store_samples import key, make_cameras, make_gaussians
 
@@ -134,7 +135,7 @@ def test_a_damaged_segment_is_named_by_check(store):
     archive.write_bytes(b"damaged".ljust(archive.stat().st_size, b"."))
     problems = store.check().problems
     assert any("made anew when the next new scene asks" in problem for problem in problems)
-    with pytest.raises(CorruptError, match="the index is made anew"):
+    with raises(CorruptError, code="arrays_corrupt"):
         store.indexes.segments(A)[0].rows(0, 5)
 
 
@@ -143,5 +144,5 @@ def test_members_that_gsmap_did_not_write_are_refused(store, told):
     store.indexes.put(A, members(A), arrays(), ())
     with store.catalog.write() as connection:
         connection.execute(text("UPDATE index_segments SET members = :m"), {"m": told})
-    with pytest.raises(CorruptError, match="members"):
+    with raises(CorruptError, code="catalog_invalid"):
         store.indexes.segments(A)

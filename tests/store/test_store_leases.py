@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from raising import raises
 from sqlalchemy import insert, select, update
 
 from gsmap.errors import BusyError, StoreError
@@ -76,7 +77,7 @@ def _text(seconds: float) -> str:
 
 def test_one_holds_and_the_other_is_told_who(store: Store, another: subprocess.Popen[str]) -> None:
     who = rf"gsmap optimize \(process {another.pid} on \S+, since \d\d:\d\d\)"
-    with pytest.raises(BusyError, match=who), store.leases.hold("poses", "update"):
+    with raises(BusyError, code="lease_held", match=who), store.leases.hold("poses", "update"):
         pass
     assert [lease.pid for lease in store.leases.others()] == [another.pid]
     with store.leases.hold("graph k", "update"):

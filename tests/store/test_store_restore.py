@@ -5,6 +5,7 @@ import shutil
 import time
 
 import pytest
+from raising import raises
 from sqlalchemy import create_engine, text
 from store_backups import PASSING, files_of, fill, holdings, make_snapshot, put, tables_of
 from store_older import check_all, unpack
@@ -49,7 +50,7 @@ def test_a_state_by_time_or_name(site, place, tmp_path):
     with Store.open(tmp_path / "late", "r") as store:
         assert len(store.scenes.list()) == saved[-1][1]
     for wanted in ({"at": "2001-01-01T00:00:00+00:00"}, {"snapshot": "nonsense"}, {"snapshot": saved[0][0].name[:15]}):
-        with pytest.raises(NotFoundError, match="no snapshot"):
+        with raises(NotFoundError, code="snapshot_not_found"):
             restore(place, tmp_path / "r", **wanted)
     assert not (tmp_path / "r").exists()
 
@@ -61,9 +62,9 @@ def test_nothing_that_exists_is_overwritten(site, place, tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     (tmp_path / "file").touch()
     for taken in (site, tmp_path / "link", tmp_path / "file"):
-        with pytest.raises(StoreError, match="is there already"):
+        with raises(StoreError, code="already_exists"):
             restore(place, taken)
-    with pytest.raises(NotFoundError, match="does not exist"):
+    with raises(NotFoundError, code="folder_not_found"):
         restore(place, tmp_path / "no" / "such")
     (tmp_path / "empty").mkdir()
     restore(place, tmp_path / "empty")
@@ -100,7 +101,7 @@ def test_a_damaged_object_is_never_restored(site, place, tmp_path, harm):
         path.symlink_to(tmp_path / "elsewhere")
     elif harm != "lose":
         path.write_bytes(data)
-    with pytest.raises(StoreError, match=file.sha256):
+    with raises(StoreError, code=("bytes_differ", "backup_damaged", "link_refused"), match=file.sha256):
         restore(place, tmp_path / "r")
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith((".", "r"))) == []
 
@@ -138,7 +139,7 @@ def test_a_path_outside_the_map_is_refused(site, place, tmp_path, path):
         map_id = store.id
     make_snapshot(place, map_id, {**files_of(site), path: b"evil"})
     before = sorted(str(p) for p in tmp_path.rglob("*"))
-    with pytest.raises(CorruptError, match="no path of a file in a map") as caught:
+    with raises(CorruptError, code="invalid_stored_name") as caught:
         restore(place, tmp_path / "r")
     assert "\x1b" not in str(caught.value)
     assert sorted(str(p) for p in tmp_path.rglob("*")) == before
@@ -166,7 +167,7 @@ def test_lists_that_are_none(site, place, tmp_path):
         restore(place, tmp_path / "r")
     huge = good.replace(f" {len(files['map.sqlite'])} map.sqlite", f" {10**17} map.sqlite")
     make_snapshot(place, map_id, files, huge.encode(), created_at="2026-03-02T03:04:05.000000+00:00")
-    with pytest.raises(StoreError, match="room for"):
+    with raises(StoreError, code="disk_full"):
         restore(place, tmp_path / "r")
     assert not (tmp_path / "r").exists()
 
@@ -197,7 +198,7 @@ def test_snapshots_that_say_what_is_not_so(site, place, tmp_path):
     name = Backup.at(place).names()[0]
     path = place.root / "snapshots" / f"{name}.json"
     path.write_bytes(path.read_bytes().replace(b'"revision": null', b'"revision": 1234'))
-    with pytest.raises(CorruptError, match="damaged"):
+    with raises(CorruptError, code="backup_damaged"):
         restore(place, tmp_path / "r", snapshot=name)
 
 
@@ -206,10 +207,10 @@ def test_a_newer_format_is_refused(site, place, tmp_path):
         save(store, place)
     marker = place.root / "gsmap-backup.json"
     marker.write_text(marker.read_text().replace('"format": 1', '"format": 2'))
-    with pytest.raises(StoreError, match="upgrade gsmap"):
+    with raises(StoreError, code="backup_version"):
         restore(place, tmp_path / "r")
     marker.write_text("[]")
-    with pytest.raises(CorruptError, match="damaged"):
+    with raises(CorruptError, code="backup_damaged"):
         restore(place, tmp_path / "r")
 
 
@@ -220,9 +221,9 @@ def test_links_in_a_backup_are_not_followed(site, place, tmp_path):
         shutil.move(place.root / "objects", outside)
         (place.root / "objects").symlink_to(outside)
         before = sorted(outside.rglob("*"))
-        with pytest.raises(StoreError, match="is a link"):
+        with raises(StoreError, code="link_refused"):
             save(store, place, keep=1)
-        with pytest.raises(StoreError, match="is a link"):
+        with raises(StoreError, code="link_refused"):
             restore(place, tmp_path / "r")
     assert sorted(outside.rglob("*")) == before
 
@@ -235,7 +236,7 @@ def test_an_older_schema_is_restored_and_asks_to_be_migrated(tmp_path, place):
     engine.dispose()
     make_snapshot(place, map_id, files_of(old), schema="0001")
     assert restore(place, tmp_path / "r").schema == "0001"
-    with pytest.raises(SchemaVersionError, match="gsmap migrate"):
+    with raises(SchemaVersionError, code="map_too_old"):
         Store.open(tmp_path / "r")
     Store.migrate(tmp_path / "r")
     with Store.open(tmp_path / "r") as store:
@@ -251,7 +252,7 @@ def test_into_postgres(site, place, tmp_path, postgres_database):
     with Store.open(tmp_path / "r") as store:
         store.scenes.add(make_gaussians(seed=9), make_cameras(), name="later")
         assert store.check().ok
-    with pytest.raises(StoreError, match="holds a map already"):
+    with raises(StoreError, code="database_not_empty"):
         restore(place, tmp_path / "r2", catalog_url=postgres_database)
     assert not (tmp_path / "r2").exists()
 
@@ -278,7 +279,7 @@ def test_a_database_is_empty_again_where_the_map_did_not_come_to_be(
         raise OSError(5, os.strerror(5))
 
     monkeypatch.setattr(restoring_module, "_put_in_place", fail)
-    with pytest.raises(StoreError, match="not made"):
+    with raises(StoreError, code="disk_failed"):
         restore(place, tmp_path / "r", catalog_url=postgres_database)
     engine = create_engine(postgres_database)
     assert tables_of(engine) == []
@@ -316,7 +317,7 @@ def test_a_clone_is_another_map(site, tmp_path):
         assert store.check().ok
         assert [scene.name for scene in store.scenes.list()] == ["a", "b"]
     assert holdings(site) == before
-    with Store.open(site) as store, pytest.raises(StoreError, match="is there already"):
+    with Store.open(site) as store, raises(StoreError, code="already_exists"):
         clone(store, tmp_path / "c.gsmap")
 
 
@@ -344,7 +345,7 @@ def test_a_clone_on_a_disk_without_links(site, tmp_path, monkeypatch):
         data = bytearray(broken.read_bytes())
         data[-1] ^= 1
         broken.write_bytes(data)
-        with pytest.raises(CorruptError, match="differs"):
+        with raises(CorruptError, code="map_damaged"):
             clone(store, tmp_path / "c2")
     assert not (tmp_path / "c2").exists()
     with Store.open(tmp_path / "c") as store:
@@ -372,6 +373,6 @@ def test_a_disk_that_fails_when_all_is_in_place(site, place, tmp_path, monkeypat
         whole(folder)
 
     monkeypatch.setattr(restoring_module, "sync_folder", fail)
-    with pytest.raises(DiskError, match="in place and whole"):
+    with raises(DiskError, code="disk_failed"):
         restore(place, tmp_path / "r")
     assert holdings(tmp_path / "r") == holdings(site)

@@ -6,6 +6,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
+from raising import raises
 from sqlalchemy import delete, select
 from store_samples import key, make_cameras, make_gaussians
 
@@ -129,7 +130,7 @@ def test_prune_gives_the_room_of_dropped_revisions_back(store):
     same(store.revisions.get(), last)
     for number in (58, 59, 60):
         assert store.revisions.get(number).poses
-    with pytest.raises(NotFoundError, match="revision 57 was dropped"):
+    with raises(NotFoundError, code="revision_dropped"):
         store.revisions.get(57)
     for old, now in zip(lines, store.revisions.list(), strict=True):
         assert replace(now, dropped_at=None) == old
@@ -320,7 +321,7 @@ def test_brief_scenes_and_what_graphs_say_are_what_lists_have(store):
     assert [scene.id for scene in store.scenes.list(among=some)] == some
     with store.catalog.write() as connection:
         connection.execute(graphs.update().where(graphs.c.scene == some[0]).values(about={"up": [1, "x", 0]}))
-    with Store.open(store.folder, "r") as other, pytest.raises(CorruptError, match=r"graphs\.about"):
+    with Store.open(store.folder, "r") as other, raises(CorruptError, code="catalog_invalid"):
         other.graphs.says()
 
 

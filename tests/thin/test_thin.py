@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from raising import raises
 from synthetic_walls import cameras_facing, wall
 
 from gsmap.errors import ConfigError
@@ -81,5 +82,5 @@ def test_with_made_up_cameras_all_stays(older):
 
 
 def test_settings_that_cannot_be():
-    with pytest.raises(ConfigError, match="min_seen_again"):
+    with raises(ConfigError, code="out_of_range", match="min_seen_again"):
         Params(min_seen_again=2)

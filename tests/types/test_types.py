@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from raising import raises
 from scipy.spatial.transform import Rotation
 
 from gsmap import Cameras, Gaussians, Registration, Sim3
@@ -64,9 +65,9 @@ def test_gaussians_concatenate_pads_sh() -> None:
 
 
 def test_gaussians_refuse_shapes_that_do_not_fit() -> None:
-    with pytest.raises(InputError, match=r"sh must have shape \(2, K, 3\)"):
+    with raises(InputError, code="shape_mismatch"):
         Gaussians(np.zeros((2, 3)), np.ones((2, 4)), np.zeros((2, 3)), np.zeros(2), np.ones((2, 5, 3)))
-    with pytest.raises(InputError, match=r"quats must have shape \(2, 4\)"):
+    with raises(InputError, code="shape_mismatch"):
         Gaussians(np.zeros((2, 3)), np.ones((3, 4)), np.zeros((2, 3)), np.zeros(2), np.ones((2, 1, 3)))
 
 
@@ -94,15 +95,15 @@ def test_cameras_name_the_one_that_is_wrong() -> None:
     c = cameras()
     pose = c.T_frame_camera.copy()
     pose[1, 0, 3] = np.nan
-    with pytest.raises(InputError, match="camera 1 holds NaN"):
+    with raises(InputError, code="not_finite"):
         Cameras(pose, c.intrinsics_px, c.sizes_px)
     pose = c.T_frame_camera.copy()
     pose[2, :3, :3] *= 2
-    with pytest.raises(InputError, match="camera 2 has a pose that is not a rigid"):
+    with raises(InputError, code="invalid_camera"):
         Cameras(pose, c.intrinsics_px, c.sizes_px)
 
 
 def test_an_accepted_registration_has_a_pose() -> None:
-    with pytest.raises(InputError, match="needs a pose"):
+    with raises(InputError, code="invalid_registration"):
         Registration("a", "b", "accepted")
     assert Registration("a", "b", "no_match", "no overlap").S_target_source is None

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from raising import raises
 
 from gsmap.errors import InputError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -43,5 +44,5 @@ def test_draws_scenes_walks_and_ties(parts):
 
 
 def test_needs_a_scene():
-    with pytest.raises(InputError, match="at least one"):
+    with raises(InputError, code="nothing_to_draw"):
         map_picture([])

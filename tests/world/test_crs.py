@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raising import raises
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.types.world import WorldFrame
@@ -56,16 +57,16 @@ def test_the_way_to_the_globe() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "code"),
     [
-        ("EPSG:999999", "no coordinate reference system"),
-        ("WGS84 UTM 32N", "no coordinate reference system"),
-        ("EPSG:5773", "no system of places"),
-        ("", "EPSG:N"),
+        ("EPSG:999999", "invalid_crs"),
+        ("WGS84 UTM 32N", "invalid_crs"),
+        ("EPSG:5773", "unsupported_crs"),
+        ("", "invalid_crs"),
     ],
 )
-def test_unknown_systems_are_refused(text: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_unknown_systems_are_refused(text: str, code: str) -> None:
+    with raises(ConfigError, code=code):
         crs(text)
 
 
@@ -123,7 +124,7 @@ def test_a_geoid_that_several_grids_lead_to_is_named(text: str) -> None:
     system = crs(text)
     assert "above the geoid" in system.heights
     assert ("US survey feet" in system.heights) == text.endswith("6360")
-    with pytest.raises(ConfigError, match=r"needs the grid us_noaa_\w+\.tif"):
+    with raises(ConfigError, code="grid_missing"):
         system.to_geodetic(np.array([[775000.0, 2956000.0, 100.0]]))
 
 
@@ -131,21 +132,21 @@ def test_a_height_system_without_its_grid_is_refused() -> None:
     """PROJ would else give heights that are off by tens of metres, and say nothing."""
     system = crs("EPSG:25832+7837")
     assert system.has_own_heights
-    with pytest.raises(ConfigError, match="needs the grid"):
+    with raises(ConfigError, code="grid_missing"):
         system.to_geodetic(UTM)
 
 
 def test_points_outside_the_area_are_refused() -> None:
     names = ["P1", "P2", "P3"]
     crs("EPSG:25832").check_area(UTM, names, 2.0)
-    with pytest.raises(InputError, match=r"P1 lies at .* axes swapped"):
+    with raises(InputError, code="outside_crs"):
         crs("EPSG:25832").check_area(UTM[:, [1, 0, 2]], names, 2.0)
-    with pytest.raises(InputError, match="P1"):  # Sydney, in a zone of the north
+    with raises(InputError, code="outside_crs"):  # Sydney, in a zone of the north
         crs("EPSG:4258").check_area(np.array([[151.2, -33.9, 10.0]]), ["P1"], 2.0)
 
 
 def test_nonsense_coordinates_are_refused() -> None:
-    with pytest.raises(InputError, match="no place"):
+    with raises(InputError, code="outside_crs"):
         crs("EPSG:4326").check_area(np.array([[11.0, 948.0, 0.0]]), ["P"], 2.0) if False else crs(WGS84).of_geodetic(
             np.array([[11.0, 48.0, np.inf]])
         )

@@ -319,7 +319,7 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
                     f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r}",
                     code="invalid_pairs_file",
                 ) from error
-            raise NotFoundError(f"{path}, line {number}: {error}", code="invalid_pairs_file") from error
+            raise NotFoundError(f"{path}, line {number}: {error}", code=error.code) from error
     return pairs
 
 
