@@ -60,13 +60,13 @@ def compare(
     upright = _upright(up)
     if upright is not None:
         older, newer = (_rotated(scene, upright) for scene in (older, newer))
-    report(0.0, "looking at the older capture")
+    report(0.0, "rendering the older capture")
     views_older = comparison.render_views(older, longest_side_px=params.longest_side_px, max_views=params.max_views)
-    report(0.15, "looking at the newer capture")
+    report(0.15, "rendering the newer capture")
     views_newer = comparison.render_views(newer, longest_side_px=params.longest_side_px, max_views=params.max_views)
-    report(0.3, "comparing what both show")
+    report(0.3, "comparing both captures")
     found = comparison.compare(views_older, views_newer)
-    report(0.7, "finding what changed")
+    report(0.7, "detecting changes")
     both = compare_surfaces(views_older, views_newer, found)
     cells = classify_cells(both)
     unlike = lighting_spread(both)
@@ -87,9 +87,9 @@ def _notes(older: PlacedScene, newer: PlacedScene, seen: float) -> tuple[str, ..
     notes = []
     for when, scene in (("older", older), ("newer", newer)):
         if scene.cameras is None or not len(scene.cameras):
-            notes.append(f"the {when} capture has no cameras: nobody knows what it looked at, so little can be said")
+            notes.append(f"the {when} capture has no cameras, so free space is unknown and few changes can be detected")
     if seen < _LITTLE and not notes:
-        notes.append(f"the newer capture looked at only {100 * seen:.0f} % of what the older one shows")
+        notes.append(f"the newer capture observed only {100 * seen:.0f} % of the older one's surface")
     return tuple(notes)
 
 

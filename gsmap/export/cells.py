@@ -177,8 +177,8 @@ class Grid:
         low, high = boxes.around
         spans = " x ".join(f"{side:.6g}" for side in high - low)
         return ConfigError(
-            f"tiles of {self.edge:.6g} (map unit) would be more than {self.most} over {spans}: use larger tiles or a "
-            "box, or set export.max_tiles",
+            f"tiles of {self.edge:.6g} (map unit) would number more than {self.most} over {spans}: use larger "
+            "tiles or a box, or increase export.max_tiles",
             code="too_many_tiles",
         )
 

@@ -102,9 +102,7 @@ class Manifest:
             )
         notes: tuple[str, ...] = ()
         if version == _NAMELESS and entries:
-            notes = (
-                f"{path} has version {version}, which does not say what made its tiles: all of them are made again",
-            )
+            notes = (f"{path} has version {version}, which has no recipes of tiles: all of them are made again",)
         return cls(
             map_id,
             {(tile.component, name): tile for name, tile, _ in entries},

@@ -96,7 +96,7 @@ def plan_tiles(
         )
     if not poses:
         raise InputError(
-            "nothing to export: no scene has a place in the map yet; run optimize first", code="nothing_to_export"
+            "nothing to export: no scene has a pose yet; run gsmap optimize first", code="nothing_to_export"
         )
     bbox = None if bbox is None else _checked_box(bbox)
     components = components or dict.fromkeys(poses, 0)
@@ -132,8 +132,8 @@ def _require_near(component: int, box: np.ndarray, metres_per_unit: float) -> No
     if offset.any() and rounded_m > _MAX_ROUNDED_M:
         at = ", ".join(f"{value:.15g}" for value in offset)
         raise InputError(
-            f"component {component} lies near ({at}), where single precision rounds by {rounded_m:.2g} m: take ({at}) "
-            "off the positions of its priors (gsmap prior), or tie it to the world instead (gsmap georeference)",
+            f"component {component} lies near ({at}), where single precision rounds by {rounded_m:.2g} m: subtract "
+            f"({at}) from the positions of its priors (gsmap prior), or georeference it instead (gsmap georeference)",
             code="precision_loss",
         )
 
@@ -172,7 +172,8 @@ def _checked_box(bbox: np.ndarray) -> np.ndarray:
     bbox = np.asarray(bbox, dtype=np.float64)
     if bbox.shape != (2, 3) or not np.isfinite(bbox).all() or not (bbox[1] > bbox[0]).all():
         raise InputError(
-            f"a box needs x0 y0 z0 below x1 y1 z1 on every axis, got {_text(bbox)}: it is empty", code="invalid_box"
+            f"a box needs x0 y0 z0 below x1 y1 z1 on every axis, got {_text(bbox)}: the box is empty",
+            code="invalid_box",
         )
     return bbox
 

@@ -58,13 +58,13 @@ class TileRecipe:
             raise ConfigError(f"cannot write {self.format!r}: choose one of {known}", code="unsupported_output")
         if self.provenance and self.format != "ply":
             raise ConfigError(
-                f"provenance is a property of .ply files, the format asked for is {self.format}",
+                f"provenance is only available in .ply, not in {self.format}",
                 code="unsupported_output",
             )
 
         if self.uncompressed and self.format != _TILES_3D:
             raise ConfigError(
-                f"uncompressed is of {_TILES_3D} alone, the format asked for is {self.format}",
+                f"uncompressed is only available in {_TILES_3D}, not in {self.format}",
                 code="unsupported_output",
             )
 

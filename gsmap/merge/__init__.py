@@ -128,7 +128,7 @@ def with_steps(method: str, params: Any, steps: int) -> Any:
     if name is None:
         takes = [other for other in methods() if merger(other).STEPS is not None]
         raise ConfigError(
-            f"merge method {method!r} takes no steps: leave --steps out, or use {' or '.join(takes)}",
+            f"merge method {method!r} does not support --steps: leave it out, or use {' or '.join(takes)}",
             code="option_not_applicable",
         )
     if steps < 0:
@@ -152,7 +152,7 @@ def with_prefer(method: str, params: Any, prefer: str) -> Any:
         return replace(params, prefer=prefer)
     takes = [other for other in methods() if hasattr(merger(other).Params(), "prefer")]
     raise ConfigError(
-        f"merge method {method!r} prefers nobody: leave --prefer out, or use {' or '.join(takes)}",
+        f"merge method {method!r} does not support --prefer: leave it out, or use {' or '.join(takes)}",
         code="option_not_applicable",
     )
 

@@ -90,7 +90,7 @@ class ResolvedScenes:
     def notes(self) -> list[str]:
         """Return notes on removed Gaussians."""
         return [
-            f"{n} Gaussians of scene {s.scene_id[:12]} are overruled where the place changed"
+            f"{n} outdated Gaussians of scene {s.scene_id[:12]} are removed where the place changed"
             for s, n in zip(self.scenes, self.lost, strict=True)
             if n
         ]

@@ -85,7 +85,7 @@ class ReferenceView:
             parts.append(np.frombuffer(content, kind, math.prod(shape), at).reshape(shape))
             at += parts[-1].nbytes
         if at != len(content):
-            raise ValueError(f"{path} is not whole")
+            raise ValueError(f"{path} is truncated")
         return cls(*parts)
 
 

@@ -103,7 +103,7 @@ def render_references(
         key=lambda one: (one[0], () if (shared := reference_views[one[0]]) is None else shared.cell(one[1]), one[1])
     )
     for done, (i, c, camera) in enumerate(todo):
-        progress(done / len(todo), "rendering the captures")
+        progress(done / len(todo), "rendering reference views")
         disputed = None
         if (shared := reference_views[i]) is not None:
             sight = shared.of(c)

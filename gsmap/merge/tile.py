@@ -92,8 +92,8 @@ def _undated(placed: Sequence[PlacedScene]) -> list[str]:
     if not count:
         return []
     return [
-        f"{count} of {len(meeting)} captures have no date: which one is newer is not known "
-        "(gsmap edit MAP SCENE --captured-at DATE tells)"
+        f"{count} of {len(meeting)} captures have no date, so their order is unknown; "
+        "set it by gsmap edit MAP SCENE --captured-at DATE"
     ]
 
 

@@ -107,7 +107,7 @@ def make_objects(
         for group, at in kept
     ]
     for c, capture in enumerate(captures):
-        progress(c / max(len(captures), 1), f"looking for {len(kept)} objects in capture {c + 1} of {len(captures)}")
+        progress(c / max(len(captures), 1), f"looking up {len(kept)} objects in scene {c + 1} of {len(captures)}")
         # Scene that provides the expected place of each object: the nearest in time.
         of = [min((o for o in at if o != c), key=lambda o: (abs(o - c), o), default=c) for _, at in kept]
         points = [places[o][0] for (_, places), o in zip(kept, of, strict=True)]

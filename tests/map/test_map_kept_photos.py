@@ -94,7 +94,7 @@ def export(m: Map, out: Path, **options) -> ExportReport:
 
 
 def reproduced(report: ExportReport) -> int:
-    notes = [note for tile in report.tiles for note in tile.notes if "reproduced as well" in note]
+    notes = [note for tile in report.tiles for note in tile.notes if "as reference views" in note]
     return sum(int(note.split()[0]) for note in notes)
 
 

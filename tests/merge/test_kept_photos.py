@@ -109,7 +109,7 @@ def test_the_merged_map_is_nearer_to_what_no_capture_showed_so_sharply():
         replace(b, photos=tuple(map(photo_at, xs[2:]))),
     ]
     plain, fitted = (merge(scenes, "tto", params) for scenes in ([a, b], with_photos))
-    assert fitted.notes == ("4 photographs were reproduced as well",)
+    assert fitted.notes == ("4 photos were used as reference views",)
     between = (-0.55, 0.0, 0.55)  # where no photo was taken
     assert error(fitted.gaussians, between) < 0.6 * error(plain.gaussians, between)
     without = replace(params, photo_weight=0.0)
@@ -164,7 +164,7 @@ def test_a_tile_reads_what_is_around_a_photograph_in_its_scenes_own_frame():
     placed = merge([replace(a, photos=(photo_at(-0.5),)), b], "tto", params, bounds=bounds)
     photo = moved(photo_at(-0.5), S)
     read = merge_tile([lazy(a, S, asked, photo), lazy(b, S, [])], "tto", params, bounds=bounds)
-    assert "1 photograph was reproduced as well" in read.notes
+    assert "1 photo was used as reference views" in read.notes
     assert error(read.gaussians, [-0.5]) == pytest.approx(error(placed.gaussians, [-0.5]), rel=0.1)
     bare = merge([a, b], "tto", params, bounds=bounds)
     assert error(placed.gaussians, [-0.5]) < 0.9 * error(bare.gaussians, [-0.5])
@@ -180,7 +180,7 @@ def test_how_well_a_photograph_is_known_in_the_unit_of_its_scene():
         S = Sim3(np.eye(3), np.zeros(3), scale)
         photo = moved(replace(photo_at(-0.5), sigma_m=sigma), S)
         notes = merge_tile([lazy(a, S, [], photo), lazy(b, S, [])], "tto", params).notes
-        assert ("1 photograph was reproduced as well" in notes) == taken
+        assert ("1 photo was used as reference views" in notes) == taken
 
 
 def test_of_too_many_photographs_those_that_show_most_are_reproduced(monkeypatch):
@@ -200,5 +200,5 @@ def test_what_is_around_photographs_that_stand_together_is_read_once():
     bounds = np.array([[-1.5, -2, -2], [0.5, 2, 2]])
     merge_tile([lazy(a, S, without), lazy(b, S, [])], "tto", params, bounds=bounds)
     notes = merge_tile([lazy(a, S, with_photos, *kept), lazy(b, S, [])], "tto", params, bounds=bounds).notes
-    assert "3 photographs were reproduced as well" in notes
+    assert "3 photos were used as reference views" in notes
     assert len(with_photos) - len(without) == 1

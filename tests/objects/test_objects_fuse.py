@@ -3,10 +3,16 @@
 import numpy as np
 import pytest
 
-from gsmap.objects import PlacedSegments, fuse
+from gsmap.objects import Params, PlacedSegments, fuse, recipe_key
 
 SIZE = np.array([0.6, 0.5, 0.8])
 GREY, RED = np.array([50.0, 0, 0]), np.array([50.0, 40, 20])
+
+
+def test_every_setting_is_in_the_recipe():
+    others = {"min_gaussians": 9, "min_overlap": 0.9, "max_views": 3, "longest_side_px": 64, "min_room_area_m2": 9.0}
+    for name, value in others.items():
+        assert recipe_key(Params(**{name: value})).recipe != recipe_key().recipe
 
 
 def surface(low, seed=0, size=SIZE) -> np.ndarray:

@@ -175,7 +175,7 @@ def merge(
         scenes, wanted, settled, replace(params, kept_fraction=1.0) if alone else params, bounds
     )
     if len(wanted) == 0 or not inside(start.means, bounds).any():
-        notes.append("nothing to optimise: no camera sees it")
+        notes.append("nothing to optimize: no camera observes the tile")
         return MergeResult(start, origin, notes=tuple(notes))
     if alone and not wanted.num_photos:
         mine = inside(start.means, bounds)
@@ -186,7 +186,7 @@ def merge(
     frozen = ~inside(start.means, bounds, params.halo_m / 2) | new
     if wanted.num_photos:
         many = wanted.num_photos > 1
-        notes.append(f"{wanted.num_photos} photograph{'s were' if many else ' was'} reproduced as well")
+        notes.append(f"{wanted.num_photos} photo{'s were' if many else ' was'} used as reference views")
     fitted, steps, truncated = with_enough_memory(
         lambda backend: _fit(start, frozen, wanted, params, deadline, progress, backend)
     )
@@ -271,7 +271,7 @@ def _fit(
         fitter.learning_rates = _rates(step / steps, size_m)
         losses.append(fitter.step(cameras[view], pictures[view], weights[view]))
         if step % 20 == 0:
-            progress(0.2 + 0.8 * step / steps, f"optimising, loss {_mean(losses[-20:]):.4f}")
+            progress(0.2 + 0.8 * step / steps, f"optimizing, loss {_mean(losses[-20:]):.4f}")
         if params.steps is None and step > _SURE_FRACTION * steps and _has_converged(losses, one_pass):
             break
     return fitter.gaussians(), len(losses), False
