@@ -141,7 +141,7 @@ def describe(
         )
         notes += remarks
     if len(cloud) and not any(len(layer) >= _FEW_NODES for layer in layers.values()):
-        notes.append(f"fewer than {_FEW_NODES} nodes in every layer: little colour or shape to hold on to")
+        notes.append(f"fewer than {_FEW_NODES} nodes in every layer: too little colour or shape for registration")
     found = None
     if params.things:
         progress(0.95, "things")

@@ -43,7 +43,7 @@ def embed_query_picture(
     embedder = method.make(SceneContext(nothing, 0, None, 1.0, limited), chosen.params.embedders[name])
     if not hasattr(embedder, "embed_picture"):
         raise ConfigError(
-            f"embedder {name} describes parts of captures alone: show one with --like SCENE:NODE",
+            f"embedder {name} cannot embed a picture file: query with --like SCENE:NODE",
             code="option_not_applicable",
         )
     vector, valid = embedder.embed_picture(rgb)
@@ -61,9 +61,9 @@ def embed_query_text(text: str, params: Params, models: Mapping[str, ModelSpec])
     method = family("embedder").get(name)
     if not hasattr(method, "embed_text"):
         raise ConfigError(
-            f"the embedder {name} knows no words: add an image encoder with a text tower (gsmap models add MAP clip "
-            "IMAGE.onnx, then clip-text TEXT.onnx and clip-tokenizer tokenizer.json) and run gsmap update; or show a "
-            "thing: --picture FILE, --like SCENE:NODE, --at X,Y,Z",
+            f"the embedder {name} has no text tower: add an image encoder with one (gsmap models add MAP clip "
+            "IMAGE.onnx, then clip-text TEXT.onnx and clip-tokenizer tokenizer.json) and run gsmap update; or query "
+            "by --picture FILE, --like SCENE:NODE or --at X,Y,Z",
             code="model_required",
         )
     limited = {kind: replace(model, limits=params.limits) for kind, model in models.items()}
@@ -79,6 +79,7 @@ def _picture(path: Path) -> np.ndarray:
         rgb = np.asarray(picture)
     if min(rgb.shape[:2]) < _MIN_PX:
         raise InputError(
-            f"{path} has {rgb.shape[1]} x {rgb.shape[0]} pixels: too few to show a thing", code="picture_too_small"
+            f"{path} has {rgb.shape[1]} x {rgb.shape[0]} pixels: pass a picture of at least {_MIN_PX} x {_MIN_PX}",
+            code="picture_too_small",
         )
     return rgb

@@ -156,7 +156,7 @@ class Pool:
                 false_starts += 1
                 if false_starts > _MAX_FALSE_STARTS:
                     raise GsmapError(
-                        f"worker processes end before they do anything: {died}", code="workers_die"
+                        f"worker processes end before their first job: {died}", code="workers_die"
                     ) from died
                 (again if task.losses else ahead).appendleft(task)
                 return False

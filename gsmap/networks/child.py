@@ -142,7 +142,7 @@ def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
         try:
             results = session.run(request["outputs"], dict(zip(request["names"], arrays, strict=True)))
             if not all(isinstance(value, np.ndarray) and value.dtype.kind in "biufc" for value in results):
-                raise TypeError("it gives something else than arrays of numbers")
+                raise TypeError("an output is not an array of numbers")
             channel.send({}, results)
             del results, arrays
         except BaseException as error:

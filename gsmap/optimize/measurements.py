@@ -99,7 +99,7 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
                     f"edge {_name(edge)} names scene {scene!r}, which is not in the map", code="unknown_scene"
                 )
         if edge.target == edge.source:
-            raise InputError(f"edge {_name(edge)} ties a scene to itself: remove it", code="self_edge")
+            raise InputError(f"edge {_name(edge)} connects a scene to itself: remove it", code="self_edge")
         if (edge.target, edge.source) in seen:
             raise InputError(
                 f"edge {_name(edge)} is given twice: pass one measurement for a target and source", code="duplicate"

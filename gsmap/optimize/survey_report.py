@@ -75,11 +75,11 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
     notes = []
     if factor_of > 1:
         notes.append(
-            f"observations and edges disagree by {np.sqrt(factor_of):.2g} times what they claim: the covariance "
-            "is widened by that"
+            f"observations and edges disagree by {np.sqrt(factor_of):.2g} times their stated errors: the "
+            "covariance is scaled accordingly"
         )
     if sum(float(tests.redundancies[kind].sum()) for kind in (0, 2, 3)) < _MIN_CHECKS:
-        notes.append("hardly anything checks these observations: a blunder in one of them could not be determined")
+        notes.append("these observations hardly check each other: a blunder in one of them could not be detected")
     world = x.world.item(0)
     return WorldTie(
         index,

@@ -67,7 +67,7 @@ def render(
     if isinstance(gaussians, Gaussians):
         if T_camera_frame is not None:
             raise InputError(
-                "T_camera_frame goes with GaussianTensors; for numpy, put the pose into the cameras",
+                "T_camera_frame needs GaussianTensors; for numpy Gaussians, set the pose of the cameras",
                 code="invalid_pose",
             )
         images = native.allocate(len(cameras), height, width, len(gaussians), depth, dominant_id, max_weight)

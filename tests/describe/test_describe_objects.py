@@ -234,7 +234,7 @@ def test_cameras_inside_walls_are_noted():
     poses[:4, :3, 3] = [0.0, 2.5, 1.2]
     poses[:4, :3, :3] = np.stack([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], 1)  # in the wall, looking out of the room
     graph = describe("walled", gaussians, Cameras(poses, cameras.intrinsics_px, cameras.sizes_px), OBJECTS)
-    assert any("stand inside something" in note for note in graph.notes)
+    assert any("are inside an object" in note for note in graph.notes)
 
 
 def test_no_cameras_no_objects_but_a_note():

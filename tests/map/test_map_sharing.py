@@ -164,4 +164,4 @@ def test_a_script_without_its_guard_ends_and_says_so(site: Path, tmp_path: Path)
     )
     assert ended.returncode == 1
     assert 'put what the script does below `if __name__ == "__main__":`' in ended.stderr
-    assert "worker processes end before they do anything" in ended.stderr
+    assert "worker processes end before their first job" in ended.stderr

@@ -46,7 +46,7 @@ def probe(spec: ModelSpec) -> None:
     if len(spec.inputs) != 1 or not spec.inputs[0].is_image or len(spec.inputs[0].shape) != 4:
         raise misfit(spec, "an image encoder takes one input of shape (N, 3, H, W) or (N, H, W, 3)")
     if not spec.outputs:
-        raise misfit(spec, "it gives nothing")
+        raise misfit(spec, "it has no outputs")
     ClipEmbedder(spec)
 
 
@@ -102,7 +102,7 @@ class ClipEmbedder:
                 value = value.mean((2, 3)) if value.shape[1] >= value.shape[3] else value.mean((1, 2))
             if value.ndim != 2 or len(value) < used:
                 raise InputError(
-                    f"model {self.spec.kind} ({self.spec.path}) gives {list(value.shape)} for {used} pictures",
+                    f"model {self.spec.kind} ({self.spec.path}) returns shape {list(value.shape)} for {used} pictures",
                     code="model_misfit",
                 )
             out.append(value[:used])

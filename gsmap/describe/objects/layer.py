@@ -203,7 +203,7 @@ def object_layer(
     nodes = [n for n in nodes if len(n.views) >= enough]
     notes = list(chosen.fallbacks)
     if blocked:
-        notes.append(f"{blocked} of {len(sampled)} sampled cameras see nothing or stand inside something; left out")
+        notes.append(f"{blocked} of {len(sampled)} sampled cameras see nothing or are inside an object; left out")
     return _layer(nodes, level, unit_m, descriptor), notes
 
 

@@ -38,13 +38,13 @@ def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
         files = {TEXT: "TEXT.onnx", TOKENIZER: "tokenizer.json"}
         verbs = " and ".join(f"gsmap models add MAP {kind} {files[kind]}" for kind in missing)
         raise ConfigError(
-            f"words are looked for by the text tower of the map's image encoder, which the map lacks: {verbs}; or show "
-            "a thing: --picture FILE, --like SCENE:NODE, --at X,Y,Z",
+            f"a text query needs the text tower of the map's image encoder, which the map lacks: {verbs}; or query by "
+            "--picture FILE, --like SCENE:NODE or --at X,Y,Z",
             code="model_required",
         )
     if len(text) > _MAX_CHARACTERS:
         raise InputError(
-            f"{len(text)} characters are more than a text tower reads: use a few words", code="invalid_query"
+            f"the query has {len(text)} characters, more than {_MAX_CHARACTERS}: use a few words", code="invalid_query"
         )
     spec = models[TEXT]
     fixed = _ids_of(spec).shape[1]
@@ -53,7 +53,8 @@ def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
     norm = float(np.linalg.norm(found))
     if not np.isfinite(norm) or norm <= 0:
         raise InputError(
-            f"model {TEXT} ({spec.path}) says nothing of {text!r}: its vector has no direction", code="invalid_query"
+            f"model {TEXT} ({spec.path}) returns a zero or infinite vector for {text!r}: use other words",
+            code="invalid_query",
         )
     return (found / norm).astype(np.float32)
 
@@ -65,9 +66,9 @@ def probe_text(spec: ModelSpec) -> None:
         InputError: its inputs and outputs do not fit, or it does not run.
     """
     if any(len(tensor.shape) == _IMAGE_DIMS for tensor in spec.inputs):
-        raise misfit(spec, "it takes pictures as well: export the text tower by itself")
+        raise misfit(spec, "it also takes images: export the text tower by itself")
     if not spec.outputs:
-        raise misfit(spec, "it gives nothing")
+        raise misfit(spec, "it has no outputs")
     length = _ids_of(spec).shape[1] or _CONTEXT
     ids = np.zeros((1, length), np.int64)
     _run(spec, ids, np.ones_like(ids))
@@ -82,7 +83,7 @@ def check_tokenizer(path: Path) -> ModelSpec:
     """
     if path.stat().st_size > _MAX_BYTES:
         raise InputError(
-            f"{path} is larger than any tokenizer: give the tokenizer.json of the model pack", code="invalid_tokenizer"
+            f"{path} is too large for a tokenizer: pass the tokenizer.json of the model pack", code="invalid_tokenizer"
         )
     _tokenizer(path)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -109,7 +110,7 @@ def _tokens(text: str, spec: ModelSpec, length: int, *, pad: bool) -> tuple[np.n
     tokenizer.enable_truncation(max_length=length)
     ids = list(tokenizer.encode(text).ids)
     if not ids:
-        raise InputError(f"the tokenizer {path} makes nothing of {text!r}", code="invalid_query")
+        raise InputError(f"the tokenizer {path} returns no tokens for {text!r}: use other words", code="invalid_query")
     empty = int(own["pad_id"]) if own else ids[-1]
     rest = length - len(ids) if pad else 0
     found = np.array([ids + [empty] * rest], np.int64)
@@ -120,9 +121,7 @@ def _tokenizer(path: Path) -> Any:
     try:
         from tokenizers import Tokenizer
     except ImportError as error:
-        raise MissingDependencyError(
-            "words are read by tokenizers, which is not installed: pip install 'gsmap[text]'"
-        ) from error
+        raise MissingDependencyError("text queries need the package tokenizers: pip install 'gsmap[text]'") from error
     try:
         return Tokenizer.from_file(str(path))
     except Exception as error:  # it raises plain exceptions, whatever is wrong
@@ -157,5 +156,5 @@ def _run(spec: ModelSpec, ids: np.ndarray, mask: np.ndarray) -> np.ndarray:
     output = (named or flat or [spec.outputs[0].name])[0]
     found = np.asarray(run(spec, open_session(spec), [output], feed)[0], np.float32)
     if found.ndim != 2 or not found.shape[1]:
-        raise misfit(spec, f"its output {output} has shape {list(found.shape)}: one vector a text is needed")
+        raise misfit(spec, f"its output {output} has shape {list(found.shape)}: one vector per text is needed")
     return found[0]

@@ -116,7 +116,7 @@ class DaskWorkers:
                 self._client = Client(self._address, timeout=self._params.timeout_s, set_as_default=False, name="gsmap")
             except (OSError, ValueError, TimeoutError) as error:
                 raise GsmapError(
-                    f"no Dask scheduler answers at {self._address} ({error}): is it running?",
+                    f"cannot connect to the Dask scheduler at {self._address}: {error}",
                     code="scheduler_unreachable",
                 ) from error
         return self._client
