@@ -266,6 +266,7 @@ def test_recipes_change_with_parameters_and_name_what_is_comparable():
     assert other.settings["landmark"] == base.settings["landmark"]
     assert other.settings["object"] != base.settings["object"]
     assert other.digest != base.digest
+    assert recipe_key(Params(view_distance_m=3.4)).digest != base.digest
     graph = describe("x", *room(n=3000), OBJECTS)
     assert graph.layers["objects"].descriptor_id == descriptor_id(OBJECTS.object, {})
 

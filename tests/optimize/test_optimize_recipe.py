@@ -35,7 +35,16 @@ def test_the_key_names_versions_and_the_solver(monkeypatch):
 
 @pytest.mark.parametrize(
     "values",
-    [{"min_wrong_probability": 1.5}, {"min_bridge_edges": 0}, {"max_unchanged_sigmas": -1.0}, {"max_tilt_deg": -1.0}],
+    [
+        {"min_wrong_probability": 1.5},
+        {"min_bridge_edges": 0},
+        {"max_unchanged_sigmas": -1.0},
+        {"max_tilt_deg": -1.0},
+        {"min_large_component": 0},
+        {"max_disagreement": 1.0},
+        {"same_visit_h": -1.0},
+        {"max_growth": -0.1},
+    ],
 )
 def test_odd_settings_are_refused(values):
     with pytest.raises(ConfigError):
