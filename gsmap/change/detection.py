@@ -17,7 +17,7 @@ from gsmap.errors import InputError
 from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.methods import RecipeKey
-from gsmap.types import PlacedScene, Sim3
+from gsmap.types import PosedScene, Sim3
 from gsmap.types.change import Change, ChangeReport
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
@@ -33,8 +33,8 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
 
 
 def compare(
-    older: PlacedScene,
-    newer: PlacedScene,
+    older: PosedScene,
+    newer: PosedScene,
     params: Params | None = None,
     progress: Progress | None = None,
     *,
@@ -83,7 +83,7 @@ def compare(
     return ChangeReport(tuple(changes), seen, found.balance.gains(), _notes(older, newer, seen))
 
 
-def _notes(older: PlacedScene, newer: PlacedScene, seen: float) -> tuple[str, ...]:
+def _notes(older: PosedScene, newer: PosedScene, seen: float) -> tuple[str, ...]:
     notes = []
     for when, scene in (("older", older), ("newer", newer)):
         if scene.cameras is None or not len(scene.cameras):
@@ -114,7 +114,7 @@ def _upright(up: np.ndarray | None) -> Sim3 | None:
     return Sim3(np.stack([x, np.cross(z, x), z]), np.zeros(3))
 
 
-def _rotated(scene: PlacedScene, S: Sim3) -> PlacedScene:
+def _rotated(scene: PosedScene, S: Sim3) -> PosedScene:
     cameras = None if scene.cameras is None else transform_cameras(scene.cameras, S)
     return replace(scene, gaussians=transform_gaussians(scene.gaussians, S), cameras=cameras)
 

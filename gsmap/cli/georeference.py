@@ -70,7 +70,7 @@ def command(
     Example: `gsmap georeference site.gsmap --crs EPSG:25832 --gcp gcp_list.txt --check P4,P7`
     """
     from gsmap.errors import ConfigError
-    from gsmap.map.placed_photos import localiser
+    from gsmap.map.photo_poses import photo_localizer
     from gsmap.map.stages.georeference import Request
 
     said = any(one is not None for one in (crs, gcp, exif, scale_bar, check))
@@ -101,7 +101,7 @@ def command(
     if photos is not None and gcp is None:
         raise ConfigError("--photos goes with --gcp", code="conflicting_options")
     with opened(map, bars=True, sets=sets) as m:
-        localise = None if photos is None else localiser(m.store, m.localize, photos)
+        localise = None if photos is None else photo_localizer(m.store, m.localize, photos)
         taken_back = tuple(name or ()) if remove else None
         report = m.georeference(request if said else None, remove=taken_back, localise=localise)
     for note in report.notes:
@@ -113,7 +113,7 @@ def command(
 
 
 def _print(map: str, report: WorldReport) -> None:
-    from gsmap.types.rows import ResidualRow, TieRow
+    from gsmap.types.rows import GeoreferenceRow, ResidualRow
 
     origin = None
     if report.origin is not None:
@@ -128,7 +128,7 @@ def _print(map: str, report: WorldReport) -> None:
     }
     print_facts("world", facts)
     for tie in report.components:
-        print_table(f"component {tie.component}", TieRow.columns, [tie])
+        print_table(f"component {tie.component}", GeoreferenceRow.columns, [tie])
         print_table("residuals", ResidualRow.columns, tie.residuals)
         for note in tie.notes:
             say(f"component {tie.component}: {note}")

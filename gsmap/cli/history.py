@@ -29,7 +29,7 @@ def command(
 
     Example: `gsmap history site.gsmap 1.5,0.2,0.8`
     """
-    from gsmap.types.rows import ObjectFactRow, ObjectRow, SightingRow
+    from gsmap.types.rows import ObjectFactRow, ObjectObservationRow, ObjectRow
 
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         report = m.history(place, box=box)
@@ -39,6 +39,6 @@ def command(
         print_rows("history", report, json)
         return
     print_table("objects", ObjectRow.columns, report.objects)
-    print_table("sightings", SightingRow.columns, report.sightings)
+    print_table("sightings", ObjectObservationRow.columns, report.sightings)
     if report.words:
         print_table("words", ObjectFactRow.columns, report.words)

@@ -52,7 +52,7 @@ def command(
 
     Example: `gsmap list site.gsmap edges --status accepted --json`
     """
-    from gsmap.map.dates import undated_note
+    from gsmap.map.date_filter import undated_note
 
     with opened(map) as m:
         rows = _rows(m, what, component, status, after, tag, as_of)

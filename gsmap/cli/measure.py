@@ -28,7 +28,7 @@ def command(
 
     Example: `gsmap measure site.gsmap monday:1.2,0.4,2.0 monday:0007.jpg@812,410`
     """
-    from gsmap.types.rows import PlaceRow
+    from gsmap.types.rows import PointRow
 
     with opened(map) as m:
         report = m.measure(a, b, component=component, crs=crs)
@@ -38,5 +38,5 @@ def command(
         print_rows("measure", report, json)
         return
     print(f"{report.distance_m:.4f} m +- {report.sigma_m:.2g} m ({report.known_by})")
-    print_table("points", PlaceRow.columns, [report.a, report.b])
+    print_table("points", PointRow.columns, [report.a, report.b])
     say_heights([report] if report.a.world is not None or report.b.world is not None else [])

@@ -64,7 +64,7 @@ OBJECTS: dict[str, Object] = {
     "show SCENE": One(rows.SceneReport),
     "show A:B": One(rows.PairReport),
     "show CHANGE": One(rows.ChangeDetail),
-    "why A:B": One(rows.WhyReport),
+    "why A:B": One(rows.PairExplanation),
     "diff": Many("scenes", rows.PoseChangeRow),
     "poses": Many("poses", rows.PoseRow),
     "georeference": One(rows.WorldReport),

@@ -12,7 +12,7 @@ from gsmap.texts import shown
 if TYPE_CHECKING:
     from gsmap.map import Map
     from gsmap.types import Sim3
-    from gsmap.types.metre import Metre
+    from gsmap.types.metric_scale import MetricScale
     from gsmap.types.rows import ChangeDetail, PairReport, SceneReport
 
 _SHOWN = 8  # edges, notes and events shown of many, so that everything fits a screen
@@ -63,12 +63,12 @@ def command(
 
 def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail:
     from gsmap.errors import NotFoundError
-    from gsmap.map.changes import number_of
+    from gsmap.map.changes import change_number
 
     try:
         return m.show_scene(thing)  # whose name may hold a colon, or look like that of a change
     except NotFoundError:
-        if number_of(thing) is not None:
+        if change_number(thing) is not None:
             return m.show_change(thing)
         if ":" in thing:
             return m.show_pair(thing)
@@ -181,13 +181,15 @@ def _captured(scene: SceneReport) -> str | None:
     return f"{scene.captured_at}, said by {(said and said[-1]) or 'a person'}"
 
 
-def _metre(scene: SceneReport) -> Metre | None:
+def _metre(scene: SceneReport) -> MetricScale | None:
     """Of the frame that it is placed in."""
-    from gsmap.types.metre import Metre, as_known_by
+    from gsmap.types.metric_scale import MetricScale, as_known_by
 
     if not scene.metre_known_by:
         return None
-    return Metre(scene.metres_per_unit or 1.0, scene.metre_sigma or float("inf"), as_known_by(scene.metre_known_by))
+    return MetricScale(
+        scene.metres_per_unit or 1.0, scene.metre_sigma or float("inf"), as_known_by(scene.metre_known_by)
+    )
 
 
 def _layers(scene: SceneReport) -> str:

@@ -12,7 +12,7 @@ def command(map: MapPath, json: AsJson = False) -> None:
 
     Example: `gsmap status site.gsmap`
     """
-    from gsmap.types.metre import Metre, as_known_by
+    from gsmap.types.metric_scale import MetricScale, as_known_by
 
     with opened(map) as m:
         report = m.status()
@@ -33,7 +33,7 @@ def command(map: MapPath, json: AsJson = False) -> None:
         + ("" if report.todo else "; nothing to do")
     )
     for row in report.metres[:_SHOWN]:
-        metre = Metre(row.metres_per_unit, row.metre_sigma or float("inf"), as_known_by(row.metre_known_by))
+        metre = MetricScale(row.metres_per_unit, row.metre_sigma or float("inf"), as_known_by(row.metre_known_by))
         print(f"component {row.component}: {metre.text()}" + (f" ({row.metre_note})" if row.metre_note else ""))
     if len(report.metres) > _SHOWN:
         print(f"... and {len(report.metres) - _SHOWN} more components: gsmap status MAP --json")

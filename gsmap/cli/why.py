@@ -22,7 +22,7 @@ def command(
 
     Example: `gsmap why site.gsmap monday:tuesday --pictures why`
     """
-    from gsmap.types.rows import WhyStep
+    from gsmap.types.rows import ExplanationStep
 
     with opened(map) as m:
         report = m.why(pair, pictures=pictures)
@@ -30,6 +30,6 @@ def command(
         print_rows("why A:B", report, json)
         return
     print_facts(report.pair, {"status": report.status, "reason": report.reason, "what would settle it": report.advice})
-    print_table("steps", WhyStep.columns, report.steps)
+    print_table("steps", ExplanationStep.columns, report.steps)
     if report.picture:
         say(f"wrote {report.picture}")

@@ -10,7 +10,7 @@ from gsmap._native import place_points
 from gsmap.compare.neighbourhoods import depth_extremes, erode
 from gsmap.geometry.voxels import voxel_labels
 from gsmap.render import render
-from gsmap.types import Cameras, Gaussians, PlacedScene
+from gsmap.types import Cameras, Gaussians, PosedScene
 
 LONGEST_SIDE_PX, MAX_VIEWS = 240, 48  # default size and number of the views of a capture
 MIN_ALPHA = 0.9  # of a pixel that shows a surface
@@ -76,7 +76,7 @@ class CaptureViews:
         placed: per view, the projections of the capture's own Gaussians.
     """
 
-    scene: PlacedScene
+    scene: PosedScene
     views: tuple[View, ...]
     surface: np.ndarray
     times_seen: np.ndarray
@@ -90,7 +90,7 @@ class CaptureViews:
 
 
 def render_views(
-    scene: PlacedScene, *, longest_side_px: int = LONGEST_SIDE_PX, max_views: int = MAX_VIEWS
+    scene: PosedScene, *, longest_side_px: int = LONGEST_SIDE_PX, max_views: int = MAX_VIEWS
 ) -> CaptureViews:
     """Render a capture from its own cameras; one without cameras has no views, and is no evidence on others."""
     count = len(scene.gaussians)
@@ -124,7 +124,7 @@ def max_per_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.nd
     return out
 
 
-def select_cameras(scene: PlacedScene, longest_side_px: int, max_views: int) -> list[Cameras]:
+def select_cameras(scene: PosedScene, longest_side_px: int, max_views: int) -> list[Cameras]:
     """Select at most ``max_views`` cameras of a capture, evenly along its path; none if they were synthesized."""
     if scene.cameras is None or scene.cameras.synthesised or not len(scene.cameras) or not len(scene.gaussians):
         return []

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.compare.capture_views import MAX_TOLERANCE_M, MAX_VIEWS, NEAREST_M, CaptureViews, project_points
 from gsmap.compare.comparison import AGREE, OTHER_BEHIND, UNSURE, Comparison
-from gsmap.types import Gaussians, PlacedScene
+from gsmap.types import Gaussians, PosedScene
 
 _SAMPLE = 1500  # points of a capture by which views of the other captures are selected
 _ENOUGH = 8  # views of a point: more add little
@@ -17,7 +17,7 @@ _VIEWS = 2  # times as many views as of one capture: several captures together s
 
 
 def combine_views(
-    parts: Sequence[tuple[CaptureViews, np.ndarray]], of: PlacedScene, max_views: int = MAX_VIEWS
+    parts: Sequence[tuple[CaptureViews, np.ndarray]], of: PosedScene, max_views: int = MAX_VIEWS
 ) -> CaptureViews:
     """Combine the views of several captures into those of one, selecting the views that show the place of ``of``.
 
@@ -46,7 +46,7 @@ def combine_views(
         np.concatenate([getattr(capture, name)[stays] for capture, stays in parts])
         for name in ("surface", "times_seen", "sharpness")
     )
-    scene = PlacedScene(gaussians, scene_id="+".join(capture.scene.scene_id for capture, _ in parts))
+    scene = PosedScene(gaussians, scene_id="+".join(capture.scene.scene_id for capture, _ in parts))
     return CaptureViews(scene, tuple(views), surface, times_seen, sharpness, tuple(sure), tuple(placed))
 
 
@@ -71,7 +71,7 @@ def mask_outdated(capture: CaptureViews, comparison: Comparison, stays: np.ndarr
     return replace(capture, views=tuple(views), sure=tuple(sure))
 
 
-def _select_views(captures: Sequence[CaptureViews], of: PlacedScene, max_views: int) -> list[list[int]]:
+def _select_views(captures: Sequence[CaptureViews], of: PosedScene, max_views: int) -> list[list[int]]:
     """Select views of each capture greedily by coverage, at most twice ``max_views`` in all."""
     chosen: list[list[int]] = [[] for _ in captures]
     points = of.gaussians.means[:: max(1, len(of.gaussians) // _SAMPLE)]

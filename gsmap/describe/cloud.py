@@ -11,13 +11,13 @@ from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.neighbours import nearest_neighbours
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians
-from gsmap.types.views import Cloud
+from gsmap.types.views import PointCloud
 
 _MAX_RELATIVE_SCALE = 3.5  # a Gaussian whose largest scale is so many times the median one is no surface
 _FLOATER_LAB = 20.0  # L*a*b* distance from the neighbours' colours from which a Gaussian floats
 
 
-def surface_cloud(gaussians: Gaussians, min_opacity: float = 0.1) -> Cloud:
+def surface_cloud(gaussians: Gaussians, min_opacity: float = 0.1) -> PointCloud:
     """Return the centres of the Gaussians of the surface: opaque, not huge, not floating, not of a stray colour.
 
     All criteria are relative to the capture, so that the cloud of a scene does not depend on its unit: a Gaussian is
@@ -41,7 +41,7 @@ def surface_cloud(gaussians: Gaussians, min_opacity: float = 0.1) -> Cloud:
     lab = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[:, 0].take(keep, axis=0)), 0.0, 1.0))
     stray, spacing = find_floaters(points, lab, _FLOATER_LAB)
     rows = np.flatnonzero(~stray)
-    return Cloud(points.take(rows, axis=0), lab.take(rows, axis=0), np.pi / 8 * spacing[rows] ** 2, keep[rows])
+    return PointCloud(points.take(rows, axis=0), lab.take(rows, axis=0), np.pi / 8 * spacing[rows] ** 2, keep[rows])
 
 
 def downsample(points: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from gsmap.errors import ConfigError, InputError
 from gsmap.formats.pictures import open_picture
 from gsmap.methods import family
 from gsmap.types.model import ModelSpec
-from gsmap.types.views import Cloud, SceneContext
+from gsmap.types.views import PointCloud, SceneContext
 
 _MIN_PX, _MAX_PX = 8, 512  # sides: smaller pictures show too little, larger ones are reduced
 
@@ -39,7 +39,7 @@ def embed_query_picture(
             f"embedder {name} needs a model: gsmap models add MAP {lacking[0]} FILE.onnx", code="model_required"
         )
     limited = {kind: replace(model, limits=params.limits) for kind, model in models.items()}
-    nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), np.zeros(0, np.int64))
+    nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), np.zeros(0, np.int64))
     embedder = method.make(SceneContext(nothing, 0, None, 1.0, limited), chosen.params.embedders[name])
     if not hasattr(embedder, "embed_picture"):
         raise ConfigError(

@@ -11,9 +11,9 @@ from multiprocessing import current_process
 from typing import Any
 
 from gsmap.methods import MethodParams, family
-from gsmap.methods.executor import SetAside, Workers
+from gsmap.methods.executor import QuarantinedJob, Workers
 
-__all__ = ["WorkerSession", "Params", "SetAside", "is_beginning", "run_jobs"]
+__all__ = ["WorkerSession", "Params", "QuarantinedJob", "is_beginning", "run_jobs"]
 
 AUTO = "auto"
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.errors import GsmapError
-from gsmap.methods.executor import SetAside
+from gsmap.methods.executor import QuarantinedJob
 
 _WORKER = Path(__file__).with_name("worker.py")
 _NOT_TO_WORKERS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -196,7 +196,7 @@ class Pool:
                     except WorkerDied as died:
                         del at[connection]
                         if lost(worker, task, died):
-                            done.append((task.index, SetAside(f"{died}, like the one that had tried it before")))
+                            done.append((task.index, QuarantinedJob(f"{died}, like the one that had tried it before")))
                         continue
                     if answer is None:
                         continue

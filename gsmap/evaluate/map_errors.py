@@ -20,7 +20,7 @@ from gsmap.evaluate.calibration import (
 )
 from gsmap.evaluate.registration import absolute_trajectory_error, pose_error
 from gsmap.types import PoseGraph, Sim3
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import (
     BandRow,
     ComponentErrorRow,
@@ -97,7 +97,7 @@ def evaluate_map(
     graph: PoseGraph | None,
     overlaps: Mapping[frozenset[str], float],
     params: Params | None = None,
-    metres: Mapping[int, Metre] | None = None,
+    metres: Mapping[int, MetricScale] | None = None,
 ) -> EvaluationReport:
     """Evaluate the edges and the newest poses of a map.
 
@@ -119,7 +119,7 @@ class _MapErrors:
         graph: PoseGraph | None,
         overlaps: Mapping[frozenset[str], float],
         params: Params,
-        metres: Mapping[int, Metre],
+        metres: Mapping[int, MetricScale],
     ) -> None:
         self.scenes = {scene.id: scene for scene in scenes}
         self.truth = {scene.id: scene.S_scene_world for scene in scenes if scene.S_scene_world is not None}

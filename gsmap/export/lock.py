@@ -14,7 +14,7 @@ from pathlib import Path
 
 from gsmap.durable import make_folder, sync_folder
 from gsmap.errors import BusyError, StoreError
-from gsmap.types.holder import Holder, this_process
+from gsmap.types.lock_owner import LockOwner, this_process
 
 LOCK_FILE = ".gsmap-export"
 """Lock file with the description of its owner; after a crash it is unlocked, and stale."""
@@ -117,6 +117,6 @@ def _is_at(handle: int, path: Path) -> bool:
 def _owner_of(handle: int) -> str:
     try:
         stored = json.loads(os.pread(handle, 10_000, 0))
-        return Holder(**{name: str(stored[name]) for name in ("task", "host", "process", "since")}).who
+        return LockOwner(**{name: str(stored[name]) for name in ("task", "host", "process", "since")}).who
     except (OSError, ValueError, KeyError, TypeError):
         return "another gsmap export"

@@ -18,7 +18,7 @@ from gsmap.durable import is_file, open_file, write_text_whole
 from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.texts import control_characters
 from gsmap.types import Sim3, Tile
-from gsmap.types.metre import Metre, as_known_by
+from gsmap.types.metric_scale import MetricScale, as_known_by
 from gsmap.types.plain import plain
 
 FILE_NAME = "tiles.json"
@@ -50,7 +50,7 @@ class Manifest:
     num_bytes: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     doomed: set[str] = field(default_factory=set)
-    metres: dict[int, Metre] = field(default_factory=dict)
+    metres: dict[int, MetricScale] = field(default_factory=dict)
     world: dict[int, dict[str, Any]] = field(default_factory=dict)
     offsets: dict[str, list[float]] = field(default_factory=dict)
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
@@ -163,7 +163,7 @@ def _as_json(content: Mapping[str, object]) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def _component(component: int, metre: Metre, world: dict[str, Any] | None) -> dict[str, object]:
+def _component(component: int, metre: MetricScale, world: dict[str, Any] | None) -> dict[str, object]:
     georeference: dict[str, object] = {} if world is None else {"world": world}
     return {
         "component": component,
@@ -174,9 +174,9 @@ def _component(component: int, metre: Metre, world: dict[str, Any] | None) -> di
     } | georeference
 
 
-def _metre(entry: Mapping[str, Any]) -> Metre:
+def _metre(entry: Mapping[str, Any]) -> MetricScale:
     sigma = entry["metre_sigma"]
-    return Metre(
+    return MetricScale(
         float(entry["metres_per_unit"]),
         math.inf if sigma is None else float(sigma),
         as_known_by(str(entry["metre_known_by"])),

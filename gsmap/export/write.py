@@ -30,9 +30,9 @@ from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.plan import Params, PlannedTile
 from gsmap.export.recipe import TileRecipe, dirty_reason
 from gsmap.formats import tiles3d
-from gsmap.methods.executor import SetAside
+from gsmap.methods.executor import QuarantinedJob
 from gsmap.types import MergeResult, Tile
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.progress import Progress, silent
 
 _STAGING = ".partial"
@@ -99,7 +99,7 @@ def export_tiles(
     *,
     map_id: str,
     recipe: TileRecipe,
-    metres: Mapping[int, Metre] | None = None,
+    metres: Mapping[int, MetricScale] | None = None,
     world: Mapping[int, dict[str, Any]] | None = None,
     offsets: Mapping[str, list[float]] | None = None,
     params: Params | None = None,
@@ -164,7 +164,7 @@ def export_tiles(
         (staging / _MARK).touch()
         with closing(_make_tiles(todo, make, run, recipe, staging, report)) as finished:
             for planned_tile, staged in finished:
-                if isinstance(staged, SetAside):
+                if isinstance(staged, QuarantinedJob):
                     aside.append((planned_tile, staged.reason))
                     continue
                 at, tile, num_bytes = _install(planned_tile, staged, out, staging, recipe)
@@ -212,7 +212,7 @@ def _make_tiles(
     recipe: TileRecipe,
     staging: Path,
     report: _ProgressReport,
-) -> Generator[tuple[PlannedTile, StagedTile | SetAside], None, None]:
+) -> Generator[tuple[PlannedTile, StagedTile | QuarantinedJob], None, None]:
     """Yield each tile with its staged file, or the reason for quarantine; closing it cancels the running jobs."""
     folder = str(staging.absolute())
     shared = os.path.join(folder, _SHARED)

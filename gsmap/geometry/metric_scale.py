@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from gsmap.types import Gaussians, ScenePose, Sim3
-from gsmap.types.metre import KnownBy, Metre
+from gsmap.types.metric_scale import KnownBy, MetricScale
 
 PLAUSIBLE_M = (0.25, 4.0)
 """Estimated metres per scene unit between which a scene's own unit may be the metre."""
@@ -42,7 +42,7 @@ class SceneUnit:
 
 def estimate_metric_scale(
     scenes: Sequence[tuple[SceneUnit, ScenePose]], surveyed: tuple[float, float] | None = None
-) -> Metre:
+) -> MetricScale:
     """Estimate the metric scale of one component.
 
     Specified values precede captures in metres, these precede assumed metres, and these precede estimates from the
@@ -69,22 +69,22 @@ def estimate_metric_scale(
     if metric:
         return _assumed(_combined([(1.0, pose) for pose in metric], _ASSUMED_SIGMA, "assumed"), guess)
     if guess is None:
-        return Metre(note=f"its metric scale is unknown: {_SET_IT}")
+        return MetricScale(note=f"its metric scale is unknown: {_SET_IT}")
     # Steps of half an octave: another capture's guess does not move everything.
     rounded = float(2.0 ** (np.round(2 * np.log2(guess)) / 2))
     note = f"its metric scale is estimated and may be off by a factor of {_FACTOR:g}: {_SET_IT}"
-    return Metre(rounded, float(np.log(_FACTOR)), "guessed", note)
+    return MetricScale(rounded, float(np.log(_FACTOR)), "guessed", note)
 
 
 _SET_IT = "set it with gsmap edit MAP SCENE --metres-per-unit X"
 
 
-def _rounded(metres_per_unit: float, sigma: float) -> Metre:
+def _rounded(metres_per_unit: float, sigma: float) -> MetricScale:
     """Round a surveyed metric scale to four digits, so that results in metres stay valid after another solve."""
-    return Metre(float(f"{metres_per_unit:.4g}"), max(sigma, 5e-4), "surveyed", "")
+    return MetricScale(float(f"{metres_per_unit:.4g}"), max(sigma, 5e-4), "surveyed", "")
 
 
-def _combined(units: Sequence[tuple[float, ScenePose]], own_sigma: float, known_by: KnownBy) -> Metre:
+def _combined(units: Sequence[tuple[float, ScenePose]], own_sigma: float, known_by: KnownBy) -> MetricScale:
     """Combine metres per unit of scenes, each with the standard deviation ``own_sigma``, to that of the frame."""
     logs = np.log([metres / pose.S_map_scene.scale for metres, pose in units])
     sigmas = np.sqrt([own_sigma**2 + _scale_variance(pose) for _, pose in units])
@@ -97,13 +97,13 @@ def _combined(units: Sequence[tuple[float, ScenePose]], own_sigma: float, known_
         if np.abs((logs - log) / sigmas).max() > _AGREE / np.sqrt(2):
             note = f"metric scales of captures differ by {100 * float(np.ptp(logs)):.2g} %: {_SET_IT}"
     if len({metres for metres, _ in units}) == 1 and all(pose.S_map_scene.scale == 1.0 for _, pose in units):
-        return Metre(units[0][0], sigma, known_by, note)  # to the last digit
+        return MetricScale(units[0][0], sigma, known_by, note)  # to the last digit
     if known_by != "told" and abs(log) <= sigma:
-        return Metre(1.0, sigma, known_by, note)
-    return Metre(float(f"{np.exp(log):.3g}"), sigma, known_by, note)
+        return MetricScale(1.0, sigma, known_by, note)
+    return MetricScale(float(f"{np.exp(log):.3g}"), sigma, known_by, note)
 
 
-def _assumed(metre: Metre, guess: float | None) -> Metre:
+def _assumed(metre: MetricScale, guess: float | None) -> MetricScale:
     """Widen the deviation of an assumed metre where the estimate from the content disagrees."""
     off = 0.0 if guess is None else abs(float(np.log(guess / metre.metres_per_unit)))
     if guess is None or off <= np.log(_FACTOR):

@@ -1,17 +1,17 @@
-"""Captures the way people have them -> Gaussians and cameras, checked."""
+"""Read captures as people have them, and check their Gaussians and cameras."""
 
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.ingest.capture import Capture, check_scale, read_capture, read_captures, take_capture
+from gsmap.ingest.capture_search import CaptureFiles, SearchResult, SkippedPath, find_captures, search_captures
 from gsmap.ingest.dates import CaptureDate, find_date, given_date, parse_date
-from gsmap.ingest.find import Found, LeftOut, Search, find_captures, search_captures
 from gsmap.ingest.validate import validate
 
 __all__ = [
     "Capture",
     "CaptureDate",
-    "Found",
-    "LeftOut",
-    "Search",
+    "CaptureFiles",
+    "SkippedPath",
+    "SearchResult",
     "check_scale",
     "find_captures",
     "find_date",

@@ -1,4 +1,4 @@
-"""Reading one capture: Gaussians, cameras, and everything said about them."""
+"""Read one capture: Gaussians, cameras and metadata."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from gsmap.errors import ConfigError, NotPinholesError
 from gsmap.formats.precision import about_origin, rounded_to, told
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.transforms import transform_cameras
+from gsmap.ingest.capture_search import CaptureFiles, find_captures
 from gsmap.ingest.dates import find_date, given_date
-from gsmap.ingest.find import Found, find_captures
 from gsmap.ingest.validate import validate_cameras, validate_gaussians
 from gsmap.stream import clamped
 from gsmap.types import Cameras, Gaussians, GaussianSource, Sim3
@@ -28,7 +28,7 @@ from gsmap.types.source import origin_of_source
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One capture, checked, ready for the store.
+    """A checked capture, ready for the store.
 
     Args:
         content: its Gaussians, in the capture's own frame; perhaps still in their file. Where the coordinates of
@@ -40,7 +40,7 @@ class Capture:
         dated_by: what said so; empty where a person did.
         scale_policy: ``auto``, ``known`` or ``unknown``.
         antialiased: trained with the 2D Mip filter.
-        notes: what a person should know.
+        notes: remarks.
     """
 
     content: GaussianSource
@@ -55,7 +55,7 @@ class Capture:
 
     @cached_property
     def gaussians(self) -> Gaussians:
-        """Its Gaussians, in memory from now on."""
+        """Return its Gaussians and keep them in memory."""
         return self.content.load()
 
 
@@ -94,14 +94,14 @@ def read_captures(
 
 
 def read_capture(
-    found: Found,
+    found: CaptureFiles,
     *,
     cameras: str | os.PathLike[str] | None = None,
     name: str | None = None,
     captured_at: str | datetime | None = None,
     scale_policy: str = "auto",
 ) -> Capture:
-    """Read and check one capture that `find_captures` found; see `read_captures`."""
+    """Read and check a capture from `find_captures`; see `read_captures`."""
     given_date(captured_at)  # refuses what is none before a large file is read
     gaussians = formats.stream(found.path)
     about = formats.info(found.path)
@@ -141,7 +141,7 @@ def take_capture(
     source: str = "",
     cameras_source: str = "",
 ) -> Capture:
-    """Check one capture; cameras are synthesised where there are none.
+    """Check a capture in memory; missing cameras are synthesized.
 
     Args:
         gaussians, cameras: in one frame; see `Capture` on its origin.
@@ -171,7 +171,7 @@ def take_capture(
 
 
 def _origin_notes(gaussians: GaussianSource, origin: np.ndarray) -> list[str]:
-    """What a person should know of a capture whose coordinates are large."""
+    """Return remarks on a capture with large coordinates."""
     notes = [f"its coordinates are large: poses and positions in its frame are those of the file less {told(origin)}"]
     step = rounded_to(gaussians)
     if step:
@@ -180,7 +180,7 @@ def _origin_notes(gaussians: GaussianSource, origin: np.ndarray) -> list[str]:
 
 
 def check_scale(policy: str) -> None:
-    """Refuse what is no scale policy.
+    """Refuse an unknown scale policy.
 
     Raises:
         ConfigError: not ``auto``, ``known`` or ``unknown``.

@@ -1,4 +1,4 @@
-"""When a capture was taken, from what lies beside it. A file's modification time is never asked: copying changes it."""
+"""Find the date of a capture from files beside it. Modification times are ignored, since copying changes them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.formats.pictures import open_picture
-from gsmap.ingest.find import Found
+from gsmap.ingest.capture_search import CaptureFiles
 
 MAX_FRAMES = 32
 """How many photographs are opened at most to date one capture."""
@@ -42,12 +42,12 @@ _DATE = re.compile(
 
 @dataclass(frozen=True)
 class CaptureDate:
-    """When a capture was taken, as far as it can be told.
+    """The date of a capture, with its source.
 
     Args:
-        when: ISO 8601 with zone; None where nothing says it.
-        source: what said it; empty where nothing did, or where a person did.
-        note: what a person should know of it; empty where there is nothing to say.
+        when: ISO 8601 with zone; None if unknown.
+        source: source of the date; empty if unknown or specified by the user.
+        note: remark for the user, or empty.
     """
 
     when: str | None = None
@@ -56,7 +56,7 @@ class CaptureDate:
 
 
 def parse_date(when: str | datetime | None) -> str | None:
-    """ISO 8601 with its zone (UTC where it has none); None stays None.
+    """Parse an ISO 8601 date (UTC if it has no zone); None stays None.
 
     Raises:
         ConfigError: not a date.
@@ -66,7 +66,7 @@ def parse_date(when: str | datetime | None) -> str | None:
 
 
 def given_date(when: str | datetime | None) -> CaptureDate:
-    """The date that a person gives.
+    """Return the date that the user gave.
 
     Raises:
         ConfigError: not a date, or one that lies more than a day in the future.
@@ -83,7 +83,7 @@ def given_date(when: str | datetime | None) -> CaptureDate:
 
 
 def photo_date(path: str | os.PathLike[str]) -> CaptureDate:
-    """When a photograph was taken, as its EXIF says; nothing where that says nothing plausible."""
+    """Return the EXIF date of a photo; empty if there is none that is plausible."""
     found = _exif_date(Path(path))
     if found is None:
         return CaptureDate()
@@ -95,9 +95,9 @@ def photo_date(path: str | os.PathLike[str]) -> CaptureDate:
 
 
 def find_date(
-    found: Found, cameras: Path | None = None, frames: Sequence[str] = (), *, now: datetime | None = None
+    found: CaptureFiles, cameras: Path | None = None, frames: Sequence[str] = (), *, now: datetime | None = None
 ) -> CaptureDate:
-    """The date of a capture on disk.
+    """Find the date of a capture on disk.
 
     In this order: a sidecar beside it (``NAME.json`` or ``NAME.meta.json`` with ``captured_at``), where NAME is its
     file's or, as for the output of trainers, its folder's; the first EXIF ``DateTimeOriginal`` of its frames; a date in
@@ -125,7 +125,7 @@ def find_date(
 
 
 def date_in_name(name: str, *, now: datetime | None = None) -> tuple[datetime | None, str]:
-    """The date in a name such as ``hall_2026-05-31T14-00``, UTC where it has no zone, and what to know of it.
+    """Find a date in a name such as ``hall_2026-05-31T14-00`` (UTC if it has no zone), with a remark.
 
     None where there is no date, where there are several, or where it lies in the future.
     """
@@ -135,7 +135,7 @@ def date_in_name(name: str, *, now: datetime | None = None) -> tuple[datetime | 
 
 
 def _date_in_name(name: str, latest: datetime, notes: list[str]) -> tuple[datetime | None, str]:
-    """As `date_in_name`; a date that lies in the future is named in ``notes``."""
+    """Find a date in a name; a date in the future is added to ``notes``."""
     dates = [date for match in _DATE.finditer(name) if (date := _matched(match)) is not None]
     future = [day for day, _ in dates if day > latest]
     dates = [(day, note) for day, note in dates if day <= latest]
@@ -151,14 +151,14 @@ def _in_future(date: datetime, source: str) -> str:
 
 
 def shown(name: str) -> str:
-    """A file's name as it may be written to a terminal and a catalog."""
+    """Escape a file name for terminals and the catalog."""
     return "".join(c if c.isprintable() else "?" for c in name)
 
 
 # --- sidecars --------------------------------------------------------------------------------------------------------
 
 
-def _from_sidecar(found: Found, latest: datetime) -> CaptureDate | None:
+def _from_sidecar(found: CaptureFiles, latest: datetime) -> CaptureDate | None:
     for folder, name in _names(found):
         for path in (folder / f"{name}.json", folder / f"{name}.meta.json"):
             said = _captured_at(path) if name else None
@@ -182,7 +182,7 @@ def _from_sidecar(found: Found, latest: datetime) -> CaptureDate | None:
 
 
 def _captured_at(path: Path) -> Any:
-    """What a sidecar says; None where there is none, or one that is about other things."""
+    """Read the date from a sidecar file; None if there is none."""
     try:
         if not path.is_file() or path.stat().st_size > _MAX_SIDECAR_BYTES:
             return None
@@ -201,8 +201,8 @@ def _captured_at(path: Path) -> Any:
 # --- photographs -----------------------------------------------------------------------------------------------------
 
 
-def _photographs(found: Found, cameras: Path | None, frames: Sequence[str]) -> list[Path]:
-    """Some of the pictures that a capture was made from, evenly chosen: those its cameras name.
+def _photographs(found: CaptureFiles, cameras: Path | None, frames: Sequence[str]) -> list[Path]:
+    """Choose some of the images of a capture, evenly, by the names of its cameras.
 
     Where they name none, those in ``images/`` beside it, unless other captures lie there too.
     """
@@ -217,7 +217,7 @@ def _photographs(found: Found, cameras: Path | None, frames: Sequence[str]) -> l
 
 
 def _picture_folders(cameras: Path) -> list[Path]:
-    """Where the pictures of a file of cameras, or of a COLMAP model's folder, may lie."""
+    """Return the folders that may hold the images of a camera file or COLMAP model."""
     root = cameras.resolve()
     root = root if root.is_dir() else root.parent
     while root.name in ("0", "sparse", "colmap"):
@@ -226,7 +226,7 @@ def _picture_folders(cameras: Path) -> list[Path]:
 
 
 def _picture(name: str, folders: Sequence[Path]) -> Path | None:
-    """The file that a camera's name means; gaussian-splatting leaves the suffix out."""
+    """Return the image file of a camera name; gaussian-splatting leaves the suffix out."""
     if not name or "\0" in name:
         return None
     for folder in folders:
@@ -257,7 +257,7 @@ def _from_frames(pictures: Sequence[Path], latest: datetime, notes: list[str]) -
 
 
 def _exif_date(path: Path) -> tuple[datetime, bool] | None:
-    """When a photograph was taken, and whether its zone is known; None where there is no date, or that of no clock."""
+    """Return the date of a photo and whether its zone is known; None if there is no plausible date."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large pictures and of damaged tags: only the header is read
@@ -281,7 +281,7 @@ def _exif_date(path: Path) -> tuple[datetime, bool] | None:
 # --- names -----------------------------------------------------------------------------------------------------------
 
 
-def _from_names(found: Found, latest: datetime, notes: list[str]) -> CaptureDate | None:
+def _from_names(found: CaptureFiles, latest: datetime, notes: list[str]) -> CaptureDate | None:
     for name in _telling_names(found):
         date, note = _date_in_name(name, latest, notes)
         if date is not None:
@@ -291,13 +291,13 @@ def _from_names(found: Found, latest: datetime, notes: list[str]) -> CaptureDate
     return None
 
 
-def _names(found: Found) -> Sequence[tuple[Path, str]]:
-    """See `Found.names`; one that was made by hand may have none."""
+def _names(found: CaptureFiles) -> Sequence[tuple[Path, str]]:
+    """Return `CaptureFiles.names`, which may be empty."""
     return found.names or ((found.path.parent, found.name),)
 
 
-def _telling_names(found: Found) -> Iterator[str]:
-    """The names that a capture goes by, and that of the folder these lie in."""
+def _telling_names(found: CaptureFiles) -> Iterator[str]:
+    """Yield the names of the capture and of its folder."""
     names = _names(found)
     around = names[-1][0].resolve()
     for folder, name in (*names, (around.parent, around.name)):
@@ -306,7 +306,7 @@ def _telling_names(found: Found) -> Iterator[str]:
 
 
 def _matched(match: re.Match[str]) -> tuple[datetime, str] | None:
-    """The date of a match and what to know of it; None where there is no such day, or no camera had that clock."""
+    """Return the date of a match with a remark; None if it is not a plausible date."""
     if match["stamp"]:
         try:
             date = _zoned(datetime.strptime(match["stamp"], "%Y%m%d%H%M%S"))
@@ -362,7 +362,7 @@ def _plausible(date: datetime, latest: datetime) -> bool:
 
 
 def _evenly(things: Sequence[_T]) -> list[_T]:
-    """At most `MAX_FRAMES` of them, the first and the last among them."""
+    """Return at most `MAX_FRAMES` items, the first and last among them."""
     if len(things) <= MAX_FRAMES:
         return list(things)
     return [things[round(i * (len(things) - 1) / (MAX_FRAMES - 1))] for i in range(MAX_FRAMES)]

@@ -1,4 +1,4 @@
-"""What is refused at the door, with the row that holds it."""
+"""Validate captures; errors name the invalid row."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SAMPLE = 20_000
 def validate(
     gaussians: GaussianSource, cameras: Cameras | None = None, *, where: str = "the capture"
 ) -> tuple[str, ...]:
-    """Refuse what cannot be a capture; return notes on what merely looks odd.
+    """Refuse an invalid capture; return notes on unusual values.
 
     Args:
         where: what to call it in messages (its file).
@@ -37,11 +37,11 @@ def validate(
 
 
 def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]:
-    """As `validate`, of the Gaussians alone; they are read once."""
+    """Validate Gaussians alone; they are read once."""
     n = gaussians.num_gaussians
     if not n:
         raise InputError(f"{where} has no Gaussians", code="no_gaussians")
-    bad = {f"NaN or infinity in {name}": _Rows() for name in FIELDS} | {"a rotation quaternion of zero": _Rows()}
+    bad = {f"NaN or infinity in {name}": _BadRows() for name in FIELDS} | {"a rotation quaternion of zero": _BadRows()}
     widest = np.empty(n, np.float32)
     sampled = []
     start, step = 0, _step(n)
@@ -64,7 +64,7 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
         found.refuse(where, what)
     low, high = np.percentile(np.concatenate(sampled), [5, 95], axis=0).astype(np.float64)
     extent = max(float(np.linalg.norm(high - low)), float(np.exp(min(float(np.median(widest)), 80.0))))
-    absurd = _Rows()
+    absurd = _BadRows()
     absurd.note(0, widest.astype(np.float64) > np.log(MAX_SCALE_OVER_EXTENT * extent))
     absurd.refuse(where, f"a scale over {MAX_SCALE_OVER_EXTENT:g} extents")
     if not opacities and not scales:
@@ -76,7 +76,7 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
 
 
 def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) -> tuple[str, ...]:
-    """As `validate`, of the cameras of Gaussians that are sound."""
+    """Validate the cameras of valid Gaussians."""
     if not len(cameras):
         raise InputError(
             f"{where} has an empty list of cameras: leave them out, and gsmap makes some", code="no_cameras"
@@ -102,7 +102,7 @@ def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) ->
 
 
 def sees(cameras: Cameras, points: np.ndarray) -> np.ndarray:
-    """(C,) whether any of the points (N, 3) lies before the camera and inside its image; occlusion is ignored."""
+    """Return (C,) whether any of the points (N, 3) projects into each camera's image; occlusion is ignored."""
     out = np.zeros(len(cameras), bool)
     for i, (view, intrinsics, size) in enumerate(
         zip(cameras.T_camera_frame, cameras.intrinsics_px, cameras.sizes_px, strict=True)
@@ -112,19 +112,19 @@ def sees(cameras: Cameras, points: np.ndarray) -> np.ndarray:
 
 
 def _step(n: int) -> int:
-    """Every so many Gaussians are looked at where all would be too many."""
+    """Return the stride for checks that would cost too much on all Gaussians."""
     return max(1, n // _SAMPLE)
 
 
 @dataclass
-class _Rows:
-    """Rows of which there should be none."""
+class _BadRows:
+    """The first invalid rows of a check."""
 
     first: int = 0
     count: int = 0
 
     def note(self, start: int, bad: np.ndarray) -> None:
-        """Of the rows from ``start`` on."""
+        """Record invalid rows from ``start`` on."""
         if bad.any():
             self.first = self.first if self.count else start + int(np.argmax(bad))
             self.count += int(bad.sum())

@@ -18,7 +18,7 @@ from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.retrieval import ViewIndex, most_alike
 from gsmap.localize.settling import Picture, Settled, inliers, settle
 from gsmap.methods.extractor import Extractor
-from gsmap.types.localization import Keypoints, Photo, Placement
+from gsmap.types.localization import Keypoints, LocalizationResult, Photo
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def localize_photo(
     extractor: Extractor,
     params: Params,
     metres_per_unit: Mapping[int, float] | None = None,
-) -> Placement:
+) -> LocalizationResult:
     """Find a photograph in the map.
 
     Views that look like it are matched with it, poses that these matches agree on are sharpened on renders of the map,
@@ -64,7 +64,7 @@ def localize_photo(
     picture, scale = prepared(photo, params)
     judged, why = judged_poses(picture, index, scenes, extractor, params)
     if not judged:
-        return Placement(photo.name, why)
+        return LocalizationResult(photo.name, why)
     return placement(photo.name, judged[0], rival_of(judged, params), picture, scale, scenes, params, metres_per_unit)
 
 
@@ -77,7 +77,7 @@ def placement(
     scenes: Mapping[str, PlacedFeatures],
     params: Params,
     metres_per_unit: Mapping[int, float] | None = None,
-) -> Placement:
+) -> LocalizationResult:
     """What is said of a pose that was looked into.
 
     Args:
@@ -89,14 +89,14 @@ def placement(
     metres = (metres_per_unit or {}).get(component, 1.0)
     told = {**best.evidence, "rival": rival}
     if reason:
-        return Placement(name, reason, component=component, probability=best.probability, evidence=told)
+        return LocalizationResult(name, reason, component=component, probability=best.probability, evidence=told)
     support, seen = _support(best, scenes, params, picture)
     pose = best.settled.T_metric_camera.copy()
     pose[:3, 3] /= metres
     assert best.covariance is not None
     known = covariance.with_scene(best.covariance, best.settled.T_metric_camera, support)
     unit = np.r_[np.ones(3), np.full(3, 1 / metres)]
-    return Placement(
+    return LocalizationResult(
         name,
         "",
         pose,

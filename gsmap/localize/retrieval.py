@@ -21,7 +21,7 @@ from gsmap.localize.features import UNIT
 from gsmap.localize.words import VERSION, Words, words_for
 from gsmap.methods import RecipeKey
 from gsmap.types.localization import Keypoints, SceneFeatures
-from gsmap.types.retrieval import Member
+from gsmap.types.retrieval import IndexedScene
 from gsmap.types.segments import PLACE_BYTES, InMemory, Segment, in_lists, lists_of, places_of, write_places
 
 _SIGNS = slice(0, 8)
@@ -113,7 +113,7 @@ def new_segment(scenes: Sequence[tuple[SceneFeatures, str]], indexed: int) -> In
         write_places(part, place)
         rows.append(part)
         lists.append(word)
-    members = [Member(found.scene, key) for found, key in scenes]
+    members = [IndexedScene(found.scene, key) for found, key in scenes]
     return in_lists(members, np.concatenate(lists), np.concatenate(rows))
 
 

@@ -34,7 +34,7 @@ from gsmap.localize.retrieval import ViewIndex
 from gsmap.localize.settling import Picture
 from gsmap.localize.words import words_for
 from gsmap.methods.extractor import Extractor
-from gsmap.types.localization import Keypoints, Photo, Placement
+from gsmap.types.localization import Keypoints, LocalizationResult, Photo
 
 
 @dataclass(eq=False)
@@ -79,7 +79,7 @@ def localize_together(
     extractor: Extractor,
     params: Params,
     metres_per_unit: Mapping[int, float] | None = None,
-) -> list[Placement]:
+) -> list[LocalizationResult]:
     """Find photographs of one place that overlap each other; see `gsmap.localize.localize_photo`.
 
     Returns:
@@ -90,13 +90,13 @@ def localize_together(
     out = []
     for shot, one in zip(shots, _believed(shots, ties, params), strict=True):
         if one is None:
-            out.append(Placement(shot.photo.name, shot.why))
+            out.append(LocalizationResult(shot.photo.name, shot.why))
             continue
         best, rival, bars = one
         said = placement(shot.photo.name, best, rival, shot.picture, shot.scale, scenes, bars, metres_per_unit)
         if shot.apart and said.is_placed:
             why = "ambiguous: other photographs lead it elsewhere"
-            said = Placement(
+            said = LocalizationResult(
                 said.name, why, component=said.component, probability=said.probability, evidence=said.evidence
             )
         out.append(said)

@@ -1,7 +1,7 @@
-"""The map: load from the store, call a pure stage, save. `Map` is the doors, `stages` the work behind them."""
+"""The map interface: read from the store, call a pure stage, save. `Map` is the facade, `stages` holds the work."""
 
+from gsmap.map.catalog_trust import catalog_of, trust
 from gsmap.map.map import Map, accept_catalog, create, migrate, open, open_or_create, restore, snapshots
-from gsmap.map.trusting import catalog_of, trust
 
 __all__ = [
     "Map",

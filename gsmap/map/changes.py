@@ -1,4 +1,4 @@
-"""Changes as typed rows, in the map's frame of today."""
+"""Changes between visits as typed rows, in the current map frame."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ import numpy as np
 
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.boxes import moved_box
-from gsmap.map.dates import last_of, parsed
-from gsmap.map.metres import map_metres, metre_notes
-from gsmap.map.one_state import of_one_state
+from gsmap.map.date_filter import end_of_date, parse_moment
+from gsmap.map.metric_scales import map_metres, metre_notes
 from gsmap.map.reports import scenes_by_id
 from gsmap.map.settings import Settings
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison, StoredChange
 from gsmap.types import Change, PoseGraph, Scene
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow, PairEventRow
 
 if TYPE_CHECKING:
-    from gsmap.map.stages.change import Wanted
+    from gsmap.map.stages.change import ComparisonPlan
 
 _ID = re.compile(r"c(\d{1,9})")
 
 
-def number_of(text: str) -> int | None:
-    """The number of a change by what it is called (``c12``); None for anything else."""
+def change_number(text: str) -> int | None:
+    """Return the number of a change id such as ``c12``; None for other texts."""
     found = _ID.fullmatch(text)
     return None if found is None else int(found[1])
 
 
-def named(text: str) -> int:
-    """The number of a change by what it is called.
+def parse_change_id(text: str) -> int:
+    """Return the number of a change id such as ``c12``.
 
     Raises:
         NotFoundError: changes are not called so.
     """
-    number = number_of(text)
+    number = change_number(text)
     if number is None:
         raise NotFoundError(
             f"no change is called {text!r}: they are called c1, c2, ... (gsmap changes MAP)", code="change_not_found"
@@ -49,9 +49,11 @@ def named(text: str) -> int:
     return number
 
 
-def within(asked: Wanted, since: str | None, between: Sequence[str] | None, as_of: str | None) -> Wanted:
-    """Those pairs whose newer capture is dated after ``since``; or after the first and at or before the second of
-    ``between``; and at or before ``as_of``. A day that is named as an end is all of it.
+def filter_by_date(
+    asked: ComparisonPlan, since: str | None, between: Sequence[str] | None, as_of: str | None
+) -> ComparisonPlan:
+    """Keep the pairs whose newer scene was captured after ``since`` (or after the first and at or before the second of
+    ``between``), and at or before ``as_of``. An end without a time of day is the end of that day.
 
     Raises:
         ConfigError: a date that is none, two ways of saying since when, or an end before its beginning.
@@ -59,8 +61,8 @@ def within(asked: Wanted, since: str | None, between: Sequence[str] | None, as_o
     if since is not None and between is not None:
         raise ConfigError("say since when, or between which dates: not both", code="conflicting_options")
     first = between[0] if between is not None else since
-    start = None if first is None else parsed(first)
-    ends = [last_of(text) for text in (between[1] if between is not None else None, as_of) if text is not None]
+    start = None if first is None else parse_moment(first)
+    ends = [end_of_date(text) for text in (between[1] if between is not None else None, as_of) if text is not None]
     if start is not None and any(end < start for end in ends):
         raise ConfigError(
             f"no date lies after {first} and before a date that is earlier: give the earlier one first",
@@ -73,19 +75,21 @@ def within(asked: Wanted, since: str | None, between: Sequence[str] | None, as_o
     return replace(asked, pairs=[pair for pair in asked.pairs if holds(asked.visits[pair[1]].when)])
 
 
-@of_one_state
+@snapshot_read
 def changes_report(
     store: Store,
     settings: Settings,
-    asked: Wanted,
+    asked: ComparisonPlan,
     *,
     min_confidence: float,
 ) -> ChangesReport:
-    """What is known of the pairs asked for."""
-    from gsmap.map.stages.change import lacking  # with the comparison, which looking at a change does without
+    """Report the stored changes of the planned comparisons."""
+    from gsmap.map.stages.change import (
+        missing_comparisons,  # with the comparison, which looking at a change does without
+    )
 
     known, (placed, metres) = scenes_by_id(store), _placed(store, settings)
-    missing = set(lacking(store, asked, settings))
+    missing = set(missing_comparisons(store, asked, settings))
     pairs = set(asked.pairs)
     chosen = [one for one in store.changes.current() if (one.older, one.newer) in pairs]
     chosen.sort(key=lambda one: (asked.visits[one.newer].when, asked.visits[one.older].when), reverse=True)
@@ -110,15 +114,15 @@ def changes_report(
 _WRITE = "gsmap changes does where the map can be written"
 
 
-@of_one_state
+@snapshot_read
 def change_row(store: Store, settings: Settings, number: int) -> ChangeRow:
-    """One change, as it is now."""
+    """Return one change, in the current map frame."""
     comparison, change = _find(store, number)
     return ChangeRow(**_row(comparison, change, scenes_by_id(store), *_placed(store, settings)))
 
 
 def change_arrays(store: Store, number: int) -> Change:
-    """One change with its arrays, in the map's frame of today.
+    """Return one change with its arrays, in the current map frame.
 
     Raises:
         NotFoundError: no such change, or the newer capture has no place now.
@@ -141,9 +145,9 @@ def change_arrays(store: Store, number: int) -> Change:
     )
 
 
-@of_one_state
+@snapshot_read
 def change_detail(store: Store, settings: Settings, number: int) -> ChangeDetail:
-    """Everything known of one change."""
+    """Report one change with its history of reviews."""
     comparison, change = _find(store, number)
     words = [PairEventRow(at=one.created_at, what=one.review, reason=one.note) for one in store.changes.reviews(number)]
     return ChangeDetail(
@@ -156,7 +160,7 @@ def change_detail(store: Store, settings: Settings, number: int) -> ChangeDetail
 
 
 def num_open(store: Store, settings: Settings) -> int:
-    """How many changes nobody has looked at yet."""
+    """Count the unreviewed changes above the minimum confidence."""
     found = [change.confidence for one in store.changes.current() for change in one.changes if change.status == "open"]
     return sum(confidence >= settings.change.min_confidence for confidence in found)
 
@@ -178,8 +182,8 @@ def _pair(one: Comparison, known: dict[str, Scene]) -> dict[str, Any]:
     }
 
 
-def _placed(store: Store, settings: Settings) -> tuple[PoseGraph | None, dict[int, Metre]]:
-    """The newest poses, and the metre of each component."""
+def _placed(store: Store, settings: Settings) -> tuple[PoseGraph | None, dict[int, MetricScale]]:
+    """Return the newest poses and the metric scale of each component."""
     graph = store.revisions.get()
     return graph, map_metres(store, settings, graph)
 
@@ -189,9 +193,9 @@ def _row(
     change: StoredChange,
     known: dict[str, Scene],
     placed: PoseGraph | None,
-    metres: Mapping[int, Metre],
+    metres: Mapping[int, MetricScale],
 ) -> dict[str, Any]:
-    """The fields of a `ChangeRow`; what was found in the map's frame of then, in that of today."""
+    """Return the fields of a `ChangeRow`, moved from the map frame of the comparison to the current one."""
     pose = placed.poses.get(one.newer) if placed is not None else None
     S_map_frame = None if pose is None else pose.S_map_scene @ one.S_frame_newer.inverse()
     box = None if S_map_frame is None else moved_box(change.box, S_map_frame)

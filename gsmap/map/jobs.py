@@ -1,4 +1,4 @@
-"""What a worker runs: a scene described, a pair registered or compared, a tile made. Each opens the map to read."""
+"""Jobs that worker processes run: describe a scene, register or compare a pair, make a tile."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from gsmap.types import (
     Cameras,
     ChangeReport,
     Gaussians,
-    KeptPhoto,
     MergeResult,
-    PlacedScene,
+    PosedScene,
+    ReferencePhoto,
     Registration,
     SceneGraph,
     Sim3,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from gsmap import localize as localizing
     from gsmap import register as registering
     from gsmap.export import PlannedTile
-    from gsmap.map.persisting import Passing
+    from gsmap.map.static_filter import DynamicContent
     from gsmap.merge.reference_view_cache import ReferenceViewCache
     from gsmap.register import SceneView
 
@@ -46,7 +46,7 @@ _MAX_PIXELS = 1 << 24  # of a kept photo: so few bytes can claim any number
 
 
 def _store(path: str) -> Store:
-    """The map at a path, kept open for the jobs to come."""
+    """Open the map at a path and keep it open for later jobs."""
     return _opened(*_catalog_file(path))
 
 
@@ -56,8 +56,8 @@ def _opened(location: str, inode: int) -> Store:
 
 
 def _catalog_file(path: str) -> tuple[str, int]:
-    """The absolute location of a map, and which file its catalog is: where jobs run in a person's own process, another
-    map may come to lie at the same path. (A file that is held open keeps its inode to itself.)"""
+    """Return the absolute location of a map and the inode of its catalog file. The inode tells maps apart that lie
+    at one path one after the other; an open file keeps its inode."""
     location = path if homes.is_remote(path) else os.path.abspath(path)
     try:
         return location, (branches.find(location).folder / sqlite.FILE).stat().st_ino
@@ -67,7 +67,7 @@ def _catalog_file(path: str) -> tuple[str, int]:
 
 @lru_cache(maxsize=4)
 def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
-    """Pairs come ordered by scene, so a few views kept save most of the reading; the key names their content."""
+    """Load the view of a scene for registration. Pairs come ordered by scene, so a small cache saves most reads."""
     from gsmap.register import SceneView
 
     store = _store(path)
@@ -79,7 +79,7 @@ def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
 
 
 def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec], params: describing.Params) -> SceneGraph:
-    """The graph of one scene of the map at ``path`` (`Store.location`)."""
+    """Build the scene graph of one scene of the map at ``path`` (`Store.location`)."""
     from gsmap import describe as describing
 
     scenes = _store(path).scenes
@@ -91,7 +91,7 @@ def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec], pa
 def features_of_scene(
     path: str, scene_id: str, models: Mapping[str, ModelSpec], params: localizing.Params
 ) -> SceneFeatures:
-    """What the views of one scene of the map at ``path`` show."""
+    """Extract the features of the views of one scene of the map at ``path``."""
     from gsmap import localize as localizing
 
     scenes = _store(path).scenes
@@ -103,7 +103,7 @@ def features_of_scene(
 def register_scenes(
     path: str, target: tuple[str, str], source: tuple[str, str], params: registering.Params
 ) -> Registration:
-    """The registration of one pair of the map at ``path``; target and source are (scene id, key of its graph)."""
+    """Register one pair of the map at ``path``; target and source are (scene id, key of its graph)."""
     from gsmap import register as registering
 
     return registering.register_pair(_view(path, *target), _view(path, *source), params)
@@ -112,7 +112,7 @@ def register_scenes(
 def compare_scenes(
     path: str, older: tuple[str, Sim3, str], newer: tuple[str, Sim3, str], params: changing.Params
 ) -> tuple[ChangeReport, tuple[int, int]]:
-    """What changed between two scenes of the map at ``path``, and how many Gaussians each had.
+    """Compare two scenes of the map at ``path``; return the changes and the number of Gaussians of each.
 
     Args:
         older, newer: scene id, S_map_scene and date.
@@ -123,47 +123,47 @@ def compare_scenes(
     return changing.compare(before, after, params), (len(before.gaussians), len(after.gaussians))
 
 
-def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> PlacedScene:
+def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> PosedScene:
     scenes = _store(path).scenes
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
-    return PlacedScene(
+    return PosedScene(
         transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene), scene_id, captured_at
     )
 
 
-def _read(path: str, scene_id: str, passing: Passing | None, bounds: np.ndarray | None) -> Gaussians:
-    """Those Gaussians of a scene that reach into a box of its frame, without those that do not persist."""
+def _read(path: str, scene_id: str, passing: DynamicContent | None, bounds: np.ndarray | None) -> Gaussians:
+    """Read the Gaussians of a scene that reach into a box of its frame, without dynamic content."""
     return _store(path).scenes.gaussians(scene_id, bounds, _left_out(path, scene_id, passing))
 
 
-def _read_within(path: str, scene_id: str, passing: Passing | None, bounds: np.ndarray) -> Gaussians:
-    """As `_read`, those whose means lie in it."""
+def _read_within(path: str, scene_id: str, passing: DynamicContent | None, bounds: np.ndarray) -> Gaussians:
+    """Read the Gaussians of a scene whose means lie in a box, without dynamic content."""
     return _store(path).scenes.gaussians_within(scene_id, bounds, _left_out(path, scene_id, passing))
 
 
-def _left_out(path: str, scene_id: str, passing: Passing | None) -> np.ndarray | None:
+def _left_out(path: str, scene_id: str, passing: DynamicContent | None) -> np.ndarray | None:
     return None if passing is None or not passing.digest else _without(path, scene_id, passing)
 
 
 @lru_cache(maxsize=8)
-def _without(path: str, scene_id: str, passing: Passing) -> np.ndarray:
-    """Tiles of one place ask for the same captures."""
-    from gsmap.map import persisting
+def _without(path: str, scene_id: str, passing: DynamicContent) -> np.ndarray:
+    """Return the rows of dynamic content, cached, since neighbouring tiles need the same scenes."""
+    from gsmap.map import static_filter
 
-    return persisting.rows(_store(path), scene_id, passing)
+    return static_filter.dynamic_rows(_store(path), scene_id, passing)
 
 
-def _kept(path: str, photo: StoredPhoto) -> KeptPhoto:
-    """A photo in the frame of its scene."""
+def _kept(path: str, photo: StoredPhoto) -> ReferencePhoto:
+    """Return a stored photo in the frame of its scene."""
     from gsmap.localize.localizing import sigmas_of
 
     one = photo.sighting
     camera = Cameras(one.T_scene_camera[None], one.intrinsics_px[None], np.array([one.size_px]))
-    return KeptPhoto(camera, partial(_picture, path, photo.number), *sigmas_of(one.covariance))
+    return ReferencePhoto(camera, partial(_picture, path, photo.number), *sigmas_of(one.covariance))
 
 
 def _picture(path: str, number: int) -> np.ndarray:
-    """(H, W, 3) uint8 of a photo as it is kept."""
+    """Return the stored image (H, W, 3) uint8 of a photo."""
     from gsmap.formats.pictures import open_picture
 
     try:
@@ -180,18 +180,18 @@ def _picture(path: str, number: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class TileMaker:
-    """Makes the content of a tile, wherever it is called.
+    """A picklable job that makes the content of a tile.
 
     Args:
-        location: of the map.
-        tile: which one.
+        location: location of the map.
+        tile: the planned tile.
         method, params: the merger and its settings.
-        is_cut: only what lies within the tile's bounds belongs to it; else everything does.
-        budget_s: ceiling on the wall seconds that it may take.
-        captured_at: the date of each of its scenes.
-        store: where what views show is kept for other tiles.
-        passing: what of each of its scenes is left out, by scene id.
-        photos: that it is to look like, by scene id.
+        is_cut: true if only content within the tile's bounds belongs to it.
+        budget_s: maximum wall time in seconds.
+        captured_at: date of each scene.
+        store: cache of reference views for other tiles.
+        passing: dynamic content to leave out, by scene id.
+        photos: reference photos, by scene id.
     """
 
     location: str
@@ -202,11 +202,11 @@ class TileMaker:
     budget_s: float | None
     captured_at: Mapping[str, str | None]
     store: ReferenceViewCache
-    passing: Mapping[str, Passing] = field(default_factory=dict)
+    passing: Mapping[str, DynamicContent] = field(default_factory=dict)
     photos: Mapping[str, Sequence[StoredPhoto]] = field(default_factory=dict)
 
     def __call__(self, progress: Progress) -> MergeResult:
-        """Merged in metres, in the map's unit when it is done."""
+        """Merge in metres and return the result in map units."""
         from gsmap.merge.overlap import clamp_inside
         from gsmap.merge.tile import LazyScene, merge_tile
 

@@ -1,4 +1,4 @@
-"""The map's ONNX models: checked when they are added, used by every describe from then on."""
+"""The ONNX models of a map: checked when added, used by every later describe."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gsmap.types.model import ModelLimits, ModelSpec, Tensor
 def add(
     store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool, limits: ModelLimits
 ) -> ModelSpec:
-    """Check a model and keep it under its kind, in place of the one there was; see `check_model` for the errors."""
+    """Check a model and store it under its kind, replacing the previous one; see `check_model` for the errors."""
     spec = check_model(kind, path, preset, limits)
     store.models.add(kind, path, kind=kind, options=spec.to_json(), copy=copy)
     return spec
 
 
 def specs(store: Store) -> dict[str, ModelSpec]:
-    """The map's models by kind, as `gsmap.describe` takes them."""
+    """Return the models of a map by kind."""
     return {model.kind: _spec(model.options, str(model.path)) for model in store.models.list()}
 
 

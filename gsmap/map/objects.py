@@ -1,4 +1,4 @@
-"""Objects of the map: made from its graphs, told as rows, and written for other programs."""
+"""The objects of a map: compute them from scene graphs, report them as rows, export them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.geometry.directions import level_frame
-from gsmap.map.object_words import apart, with_words
-from gsmap.map.photos import with_photos
+from gsmap.map.object_annotations import apply_annotations, why_distinct
+from gsmap.map.photos import add_photo_observations
 from gsmap.map.settings import Settings
-from gsmap.map.stages.objects import Part, objects_of_components
+from gsmap.map.stages.objects import ComponentObjects, objects_of_components
 from gsmap.objects import estimate_persistence, graphml, object_graph, relations
 from gsmap.store import Store
 from gsmap.store.objects import Computed, ObjectFact, number_of
@@ -31,11 +31,11 @@ from gsmap.types.rows import (
     SCHEMA,
     HistoryReport,
     ObjectFactRow,
+    ObjectObservationRow,
     ObjectRow,
     ObjectsReport,
     RelationRow,
     RoomRow,
-    SightingRow,
 )
 
 FORMATS = ("json", "graphml")
@@ -46,19 +46,19 @@ _NEAR_M = 0.1  # a point so near to a box is in it: it was read off a picture
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """The objects of a map and what is needed to tell of them.
+class MapObjects:
+    """The objects of a map with the scenes, rooms and annotations needed to report them.
 
     Args:
-        objects: of all components.
-        scenes: the placed captures by id.
-        notes: who tells nothing, and why.
-        metres: per unit of the map, by component.
-        photos: photographs that the map keeps, by digest: (file, date).
-        joined: id of the object that each is told as one with, where a person said so.
-        facts: all that people ever said of objects, by id.
-        rooms: of each component the rotation (3, 3) from its frame to a level one, and its rooms in that, in metres.
-        parted: id of the object that each was one with until their component came apart.
+        objects: the objects of all components.
+        scenes: the placed scenes by id.
+        notes: scenes without objects, with the reason.
+        metres: metres per map unit, by component.
+        photos: (file, date) of the stored photos, by digest.
+        joined: id of the object into which each joined object was merged.
+        facts: all annotations, by object id.
+        rooms: rotation (3, 3) from the component's frame to a level one, and the rooms in that frame in metres.
+        parted: id of the object from which each was split when its component fell apart.
     """
 
     objects: list[MapObject]
@@ -73,17 +73,17 @@ class Known:
 
     @property
     def dates(self) -> dict[str, str | None]:
-        """Of captures and photographs, by id."""
+        """Dates of scenes and photos, by id."""
         of_photos = {photo: when for photo, (_, when) in self.photos.items()}
         return {scene.id: scene.captured_at for scene in self.scenes.values()} | of_photos
 
     def name_of(self, who: str) -> str:
-        """Of a capture or a photograph."""
+        """Return the name of a scene or photo."""
         return self.scenes[who].name if who in self.scenes else self.photos[who][0]
 
     @cached_property
     def rooms_of(self) -> dict[str, str]:
-        """Id of the room that each object stands in, by id; those of which that is not known are left out."""
+        """Room id of each object, by object id; objects without a known room are left out."""
         out = {}
         for thing in self.objects:
             level, mine = self.rooms.get(thing.component, (np.eye(3), ()))
@@ -99,7 +99,7 @@ class Known:
         return f"r{before + number + 1}"
 
     def room_rows(self) -> tuple[RoomRow, ...]:
-        """The rooms of all components; of each the largest first."""
+        """Return the rooms of all components, the largest of each component first."""
         rows = []
         for component, (level, mine) in sorted(self.rooms.items()):
             unit = self.metres[component]
@@ -120,7 +120,7 @@ class Known:
         return tuple(rows)
 
     def named(self, text: str) -> MapObject:
-        """The object of an id (``o12``), of the id of one that is told as one with it, or of a name.
+        """Return an object by its id (``o12``), the id of an object joined to it, or its name.
 
         Raises:
             NotFoundError: none, or several.
@@ -138,22 +138,22 @@ class Known:
         return found[0]
 
 
-def known_objects(
+def compute_objects(
     store: Store,
     settings: Settings,
     progress: StageProgress,
     graphs: Mapping[str, SceneGraph] | None = None,
     *,
     make: bool = True,
-) -> Known:
-    """The objects of every component by the newest poses, with what people and photographs say of them.
+) -> MapObjects:
+    """Return the objects of every component by the newest poses, with annotations and photo observations.
 
     They are made where what is kept of them is out of date, and then kept, unless the map is open for reading only.
 
     Args:
         graphs: by scene, what the captures are taken to show; no capture is then asked whether it looked where others
             show something, and nothing is kept. By default the newest graph of each, and all are asked.
-        make: those that are out of date.
+        make: compute objects that are out of date.
 
     Raises:
         NotFoundError: the map has no poses yet, or what is kept is out of date and is not to be made.
@@ -166,15 +166,15 @@ def known_objects(
         told = few([f"{one} from {other}" for one, other in parted.items()])
         notes = [*notes, f"components came apart, and objects with them: {told} were split"]
     rooms = {part.component: (level_frame(part.made.up), part.made.rooms) for part in parts}
-    objects, joined, said = with_words(store, objects, scenes)
+    objects, joined, said = apply_annotations(store, objects, scenes)
     kept = store.photos.list() if graphs is None else []
     if kept:
         at = {scene: pose.S_map_scene for scene, pose in placed.poses.items()}
         components = {scene: pose.component for scene, pose in placed.poses.items()}
-        objects = with_photos(objects, kept, scenes, at, metres, components, settings.localize.sighted)
+        objects = add_photo_observations(objects, kept, scenes, at, metres, components, settings.localize.sighted)
     progress("objects", 1.0, f"{len(objects)} objects")
     photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
-    return Known(
+    return MapObjects(
         objects,
         scenes,
         (*notes, *(said if graphs is None else ())),
@@ -187,8 +187,8 @@ def known_objects(
     )
 
 
-def _numbered(store: Store, parts: Sequence[Part]) -> list[MapObject]:
-    """The objects of all components with their numbers; what was made now is kept, if it is to be and may be."""
+def _numbered(store: Store, parts: Sequence[ComponentObjects]) -> list[MapObject]:
+    """Number the objects of all components, and store new objects if the map is writable."""
     new = [part for part in parts if part.places is not None]
     made: dict[int, Sequence[MapObject]] = {
         part.component: [replace(thing, component=part.component) for thing in part.made.objects] for part in parts
@@ -207,13 +207,13 @@ def _numbered(store: Store, parts: Sequence[Part]) -> list[MapObject]:
     return [thing for part in parts for thing in made[part.component]]
 
 
-def kept_objects(store: Store, settings: Settings) -> Known:
-    """The objects of the map as they are kept; only the catalog is read.
+def load_objects(store: Store, settings: Settings) -> MapObjects:
+    """Load the stored objects of a map from the catalog.
 
     Raises:
         NotFoundError: they are out of date.
     """
-    return known_objects(store, settings, lambda *_: None, make=False)
+    return compute_objects(store, settings, lambda *_: None, make=False)
 
 
 # --- what people say ------------------------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ def edit_object(
     same_as: str | None = None,
     author: str = "",
 ) -> ObjectRow:
-    """Say something of an object, and what it is then.
+    """Annotate an object and return its row.
 
     Args:
         ref: its id or name.
@@ -241,7 +241,7 @@ def edit_object(
         NotFoundError: no such object.
         InputError: a name that is taken, two that one capture shows apart; nothing is written.
     """
-    known = known_objects(store, settings, progress)
+    known = compute_objects(store, settings, progress)
     if name is not None and _none(name):
         name = ""
     thing = next((one for one in known.objects if one.id == ref), None)
@@ -254,7 +254,7 @@ def edit_object(
     if same_as is not None and not _none(same_as):
         target, mine = known.named(same_as), known.named(f"o{number}")
         other = number_of(target.id)
-        if why := apart(mine, target, known.scenes):
+        if why := why_distinct(mine, target, known.scenes):
             raise InputError(f"o{number} and {target.id} cannot be one: {why}", code="objects_differ")
     store.objects.edit(
         number,
@@ -264,7 +264,7 @@ def edit_object(
         same_as=other,
         author=author,
     )
-    known = known_objects(store, settings, progress)
+    known = compute_objects(store, settings, progress)
     return object_row(known.named(f"o{number}"), known)
 
 
@@ -275,8 +275,8 @@ def _none(text: str) -> bool:
 # --- rows ------------------------------------------------------------------------------------------------------------
 
 
-def objects_report(known: Known) -> ObjectsReport:
-    """The scene graph of the map."""
+def objects_report(known: MapObjects) -> ObjectsReport:
+    """Report the objects, relations and rooms of a map."""
     return ObjectsReport(
         objects=tuple(object_row(thing, known) for thing in known.objects),
         relations=tuple(
@@ -288,8 +288,8 @@ def objects_report(known: Known) -> ObjectsReport:
     )
 
 
-def history_report(known: Known, place: str | None, box: Sequence[float] | None) -> HistoryReport:
-    """What stood at a place: an object by its id or name, a point ``X,Y,Z``, or a box of six numbers.
+def history_report(known: MapObjects, place: str | None, box: Sequence[float] | None) -> HistoryReport:
+    """Report the history of a place: an object (id or name), a point ``X,Y,Z``, or a box of six numbers.
 
     Raises:
         ConfigError: neither, both, or not what these look like.
@@ -309,7 +309,7 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
             if any(_meets(s.box, area, _NEAR_M / known.metres[thing.component]) for s in thing.sightings)
         ]
     rows = [
-        SightingRow(
+        ObjectObservationRow(
             object=thing.id,
             scene=sighting.scene,
             scene_name=known.name_of(sighting.scene),
@@ -339,7 +339,7 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
 
 
 def _area(place: str | None, box: Sequence[float] | None) -> np.ndarray:
-    """(2, 3) corners."""
+    """Return the (2, 3) corners of a point or box."""
     try:
         numbers = (
             [float(part) for part in place.split(",")] if place is not None else [float(part) for part in box or ()]
@@ -360,8 +360,8 @@ def _meets(box: np.ndarray | None, area: np.ndarray, near: float) -> bool:
     return box is not None and bool((box[0] <= area[1] + near).all() and (box[1] >= area[0] - near).all())
 
 
-def object_row(thing: MapObject, known: Known) -> ObjectRow:
-    """One object."""
+def object_row(thing: MapObject, known: MapObjects) -> ObjectRow:
+    """Return the row of an object."""
     stays = estimate_persistence(thing, known.dates)
     seen = [known.dates[sighting.scene] for sighting in thing.sightings if sighting.state == "seen"]
     return ObjectRow(
@@ -387,12 +387,12 @@ def object_row(thing: MapObject, known: Known) -> ObjectRow:
 # --- other programs --------------------------------------------------------------------------------------------------
 
 
-def as_networkx(known: Known) -> Any:
-    """A `networkx.MultiDiGraph`, see `gsmap.objects.object_graph`."""
+def as_networkx(known: MapObjects) -> Any:
+    """Return a `networkx.MultiDiGraph`, see `gsmap.objects.object_graph`."""
     return object_graph(known.objects, known.dates, known.metres, known.room_rows())
 
 
-def write_graph(known: Known, out: str | os.PathLike[str], format: str) -> Path:
+def write_graph(known: MapObjects, out: str | os.PathLike[str], format: str) -> Path:
     """Write the scene graph of the map, whole or not at all.
 
     Raises:

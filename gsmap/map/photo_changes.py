@@ -1,4 +1,4 @@
-"""What placed photographs show otherwise than the map: rows, the things it concerns, and pictures of it."""
+"""Compare localized photos with the map: rows, affected objects, and annotated images."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from gsmap.durable import make_folder, write_whole
 from gsmap.errors import NotFoundError
 from gsmap.localize import Region, compare_photo
 from gsmap.localize.localizing import prepared
-from gsmap.map.objects import Known, known_objects
-from gsmap.map.photos import Told, things_in
+from gsmap.map.objects import MapObjects, compute_objects
+from gsmap.map.photos import PhotoObservation, objects_in_photo
 from gsmap.map.stages.localize import Localizer
 from gsmap.methods import text_digest
 from gsmap.types import MapObject, SceneGraph
-from gsmap.types.localization import Photo, Placement
-from gsmap.types.photo_sighting import ThingInPhoto
+from gsmap.types.localization import LocalizationResult, Photo
+from gsmap.types.localized_photo import PhotoObjectObservation
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.localize import LocalizeRow, PhotoChangeRow
 
@@ -29,29 +29,29 @@ _COLOURS = {"appeared": (30, 160, 60), "disappeared": (215, 50, 40), "recoloured
 _OTHER = (235, 140, 20)
 
 
-class Teller:
-    """Compares placed photos with the map; objects and eyes are made once, when a photo needs them."""
+class PhotoReporter:
+    """Compares localized photos with the map; objects and reference views are loaded on first use."""
 
     def __init__(self, localizer: Localizer, progress: StageProgress) -> None:
         self._localizer, self._progress = localizer, progress
-        self._known: Known | None = None
+        self._known: MapObjects | None = None
         self._asked = False
         self._graphs: dict[str, SceneGraph | None] = {}
 
     @property
-    def known(self) -> Known | None:
-        """The objects of the map; None where nobody knows them."""
+    def known(self) -> MapObjects | None:
+        """Objects of the map; None if they cannot be computed."""
         if not self._asked:
             self._asked = True
             held = self._localizer
             try:
-                self._known = known_objects(held.store, held.settings, self._progress)
+                self._known = compute_objects(held.store, held.settings, self._progress)
             except NotFoundError:
                 self._known = None
         return self._known
 
-    def tell(self, photo: Photo, where: Placement) -> Told:
-        """What a placed photo shows otherwise than the map does there."""
+    def compare(self, photo: Photo, where: LocalizationResult) -> PhotoObservation:
+        """Compare a localized photo with the map."""
         assert where.T_map_camera is not None
         assert where.covariance is not None
         assert where.intrinsics_px is not None
@@ -68,7 +68,7 @@ class Teller:
             where.covariance * np.outer(in_metres, in_metres),
             where.intrinsics_px,
             support,
-            {one.scene: held.eyes(one.scene) for one in support},
+            {one.scene: held.reference_views(one.scene) for one in support},
             held.params,
         )
         rows = tuple(self._row(region, where.component, unit) for region in found.regions)
@@ -77,16 +77,16 @@ class Teller:
             notes.append(
                 f"{photo.name}: only {found.judged:.0%} of it could be compared: elsewhere no capture looked from there"
             )
-        return Told(found, rows, tuple(notes))
+        return PhotoObservation(found, rows, tuple(notes))
 
-    def things(self, row: LocalizeRow, told: Told) -> list[ThingInPhoto]:
-        """What a placed photo says of the map's objects, places in the map's frame."""
+    def observed_objects(self, row: LocalizeRow, told: PhotoObservation) -> list[PhotoObjectObservation]:
+        """Return the objects that a localized photo shows or shows to be absent, map frame."""
         if self.known is None or row.component is None:
             return []
         held = self._localizer
         poses = {scene: pose.S_map_scene for scene, pose in held.store.revisions.poses().items()}
         unit = held.metres.get(row.component, 1.0)
-        return things_in(told, row, unit, self.known.objects, self._graph, poses, held.params.sighted)
+        return objects_in_photo(told, row, unit, self.known.objects, self._graph, poses, held.params.sighted)
 
     def _graph(self, scene: str) -> SceneGraph | None:
         if scene not in self._graphs:
@@ -111,8 +111,8 @@ class Teller:
 _LITTLE = 0.2
 
 
-def nearest_object(known: Known | None, component: int, position: np.ndarray, unit: float) -> MapObject | None:
-    """The object whose box, where it was last seen, is nearest to a place, if any is near."""
+def nearest_object(known: MapObjects | None, component: int, position: np.ndarray, unit: float) -> MapObject | None:
+    """Return the present object whose box is nearest to a point, if it is near enough."""
     if known is None:
         return None
     best, far = None, _NEAR_M / unit
@@ -131,8 +131,10 @@ def _volume(thing: MapObject) -> float:
     return float(np.prod(thing.box[1] - thing.box[0]))
 
 
-def write_picture(folder: str | os.PathLike[str], file: str, photo: Photo, told: Told, localizer: Localizer) -> Path:
-    """The photo with what differs outlined and numbered, and what could not be compared in grey.
+def write_picture(
+    folder: str | os.PathLike[str], file: str, photo: Photo, told: PhotoObservation, localizer: Localizer
+) -> Path:
+    """Write the photo with differences outlined and numbered, and uncomparable parts in grey.
 
     Returns:
         The file, named by the photo's name and content, so that two of one name do not meet.

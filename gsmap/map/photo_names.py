@@ -19,13 +19,12 @@ of the path that agree; the suffix agrees."""
 
 @dataclass(frozen=True, eq=False)
 class PhotoMatches:
-    """Photos and the cameras that they are.
+    """Photos matched to cameras.
 
     Args:
-        cameras: scene name and row among its cameras, by photo.
-        left_out: photos that only share a file name with a camera, by the photo that is that camera or shows that the
-            scene's photos lie elsewhere.
-        by_file_name: matched photos of which neither a folder nor the file name tells the scene.
+        cameras: scene name and camera row, by photo.
+        left_out: photos that only share a file name with a camera, with the photo that takes precedence.
+        by_file_name: photos matched by file name alone, without evidence for the scene.
     """
 
     cameras: dict[str, _Camera]
@@ -43,8 +42,8 @@ def match_photos(photos: Collection[str], names: Mapping[str, Sequence[str]], wh
 
     Args:
         photos: paths, as long as they are known; ``/`` and ``\\`` part folders.
-        names: of the cameras of each scene, by scene name.
-        where: the place to name in errors, by photo.
+        names: camera names of each scene, by scene name.
+        where: source of each photo's name, for error messages.
 
     Raises:
         InputError: a photo may be several cameras, or several photos may be one.
@@ -83,7 +82,7 @@ def match_photos(photos: Collection[str], names: Mapping[str, Sequence[str]], wh
 
 
 def rows_of_photo(names: Sequence[str], photo: str) -> list[int]:
-    """The rows of the cameras of one scene that a photo's name may mean: one where it is not ambiguous."""
+    """Return the rows of a scene's cameras that a photo's name may mean; one if it is unambiguous."""
     exact = [row for row, name in enumerate(names) if name == photo]
     if exact:
         return exact
@@ -94,7 +93,7 @@ def rows_of_photo(names: Sequence[str], photo: str) -> list[int]:
 
 
 def _drop_other_folders(ranked: dict[str, dict[_Camera, _Rank]]) -> dict[str, str]:
-    """Take out of ``ranked`` what folders speak against: the photos left out, by one that lies where it should."""
+    """Remove from ``ranked`` the photos that folders exclude; return them with a photo in the expected folder."""
     best: dict[str, tuple[tuple[bool, bool], str]] = {}
     for photo, ranks in ranked.items():
         for (scene, _), rank in ranks.items() if len(_parts(photo)) > 1 else ():
@@ -116,7 +115,7 @@ def _drop_other_folders(ranked: dict[str, dict[_Camera, _Rank]]) -> dict[str, st
 
 
 def _is_bare(photo: str, scene: str, rank: _Rank) -> bool:
-    """Whether neither a folder nor the file name tells that a photo is of a scene."""
+    """Return true if neither a folder nor the file name identifies the scene of a photo."""
     return not rank[0] and rank[2] == 1 and scene not in _parts(photo)[-1]
 
 
@@ -126,7 +125,7 @@ def _one_photo_each(
     names: Mapping[str, Sequence[str]],
     where: Mapping[str, str],
 ) -> dict[str, str]:
-    """Take out of ``chosen`` what another photo fits better: the photos left out, by that one."""
+    """Keep the best photo of each camera in ``chosen``; return the removed photos with the kept one."""
     photos_of: dict[_Camera, list[str]] = {}
     for photo, camera in chosen.items():
         photos_of.setdefault(camera, []).append(photo)
@@ -149,13 +148,13 @@ def _one_photo_each(
 
 
 def _is_same_photo(a: Sequence[str], b: Sequence[str]) -> bool:
-    """Whether these are two ways to write one photo: one path is the tail of the other, but for a suffix left out."""
+    """Return true if two paths name one photo: one is the tail of the other, apart from a missing suffix."""
     whole, _, same = _agreement(a, b)
     return whole and (same or _stem(a[-1]) in (a[-1], b[-1]))
 
 
 def _agreement(photo: Sequence[str], camera: Sequence[str]) -> tuple[bool, int, bool]:
-    """Whether no folder differs; how many parts agree from the end, the last one but for its suffix; that, too."""
+    """Return whether all folders agree, the number of agreeing parts from the end, and whether the suffix agrees."""
     tail = 1
     while tail < min(len(photo), len(camera)) and photo[-tail - 1] == camera[-tail - 1]:
         tail += 1
@@ -163,7 +162,7 @@ def _agreement(photo: Sequence[str], camera: Sequence[str]) -> tuple[bool, int, 
 
 
 def _scene_of(folders: Sequence[str], scenes: Mapping[tuple[str, ...], str]) -> str | None:
-    """The scene that the deepest folder is called as; None where none is."""
+    """Return the scene named like the deepest folder; None if there is none."""
     sizes = sorted({len(name) for name in scenes}, reverse=True)
     for end in range(len(folders), 0, -1):
         for size in sizes:
@@ -173,7 +172,7 @@ def _scene_of(folders: Sequence[str], scenes: Mapping[tuple[str, ...], str]) -> 
 
 
 def _parts(path: str) -> list[str]:
-    """Folders and file name."""
+    """Split a path into folders and file name."""
     return [part for part in path.replace("\\", "/").split("/") if part not in ("", ".")] or [path]
 
 

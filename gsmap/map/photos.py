@@ -1,4 +1,4 @@
-"""Photographs that a map keeps: what each says of the map's things, where they stand by the newest poses, as rows."""
+"""Photos stored in a map: their object observations and their poses, as rows."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from PIL import Image
 from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.transforms import transform_poses
 from gsmap.localize import Differences, sighted
-from gsmap.map.dates import parsed
-from gsmap.map.placed_photos import placed_photo
+from gsmap.map.date_filter import parse_moment
+from gsmap.map.photo_poses import photo_pose_of
 from gsmap.store import Store
 from gsmap.store.photos import MAX_BYTES, StoredPhoto
-from gsmap.types import MapObject, Scene, SceneGraph, Sighting, Sim3
+from gsmap.types import MapObject, ObjectObservation, Scene, SceneGraph, Sim3
 from gsmap.types.localization import Photo
-from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
+from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 from gsmap.types.rows.localize import LocalizeRow, PhotoChangeRow, PhotoRow
 
 _SIDE_PX = 960  # of the picture that is kept: as large as captures are rendered for the merged map to look like
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What one placed photo tells.
+class PhotoObservation:
+    """The comparison of one localized photo with the map.
 
     Args:
-        found: where it differs.
-        rows: of that, for people.
-        notes: what they should know.
+        found: the differences.
+        rows: the differences as rows.
+        notes: remarks for the user.
     """
 
     found: Differences
@@ -42,21 +42,21 @@ class Told:
     notes: tuple[str, ...]
 
 
-def sighting_of(
-    store: Store, row: LocalizeRow, photo: Photo, things: Sequence[ThingInPhoto], captured_at: str | None
-) -> PhotoSighting | None:
-    """What is kept of a placed photo; None where the scene that supports it is gone.
+def localized_photo_of(
+    store: Store, row: LocalizeRow, photo: Photo, things: Sequence[PhotoObjectObservation], captured_at: str | None
+) -> LocalizedPhoto | None:
+    """Return the record to store for a localized photo; None if its supporting scene is gone.
 
     Args:
-        things: what it says, places in the map's frame.
+        things: object observations, positions in the map frame.
     """
     poses, ids = store.revisions.poses(), {scene.name: scene.id for scene in store.scenes.list()}
-    placed = placed_photo(row, photo.size_px, poses, ids)
+    placed = photo_pose_of(row, photo.size_px, poses, ids)
     if placed is None:
         return None
     S_scene_map = poses[placed.scene].S_map_scene.inverse()
     width, height = placed.size_px
-    return PhotoSighting(
+    return LocalizedPhoto(
         digest=digest_of(row.file, photo),
         name=os.path.basename(row.file) or "photo",
         captured_at=captured_at,
@@ -71,7 +71,7 @@ def sighting_of(
 
 
 def digest_of(file: str, photo: Photo) -> str:
-    """SHA-256 of a photo's file; of a frame of a clip, of its pixels."""
+    """Return the SHA-256 of a photo's file, or of the pixels of a video frame."""
     made = hashlib.sha256()
     if os.path.isfile(file):
         with open(file, "rb") as stream:
@@ -83,7 +83,7 @@ def digest_of(file: str, photo: Photo) -> str:
 
 
 def small_jpeg(photo: Photo) -> bytes:
-    """The photo as it is kept."""
+    """Encode a photo as the JPEG that the map stores."""
     image = Image.fromarray(photo.rgb)
     image.thumbnail((_SIDE_PX, _SIDE_PX))
     for quality in (82, 60, 30):
@@ -94,16 +94,16 @@ def small_jpeg(photo: Photo) -> bytes:
     return content.getvalue()
 
 
-def things_in(
-    told: Told,
+def objects_in_photo(
+    told: PhotoObservation,
     row: LocalizeRow,
     unit: float,
     objects: Sequence[MapObject],
     graph_of: Callable[[str], SceneGraph | None],
     poses: Mapping[str, Sim3],
     params: sighted.Params,
-) -> list[ThingInPhoto]:
-    """What a placed photo says of the objects of its component: those it shows, and those it shows to be gone.
+) -> list[PhotoObjectObservation]:
+    """Return which objects of its component a localized photo shows, and which it shows to be absent.
 
     An object is in sight where the map, seen from the photo, shows its surface: where something the map has stands
     before it nothing is said, and neither where something new does.
@@ -137,16 +137,16 @@ def things_in(
         if len(column) < params.min_samples or share < params.min_share:
             continue
         if gone[line, column].mean() >= params.gone:
-            out.append(ThingInPhoto(thing.position, "absent", share))
+            out.append(PhotoObjectObservation(thing.position, "absent", share))
         elif (told.found.agrees & ~hidden)[line, column].mean() >= params.seen:
-            out.append(ThingInPhoto(thing.position, "seen", share))
+            out.append(PhotoObjectObservation(thing.position, "seen", share))
     return out
 
 
 def _points(
     thing: MapObject, graph_of: Callable[[str], SceneGraph | None], poses: Mapping[str, Sim3]
 ) -> np.ndarray | None:
-    """(K, 3) samples of an object's surface where it was last a thing of a capture, map frame."""
+    """Return the (K, 3) surface samples of an object from the newest scene that shows it, map frame."""
     for sighting in reversed(thing.sightings):
         if sighting.state != "seen" or sighting.thing < 0:
             continue
@@ -158,7 +158,7 @@ def _points(
     return None
 
 
-def with_photos(
+def add_photo_observations(
     objects: Sequence[MapObject],
     kept: Sequence[StoredPhoto],
     scenes: Mapping[str, Scene],
@@ -167,7 +167,7 @@ def with_photos(
     components: Mapping[str, int],
     params: sighted.Params,
 ) -> list[MapObject]:
-    """Objects with what kept photographs say of them, among the captures in the order of dates.
+    """Add the observations of stored photos to objects, in the order of dates.
 
     What a photo said of a thing holds for the object that stands or stood at that place.
 
@@ -175,7 +175,7 @@ def with_photos(
         poses: ``S_map_scene`` by scene id. components: the same of components.
         metres: per unit, by component.
     """
-    said: dict[int, dict[str, Sighting]] = {}
+    said: dict[int, dict[str, ObjectObservation]] = {}
     for photo in kept:
         one = photo.sighting
         if one.scene not in poses:
@@ -185,7 +185,7 @@ def with_photos(
             at = poses[one.scene].apply(thing.position)
             number = _at(objects, component, at, params.same_place_m / metres[component])
             if number is not None:
-                sighting = Sighting(one.digest, thing.state, -1, None, thing.share)
+                sighting = ObjectObservation(one.digest, thing.state, -1, None, thing.share)
                 said.setdefault(number, {}).setdefault(one.digest, sighting)
     whens = {scene.id: _when(scene.captured_at, scene.ingested_at) for scene in scenes.values()}
     whens |= {photo.sighting.digest: _when(photo.sighting.captured_at, photo.created_at) for photo in kept}
@@ -198,7 +198,7 @@ def with_photos(
 
 
 def _at(objects: Sequence[MapObject], component: int, at: np.ndarray, near: float) -> int | None:
-    """The object that stands or stood at a place: of several the one whose box's middle is nearest."""
+    """Return the index of the object at a point; of several the one whose box centre is nearest."""
     best, far = None, np.inf
     for number, thing in enumerate(objects):
         if thing.component != component:
@@ -213,14 +213,14 @@ def _at(objects: Sequence[MapObject], component: int, at: np.ndarray, near: floa
 
 
 def _when(captured_at: str | None, came_at: str | None) -> tuple[bool, float, str]:
-    """Dated ones by their date; then the others, as they came."""
+    """Return a sort key: dated items by date, then undated items by arrival."""
     if captured_at is None:
         return True, 0.0, came_at or ""
-    return False, parsed(captured_at).timestamp(), came_at or ""
+    return False, parse_moment(captured_at).timestamp(), came_at or ""
 
 
 def photo_rows(store: Store) -> list[PhotoRow]:
-    """The photographs that a map keeps, oldest first, each where it stands by the newest poses.
+    """List the stored photos, oldest first, with poses by the newest revision.
 
     One whose scene has no pose now has neither component nor pose.
     """

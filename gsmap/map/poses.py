@@ -1,4 +1,4 @@
-"""Poses for other programs: TUM and g2o for the scenes, COLMAP and nerfstudio for the cameras, JSON for both ids."""
+"""Export poses: TUM and g2o for scenes, COLMAP and nerfstudio for cameras, JSON for both."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats import colmap, g2o, nerfstudio, tum
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.map import reports
-from gsmap.map.dates import NO_DATE, parsed
-from gsmap.map.metres import map_metres
-from gsmap.map.one_state import of_one_state
+from gsmap.map.date_filter import NO_DATE, parse_moment
+from gsmap.map.metric_scales import map_metres
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.texts import few
 from gsmap.types import Cameras, Edge, Scene, ScenePose, Sim3
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import SCHEMA
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ FORMATS = ("tum", "g2o", "colmap", "nerfstudio", "json")
 _log = logging.getLogger("gsmap.map")
 
 
-@of_one_state
+@snapshot_read
 def write_poses(
     store: Store, out: Path, format: str, crs: str | None = None, *, settings: Settings | None = None
 ) -> list[Path]:
@@ -90,7 +90,7 @@ def write_poses(
     written = []
     for component in components:
         members = [pose for pose in placed if pose.component == component]
-        metre = metres.get(component, Metre())
+        metre = metres.get(component, MetricScale())
         path = out if len(components) == 1 else out.with_name(f"{out.stem}_component_{component}{out.suffix}")
         if format == "tum":
             _write_tum(path, members, scenes, metre)
@@ -107,14 +107,14 @@ def write_poses(
     return written
 
 
-def _write_tum(path: Path, members: Sequence[ScenePose], scenes: Mapping[str, Scene], metre: Metre) -> None:
+def _write_tum(path: Path, members: Sequence[ScenePose], scenes: Mapping[str, Scene], metre: MetricScale) -> None:
     undated = [scenes[pose.scene].name for pose in members if scenes[pose.scene].captured_at is None]
     times, remarks = None, []
     if undated:
         have = "has no date" if len(undated) == 1 else "have no date"
         remarks.append(f"times are made up, 0, 1, 2, ... in the order of names: {few(undated)} {have} ({NO_DATE})")
     else:
-        dates = [parsed(scenes[pose.scene].captured_at or "").timestamp() for pose in members]
+        dates = [parse_moment(scenes[pose.scene].captured_at or "").timestamp() for pose in members]
         order = np.argsort(dates, kind="stable")
         members, dates = [members[i] for i in order], [dates[i] for i in order]
         times = _distinct(dates)
@@ -134,7 +134,7 @@ def _write_tum(path: Path, members: Sequence[ScenePose], scenes: Mapping[str, Sc
 
 
 def _distinct(times_s: Sequence[float]) -> list[float]:
-    """Times in order, of which the equal ones are spread before the next one, at most a second apart."""
+    """Return sorted times in which equal ones are spread towards the next one, at most a second apart."""
     groups = [(time_s, len(list(same))) for time_s, same in groupby(times_s)]
     out: list[float] = []
     for i, (time_s, count) in enumerate(groups):
@@ -144,7 +144,7 @@ def _distinct(times_s: Sequence[float]) -> list[float]:
 
 
 def _write_g2o(
-    path: Path, members: Sequence[ScenePose], edges: Sequence[Edge], scenes: Mapping[str, Scene], metre: Metre
+    path: Path, members: Sequence[ScenePose], edges: Sequence[Edge], scenes: Mapping[str, Scene], metre: MetricScale
 ) -> None:
     factor, unit = _unit(path, metre)
     in_factor = np.array([1.0] * 3 + [1 / factor] * 3 + [1.0])  # of the tangent, [rot_rad, trans, log_scale]
@@ -160,8 +160,8 @@ def _write_g2o(
     g2o.write_graph(path, poses, moved, names={scene: scenes[scene].name for scene in poses}, remarks=[unit])
 
 
-def _unit(path: Path, metre: Metre) -> tuple[float, str]:
-    """By what lengths of a component are multiplied before they are written, and a remark on their unit."""
+def _unit(path: Path, metre: MetricScale) -> tuple[float, str]:
+    """Return the factor from component units to output units, and a remark on the unit."""
     if not metre.is_rough:
         return metre.metres_per_unit, f"lengths in metres ({metre.text()} of the map)"
     remark = f"lengths in the unit of the map: {metre.text()}"
@@ -170,7 +170,7 @@ def _unit(path: Path, metre: Metre) -> tuple[float, str]:
 
 
 def _moved(S: Sim3, factor: float) -> Sim3:
-    """A pose with its lengths in another unit, on both sides."""
+    """Scale the lengths of a pose on both sides."""
     return Sim3(S.rotation, S.translation * factor, S.scale)
 
 
@@ -189,7 +189,7 @@ def _edges(store: Store, members: Sequence[ScenePose], used: set[tuple[str, str]
 
 
 def _cameras(store: Store, members: Sequence[ScenePose], scenes: Mapping[str, Scene]) -> Cameras:
-    """The cameras of all members, map frame, under names that tell the scenes apart."""
+    """Return the cameras of all scenes in the map frame, with names unique across scenes."""
     moved = [(pose, transform_cameras(store.scenes.cameras(pose.scene), pose.S_map_scene)) for pose in members]
     return Cameras(
         np.concatenate([cameras.T_frame_camera for _, cameras in moved]),

@@ -1,4 +1,4 @@
-"""The settings of a map: one frozen tree of the parameters of all stages, its presets, and ``MAP/settings.toml``."""
+"""The settings of a map: one frozen tree of the parameters of all stages, presets, and ``MAP/settings.toml``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmap.errors import ConfigError
-from gsmap.settings import FILE_NAME, changed, load, save
+from gsmap.settings import FILE_NAME, changed, contains, load, save
 from gsmap.settings.file import PRESET
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 class _Section:
-    """A field of `Settings` whose default is made, and whose module is imported, on first use."""
+    """A field of `Settings` whose module is imported, and whose default is made, on first use."""
 
     def __init__(self, module: str) -> None:
         self._module = module
@@ -97,26 +97,26 @@ def _params_of(module: str) -> Any:
 
 @dataclass(frozen=True)
 class Settings:
-    """All parameters of a map. Rooms whose parameters nobody asks for are not imported.
+    """The settings of a map, one section per stage. The module of a section is imported on first use.
 
     Args:
-        describe: how captures become scene graphs.
-        retrieve: which pairs are tried.
-        register: how a pair is registered and judged.
-        optimize: how poses are solved.
-        world: how observations of the world are read.
-        thin: when a capture is kept compact.
-        merge: how captures become one.
-        export: how tiles are planned and kept.
-        visits: which captures are compared for changes.
-        change: how changes between two captures are found.
-        objects: when things of several captures are one, and how they are looked for.
-        localize: how photographs are found.
-        scan: how a scan is looked for.
-        evaluate: when an edge counts as wrong.
-        report: how much a report shows.
-        view: how the map is looked at.
-        engine: where jobs run.
+        describe: description of captures as scene graphs.
+        retrieve: choice of the pairs to register.
+        register: registration of pairs and its verdict.
+        optimize: optimization of the poses.
+        world: use of observations of the world.
+        thin: thinning of superseded captures.
+        merge: merging of captures.
+        export: planning and storage of tiles.
+        visits: choice of the visits to compare.
+        change: detection of changes.
+        objects: association of segments over captures.
+        localize: localization of photos.
+        scan: localization of scans.
+        evaluate: thresholds of the evaluation.
+        report: limits of a report.
+        view: limits of the page.
+        engine: execution of jobs.
     """
 
     describe: describe.Params = field(default=_params_of("gsmap.describe"))
@@ -139,7 +139,7 @@ class Settings:
 
 
 def settings_of(values: Mapping[str, Any], preset: str | None = None) -> Settings:
-    """The defaults, changed by a preset and then by values by dotted name.
+    """Return the defaults, changed by a preset and then by values by dotted name.
 
     Raises:
         ConfigError: no such preset or setting, or a value that does not fit.
@@ -151,28 +151,49 @@ def settings_of(values: Mapping[str, Any], preset: str | None = None) -> Setting
 
 
 def read_settings(folder: Path) -> tuple[str, dict[str, Any]]:
-    """The preset of a map and what it changes besides, by dotted name.
+    """Read the preset of a map and its own settings by dotted name, unknown names included.
 
     Raises:
         ConfigError: ``settings.toml`` cannot be read.
     """
     values = load(folder / FILE_NAME)
     for name in [name for name in values if _is_of_the_run(name)]:
-        _log.warning("%s: %s is left out: where jobs run is for whoever runs gsmap to say", folder / FILE_NAME, name)
+        _log.warning("%s: %s is ignored: an executor is chosen with each run (--executor)", folder / FILE_NAME, name)
         del values[name]
     return str(values.pop(PRESET, "default")), values
 
 
+_WARNED: set[tuple[Path, str]] = set()
+"""File and name of the settings that were reported as unknown, each once."""
+
+
+def _known(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a file that exist; warn once of each other one, so that a map of an older gsmap opens."""
+    defaults, path = Settings(), folder / FILE_NAME
+    unknown = [name for name in values if not contains(defaults, name)]
+    for name in unknown:
+        if (path, name) not in _WARNED:
+            _WARNED.add((path, name))
+            _log.warning(
+                "%s: setting %s is ignored: this version of gsmap has a constant in its place, or another name for it "
+                "(gsmap settings MAP --json lists all settings); remove it with gsmap settings MAP --unset %s",
+                path,
+                name,
+                name,
+            )
+    return {name: value for name, value in values.items() if name not in unknown}
+
+
 def _is_of_the_run(name: str) -> bool:
-    """Whether a setting may lead to another machine: a map may come from a stranger."""
+    """Return true for a setting that may start jobs on another machine: a map may come from a stranger."""
     return name.startswith("engine.") and not name.startswith("engine.executors.local.")
 
 
 def map_settings(folder: Path, run_preset: str | None, run_values: Mapping[str, Any]) -> Settings:
-    """The tree in force: defaults, the map's preset and settings, then those of a run.
+    """Return the settings in force: defaults, the map's preset and settings, then those of a run.
 
     Args:
-        run_preset: takes the place of all that the map is set to.
+        run_preset: replaces the preset and the settings of the map.
         run_values: by dotted name.
 
     Raises:
@@ -181,11 +202,11 @@ def map_settings(folder: Path, run_preset: str | None, run_values: Mapping[str, 
     if run_preset is not None:
         return settings_of(run_values, run_preset)
     preset, values = read_settings(folder)
-    return _combined(folder, preset, values, run_values)
+    return _combined(folder, preset, _known(folder, values), run_values)
 
 
 def _combined(folder: Path, preset: str, values: Mapping[str, Any], more: Mapping[str, Any]) -> Settings:
-    """The map's settings with more on top."""
+    """Return the map's settings with further values on top."""
     try:
         return settings_of({**values, **more}, preset)
     except ConfigError:
@@ -199,18 +220,18 @@ def _combined(folder: Path, preset: str, values: Mapping[str, Any], more: Mappin
 def write_settings(
     folder: Path, values: Mapping[str, Any], *, preset: str | None = None, drop: tuple[str, ...] = ()
 ) -> None:
-    """Change a map's ``settings.toml``; nothing is written unless the whole tree makes sense.
+    """Change a map's ``settings.toml``; nothing is written unless all settings are valid.
 
     Args:
         values: settings by dotted name.
-        preset: the map's preset from now on.
-        drop: names that go back to what the preset, or else the default, says.
+        preset: new preset of the map.
+        drop: names to reset to the preset or default.
 
     Raises:
         ConfigError: no such preset or setting, or a value that does not fit.
     """
     old_preset, old = read_settings(folder)
-    kept = {name: value for name, value in old.items() if name not in drop}
+    kept = _known(folder, {name: value for name, value in old.items() if name not in drop})
     if preset is not None:
         settings_of({}, preset)
     unknown = [name for name in drop if name not in old]

@@ -1,4 +1,4 @@
-"""A small map, for localisation alone: a folder of ``localize.json`` and one file for each scene; it is only read.
+"""Small maps for localization only: a folder with ``localize.json`` and one file per scene.
 
 What is in it: of every scene that has a place its pose, metre, name and date, features of its views, and its Gaussians
 merged to fewer, both rounded. It is no map: nothing can be added to it, and no other verb opens it.
@@ -35,11 +35,11 @@ from gsmap.localize import (
     packing,
     view_index,
 )
-from gsmap.map import persisting
-from gsmap.map.objects import Known
-from gsmap.map.persisting import what_passes
+from gsmap.map import static_filter
+from gsmap.map.objects import MapObjects
 from gsmap.map.settings import Settings, settings_of
-from gsmap.map.stages.localize import Localizer, Near
+from gsmap.map.stages.localize import Localizer, SearchRegion
+from gsmap.map.static_filter import find_dynamic_content
 from gsmap.methods import family
 from gsmap.store import Store, staging
 from gsmap.types import Cameras, Gaussians, Sim3
@@ -59,15 +59,15 @@ _SPARSER = 0.11  # of N Gaussians merged to n each takes (N / n) ** 0.11 times t
 
 
 @dataclass(frozen=True, eq=False)
-class SmallScene:
-    """What a small map knows of a scene without reading its arrays.
+class SmallMapScene:
+    """The metadata of a scene in a small map.
 
     Args:
         id, name, captured_at: as in the map.
-        component: whose frame ``S_map_scene`` is in.
-        covariance: (7, 7) of that pose, or None.
-        bounds: (2, 3) of its Gaussians, scene frame.
-        sha256: of its file.
+        component: component of ``S_map_scene``.
+        covariance: (7, 7) covariance of that pose, or None.
+        bounds: (2, 3) box of its Gaussians, scene frame.
+        sha256: digest of its file.
     """
 
     id: str
@@ -89,13 +89,13 @@ def export_small(
     budget_bytes: int,
     settings: Settings,
     progress: StageProgress,
-    known: Known | None = None,
+    known: MapObjects | None = None,
 ) -> SmallMapReport:
     """Write a small map; it appears whole or not at all.
 
     Args:
-        budget_bytes: of all its files together.
-        known: the objects of the map, to leave out what of it does not persist; by default what changes say is gone.
+        budget_bytes: maximum size of all files together.
+        known: objects of the map, to leave out dynamic content; default: leave out what changes show to be gone.
 
     Raises:
         StoreError: the folder is not empty.
@@ -112,12 +112,12 @@ def export_small(
     localizer = Localizer(store, settings, progress)
     params = settings.localize.small
     scenes = sorted(localizer.placed)
-    passing = {} if known is None else what_passes(store, known)
+    passing = {} if known is None else find_dynamic_content(store, known)
     wanted: dict[str, int] = {}
     shown: dict[str, int] = {}
     for number, scene in enumerate(scenes):
         progress("export", 0.4 * number / len(scenes), f"what of {localizer.scenes[scene].name} shows")
-        whole = _whole(localizer, scene, passing.get(scene))
+        whole = _scene_content(localizer, scene, passing.get(scene))
         wanted[scene], shown[scene] = whole.num_bytes, len(whole.gaussians)
     free = budget_bytes - _HEADER_BYTES * len(scenes) - 500
     factor = free / max(sum(wanted.values()), 1)
@@ -128,7 +128,7 @@ def export_small(
         files, rows = {}, []
         for number, scene in enumerate(scenes):
             progress("export", 0.4 + 0.5 * number / len(scenes), f"packing {localizer.scenes[scene].name}")
-            whole = _whole(localizer, scene, passing.get(scene))
+            whole = _scene_content(localizer, scene, passing.get(scene))
             content, row = _packed(localizer, whole, factor * wanted[scene], params)
             files[scene] = content
             rows.append(row)
@@ -153,15 +153,15 @@ def export_small(
 
 
 @dataclass(frozen=True, eq=False)
-class _Whole:
-    """What of a scene a small map may hold.
+class _SceneContent:
+    """The content of a scene that a small map may store.
 
     Args:
-        scene: its id.
-        features: of its views.
-        gaussians: that show in its own pictures, in one colour each.
-        cameras: of these pictures; None where the scene has none.
-        first: features of a view that photographs are looked for by.
+        scene: scene id.
+        features: features of its views.
+        gaussians: Gaussians visible in its own images, each of one colour.
+        cameras: cameras of these images; None if the scene has none.
+        first: number of features per view that retrieval uses.
     """
 
     scene: str
@@ -176,34 +176,34 @@ class _Whole:
 
     @property
     def num_bytes(self) -> int:
-        """Packed, but for the coarser steps that fewer bytes take."""
+        """Packed size before coarser rounding."""
         features = packed_features.pack(self.features, self.step, self.first)
         return len(_npz(features)) + len(_npz(packed_gaussians.pack(self.gaussians)))
 
 
-def _whole(localizer: Localizer, scene: str, passing: persisting.Passing | None) -> _Whole:
-    """What a small map may hold of a scene.
+def _scene_content(localizer: Localizer, scene: str, passing: static_filter.DynamicContent | None) -> _SceneContent:
+    """Return the content of a scene that a small map may store.
 
     Args:
-        passing: what of it does not persist; None where what changes say is gone is left out.
+        passing: dynamic content to leave out; None leaves out what changes show to be gone.
     """
     store, params, placed = localizer.store, localizer.params.small, localizer.placed[scene]
     held = store.scenes.cameras(scene)
     own = None if held is None or held.synthesised else held
     features = placed.features
     if passing is None:
-        gone = _gone(store, scene)
+        gone = _removed(store, scene)
     else:
-        gone = persisting.rows(store, scene, passing)
+        gone = static_filter.dynamic_rows(store, scene, passing)
         features = packing.without(features, placed.gaussians.means, gone)
     weights, coloured = packing.shown(placed, own, params)
     kept = coloured[np.flatnonzero((weights >= params.min_weight) & ~np.asarray(gone))]
     placed.drop()
-    return _Whole(scene, features, kept, own, localizer.params.features.indexed)
+    return _SceneContent(scene, features, kept, own, localizer.params.features.indexed)
 
 
-def _gone(store: Store, scene: str) -> np.ndarray | bool:
-    """Which Gaussians of a scene are of things that changes say are gone since; none where nobody looked."""
+def _removed(store: Store, scene: str) -> np.ndarray | bool:
+    """Return a mask of the Gaussians that later changes show to be gone; false if nothing was compared."""
     out: np.ndarray | bool = False
     for comparison in store.changes.current():
         if comparison.older != scene or not comparison.changes:
@@ -218,9 +218,9 @@ def _gone(store: Store, scene: str) -> np.ndarray | bool:
 
 
 def _packed(
-    localizer: Localizer, whole: _Whole, num_bytes: float, params: packing.Params
+    localizer: Localizer, whole: _SceneContent, num_bytes: float, params: packing.Params
 ) -> tuple[bytes, SmallSceneRow]:
-    """A scene's file of about so many bytes: what shows is rounded coarser, and then merged, as far as must be."""
+    """Pack a scene into about ``num_bytes``: round more coarsely first, then merge Gaussians."""
     shown = whole.gaussians
     all_features = _npz(packed_features.pack(whole.features, whole.step, whole.first))
     part = params.features_share * num_bytes / len(all_features)
@@ -318,16 +318,16 @@ def _header(store: Store, localizer: Localizer, files: Mapping[str, bytes], sett
 
 
 def is_small(path: str | os.PathLike[str]) -> bool:
-    """Whether a small map lies there."""
+    """Return true if the path is a small map."""
     return (Path(path) / FILE_NAME).is_file()
 
 
 class SmallLocalizer(Localizer):
-    """The scenes of a small map, ready for photographs; see `Localizer`.
+    """The scenes of a small map, ready to localize photos; see `Localizer`.
 
     Args:
-        folder: of the small map.
-        settings: how photographs are looked for; of what is kept nothing depends on them.
+        folder: folder of the small map.
+        settings: settings of localization; the stored data do not depend on them.
 
     Raises:
         CorruptError: it was not written by gsmap, or bytes differ.
@@ -361,7 +361,7 @@ class SmallLocalizer(Localizer):
                 partial(self._small_gaussians, one.id),
                 partial(self._small_features, one.id),
             )
-        self._used, self._eyes = [], {}
+        self._used, self._views = [], {}
         held = [(placed.features, one) for one, placed in self.placed.items()]
         self.index = view_index([new_segment(held, self.params.features.indexed)])
         for placed in self.placed.values():
@@ -372,8 +372,8 @@ class SmallLocalizer(Localizer):
     def _renewed(self, error: GsmapError) -> ViewIndex:
         raise error  # it lies in memory
 
-    def near(self, text: str) -> Near:
-        """``SCENE``, or ``X,Y,Z,R``, see `gsmap.map.stages.localize.parse_near`."""
+    def near(self, text: str) -> SearchRegion:
+        """Parse ``SCENE`` or ``X,Y,Z,R``, see `gsmap.map.stages.localize.parse_near`."""
         from gsmap.map.stages.localize import near_of
 
         return near_of(text, self._id_of)
@@ -401,7 +401,7 @@ class SmallLocalizer(Localizer):
             raise _corrupt(self.folder / f"{scene}.npz", error) from error
 
     def _arrays(self, scene: str, names: Sequence[str]) -> tuple[dict[str, np.ndarray], int]:
-        """Arrays of a scene's file, whose bytes are those that were written, and how many bytes these are."""
+        """Return arrays of a scene's verified file, and the size of the file."""
         import hashlib
 
         path = self.folder / f"{scene}.npz"
@@ -417,7 +417,7 @@ class SmallLocalizer(Localizer):
 
 
 def _read_file(path: Path, most: int) -> bytes:
-    """The bytes of a file of at most so many; memory is taken for those that there are.
+    """Read a file of at most ``most`` bytes.
 
     Raises:
         ValueError: it has more.
@@ -430,7 +430,7 @@ def _read_file(path: Path, most: int) -> bytes:
 
 
 def _unpacked(path: Path, content: bytes, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Arrays of a scene's file, once their headers say that they are no larger than its bytes can mean.
+    """Unpack arrays of a scene's file after checking that their headers match its size.
 
     Raises:
         ValueError, KeyError, BadZipFile: bytes that `_npz` did not write, or that claim far more than they hold.
@@ -469,7 +469,7 @@ def _read_header(path: Path) -> dict[str, Any]:
     return dict(told)
 
 
-def _scene(row: Mapping[str, Any]) -> SmallScene:
+def _scene(row: Mapping[str, Any]) -> SmallMapScene:
     known = None if row["covariance"] is None else np.array(row["covariance"], np.float64)
     bounds = np.array(row["bounds"], np.float64)
     if bounds.shape != (2, 3) or not np.isfinite(bounds).all():
@@ -479,7 +479,7 @@ def _scene(row: Mapping[str, Any]) -> SmallScene:
     texts = (row["id"], row["name"], row["sha256"])
     if not all(isinstance(text, str) for text in texts) or not row["id"].isalnum():
         raise ValueError("names that are none")
-    return SmallScene(
+    return SmallMapScene(
         row["id"],
         row["name"],
         row["captured_at"] if isinstance(row["captured_at"], str) else None,

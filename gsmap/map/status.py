@@ -1,4 +1,4 @@
-"""What to do next: what a map lacks, what other settings or versions made, and what wants a person."""
+"""List what a map lacks, what is stale, and what needs a person's decision."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gsmap.map.changes import num_open
-from gsmap.map.metres import map_metres
-from gsmap.map.one_state import of_one_state
+from gsmap.map.metric_scales import map_metres
 from gsmap.map.settings import Settings
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.describe import graph_keys, unthinned, without_graph
 from gsmap.map.stages.optimize import pose_basis
 from gsmap.map.stages.register import num_stale
@@ -18,14 +18,14 @@ from gsmap.store import Store
 from gsmap.store.leases import Lease
 from gsmap.store.set_aside import CAPTURE
 from gsmap.types import PoseGraph
-from gsmap.types.metre import Metre
-from gsmap.types.rows import AtWorkRow, MapStatus, MetreRow, TodoRow
+from gsmap.types.metric_scale import MetricScale
+from gsmap.types.rows import LeaseRow, MapStatus, MetricScaleRow, TodoRow
 from gsmap.types.rows.maps import TodoKind
 
 
-@of_one_state
+@snapshot_read
 def status(store: Store, settings: Settings) -> MapStatus:
-    """``gsmap status MAP``, from the catalog alone: no array is read, nothing is computed."""
+    """Report the status of a map (``gsmap status MAP``) from the catalog; nothing is computed."""
     at = shlex.quote(store.location)
     update = f"gsmap update {at} --no-create"
     scenes = store.scenes.brief()
@@ -75,7 +75,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     judged = store.revisions.undecided(newest.number).get(newest.number, []) if newest else []
     undecided = [pair for pair in judged if living.issuperset(pair)]
     add("undecided", len(undecided), _look(store, undecided), "edges that nothing could decide: confirm or reject")
-    todo += set_aside_rows(store)
+    todo += quarantined_rows(store)
     add("changes", num_open(store, settings), f"gsmap changes {at}", "changes nobody looked at")
     outweighed = [scene for scene in (newest.provenance.contradicted_priors if newest else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
@@ -98,12 +98,12 @@ def status(store: Store, settings: Settings) -> MapStatus:
         revision=newest.number if newest else None,
         metres_per_unit=next((one.metres_per_unit for one in metres.values() if one.is_known), None),
         metres=tuple(metre_row(component, one) for component, one in metres.items()),
-        at_work=at_work_rows(store.leases.others()),
+        at_work=lease_rows(store.leases.others()),
     )
 
 
 def _look(store: Store, pairs: Sequence[tuple[str, str]]) -> str:
-    """The command with which a person judges some pairs of scenes (ids)."""
+    """Return the command to review some pairs of scenes (ids)."""
     at = shlex.quote(store.location)
     if len(pairs) != 1:
         return f"gsmap view {at}"
@@ -111,8 +111,8 @@ def _look(store: Store, pairs: Sequence[tuple[str, str]]) -> str:
     return f"gsmap why {at} {shlex.quote(f'{target}:{source}')}"
 
 
-def set_aside_rows(store: Store) -> list[TodoRow]:
-    """What was set aside, one row a job or capture, with the command that tries it again."""
+def quarantined_rows(store: Store) -> list[TodoRow]:
+    """Return one row per quarantined job or capture, with the command to retry it."""
     aside = store.set_aside.list()
     at, names = shlex.quote(store.location), store.scenes.names() if aside else {}
     rows = []
@@ -135,15 +135,15 @@ def set_aside_rows(store: Store) -> list[TodoRow]:
 _TRIES_AGAIN = {"graph": "describe", "edge": "register", "comparison": "changes"}
 
 
-def at_work_rows(leases: Sequence[Lease]) -> tuple[AtWorkRow, ...]:
-    """Who is at work on what, as rows."""
+def lease_rows(leases: Sequence[Lease]) -> tuple[LeaseRow, ...]:
+    """Return the running processes as rows."""
     return tuple(
-        AtWorkRow(what=one.what, task=one.task, host=one.host, process=one.pid, since=one.since) for one in leases
+        LeaseRow(what=one.what, task=one.task, host=one.host, process=one.pid, since=one.since) for one in leases
     )
 
 
 def _add_unsolved(store: Store, settings: Settings, add: Callable[[TodoKind, int, str, str], None], verb: str) -> None:
-    """Whether the newest poses are what these settings make of what the map knows now, and if not, why."""
+    """Add an entry if the newest poses are out of date, with the reason."""
     given = pose_basis(store, settings)
     newest = store.revisions.newest()
     if not given.scenes or (newest is not None and newest.key == given.key.digest):
@@ -154,9 +154,9 @@ def _add_unsolved(store: Store, settings: Settings, add: Callable[[TodoKind, int
         add("unsolved", 1, verb, "scenes, edges, reviews, priors or observations newer than the poses")
 
 
-def metre_row(component: int, metre: Metre) -> MetreRow:
-    """The metre of a component as a row."""
-    return MetreRow(
+def metre_row(component: int, metre: MetricScale) -> MetricScaleRow:
+    """Return the metric scale of a component as a row."""
+    return MetricScaleRow(
         component=component,
         metres_per_unit=metre.metres_per_unit,
         metre_sigma=metre.sigma if metre.is_known else None,

@@ -1,4 +1,4 @@
-"""Where components of the poses lie in the world, for what leaves the map."""
+"""Georeference the components of a revision for exports."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ _IN_THE_FILE = ("3dtiles",)
 
 
 @dataclass(frozen=True, eq=False)
-class InWorld:
-    """A component that is tied to the world.
+class GeoreferencedComponent:
+    """A component with a pose in the world.
 
     Args:
         frame: the world frame.
-        S_world_map: takes the component's frame to it. S_ecef_map: to Earth-centred metres (EPSG:4978).
+        S_world_map: component to world frame. S_ecef_map: to Earth-centred metres (EPSG:4978).
     """
 
     frame: WorldFrame
     S_world_map: Sim3
     S_ecef_map: Sim3
 
-    def told(self) -> dict[str, Any]:
-        """As ``tiles.json`` has it: float64 to the last bit."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of ``tiles.json``, exact to the last bit."""
         return {
             "crs": self.frame.crs,
             "origin": {k: v for k, v in plain(self.frame).items() if k != "crs"},
@@ -37,20 +37,20 @@ class InWorld:
         }
 
 
-def in_world(graph: PoseGraph | None, components: Collection[int]) -> dict[int, InWorld]:
-    """Those of some components that are tied to the world."""
+def georeferenced_components(graph: PoseGraph | None, components: Collection[int]) -> dict[int, GeoreferencedComponent]:
+    """Return the components that have a pose in the world."""
     found = {}
     for tie in graph.world if graph is not None else ():
         if tie.component in components and tie.S_world_map is not None and tie.frame is not None:
             from gsmap.world.frame import T_ecef_frame
 
             S_ecef_map = T_ecef_frame(tie.frame) @ tie.S_world_map
-            found[tie.component] = InWorld(tie.frame, tie.S_world_map, S_ecef_map)
+            found[tie.component] = GeoreferencedComponent(tie.frame, tie.S_world_map, S_ecef_map)
     return found
 
 
-def world_notes(found: Mapping[int, InWorld], format: str) -> tuple[str, ...]:
-    """What a person should know of where the tiles of a format are."""
+def world_notes(found: Mapping[int, GeoreferencedComponent], format: str) -> tuple[str, ...]:
+    """Return remarks on the coordinates of exported tiles."""
     if not found or format in _IN_THE_FILE:
         return ()
     named = ", ".join(sorted({one.frame.crs for one in found.values()}))

@@ -17,7 +17,7 @@ from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.boxes import inside
 from gsmap.methods import MethodParams, RecipeKey, family
 from gsmap.methods.merger import Merger
-from gsmap.types import MergeResult, PlacedScene
+from gsmap.types import MergeResult, PosedScene
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
@@ -28,7 +28,7 @@ __all__ = [
     "VERSION",
     "MergeResult",
     "Params",
-    "PlacedScene",
+    "PosedScene",
     "checked_params",
     "default_params",
     "merge",
@@ -176,7 +176,7 @@ def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
 
 
 def merge(
-    scenes: Sequence[PlacedScene],
+    scenes: Sequence[PosedScene],
     method: str = "tto",
     params: Any = None,
     *,

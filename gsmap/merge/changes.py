@@ -16,7 +16,7 @@ from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.merge.exposure import apply_balance
 from gsmap.merge.overlap import boxes_overlap, share_in_view
 from gsmap.render import render
-from gsmap.types import Cameras, Gaussians, PlacedScene
+from gsmap.types import Cameras, Gaussians, PosedScene
 
 Prefer = Literal["newest", "best", "both"]
 """Preferred scene where scenes disagree: the ``newest``, the ``best`` observed one, or none, so that ``both`` show."""
@@ -48,7 +48,7 @@ class ResolvedScenes:
         losers: per scene, its removed Gaussians.
     """
 
-    scenes: list[PlacedScene]
+    scenes: list[PosedScene]
     lost: list[int]
     changed: list[np.ndarray]
     behind: list[np.ndarray]
@@ -97,7 +97,7 @@ class ResolvedScenes:
 
 
 def resolve_changes(
-    scenes: Sequence[PlacedScene],
+    scenes: Sequence[PosedScene],
     prefer: Prefer = "newest",
     *,
     max_views: int = compare.MAX_VIEWS,
@@ -261,7 +261,7 @@ def _exposed(gaussians: Gaussians, exposure: compare.Balance | None) -> Gaussian
     return gaussians if exposure is None else apply_balance(gaussians, exposure)
 
 
-def _remaining(scene: PlacedScene, stays: np.ndarray, exposure: compare.Balance | None) -> PlacedScene:
+def _remaining(scene: PosedScene, stays: np.ndarray, exposure: compare.Balance | None) -> PosedScene:
     if stays.all() and exposure is None:
         return scene
     # Earlier renders of its views show the removed Gaussians.
@@ -277,11 +277,11 @@ def _in_grey(gaussians: Gaussians, value: float) -> Gaussians:
     return replace(gaussians, sh=sh0_of_rgb(np.full((len(gaussians), 1, 3), value, np.float32)))
 
 
-def _empty(scene: PlacedScene) -> Gaussians:
+def _empty(scene: PosedScene) -> Gaussians:
     return scene.gaussians[np.zeros(0, dtype=np.int64)]
 
 
-def _by_date(scenes: Sequence[PlacedScene]) -> list[list[int]]:
+def _by_date(scenes: Sequence[PosedScene]) -> list[list[int]]:
     """Group the indices of dated scenes by date, newest first; empty for a single date."""
     times = {i: _time(scene.captured_at) for i, scene in enumerate(scenes)}
     dated = {i: time for i, time in times.items() if time is not None}
@@ -289,7 +289,7 @@ def _by_date(scenes: Sequence[PlacedScene]) -> list[list[int]]:
     return groups if len(groups) > 1 else []
 
 
-def newest_first(scenes: Sequence[PlacedScene]) -> list[int]:
+def newest_first(scenes: Sequence[PosedScene]) -> list[int]:
     """Return the indices of all scenes, newest first, undated ones last in their order."""
     times = [_time(scene.captured_at) for scene in scenes]
     return sorted(range(len(scenes)), key=lambda i: (-t.timestamp() if (t := times[i]) else np.inf, i))

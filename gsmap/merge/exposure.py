@@ -12,7 +12,7 @@ from gsmap.compare.colours import FLOOR
 from gsmap.geometry.sh import SH_C0, rgb_of_sh0, sh0_of_rgb
 from gsmap.merge.overlap import boxes_overlap, share_in_view
 from gsmap.render import render
-from gsmap.types import Cameras, Gaussians, KeptPhoto, PlacedScene
+from gsmap.types import Cameras, Gaussians, PosedScene, ReferencePhoto
 
 _MAX_VIEWS, _LONGEST_SIDE_PX = 6, 160  # of a pair: views of one scene that see most of the other, and their size
 _MIN_PIXELS = 500  # that show one surface in both scenes, for a gain to be estimated
@@ -23,7 +23,7 @@ _NEGLIGIBLE_LOG_GAIN = 0.01
 _MAX_GAIN = 4.0
 
 
-def balance_exposure(scenes: Sequence[PlacedScene]) -> tuple[list[PlacedScene], np.ndarray]:
+def balance_exposure(scenes: Sequence[PosedScene]) -> tuple[list[PosedScene], np.ndarray]:
     """Balance scenes by one gain per scene and colour channel; return them and the applied log-gains (S, 3).
 
     Gains are the least-squares solution to the median log-ratios of colour on common surfaces of scene pairs; their
@@ -43,7 +43,7 @@ def balance_exposure(scenes: Sequence[PlacedScene]) -> tuple[list[PlacedScene], 
     return balanced, log_gains
 
 
-def _with_gain(photo: KeptPhoto, gain: np.ndarray) -> KeptPhoto:
+def _with_gain(photo: ReferencePhoto, gain: np.ndarray) -> ReferencePhoto:
     """Apply a gain to the surroundings that a photo's colours are balanced to."""
     around = photo.around
     return photo if around is None else replace(photo, around=lambda: apply_gain(around(), gain))
@@ -71,7 +71,7 @@ def apply_balance(gaussians: Gaussians, balance: Balance) -> Gaussians:
     return replace(gaussians, sh=sh)
 
 
-def _ratios(scenes: Sequence[PlacedScene]) -> list[tuple[int, int, np.ndarray, float]]:
+def _ratios(scenes: Sequence[PosedScene]) -> list[tuple[int, int, np.ndarray, float]]:
     """Return (i, j, median log(colour_i / colour_j) (3,), pixels) of every pair of scenes with a common surface."""
     found = []
     for i, scene in enumerate(scenes):
@@ -93,7 +93,7 @@ def _looking_at(cameras: Cameras, gaussians: Gaussians) -> Cameras:
     return cameras[best[share[best] > 0]].resized(_LONGEST_SIDE_PX)
 
 
-def _same_surface(scene: PlacedScene, other: PlacedScene, camera: Cameras) -> np.ndarray:
+def _same_surface(scene: PosedScene, other: PosedScene, camera: Cameras) -> np.ndarray:
     """Return (K, 3) log-ratios of colour at pixels of a common surface that are neither black nor saturated."""
     a, b = render(scene.gaussians, camera), render(other.gaussians, camera)
     same = np.abs(a.depth[0] - b.depth[0]) < _MAX_DEPTH_RATIO * np.minimum(a.depth[0], b.depth[0])

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.geometry.boxes import box_around
 from gsmap.geometry.projection import in_image, project
-from gsmap.types import Cameras, Gaussians, PlacedScene
+from gsmap.types import Cameras, Gaussians, PosedScene
 
 
 def clamp_inside(points: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
@@ -21,13 +21,13 @@ def clamp_inside(points: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
     return np.clip(points, low, high)
 
 
-def concatenate_scenes(scenes: Sequence[PlacedScene]) -> tuple[Gaussians, np.ndarray]:
+def concatenate_scenes(scenes: Sequence[PosedScene]) -> tuple[Gaussians, np.ndarray]:
     """Concatenate the Gaussians of scenes, and return the scene index (N,) int32 of each."""
     origin = np.repeat(np.arange(len(scenes), dtype=np.int32), [len(s.gaussians) for s in scenes])
     return Gaussians.concatenate([s.gaussians for s in scenes]), origin
 
 
-def boxes_overlap(a: PlacedScene, b: PlacedScene) -> bool:
+def boxes_overlap(a: PosedScene, b: PosedScene) -> bool:
     """Return whether the bounding boxes of two scenes' means intersect."""
     if len(a.gaussians) == 0 or len(b.gaussians) == 0:
         return False

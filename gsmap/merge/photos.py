@@ -13,7 +13,7 @@ import numpy as np
 from gsmap.compare import colours
 from gsmap.compare.neighbourhoods import dilate
 from gsmap.render import render
-from gsmap.types import Cameras, KeptPhoto, PlacedScene
+from gsmap.types import Cameras, PosedScene, ReferencePhoto
 
 _MAX_SIGMA_PX = 3.0  # pose uncertainty of a photo that is used, at a longest side of 480 pixels
 _MIN_ALPHA = 0.9  # of the scene, in pixels that are compared
@@ -40,7 +40,7 @@ class PhotoReference:
     depth: np.ndarray
 
 
-def make_photo_reference(photo: KeptPhoto, scene: PlacedScene, longest_side_px: int) -> PhotoReference | None:
+def make_photo_reference(photo: ReferencePhoto, scene: PosedScene, longest_side_px: int) -> PhotoReference | None:
     """Balance a photo to its scene and mask pixels that disagree; None for another place or an uncertain pose."""
     longest = int(photo.camera.sizes_px.max())
     camera = photo.camera.resized(min(longest_side_px, longest))

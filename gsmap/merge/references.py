@@ -14,7 +14,7 @@ from gsmap.merge.changes import ResolvedScenes, newest_first
 from gsmap.merge.overlap import share_in_view
 from gsmap.merge.reference_view_cache import surface_axes
 from gsmap.render import Rendering, render
-from gsmap.types import Cameras, Gaussians, PlacedScene
+from gsmap.types import Cameras, Gaussians, PosedScene
 from gsmap.types.progress import Progress
 
 WEIGHT_UNIT = 0.1  # of `References.visible_pixels`, for Gaussians that dominate no pixel: always less than one pixel
@@ -55,7 +55,7 @@ class References:
 
 
 def render_references(
-    scenes: Sequence[PlacedScene],
+    scenes: Sequence[PosedScene],
     bounds: np.ndarray | None,
     halo_m: float,
     longest_side_px: int,
@@ -167,7 +167,7 @@ def render_references(
 
 
 def _photos(
-    scenes: Sequence[PlacedScene],
+    scenes: Sequence[PosedScene],
     pieces: Sequence[Gaussians],
     longest_side_px: int,
 ) -> Iterator[tuple[int, photos.PhotoReference]]:
@@ -191,7 +191,7 @@ _SAMPLE = 600  # points by which views are selected, if there are too many
 
 
 def _best_views(
-    todo: list[tuple[int, int, Cameras]], scenes: Sequence[PlacedScene], pieces: Sequence[Gaussians], count: int
+    todo: list[tuple[int, int, Cameras]], scenes: Sequence[PosedScene], pieces: Sequence[Gaussians], count: int
 ) -> list[tuple[int, int, Cameras]]:
     """Select at most ``count`` views greedily by coverage, in their order.
 

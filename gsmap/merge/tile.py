@@ -21,7 +21,7 @@ from gsmap.merge.reference_view_cache import (
     SceneReferenceViews,
     keys_of,
 )
-from gsmap.types import Cameras, Gaussians, KeptPhoto, MergeResult, PlacedScene, Sim3
+from gsmap.types import Cameras, Gaussians, MergeResult, PosedScene, ReferencePhoto, Sim3
 from gsmap.types.progress import Progress
 
 
@@ -49,7 +49,7 @@ class LazyScene:
     store: ReferenceViewCache = field(default_factory=ReferenceViewCache)
     without: str = ""
     load_within: Callable[[np.ndarray], Gaussians] | None = None
-    photos: tuple[KeptPhoto, ...] = ()
+    photos: tuple[ReferencePhoto, ...] = ()
 
     def centroid(self) -> np.ndarray | None:
         """Return (3,) the mean of all its means, map frame; None if it is empty."""
@@ -83,7 +83,7 @@ def merge_tile(
     return replace(result, notes=(*result.notes, *_undated(placed))) if how.uses_dates(params) else result
 
 
-def _undated(placed: Sequence[PlacedScene]) -> list[str]:
+def _undated(placed: Sequence[PosedScene]) -> list[str]:
     """Return a note if overlapping scenes lack dates."""
     if all(scene.captured_at is not None for scene in placed):
         return []
@@ -107,13 +107,13 @@ class _Reading:
     min_cameras: int
 
 
-def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> PlacedScene:
+def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> PosedScene:
     S = scene.S_map_scene
     cameras = None if scene.cameras is None else transform_cameras(scene.cameras, S)
     if bounds is None:
         photos = tuple(_placed(photo, S) for photo in scene.photos)
         whole = transform_gaussians(scene.load(None), S)
-        return PlacedScene(whole, cameras, scene.scene_id, scene.captured_at, photos=photos)
+        return PosedScene(whole, cameras, scene.scene_id, scene.captured_at, photos=photos)
     around_m = reading.looking_m + reading.reach_m + float((bounds[1] - bounds[0]).max())
     box = np.array([bounds[0] - reading.reading_m, bounds[1] + reading.reading_m])
     rows = None
@@ -135,10 +135,10 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pla
     moved = transform_gaussians(read, S)
     place = RegionCache(lambda near: transform_gaussians(scene.load(near), S), around_m / S.scale)
     photos = tuple(replace(_placed(p, S), around=partial(place.of, p.camera.centers[0])) for p in scene.photos)
-    return PlacedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, reference_views, photos)
+    return PosedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, reference_views, photos)
 
 
-def _placed(photo: KeptPhoto, S: Sim3) -> KeptPhoto:
+def _placed(photo: ReferencePhoto, S: Sim3) -> ReferencePhoto:
     return replace(photo, camera=transform_cameras(photo.camera, S), sigma_m=photo.sigma_m * S.scale)
 
 

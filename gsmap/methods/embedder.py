@@ -12,7 +12,7 @@ from gsmap.types.views import Mask, SceneContext, View
 
 
 class Embedder(Protocol):
-    """An embedder ready for the views of one scene: vectors whose cosine says how alike two things look.
+    """An embedder for one scene; the cosine of two embeddings measures similarity.
 
     They depend on the method, its parameters and its model alone beside what is seen, so that those of all scenes
     compare.
@@ -36,10 +36,10 @@ class Embedder(Protocol):
 
 
 class PictureEmbedder(Embedder, Protocol):
-    """An embedder that can be shown a picture of one thing, to find it by; it need not be."""
+    """An embedder that can also embed an image of one object."""
 
     def embed_picture(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Features of a picture that shows one thing and little else.
+        """Embed an image that shows one object and little else.
 
         Args:
             rgb: (H, W, 3) uint8.
@@ -52,7 +52,7 @@ class PictureEmbedder(Embedder, Protocol):
 
 
 class EmbedderMethod(Protocol):
-    """What a module (or object) offers to be an embedder.
+    """The interface of an embedder module or object.
 
     Attributes:
         Params: frozen dataclass of its settings, each explained under ``Args:``.
@@ -68,7 +68,7 @@ class EmbedderMethod(Protocol):
     MODELS: tuple[str, ...]
 
     def make(self, context: SceneContext, params: Any) -> Embedder:
-        """An embedder for one scene; called once per scene, before its first view.
+        """Create an embedder for one scene, before its first view.
 
         Args:
             context: the scene's surface (scene frame and unit), what is up, the metre, and the models, of which those
@@ -81,7 +81,7 @@ class EmbedderMethod(Protocol):
         ...
 
     def probe(self, spec: ModelSpec) -> None:
-        """Refuse a model of one of the kinds in ``MODELS`` that cannot do its work; called when it is added to a map.
+        """Refuse an unsuitable model of a kind in ``MODELS``; called when it is added to a map.
 
         Raises:
             InputError: its inputs and outputs do not fit, or it does not run.

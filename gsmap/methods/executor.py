@@ -1,4 +1,4 @@
-"""The contract of an executor: where the jobs of a stage run."""
+"""The contract of an executor, which runs the jobs of a stage."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any, Protocol
 
 
 @dataclass(frozen=True)
-class SetAside:
-    """In place of the result of a job that twice ended the process it ran in.
+class QuarantinedJob:
+    """The result of a job that twice ended the process it ran in.
 
     Args:
-        reason: what became of the processes, for a person.
+        reason: what happened to the processes, for the user.
     """
 
     reason: str
 
 
 class Workers(Protocol):
-    """Where an executor runs jobs; kept from one stage to the next, and used by one at a time."""
+    """The worker processes of an executor; kept between stages, used by one stage at a time."""
 
     def run(
         self, job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], *, quick: bool = False
@@ -30,12 +30,12 @@ class Workers(Protocol):
         process does them. Jobs that share an argument best run where the other one ran, which has read what it names.
         What runs is given up when the iterator is closed.
 
-        A job whose process dies is tried once more; if that dies, too, its result is a `SetAside`, and the rest goes
-        on.
+        A job whose process dies is retried once; if that process dies, too, its result is a `QuarantinedJob`, and the
+        other jobs go on.
 
         Args:
-            quick: a job takes about as long as a process takes to start, or less. ``operator.length_hint`` of the
-                arguments may tell how many there are.
+            quick: true if a job takes no longer than starting a process. ``operator.length_hint`` of the arguments may
+                give their number.
 
         Raises:
             GsmapError: no process can be started or reached; what was yielded before stands.
@@ -44,12 +44,12 @@ class Workers(Protocol):
         ...
 
     def close(self) -> None:
-        """End all processes that were started; none of them is waited for."""
+        """End all started processes without waiting."""
         ...
 
 
 class Executor(Protocol):
-    """Runs jobs, here or elsewhere.
+    """Runs jobs on this machine or elsewhere.
 
     A job is a module-level function, and arguments that are small and picklable: the location of a map, ids, settings;
     never arrays. Whoever runs it opens the map for reading, computes, and sends the result back. Only the caller
@@ -64,7 +64,7 @@ class Executor(Protocol):
     VERSION: int
 
     def start(self, params: Any) -> Workers:
-        """Where jobs run under these settings; nothing needs to be started before there is a job.
+        """Return workers with these settings; processes start with the first job.
 
         Raises:
             ConfigError: settings with which nothing can run.

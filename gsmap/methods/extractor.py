@@ -1,4 +1,4 @@
-"""The contract of an extractor: from a picture to local features that are found again in other pictures of a place."""
+"""The contract of an extractor of local features."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from gsmap.types.model import ModelSpec
 
 
 class Extractor(Protocol):
-    """An extractor ready for pictures."""
+    """A local feature extractor."""
 
     def extract(self, rgb: np.ndarray) -> Keypoints:
-        """Features of a picture.
+        """Extract the features of an image.
 
         Args:
             rgb: (H, W, 3) uint8: a photograph, or a render of a scene.
@@ -32,7 +32,7 @@ class Extractor(Protocol):
 
 
 class ExtractorMethod(Protocol):
-    """What a module (or object) offers to be an extractor.
+    """The interface of an extractor module or object.
 
     Attributes:
         Params: frozen dataclass of its settings, each explained under ``Args:``.
@@ -46,7 +46,7 @@ class ExtractorMethod(Protocol):
     MODELS: tuple[str, ...]
 
     def make(self, models: Mapping[str, ModelSpec], params: Any) -> Extractor:
-        """An extractor.
+        """Create an extractor.
 
         Args:
             models: checked ONNX models by kind, those of ``MODELS`` among them.
@@ -58,7 +58,7 @@ class ExtractorMethod(Protocol):
         ...
 
     def probe(self, spec: ModelSpec) -> None:
-        """Refuse a model of one of the kinds in ``MODELS`` that cannot do its work; called when it is added to a map.
+        """Refuse an unsuitable model of a kind in ``MODELS``; called when it is added to a map.
 
         Raises:
             InputError: its inputs and outputs do not fit, or it does not run.

@@ -1,4 +1,4 @@
-"""Families of methods: what is built in, what other packages add, and the parameters of each."""
+"""Families of methods: built-in methods, plug-ins, and their parameters."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DECLARED: dict[str, Family] = {}
 
 @dataclass(frozen=True)
 class Family:
-    """Interchangeable ways of doing one thing.
+    """A family of interchangeable methods.
 
     A method is a module, or any object, with
 
@@ -38,13 +38,13 @@ class Family:
         nearest = "my_package.nearest_merger"
 
     Args:
-        name: in the singular.
-        folder: dotted name of the package that holds the built-in ones; its modules with a leading underscore, or
-            called ``base``, are not methods.
-        contract: names that a method must have beside ``Params`` and ``VERSION``.
-        table: built-in ones by name (dotted module names) where a folder holds other things too.
-        any_of: names of which a method must have at least one.
-        has_params: false where a method's functions take their options themselves, so that it has no ``Params``.
+        name: name in the singular.
+        folder: dotted name of the package with the built-in methods; modules with a leading underscore, or called
+            ``base``, are not methods.
+        contract: required names beside ``Params`` and ``VERSION``.
+        table: built-in methods by name (dotted module names), if the folder holds other modules too.
+        any_of: names of which a method needs at least one.
+        has_params: false if the methods have no ``Params``.
     """
 
     name: str
@@ -56,11 +56,11 @@ class Family:
 
     @property
     def group(self) -> str:
-        """The entry point group."""
+        """Name of the entry point group."""
         return f"gsmap.{self.name}s"
 
     def names(self) -> tuple[str, ...]:
-        """All methods of the family that can be asked for, in alphabetical order."""
+        """Return the names of all methods, in alphabetical order."""
         return tuple(sorted({**self._added(), **self._built_in()}))
 
     def usable(self) -> tuple[str, ...]:
@@ -68,7 +68,7 @@ class Family:
         return _usable(self, tuple(sys.path))
 
     def get(self, name: str) -> Any:
-        """A method by name.
+        """Load a method by name.
 
         Raises:
             ConfigError: no such method, or one that does not keep the contract.
@@ -76,12 +76,12 @@ class Family:
         return _loaded(self, name)
 
     def params_type(self, name: str) -> type:
-        """The ``Params`` of a method."""
+        """Return the ``Params`` class of a method."""
         found: type = self.get(name).Params
         return found
 
     def version(self, name: str) -> dict[str, int]:
-        """``{"<family>.<name>": VERSION}``, as `RecipeKey.version` wants it."""
+        """Return ``{"<family>.<name>": VERSION}`` for `RecipeKey.version`."""
         return {f"{self.name}.{name.lstrip('.')}": int(self.get(name).VERSION)}
 
     def _built_in(self) -> dict[str, str]:
@@ -140,7 +140,7 @@ class Family:
 
 @dataclass(frozen=True)
 class MethodParams(Mapping[str, Any]):
-    """The parameters of every method of a family, by the method's name: a node of the settings tree.
+    """The parameters of all methods of a family by name: a node of the settings tree.
 
     Methods that nobody changed have their defaults, and are not even imported before they are asked for.
 
@@ -172,7 +172,7 @@ class MethodParams(Mapping[str, Any]):
         return hash((self.family, self.changed))
 
     def with_params(self, name: str, params: Any) -> MethodParams:
-        """The same with other parameters for one method.
+        """Return a copy with other parameters for one method.
 
         Raises:
             ConfigError: no such method, or the parameters of another.
@@ -192,27 +192,27 @@ class MethodParams(Mapping[str, Any]):
 
 
 def _is_frozen(params: Any) -> bool:
-    """Whether it is a frozen dataclass."""
+    """Return true for a frozen dataclass."""
     shape = getattr(params, "__dataclass_params__", None)
     return shape is not None and bool(shape.frozen)
 
 
 @lru_cache(maxsize=64)
 def _modules_in(places: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the methods that lie in the folders of a package: listing takes a while, so once."""
+    """List the methods in the folders of a package, cached."""
     found = [module.name for module in pkgutil.iter_modules(list(places))]
     return tuple(name for name in found if not name.startswith("_") and name != "base")
 
 
 @lru_cache(maxsize=64)
 def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """What other packages add; reading what is installed takes milliseconds, so once for a search path."""
+    """List the entry points of other packages, cached per search path."""
     return tuple(entry_points(group=group))
 
 
 @lru_cache(maxsize=64)
 def _usable(family: Family, path: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the methods that load; once for a search path, so that a broken one is reported once."""
+    """Return the names of the methods that load, cached per search path; each broken method is reported once."""
     found = []
     for name in family.names():
         try:
@@ -230,7 +230,7 @@ def _loaded(family: Family, name: str) -> Any:
 
 
 def declare(found: Mapping[str, Family]) -> None:
-    """Say which families there are; `gsmap.methods` does, so that this module need not import it."""
+    """Register the families; `gsmap.methods` calls it, which avoids an import cycle."""
     _DECLARED.update(found)
 
 

@@ -1,4 +1,4 @@
-"""The contract of a format: how files of Gaussians are read and written."""
+"""The contract of a file format of Gaussians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsmap.types import FileInfo, Gaussians, GaussianSource
 
 
 class Format(Protocol):
-    """Files of one layout, by their suffix.
+    """A file format, known by its suffix.
 
     Its name in the family is the suffix itself, in lower case (``.ply``, ``.compressed.ply``, ``tileset.json``); where
     several fit a path, the longest counts, and a built-in one goes before another package's of the same name::
@@ -40,7 +40,7 @@ class ReadableFormat(Format, Protocol):
     """A format that can be read."""
 
     def read(self, path: str | os.PathLike[str], /) -> Gaussians:
-        """The Gaussians of a file; their values are checked elsewhere, so NaN may pass.
+        """Read the Gaussians of a file; values are not checked and may be NaN.
 
         Raises:
             InputError: the file is not what its suffix says, is damaged, or promises more than its size can hold.
@@ -50,10 +50,10 @@ class ReadableFormat(Format, Protocol):
 
 
 class DescribedFormat(ReadableFormat, Protocol):
-    """A format whose files say something beside their Gaussians."""
+    """A format with metadata."""
 
     def info(self, path: str | os.PathLike[str], /) -> FileInfo:
-        """What that is, from the header alone.
+        """Read the metadata from the header alone.
 
         Raises:
             InputError, OSError: as ``read``.
@@ -62,10 +62,10 @@ class DescribedFormat(ReadableFormat, Protocol):
 
 
 class StreamedFormat(ReadableFormat, Protocol):
-    """A format of files that need not fit in memory; where it has ``write``, that takes a `GaussianSource` too."""
+    """A format that is read in chunks; its ``write``, if it has one, also takes a `GaussianSource`."""
 
     def stream(self, path: str | os.PathLike[str], /) -> GaussianSource:
-        """As ``read``, a chunk at a time; what is wrong with the file as a whole is said when it is opened.
+        """Open a file to read it in chunks; errors of the whole file are raised when it is opened.
 
         Raises:
             InputError, OSError: as ``read``.
@@ -77,7 +77,7 @@ class WritableFormat(Format, Protocol):
     """A format that can be written."""
 
     def write(self, path: str | os.PathLike[str], gaussians: Gaussians, /, **options: Any) -> None:
-        """Write a file under a passing name in the folder where it will stay; the caller renames it.
+        """Write a file under a temporary name in its final folder; the caller renames it.
 
         Raises:
             InputError: Gaussians that the format cannot hold.

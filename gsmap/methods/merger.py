@@ -1,4 +1,4 @@
-"""The contract of a merger: captures that lie in one frame in, one set of Gaussians out."""
+"""The contract of a merger: from scenes in one frame to one set of Gaussians."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gsmap.types import MergeResult, PlacedScene
+from gsmap.types import MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
 
 class Merger(Protocol):
-    """One way of merging; a module of `gsmap.merge.mergers`, or what an entry point in ``gsmap.mergers`` names.
+    """A method of merging: a module of `gsmap.merge.mergers`, or an entry point in ``gsmap.mergers``.
 
     All lengths are in metres of the map frame. Importing a merger must not import torch: recipes are computed of
     settings alone. The same scenes, params and bounds give the same bits, whatever the order of the scenes was and for
     any number of threads; ``budget_s`` is the one exception, and a result that it cut short says so.
 
-    One that reproduces kept photographs (`PlacedScene.photos`) has ``photos_m(params)`` as well: how far beyond a tile
+    One that reproduces kept photographs (`PosedScene.photos`) has ``photos_m(params)`` as well: how far beyond a tile
     they are looked for, in metres, or None. The others are given none, and a photograph makes no tile of theirs
     dirty.
     """
@@ -36,29 +36,29 @@ class Merger(Protocol):
     """Whether it renders, so that the render backend may change its bits and belongs to the name of its results."""
 
     def reach_m(self, params: Any) -> float:
-        """How far beyond a tile's bounds a scene's Gaussians decide what is in the tile, in metres.
+        """Return the distance beyond a tile's bounds within which Gaussians affect the tile, in metres.
 
         A tile depends on the scenes that come that near to it, and on no others.
         """
         ...
 
     def reading_m(self, params: Any, dated: bool) -> float:
-        """How far beyond a tile's bounds Gaussians are read, in metres; at least `reach_m`.
+        """Return the distance beyond a tile's bounds within which Gaussians are read, in metres; at least `reach_m`.
 
-        More than that where Gaussians farther away stand in cameras' ways, and `PlacedScene.reference_views` does not
+        More than that where Gaussians farther away stand in cameras' ways, and `PosedScene.reference_views` does not
         do.
 
         Args:
-            dated: whether captures of several dates come near the tile.
+            dated: true if captures of several dates come near the tile.
         """
         ...
 
     def looking_m(self, params: Any) -> float:
-        """How far beyond a tile's bounds cameras are looked for, in metres."""
+        """Return the distance beyond a tile's bounds within which cameras are used, in metres."""
         ...
 
     def min_cameras(self, params: Any) -> int:
-        """How many of a scene's cameras are given at least, the nearest ones, however far from a tile they stand.
+        """Return the minimum number of a scene's cameras to use, nearest first, at any distance.
 
         0 where those within `looking_m` are enough. Where more is read than `reach_m`, so are the Gaussians between
         such cameras and the tile.
@@ -66,12 +66,12 @@ class Merger(Protocol):
         ...
 
     def uses_dates(self, params: Any) -> bool:
-        """Whether the dates of the captures decide anything: if so, another date makes a tile dirty."""
+        """Return true if capture dates affect the result, so that a new date makes a tile dirty."""
         ...
 
     def merge(
         self,
-        scenes: Sequence[PlacedScene],
+        scenes: Sequence[PosedScene],
         params: Any,
         bounds: np.ndarray | None,
         budget_s: float | None,
@@ -82,8 +82,8 @@ class Merger(Protocol):
         Args:
             scenes: at least one, in the order of their ids, map frame. For a tile each holds at least its Gaussians
                 within `reading_m` of the bounds, and its cameras within `looking_m`; what must be known of the whole
-                capture it can be asked for (`PlacedScene.whole_centroid`), and what its views show
-                (`PlacedScene.reference_views`).
+                capture it can be asked for (`PosedScene.whole_centroid`), and what its views show
+                (`PosedScene.reference_views`).
             params: an instance of ``Params``.
             bounds: (2, 3) float64 lowest and highest corner of the tile; None for everything.
             budget_s: ceiling on the wall seconds it may take (None for no ceiling); closed forms ignore it.

@@ -1,4 +1,4 @@
-"""The contract of proposers: ways to find poses of a pair of scenes without knowing any."""
+"""The contract of proposers, which propose poses of a pair of scenes without an initial pose."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ __all__ = ["Proposal", "Proposer", "Scene", "Surface"]
 
 
 class Scene(Protocol):
-    """What a proposer is given of one scene."""
+    """A scene as proposers see it."""
 
     @property
     def graph(self) -> SceneGraph:
-        """Its nodes, in the scene's own frame and unit."""
+        """Scene graph, in the scene's own frame and unit."""
 
     @property
     def unit_m(self) -> float:
-        """Metres per unit of the scene, as far as that is known or guessed."""
+        """Metres per unit of the scene, known or guessed."""
 
     def surface(self) -> Surface:
-        """Its surface in metres; prepared when first asked for."""
+        """Return the surface in metres, computed on first use."""
 
 
 class Proposer(Protocol):
-    """A module or object beside whose ``Params`` and ``VERSION`` stand these."""
+    """The interface of a proposer module or object, beside ``Params`` and ``VERSION``."""
 
     Params: ClassVar[type]
     VERSION: ClassVar[int]
@@ -40,7 +40,7 @@ class Proposer(Protocol):
     named, with their versions, in the key of every registration that might have asked it."""
 
     def propose(self, target: Scene, source: Scene, params: Any = None, *, with_scale: bool = False) -> list[Proposal]:
-        """Poses worth refining and judging, most promising first; empty where nothing is suggested.
+        """Propose poses to refine and verify, most promising first; empty if there are none.
 
         Args:
             target, source: the scenes. Where no scale is sought both have the same ``unit_m``.

@@ -1,4 +1,4 @@
-"""What names a stored result: everything that made it, and nothing else."""
+"""Recipe keys, which name stored results by everything that determines them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmap.types.plain import canonical, plain
 
 @dataclass(frozen=True, eq=False)
 class RecipeKey:
-    """The recipe of a result, and what it was made from.
+    """The recipe and inputs of a result.
 
     Nothing else decides whether a result is made again: equal keys mean equal results, on any machine.
 
@@ -37,13 +37,13 @@ class RecipeKey:
     inputs: tuple[str, ...] = ()
 
     def of(self, *inputs: str) -> RecipeKey:
-        """The same recipe for these inputs."""
+        """Return the same recipe with these inputs."""
         made = object.__new__(RecipeKey)  # as `replace` does, in a tenth of the time: one is made for every scene
         made.__dict__.update(self._parts, inputs=inputs)
         return made
 
     def digest_of(self, *inputs: str) -> str:
-        """`digest` of the same recipe for these inputs: for many of them, of which few are needed as keys."""
+        """Return the `digest` of the same recipe with these inputs, faster than `of` for many inputs."""
         # `canonical` of texts; where these are digests and words it is written here, in a third of the time: an update
         # asks what would name each pair of the map.
         flat = "".join(inputs)
@@ -54,11 +54,11 @@ class RecipeKey:
 
     @cached_property
     def _parts(self) -> dict[str, Any]:
-        """What all keys of this recipe share; the digest too, for turning settings into a text takes long."""
+        """Return the common parts of all keys of this recipe, cached."""
         return {one.name: getattr(self, one.name) for one in fields(self)} | {"recipe": self.recipe}
 
     def to_json(self) -> dict[str, Any]:
-        """The recipe without its inputs, as plain values."""
+        """Return the recipe without its inputs as plain values."""
         return {
             "stage": self.stage,
             "method": self.method,
@@ -69,12 +69,12 @@ class RecipeKey:
 
     @cached_property
     def recipe(self) -> str:
-        """32 hex digits of the recipe without its inputs."""
+        """Return 32 hex digits of the recipe without its inputs."""
         return text_digest(canonical(self.to_json()))
 
     @cached_property
     def digest(self) -> str:
-        """32 hex digits of the recipe and its inputs: the name a result is kept under."""
+        """Return 32 hex digits of the recipe and its inputs: the name of the stored result."""
         return self.digest_of(*self.inputs)
 
 
@@ -82,5 +82,5 @@ _encoded = json.JSONEncoder(separators=(",", ":")).encode
 
 
 def text_digest(text: str) -> str:
-    """32 hex digits (SHA-256) of a text."""
+    """Return 32 hex digits (SHA-256) of a text."""
     return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -1,4 +1,4 @@
-"""The contract of refiners: ways to sharpen a pose that is nearly right."""
+"""The contract of refiners, which refine an approximate pose."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Correspondences = tuple[np.ndarray, np.ndarray]
 
 
 class Refiner(Protocol):
-    """A module or object beside whose ``Params`` and ``VERSION`` stand these."""
+    """The interface of a refiner module or object, beside ``Params`` and ``VERSION``."""
 
     Params: ClassVar[type]
     VERSION: ClassVar[int]
@@ -27,7 +27,7 @@ class Refiner(Protocol):
     def refine(
         self, target: Surface, source: Surface, start: Sim3, params: Any = None, *, with_scale: bool = False
     ) -> Sim3:
-        """A better pose than the start.
+        """Refine a start pose.
 
         A refiner whose module or object has ``USES_CORRESPONDENCES = True`` takes one more keyword,
         ``correspondences``: those that the start rests on (`Correspondences`), or None. One that has ``SCHEDULES``, a

@@ -1,4 +1,4 @@
-"""The contract of a segmenter: from renders of a scene to masks of things."""
+"""The contract of a segmenter: from renders of a scene to object masks."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from gsmap.types.views import Mask, SceneContext, View
 
 
 class Segmenter(Protocol):
-    """A segmenter ready for the views of one scene."""
+    """A segmenter for one scene."""
 
     def segment(self, view: View) -> list[Mask]:
-        """The masks of a view, in any order; they may overlap.
+        """Return the masks of a view, in any order; they may overlap.
 
         Args:
             view: a render: colour (H, W, 3) uint8, depth (H, W) in scene units.
@@ -27,7 +27,7 @@ class Segmenter(Protocol):
 
 
 class SegmenterMethod(Protocol):
-    """What a module (or object) offers to be a segmenter.
+    """The interface of a segmenter module or object.
 
     Attributes:
         Params: frozen dataclass of its settings, each explained under ``Args:``.
@@ -42,7 +42,7 @@ class SegmenterMethod(Protocol):
     MODELS: tuple[str, ...]
 
     def make(self, context: SceneContext, params: Any) -> Segmenter:
-        """A segmenter for one scene; called once per scene, before its first view.
+        """Create a segmenter for one scene, before its first view.
 
         Args:
             context: the scene's surface (scene frame and unit), what is up, the metre, and the models, of which those
@@ -55,7 +55,7 @@ class SegmenterMethod(Protocol):
         ...
 
     def probe(self, spec: ModelSpec) -> None:
-        """Refuse a model of one of the kinds in ``MODELS`` that cannot do its work; called when it is added to a map.
+        """Refuse an unsuitable model of a kind in ``MODELS``; called when it is added to a map.
 
         Raises:
             InputError: its inputs and outputs do not fit, or it does not run.

@@ -1,4 +1,4 @@
-"""The surface of a scene, as proposers and refiners are handed it."""
+"""The surface of a scene for proposers and refiners."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsmap.types import Cameras, Gaussians
 
 
 class Surface(Protocol):
-    """The surface of one scene in metres: its frame's axes and origin, lengths times `unit_m`.
+    """The surface of a scene in metres: the scene's axes and origin, lengths times `unit_m`.
 
     Everything is computed once, when it is first asked for, and kept; arrays are not to be written to.
     """
@@ -33,28 +33,28 @@ class Surface(Protocol):
 
     @property
     def gaussians(self) -> Gaussians | None:
-        """The whole scene in its own unit; None where only points are known."""
+        """Return the whole scene in its own unit; None if only points are known."""
 
     @property
     def cameras(self) -> Cameras | None:
-        """The scene's cameras in its own unit; None where it has none."""
+        """Return the scene's cameras in its own unit; None if it has none."""
 
     def __len__(self) -> int:
         """How many points there are."""
 
     @property
     def coarse(self) -> tuple[np.ndarray, np.ndarray]:
-        """Means (M, 3) of points, float64 metres, and of colours, float32, over cells; in the cells' order in space."""
+        """Return the means of points (M, 3), float64 metres, and of colours, float32, over cells in spatial order."""
 
     def scaled(self, factor: float) -> Surface:
-        """The same surface, points only, in a unit ``factor`` times smaller."""
+        """Return the surface without Gaussians in a unit ``factor`` times smaller."""
 
     def sample(self, count: int) -> np.ndarray:
-        """Rows of at most ``count`` cells, evenly strided."""
+        """Return rows of at most ``count`` cells, evenly strided."""
 
     @property
     def normals(self) -> np.ndarray:
-        """(M, 3) float64 unit normals at the cell means; signs mean nothing."""
+        """Return (M, 3) float64 unit normals at the cell means; signs are arbitrary."""
 
     @property
     def lightness(self) -> np.ndarray:
@@ -70,7 +70,7 @@ class Surface(Protocol):
 
     @property
     def cloud(self) -> tuple[Any, Any]:
-        """The cell means with covariances and normals, and their search tree, as small_gicp keeps them."""
+        """Return the cell means with covariances and normals, and their search tree, as small_gicp types."""
 
     @property
     def oriented_normals(self) -> np.ndarray | None:
@@ -80,7 +80,8 @@ class Surface(Protocol):
     def nearest(
         self, points: np.ndarray, radius_m: float, normals: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (P,) to and row (P,) of the cell mean nearest to each point (P, 3); inf and 0 beyond the radius.
+        """Return the distance (P,) to and row (P,) of the nearest cell mean of each point (P, 3); inf and 0 beyond the
+        radius.
 
         Cells that face the other way than the points (``normals`` (P, 3), in this frame) are passed over.
         """

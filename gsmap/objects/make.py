@@ -11,7 +11,7 @@ from gsmap import render as rendering
 from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse
 from gsmap.objects.visibility import RenderedViews, classify_observation, observe_points
-from gsmap.types import MapObject, Segments, Sighting, SightingState, Sim3
+from gsmap.types import MapObject, ObjectObservation, ObservationState, Segments, Sim3
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
@@ -69,7 +69,7 @@ def make_objects(
     metres: float = 1.0,
     moved: Sequence[tuple[SegmentId, SegmentId]] = (),
     parted: Sequence[tuple[SegmentId, int]] = (),
-    find_earlier: Callable[[int, SegmentId], tuple[SightingState, float] | None] = lambda capture, node: None,
+    find_earlier: Callable[[int, SegmentId], tuple[ObservationState, float] | None] = lambda capture, node: None,
     in_frustum: Callable[[SegmentedScene, np.ndarray], bool] = lambda capture, points: True,
     params: Params | None = None,
     progress: Progress = silent,
@@ -102,8 +102,11 @@ def make_objects(
         members = max(np.count_nonzero(captures[c].segments.members == t) for c, t in group)
         if members >= params.min_gaussians:
             kept.append((group, places))
-    sightings: list[dict[int, Sighting]] = [
-        {c: Sighting(captures[c].scene, "seen", t, np.array([at[c][0].min(0), at[c][0].max(0)])) for c, t in group}
+    sightings: list[dict[int, ObjectObservation]] = [
+        {
+            c: ObjectObservation(captures[c].scene, "seen", t, np.array([at[c][0].min(0), at[c][0].max(0)]))
+            for c, t in group
+        }
         for group, at in kept
     ]
     for c, capture in enumerate(captures):
@@ -112,7 +115,7 @@ def make_objects(
         of = [min((o for o in at if o != c), key=lambda o: (abs(o - c), o), default=c) for _, at in kept]
         points = [places[o][0] for (_, places), o in zip(kept, of, strict=True)]
         S_scene_map, unit = capture.S_map_scene.inverse(), metres * capture.S_map_scene.scale
-        results: dict[int, tuple[SightingState, float]] = {}
+        results: dict[int, tuple[ObservationState, float]] = {}
         to_observe = []
         for i, mine in enumerate(sightings):
             if c in mine:
@@ -123,7 +126,7 @@ def make_objects(
             elif in_frustum(capture, S_scene_map.apply(points[i])):
                 to_observe.append(i)
             else:
-                sightings[i][c] = Sighting(capture.scene, "unseen", -1, None, 0.0)
+                sightings[i][c] = ObjectObservation(capture.scene, "unseen", -1, None, 0.0)
         if to_observe:
             seen = render(capture)
             own = [places[o][1] for (_, places), o in zip(kept, of, strict=True)]
@@ -141,7 +144,7 @@ def make_objects(
             if any((node, c) in gone for node in kept[i][0]):
                 state, observed_at = "absent", ""  # a review may revert it, so it is not kept as an observation
             box = np.array([points[i].min(0), points[i].max(0)]) if state == "seen" else None
-            sightings[i][c] = Sighting(capture.scene, state, -1, box, share, observed_at)
+            sightings[i][c] = ObjectObservation(capture.scene, state, -1, box, share, observed_at)
     objects = []
     for (group, _), mine in zip(kept, sightings, strict=True):
         first, last = group[0], group[-1]

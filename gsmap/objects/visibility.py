@@ -10,7 +10,7 @@ from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
-from gsmap.types import Cameras, Gaussians, SightingState
+from gsmap.types import Cameras, Gaussians, ObservationState
 
 MAX_VIEWS, LONGEST_SIDE_PX = 32, 128  # default number of a capture's views that are rendered, and their size
 _TOLERANCE_M, _TOLERANCE_PER_DEPTH = 0.1, 0.02  # between a point and the surface that it is on; metres, and per metre
@@ -102,7 +102,7 @@ def observe_points(views: RenderedViews, points: np.ndarray, unit_m: float) -> P
 
 def classify_observation(
     seen: PointObservations, points: np.ndarray, colours: np.ndarray, shift: np.ndarray
-) -> tuple[SightingState, float]:
+) -> tuple[ObservationState, float]:
     """Classify the observation of an object of other scenes.
 
     Args:

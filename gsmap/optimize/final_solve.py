@@ -17,7 +17,7 @@ from gsmap.optimize.survey import tie_component
 from gsmap.optimize.survey_system import Component
 from gsmap.types import PoseGraph, Sim3
 from gsmap.types.progress import Progress
-from gsmap.types.world import Survey, WorldTie
+from gsmap.types.world import Georeference, Survey
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class FinalPoses:
     component: np.ndarray
     covariances: np.ndarray
     notes: tuple[str, ...]
-    world: tuple[WorldTie, ...] = ()
+    world: tuple[Georeference, ...] = ()
 
 
 def solve_components(
@@ -67,7 +67,7 @@ def solve_components(
     covariances = np.zeros((m.num_scenes, 7, 7))
     component = np.zeros(m.num_scenes, dtype=np.int64)
     missing: list[tuple[int, int, str]] = []
-    ties: list[tuple[int, WorldTie]] = []
+    ties: list[tuple[int, Georeference]] = []
     world: int | None = None
     max_scenes = params.max_marginal_scenes if params.marginals else 0
     for index, label in enumerate(order):
@@ -104,7 +104,7 @@ def solve_components(
     notes = tuple(
         f"no covariances in component {component[scene]} ({size} scenes): {reason}" for scene, size, reason in missing
     )
-    placed: dict[int, WorldTie] = {}
+    placed: dict[int, Georeference] = {}
     for scene, tie in ties:  # of components in one frame of priors, the largest gives the tie
         placed.setdefault(int(component[scene]), replace(tie, component=int(component[scene])))
     return FinalPoses(poses, component, covariances, notes, tuple(placed.values()))

@@ -11,7 +11,7 @@ from gsmap.geometry.directions import rotation_to_z
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.params import Params
 from gsmap.types import PoseGraph, ScenePose, Sim3
-from gsmap.types.world import WorldTie
+from gsmap.types.world import Georeference
 
 _MIN_AGREEMENT = 0.5  # length of the median of unit up directions below which scenes do not agree on what is up
 
@@ -52,7 +52,7 @@ def gravity_align(
     return replace(graph, poses=poses, world=tuple(world.values()))
 
 
-def _turned(tie: WorldTie, turn: Sim3) -> WorldTie:
+def _turned(tie: Georeference, turn: Sim3) -> Georeference:
     """Return the world tie of a component whose frame was turned."""
     if tie.S_world_map is None or tie.covariance is None:
         return tie

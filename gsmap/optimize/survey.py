@@ -23,7 +23,7 @@ from gsmap.optimize.survey_report import active_observations, build_world_tie, t
 from gsmap.optimize.survey_system import Component, System
 from gsmap.optimize.survey_terms import SurveyTerms
 from gsmap.types import Edge, PoseGraph, Prior, Sim3
-from gsmap.types.world import UNSOLVED, Survey, WorldTie
+from gsmap.types.world import UNSOLVED, Georeference, Survey
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class ComponentSolution:
 
     poses: Similarities
     covariances: np.ndarray | None
-    tie: WorldTie
+    tie: Georeference
 
 
 def tie_component(

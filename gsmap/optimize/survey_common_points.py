@@ -13,7 +13,7 @@ from gsmap.geometry.rotations import skew
 from gsmap.geometry.umeyama import umeyama
 from gsmap.optimize.survey_system import System
 from gsmap.types import Sim3
-from gsmap.types.world import Fix
+from gsmap.types.world import PositionFix
 
 NOTHING = (
     "position, rotation and scale are not determined: it takes three control points that photos of the map show, or "
@@ -226,7 +226,7 @@ def collect_common_points(system: System) -> CommonPoints:
     )
 
 
-def fix_kind(fix: Fix) -> str:
+def fix_kind(fix: PositionFix) -> str:
     """Return the group of observations that a fix belongs to."""
     return "scenes" if fix.name == SURVEYED else "photos"
 

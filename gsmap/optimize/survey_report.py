@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, ObservationTests, System
 from gsmap.optimize.survey_terms import Terms, Unknowns
-from gsmap.types.world import Contradiction, Residual, Survey, WorldFrame, WorldTie
+from gsmap.types.world import Contradiction, Georeference, Residual, Survey, WorldFrame
 
 _MIN_CHECKS = 2.5  # redundancy of points, fixes and bars below which a note warns of unchecked observations
 _CONTRADICTS = "it contradicts the other observations"
@@ -47,7 +47,7 @@ class SurveyFailure:
     contradictions: tuple[Contradiction, ...] = ()
 
 
-def active_observations(system: System, tie: WorldTie) -> Active:
+def active_observations(system: System, tie: Georeference) -> Active:
     """Return the observations that an answer was solved from."""
     out = tie.left_out()
     terms = system.terms
@@ -64,7 +64,7 @@ def active_observations(system: System, tie: WorldTie) -> Active:
     return points, images, fixes, bars
 
 
-def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFrame | None) -> WorldTie:
+def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFrame | None) -> Georeference:
     """Build the tie to the world with all residuals."""
     x, active, factor = solved.x, solved.active, solved.factor
     tests = system.tests(x, active, factor)
@@ -81,7 +81,7 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
     if sum(float(tests.redundancies[kind].sum()) for kind in (0, 2, 3)) < _MIN_CHECKS:
         notes.append("these observations hardly check each other: a blunder in one of them could not be detected")
     world = x.world.item(0)
-    return WorldTie(
+    return Georeference(
         index,
         world,
         covariance * factor_of,
@@ -94,10 +94,10 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
     )
 
 
-def tie_by_bars(system: System, index: int, survey: Survey, refusal: SurveyFailure) -> WorldTie:
+def tie_by_bars(system: System, index: int, survey: Survey, refusal: SurveyFailure) -> Georeference:
     """Build a tie from scale bars alone, where positions do not determine the rest: metric scale and nothing else."""
     terms, missing = system.terms, refusal.problem
-    nothing = WorldTie(
+    nothing = Georeference(
         index, frame=survey.frame, problem=missing, problem_code=refusal.code, contradictions=refusal.contradictions
     )
     rows = [Residual("point", p.name, "", "check" if p.check else "unused", reason=missing) for p in terms.points]

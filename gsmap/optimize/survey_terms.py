@@ -20,7 +20,7 @@ import numpy as np
 from gsmap.geometry.rotations import skew
 from gsmap.geometry.similarities import Similarities, commutator, exp
 from gsmap.types import Sim3
-from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey
+from gsmap.types.world import ControlPoint, ImagePoint, PositionFix, ScaleBar, Survey
 
 _FAR = 1e6  # m: sigma of points without other terms, which keeps the system regular without effect
 _BEHIND = 1e3  # residual in standard deviations of a point behind the camera
@@ -134,7 +134,7 @@ class SurveyTerms:
     dim: int
     points: tuple[ControlPoint, ...]
     images: tuple[ImagePoint, ...]
-    fixes: tuple[Fix, ...]
+    fixes: tuple[PositionFix, ...]
     bars: tuple[ScaleBar, ...]
 
     @classmethod

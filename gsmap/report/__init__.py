@@ -2,7 +2,7 @@
 
 `page` makes one HTML file of a `Report`. It holds everything it shows: no script, no link to anything outside,
 and a Content-Security-Policy that lets a browser load nothing. What a report says is put together in
-`gsmap.map.reporting`; here is how it is drawn.
+`gsmap.map.report_builder`; here is how it is drawn.
 """
 
 from gsmap.report.content import (

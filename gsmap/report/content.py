@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.report.params import Params
 from gsmap.report.plan import Plan
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, ObjectsReport, PoseChangeRow, RevisionRow, SceneRow
 
 CHI2_DOF = 7
@@ -107,7 +107,7 @@ class Island:
 
     component: int
     scenes: tuple[str, ...]
-    metre: Metre
+    metre: MetricScale
     plan: Plan | None = None
     note: str = ""
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Literal, assert_never
 
 from gsmap.report.content import CHI2_999, EdgeEntry, Report
-from gsmap.types.metre import KnownBy, Metre
+from gsmap.types.metric_scale import KnownBy, MetricScale
 from gsmap.types.rows.maps import TodoKind
 
 _SHOWN = 3  # names in a sentence
@@ -112,7 +112,7 @@ def cut_pair(pair: tuple[str, str], most: int = 22) -> str:
     return ":".join(name if len(name) <= half else f"…{name[1 - half :]}" for name in pair)
 
 
-def metre(one: Metre) -> str:
+def metre(one: MetricScale) -> str:
     """How lengths are known, in a sentence's half."""
     how = _how(one.known_by)
     if not one.is_known or not math.isfinite(one.sigma):

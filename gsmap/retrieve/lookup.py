@@ -13,7 +13,7 @@ from gsmap.retrieve import codes
 from gsmap.retrieve.index import positions_of
 from gsmap.retrieve.params import Params
 from gsmap.retrieve.scene_nodes import SceneNodes
-from gsmap.types.retrieval import Candidate, Member
+from gsmap.types.retrieval import Candidate, IndexedScene
 from gsmap.types.segments import Segment, lists_of, places_of
 
 VERSION = 5
@@ -61,7 +61,7 @@ class _IndexedScenes:
     """The indexed scenes of all segments, each once, sorted by id."""
 
     def __init__(self, segments: Sequence[Segment]) -> None:
-        first: dict[str, tuple[int, int, Member]] = {}
+        first: dict[str, tuple[int, int, IndexedScene]] = {}
         for number, segment in enumerate(segments):
             for place, member in enumerate(segment.members):
                 if member is not None:

@@ -10,7 +10,7 @@ from gsmap.geometry.directions import level_frame
 from gsmap.retrieve import codes
 from gsmap.retrieve.codes import NUM_DIMS
 from gsmap.types import NodeLayer, SceneGraph
-from gsmap.types.retrieval import Member
+from gsmap.types.retrieval import IndexedScene
 
 INDEX_VERSION = 2
 """Version of the nodes in an index; an index of another version is rebuilt."""
@@ -47,7 +47,7 @@ class SceneNodes:
             pairs with a scene of unknown gravity match by gravity-free landmarks.
     """
 
-    member: Member
+    member: IndexedScene
     index_nodes: Nodes
     query_nodes: Nodes
 
@@ -75,7 +75,7 @@ def select_nodes(graph: SceneGraph, key: str, nodes_per_scene: int) -> SceneNode
         if not upright:
             query_nodes.append(_with_keys(nodes, layer.descriptor_id, second=True))
     coarseness = 1.0 / graph.working_m if "landmarks" in metric else 1.0
-    member = Member(graph.scene_id, key, upright, "landmarks" in metric, coarseness)
+    member = IndexedScene(graph.scene_id, key, upright, "landmarks" in metric, coarseness)
     return SceneNodes(member, *_join_groups(index_nodes, query_nodes))
 
 

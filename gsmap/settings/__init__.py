@@ -1,4 +1,4 @@
-"""Settings: one frozen tree of all parameters, as dotted names, as TOML, and as ``--set`` on the command line.
+"""Settings: a frozen tree of parameters with dotted names, stored as TOML and set by ``--set``.
 
 This room knows how any such tree is walked, changed and written; the tree itself is put together in `gsmap.map`, which
 knows all stages. Stages are handed their own ``Params``: nothing here is global.
@@ -6,12 +6,13 @@ knows all stages. Stages are handed their own ``Params``: nothing here is global
 
 from gsmap.settings.docs import field_docs, unit_of
 from gsmap.settings.file import FILE_NAME, load, save
-from gsmap.settings.tree import Leaf, changed, differences, leaves, parse
+from gsmap.settings.tree import Leaf, changed, contains, differences, leaves, parse
 
 __all__ = [
     "FILE_NAME",
     "Leaf",
     "changed",
+    "contains",
     "differences",
     "field_docs",
     "leaves",

@@ -1,4 +1,4 @@
-"""What the docstrings of settings say: meaning and unit of each field."""
+"""Read the meaning and unit of settings from docstrings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ENTRY = re.compile(r"^(?P<names>[A-Za-z_]\w*(?:, [A-Za-z_]\w*)*): (?P<text>.*)$
 
 @lru_cache(maxsize=512)
 def field_docs(cls: type) -> dict[str, str]:
-    """Meaning of each field of a dataclass, from the ``Args:`` of its docstring; several names may share an entry.
+    """Return the meaning of each field of a dataclass from the ``Args:`` of its docstring; names may share an entry.
 
     A docstring may also begin with ``Args:``, followed by a remark in brackets on the units.
     """
@@ -54,6 +54,6 @@ def field_docs(cls: type) -> dict[str, str]:
 
 
 def unit_of(name: str) -> str:
-    """The unit that a field's name ends with; empty where it has none."""
+    """Return the unit from the suffix of a field's name, or an empty text."""
     parts = [ending for ending in _UNITS if name.endswith(ending)]
     return _UNITS[max(parts, key=len)] if parts else ""

@@ -1,4 +1,4 @@
-"""``settings.toml``: what a map changes of the defaults; a person may edit it, comments are kept."""
+"""``settings.toml``: the settings of a map that differ from the defaults; comments are kept."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HEADER = "Settings of this map that differ from the defaults; `gsmap settings M
 
 
 def load(path: Path) -> dict[str, Any]:
-    """The settings of a file by dotted name (``preset`` among them); empty where there is no file.
+    """Load settings by dotted name (``preset`` among them); empty if there is no file.
 
     Raises:
         ConfigError: not TOML; the line is named.
@@ -37,11 +37,11 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def save(path: Path, values: Mapping[str, Any], drop: tuple[str, ...] = ()) -> None:
-    """Set some settings in a file, and take others out; the rest of it, comments included, stays as it is.
+    """Set and remove settings in a file; the rest of it, comments included, stays unchanged.
 
     Args:
         values: by dotted name.
-        drop: dotted names that go back to their defaults.
+        drop: dotted names to remove.
     """
     import tomlkit
 

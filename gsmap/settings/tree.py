@@ -1,4 +1,4 @@
-"""A tree of frozen settings: every leaf by its dotted name, and the tree with some leaves changed.
+"""A tree of frozen settings: list its leaves by dotted name, and change some of them.
 
 The nodes are frozen dataclasses and `gsmap.methods.MethodParams`; a leaf is anything else: a number, a text, a switch,
 a tuple of them, or None where nothing is chosen.
@@ -29,8 +29,8 @@ class Leaf:
 
     Args:
         name: dotted, such as ``register.verdict.max_log_nfa``.
-        value: as it is.
-        type: its annotation.
+        value: current value.
+        type: type annotation.
         meaning: from the docstring of the dataclass that holds it.
         unit: from its name; empty where it has none.
     """
@@ -43,7 +43,7 @@ class Leaf:
 
 
 def leaves(tree: Any, prefix: str = "") -> Iterator[Leaf]:
-    """Every setting of a tree, in the order in which they are declared."""
+    """Yield every setting of a tree in the order of declaration."""
     for name, value, annotation, meaning in _children(tree):
         path = f"{prefix}{name}"
         if _is_node(value):
@@ -53,7 +53,7 @@ def leaves(tree: Any, prefix: str = "") -> Iterator[Leaf]:
 
 
 def changed(tree: Any, values: Mapping[str, Any]) -> Any:
-    """The tree with some leaves set; values are plain (as TOML or JSON hold them) or already of the leaf's type.
+    """Return the tree with some settings changed; values are plain (as TOML or JSON hold them) or typed.
 
     Raises:
         ConfigError: an unknown name (the nearest known one is named), a value of another type, or one that the
@@ -65,15 +65,27 @@ def changed(tree: Any, values: Mapping[str, Any]) -> Any:
 
 
 def differences(tree: Any, base: Any) -> dict[str, Any]:
-    """The leaves of a tree that are not as in another one of the same shape."""
+    """Return the settings of a tree that differ from another tree of the same shape."""
     before = {leaf.name: leaf.value for leaf in leaves(base)}
     return {
         leaf.name: leaf.value for leaf in leaves(tree) if leaf.name not in before or before[leaf.name] != leaf.value
     }
 
 
+def contains(tree: Any, name: str) -> bool:
+    """Return true if a tree has a setting or a group of settings under a dotted name."""
+    for part in name.split("."):
+        try:
+            tree, _ = _child(tree, part)
+        except KeyError:
+            return False
+        except (AttributeError, TypeError):  # below a value
+            return False
+    return True
+
+
 def parse(text: str) -> tuple[str, Any]:
-    """Name and value of ``a.b=value``, as ``--set`` takes them; the value is TOML (but ``.3`` will do), or plain text.
+    """Parse ``a.b=value`` of ``--set``; the value is TOML (``.3`` is accepted, too) or plain text.
 
     Raises:
         ConfigError: no ``=``, or nothing before it.
@@ -98,7 +110,7 @@ def _is_node(value: Any) -> bool:
 
 
 def _children(tree: Any) -> Iterator[tuple[str, Any, Any, str]]:
-    """(name, value, annotation, meaning) of what hangs at a node."""
+    """Yield (name, value, annotation, meaning) of a node's children."""
     if isinstance(tree, MethodParams):
         for name in tree:
             yield name, tree[name], None, ""
@@ -112,7 +124,7 @@ def _children(tree: Any) -> Iterator[tuple[str, Any, Any, str]]:
 
 @lru_cache(maxsize=512)
 def _names(cls: type) -> tuple[str, ...]:
-    """Names of the fields that can be set."""
+    """Return the names of the fields that can be set."""
     return tuple(field.name for field in fields(cls) if field.init)
 
 
@@ -127,7 +139,7 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def _child(tree: Any, name: str) -> tuple[Any, Any]:
-    """Value and annotation of one child; of a family only the method that is named is loaded.
+    """Return value and annotation of one child; of a family only the named method is loaded.
 
     Raises:
         KeyError: no such child.
@@ -174,7 +186,7 @@ def _unknown(name: str, root: Any) -> ConfigError:
 
 
 def _of_type(value: Any, annotation: Any, name: str) -> Any:
-    """The value as the leaf's type has it."""
+    """Convert a value to the setting's type."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin in (Union, types.UnionType):
         if value is None and type(None) in inner:

@@ -17,7 +17,7 @@ from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.groups import manifest, publish, unless_pruned, unname
 from gsmap.store.scene_refs import living_ids
 from gsmap.store.schema import index_segments, lookups
-from gsmap.types.retrieval import Candidate, IndexArrays, Member
+from gsmap.types.retrieval import Candidate, IndexArrays, IndexedScene
 
 KIND = "indexes"
 
@@ -33,7 +33,7 @@ class StoredSegment:
     """
 
     id: str
-    members: Sequence[Member | None]
+    members: Sequence[IndexedScene | None]
     num_nodes: int
     _files: tuple[StoredFile, ...]
     _arrays: Arrays
@@ -93,7 +93,7 @@ class Indexes:
     def put(
         self,
         key: str,
-        members: Sequence[Member],
+        members: Sequence[IndexedScene],
         arrays: IndexArrays,
         instead_of: Collection[str],
         beside: Collection[str] = (),
@@ -176,7 +176,7 @@ class Indexes:
                     connection.execute(update(lookups).where(mine).values(num_left=num_left[row.scene]))
 
     def _segment(self, row: Row[Any], files: tuple[StoredFile, ...]) -> StoredSegment:
-        members = [Member(scene, graph, bool(up), bool(metric), c) for scene, graph, up, metric, c in row.members]
+        members = [IndexedScene(scene, graph, bool(up), bool(metric), c) for scene, graph, up, metric, c in row.members]
         if row.num_nodes < 0:
             raise CorruptError(
                 f"the catalog holds {row.num_nodes} in index_segments.num_nodes: restore it", code="catalog_invalid"

@@ -13,7 +13,7 @@ from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
 from gsmap.types import PoseGraph, ScenePose, Sim3
-from gsmap.types.world import WorldTie
+from gsmap.types.world import Georeference
 
 # Scenes in both maps agree where their poses differ by no more than what both solutions leave open. The covariance of
 # the scene that holds a component's frame is next to nothing, so that this much is always allowed: [rad, scene units,
@@ -83,7 +83,7 @@ def restricted(graph: PoseGraph, scenes: Collection[str]) -> PoseGraph:
     return PoseGraph(placed, outcomes, settings=graph.settings, notes=graph.notes, world=world)
 
 
-def _ties(graph: PoseGraph, placed: Mapping[str, ScenePose], before: Mapping[str, int]) -> tuple[WorldTie, ...]:
+def _ties(graph: PoseGraph, placed: Mapping[str, ScenePose], before: Mapping[str, int]) -> tuple[Georeference, ...]:
     """Where components lie in the world, under their new numbers; of what was observed, that of scenes that are here.
 
     Args:

@@ -24,7 +24,7 @@ from gsmap.errors import BusyError, GsmapError, StoreError
 from gsmap.store.catalog import Catalog
 from gsmap.store.explained import called
 from gsmap.store.schema import leases
-from gsmap.types.holder import Holder, this_process
+from gsmap.types.lock_owner import LockOwner, this_process
 
 _log = logging.getLogger("gsmap.leases")
 
@@ -41,7 +41,7 @@ _PATIENCE_S = 1.0  # for the writer lock, to give leases back: who ends must not
 
 
 @dataclass(frozen=True)
-class Lease(Holder):
+class Lease(LockOwner):
     """What a process is at work on.
 
     Args:

@@ -24,8 +24,8 @@ from gsmap.store import facts, recipes
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.matrices import from_array, from_pose, to_pose
 from gsmap.store.schema import object_facts, object_places, object_sets, objects
-from gsmap.types import MapObject, ObjectWords, Room, Sighting, Sim3
-from gsmap.types.map_object import SIGHTING_STATES
+from gsmap.types import MapObject, ObjectAnnotations, ObjectObservation, Room, Sim3
+from gsmap.types.map_object import OBSERVATION_STATES
 from gsmap.types.plain import plain
 
 Places = Mapping[str, np.ndarray]
@@ -272,7 +272,7 @@ class Objects:
                         f"this map has no object o{one}: gsmap graph MAP lists them", code="object_not_found"
                     )
             words = standing(connection)
-            mine = words.get(number, ObjectWords())
+            mine = words.get(number, ObjectAnnotations())
             said = [(kind, value) for kind, value in said if kind == "note" or getattr(mine, kind) != value]
             for kind, value in said:
                 if kind == "name" and value:
@@ -286,7 +286,7 @@ class Objects:
             if rows:
                 connection.execute(insert(object_facts), rows)
 
-    def words(self) -> dict[str, ObjectWords]:
+    def words(self) -> dict[str, ObjectAnnotations]:
         """What people say of objects now, by id (``o12``); those of which nobody said anything are left out."""
         with self._catalog.read() as connection:
             return {f"o{number}": words for number, words in standing(connection).items()}
@@ -375,12 +375,12 @@ def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # --- words -----------------------------------------------------------------------------------------------------------
 
 
-def standing(connection: Connection) -> dict[int, ObjectWords]:
+def standing(connection: Connection) -> dict[int, ObjectAnnotations]:
     """What people say of objects now, by number."""
     said: dict[int, dict[str, str]] = {}
     for row in connection.execute(select(object_facts).order_by(object_facts.c.number)):
         said.setdefault(row.object, {})[row.kind] = row.value
-    return {number: ObjectWords(**values) for number, values in said.items() if any(values.values())}
+    return {number: ObjectAnnotations(**values) for number, values in said.items() if any(values.values())}
 
 
 def _checked_name(name: str) -> str:
@@ -390,7 +390,7 @@ def _checked_name(name: str) -> str:
     return name
 
 
-def _check_free(words: Mapping[int, ObjectWords], number: int, name: str) -> None:
+def _check_free(words: Mapping[int, ObjectAnnotations], number: int, name: str) -> None:
     for other, said in words.items():
         if other != number and said.name.casefold() == name.casefold():
             raise InputError(
@@ -400,7 +400,7 @@ def _check_free(words: Mapping[int, ObjectWords], number: int, name: str) -> Non
             )
 
 
-def _check_no_circle(words: Mapping[int, ObjectWords], number: int, same_as: str) -> None:
+def _check_no_circle(words: Mapping[int, ObjectAnnotations], number: int, same_as: str) -> None:
     seen = {f"o{number}"}
     at: str | None = same_as
     while at:
@@ -409,7 +409,7 @@ def _check_no_circle(words: Mapping[int, ObjectWords], number: int, same_as: str
                 f"o{number} and {same_as} are said to be one already, or are the same object", code="already_same"
             )
         seen.add(at)
-        at = words.get(number_of(at) or 0, ObjectWords()).same_as
+        at = words.get(number_of(at) or 0, ObjectAnnotations()).same_as
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
@@ -508,18 +508,20 @@ def _read(row: Row[Any]) -> ObjectSet:
 
 
 def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, str]) -> MapObject:
-    said: dict[int, Sighting] = {}
+    said: dict[int, ObjectObservation] = {}
     for at, state, thing, box, looked, asked in one["sightings"]:
-        if state not in SIGHTING_STATES or not 0 <= at < len(scenes) or not -1 <= asked < len(scenes):
+        if state not in OBSERVATION_STATES or not 0 <= at < len(scenes) or not -1 <= asked < len(scenes):
             raise InputError(f"a sighting of {state!r}", code="invalid_record")
         corners = None if box is None else _numbers(box, (2, 3))
         by = "" if asked < 0 else scenes[asked]
-        said[at] = Sighting(scenes[at], state, int(thing), corners, float(looked), by)
+        said[at] = ObjectObservation(scenes[at], state, int(thing), corners, float(looked), by)
     if number_of(str(one["id"])) is None:
         raise InputError(f"an object called {one['id']!r}", code="invalid_record")
     # Captures whose things nobody knows tell nothing of any.
     every = tuple(
-        said.get(i, Sighting(scene, "unseen", -1, None, 0.0)) for i, scene in enumerate(scenes) if things[scene]
+        said.get(i, ObjectObservation(scene, "unseen", -1, None, 0.0))
+        for i, scene in enumerate(scenes)
+        if things[scene]
     )
     colour = _numbers(one["colour"], (3,)).astype(np.float32)
     box, position = _numbers(one["box"], (2, 3)), _numbers(one["position"], (3,))

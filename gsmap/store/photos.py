@@ -1,4 +1,4 @@
-"""Photographs that a map keeps as evidence (`PhotoSighting`), each with a small JPEG to show it.
+"""Photographs that a map keeps as evidence (`LocalizedPhoto`), each with a small JPEG to show it.
 
 A row is never overwritten: one that is taken back stays, and says when. A photo's pose is relative to the scene that
 supports it, whose newest pose takes it to the map.
@@ -20,7 +20,7 @@ from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.groups import manifest, publish, unless_pruned
 from gsmap.store.scene_refs import living_ids, resolve
 from gsmap.store.schema import photo_sightings
-from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
+from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 
 KIND = "photos"
 MAX_BYTES = 1 << 19  # of a photo's JPEG: the merged map is to look like it, and no sharper
@@ -38,7 +38,7 @@ class StoredPhoto:
     """
 
     number: int
-    sighting: PhotoSighting
+    sighting: LocalizedPhoto
     created_at: str
     picture: str = ""
 
@@ -50,7 +50,7 @@ class Photos:
         self._catalog = catalog
         self._arrays = arrays
 
-    def add(self, sighting: PhotoSighting, jpeg: bytes) -> bool:
+    def add(self, sighting: LocalizedPhoto, jpeg: bytes) -> bool:
         """Keep a photo; False, and nothing is changed, where the same one is kept already.
 
         Raises:
@@ -162,7 +162,7 @@ def _standing() -> Any:
     return photo_sightings.c.removed_at.is_(None)
 
 
-def _value(sighting: PhotoSighting) -> dict[str, Any]:
+def _value(sighting: LocalizedPhoto) -> dict[str, Any]:
     return {
         "T_scene_camera": sighting.T_scene_camera.tolist(),
         "covariance": sighting.covariance.tolist(),
@@ -181,11 +181,11 @@ def _stored(row: Row[Any]) -> StoredPhoto:
         value = row.value
         when = None if row.captured_at is None else facts.checked_date(row.captured_at)
         things = tuple(
-            ThingInPhoto(np.array(one["position"], np.float64), one["state"], float(one["share"]))
+            PhotoObjectObservation(np.array(one["position"], np.float64), one["state"], float(one["share"]))
             for one in value["things"]
         )
         width, height = value["size_px"]
-        sighting = PhotoSighting(
+        sighting = LocalizedPhoto(
             row.digest,
             row.name,
             when,

@@ -40,7 +40,7 @@ from gsmap.store.schema import REVISION_COUNTS, edges, poses, revisions
 from gsmap.store.ties import tie_value, ties_of
 from gsmap.types import EdgeOutcome, PoseGraph, Provenance, ScenePose
 from gsmap.types.plain import plain
-from gsmap.types.world import WorldTie
+from gsmap.types.world import Georeference
 
 PairsByRevision = dict[int, list[tuple[str, str]]]
 
@@ -182,7 +182,7 @@ class Revisions:
         with self._catalog.read() as connection:
             return _poses(connection, newest & poses.c.scene.in_(scenes) if scenes else newest)
 
-    def world(self) -> tuple[WorldTie, ...]:
+    def world(self) -> tuple[Georeference, ...]:
         """Where the components of the newest revision lie in the world, of those of which anything was observed."""
         with self._catalog.read() as connection:
             row = connection.execute(_NEWEST).first()

@@ -382,7 +382,7 @@ photo_sightings = _table(
     Column("name", Line, nullable=False),
     Column("captured_at", Line),
     _scene("scene", index=True),  # whose frame its pose is in
-    Column("value", Json(an_object), nullable=False),  # as of `gsmap.types.photo_sighting`
+    Column("value", Json(an_object), nullable=False),  # as of `gsmap.types.localized_photo`
     Column("group_id", Digest, ForeignKey("groups.id")),  # of its small JPEG; null once it was taken back and pruned
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),

@@ -9,12 +9,12 @@ import numpy as np
 from gsmap.errors import CorruptError, GsmapError
 from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
 from gsmap.types.plain import plain
-from gsmap.types.world import Contradiction, Residual, WorldFrame, WorldTie
+from gsmap.types.world import Contradiction, Georeference, Residual, WorldFrame
 
 _PAIRS = ("error_m", "sigma_m", "error_px")
 
 
-def tie_value(tie: WorldTie) -> dict[str, Any]:
+def tie_value(tie: Georeference) -> dict[str, Any]:
     """As JSON holds it, to the last bit."""
     return {
         "component": int(tie.component),
@@ -31,7 +31,7 @@ def tie_value(tie: WorldTie) -> dict[str, Any]:
     }
 
 
-def ties_of(values: list[dict[str, Any]]) -> tuple[WorldTie, ...]:
+def ties_of(values: list[dict[str, Any]]) -> tuple[Georeference, ...]:
     """The reverse.
 
     Raises:
@@ -47,7 +47,7 @@ def ties_of(values: list[dict[str, Any]]) -> tuple[WorldTie, ...]:
         ) from error
 
 
-def _tie(value: dict[str, Any]) -> WorldTie:
+def _tie(value: dict[str, Any]) -> Georeference:
     covariance, metres = to_array(value["covariance"]), value["metres_per_unit"]
     if covariance is not None and (covariance.shape != (7, 7) or not np.isfinite(covariance).all()):
         raise ValueError("no covariance")
@@ -61,7 +61,7 @@ def _tie(value: dict[str, Any]) -> WorldTie:
         if not isinstance(values["dof"], int) or not isinstance(values["statistic"], float | int | None):
             raise ValueError("no statistic")
         rows.append(Residual(**values))
-    return WorldTie(
+    return Georeference(
         int(value["component"]),
         to_pose(value["S_world_map"]),
         covariance,

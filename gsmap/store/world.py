@@ -18,14 +18,14 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.scene_refs import living_ids
 from gsmap.store.schema import observations
 from gsmap.types.plain import plain
-from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldFrame
+from gsmap.types.world import ControlPoint, ImagePoint, PositionFix, ScaleBar, Survey, WorldFrame
 
-Observation = WorldFrame | ControlPoint | ImagePoint | Fix | ScaleBar
+Observation = WorldFrame | ControlPoint | ImagePoint | PositionFix | ScaleBar
 _TYPES: Mapping[str, type[Observation]] = {
     "frame": WorldFrame,
     "point": ControlPoint,
     "image": ImagePoint,
-    "fix": Fix,
+    "fix": PositionFix,
     "bar": ScaleBar,
 }
 _ARRAYS = {"position", "pixel", "T_scene_camera", "intrinsics_px", "camera_covariance", "point", "points"}

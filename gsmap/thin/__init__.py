@@ -11,7 +11,7 @@ from gsmap.compare import HIDDEN, UNSEEN, CaptureViews, compare, render_views
 from gsmap.compare.capture_views import CELL_M, max_per_cell
 from gsmap.errors import ConfigError
 from gsmap.render import render
-from gsmap.types import Gaussians, PlacedScene
+from gsmap.types import Gaussians, PosedScene
 
 __all__ = ["Params", "measure_fidelity_db", "render_views", "observed_fraction", "find_visible"]
 
@@ -49,7 +49,7 @@ class Params:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}", code="out_of_range")
 
 
-def observed_fraction(older: PlacedScene, newer: Sequence[CaptureViews]) -> float:
+def observed_fraction(older: PosedScene, newer: Sequence[CaptureViews]) -> float:
     """Return the fraction of a scene's surface that newer scenes of the same frame observed, changed or not.
 
     Occluded surfaces are not observed; Gaussians slightly behind an observed surface in one cell are part of it.
@@ -69,7 +69,7 @@ def observed_fraction(older: PlacedScene, newer: Sequence[CaptureViews]) -> floa
     return float(seen[surface].mean())
 
 
-def find_visible(scene: PlacedScene, params: Params) -> np.ndarray:
+def find_visible(scene: PosedScene, params: Params) -> np.ndarray:
     """Return (N,) bool, Gaussians visible in some own view of a scene; all if cameras are missing or synthesized."""
     if scene.cameras is None or not len(scene.cameras) or scene.cameras.synthesised:
         return np.ones(len(scene.gaussians), dtype=bool)
@@ -82,7 +82,7 @@ def find_visible(scene: PlacedScene, params: Params) -> np.ndarray:
     return out
 
 
-def measure_fidelity_db(scene: PlacedScene, kept: Gaussians, params: Params) -> float:
+def measure_fidelity_db(scene: PosedScene, kept: Gaussians, params: Params) -> float:
     """Measure the PSNR in dB, colours in [0, 1], of the kept Gaussians against all, over the scene's own views.
 
     Infinite for equal views, NaN without cameras.

@@ -1,11 +1,11 @@
-"""The frozen nouns of gsmap. numpy only: they travel between stages, processes and machines."""
+"""The frozen data types of gsmap. They need numpy only and are passed between stages, processes and machines."""
 
 from gsmap.types.cameras import Cameras
 from gsmap.types.change import CHANGE_KINDS, Change, ChangeKind, ChangeReport
 from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
-from gsmap.types.map_object import SIGHTING_STATES, MapObject, ObjectWords, Sighting, SightingState
-from gsmap.types.merging import KeptPhoto, MergeResult, PlacedScene
+from gsmap.types.map_object import OBSERVATION_STATES, MapObject, ObjectAnnotations, ObjectObservation, ObservationState
+from gsmap.types.merging import MergeResult, PosedScene, ReferencePhoto
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
 from gsmap.types.room import Room
@@ -18,7 +18,7 @@ from gsmap.types.tile import Tile
 
 __all__ = [
     "CHANGE_KINDS",
-    "SIGHTING_STATES",
+    "OBSERVATION_STATES",
     "Cameras",
     "Change",
     "ChangeKind",
@@ -28,12 +28,12 @@ __all__ = [
     "FileInfo",
     "GaussianSource",
     "Gaussians",
-    "KeptPhoto",
+    "ReferencePhoto",
     "MapObject",
     "MergeResult",
     "NodeLayer",
-    "ObjectWords",
-    "PlacedScene",
+    "ObjectAnnotations",
+    "PosedScene",
     "PoseChange",
     "PoseGraph",
     "Prior",
@@ -44,8 +44,8 @@ __all__ = [
     "Scene",
     "SceneGraph",
     "ScenePose",
-    "Sighting",
-    "SightingState",
+    "ObjectObservation",
+    "ObservationState",
     "Sim3",
     "Thinning",
     "Segments",

@@ -19,9 +19,8 @@ class Cameras:
         intrinsics_px: (C, 4) float64 ``fx fy cx cy``, in pixels of an image of ``sizes_px``.
         sizes_px: (C, 2) int64 ``width height``.
         names: C image names, unique; ids as text where the source has none.
-        synthesised: true when gsmap invented the cameras because the source had none.
-        notes: what a person should know about how they were read, such as that their lenses are no pinholes; not of
-            cameras that are made from these.
+        synthesised: true if gsmap synthesized the cameras because the source had none.
+        notes: remarks on how they were read, such as lenses that are not pinholes; not copied to derived cameras.
 
     Raises:
         InputError: wrong shapes, NaN, a pose that is not rigid, a focal length or image size that is not positive.
@@ -96,7 +95,7 @@ class Cameras:
         return out
 
     def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Cameras:
-        """The cameras at an index, slice, boolean mask or integer array; always a `Cameras`."""
+        """Return the cameras at an index, slice, boolean mask or integer array; always a `Cameras`."""
         rows = np.atleast_1d(np.arange(len(self))[index])
         names = tuple(self.names[i] for i in rows)
         return Cameras(
@@ -104,13 +103,13 @@ class Cameras:
         )
 
     def evenly(self, count: int) -> Cameras:
-        """At most ``count`` of them, evenly along the capture, in its order."""
+        """Return at most ``count`` cameras, evenly spaced along the capture, in its order."""
         if len(self) <= count:
             return self
         return self[np.linspace(0, len(self) - 1, count).round().astype(int)]
 
     def resized(self, longest_side_px: int) -> Cameras:
-        """The same views with images shrunk so that the longer side has at most ``longest_side_px`` pixels."""
+        """Return the same views with images shrunk to at most ``longest_side_px`` pixels on the longer side."""
         factor = np.minimum(1.0, longest_side_px / self.sizes_px.max(1))
         sizes = np.maximum(1, np.round(self.sizes_px * factor[:, None])).astype(np.int64)
         # Scale by the rounded sizes, so that the principal point stays at the same place of the image.

@@ -1,4 +1,4 @@
-"""What changed between two captures of one place."""
+"""Changes between two captures of one place."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ class Change:
     """One change from an older capture to a newer one; all lengths and frames are those of the comparison.
 
     Args:
-        kind: what happened.
-        box: (2, 3) float64 lowest and highest corner around all that changed.
-        voxels: (K, 3) float32 centres of the cells that changed, those left and those taken.
-        before: (I,) int32 Gaussians of the older capture that are no longer there or no longer look so.
-        after: (J,) int32 Gaussians of the newer capture that were not there or did not look so.
-        S_after_before: of a thing that moved: takes a point of it from where it stood to where it stands.
-        symmetry: of a thing that moved: ``none``, or the turn about the vertical that nothing tells apart, ``half`` or
-            ``any``; its yaw is known up to that.
-        confidence: in [0, 1], how probable it is that something changed here, of as many right ones as wrong.
-        evidence: numbers behind it, by name, such as the views that looked through.
+        kind: the kind of change.
+        box: (2, 3) float64 lowest and highest corner around the change.
+        voxels: (K, 3) float32 centres of the changed cells, old and new.
+        before: (I,) int32 Gaussians of the older capture that disappeared or look different.
+        after: (J,) int32 Gaussians of the newer capture that appeared or look different.
+        S_after_before: old to new pose of an object that moved; None for other kinds.
+        symmetry: symmetry of an object that moved: ``none``, or the rotation about the vertical up to which its yaw is
+            known, ``half`` or ``any``.
+        confidence: probability in [0, 1] that something changed here, with a prior of one half.
+        evidence: evidence values by name, such as the number of views that looked through.
     """
 
     kind: ChangeKind
@@ -52,13 +52,13 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class ChangeReport:
-    """What two captures say of each other.
+    """The comparison of two captures.
 
     Args:
-        changes: what changed, surest first.
-        seen_share: share of the older capture's surface that the newer one looked at; of the rest nothing is said.
-        gains: (3,) by which the older capture's colours are to be multiplied to look like the newer's.
-        notes: what a person should know.
+        changes: the changes, most confident first.
+        seen_share: fraction of the older capture's surface that the newer one observed.
+        gains: (3,) factors from the older capture's colours to the newer's.
+        notes: remarks.
     """
 
     changes: tuple[Change, ...]

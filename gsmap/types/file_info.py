@@ -1,4 +1,4 @@
-"""What a file of Gaussians says about itself."""
+"""Metadata of a file of Gaussians."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class FileInfo:
-    """What a file says about itself beside its Gaussians.
+    """Metadata that a file stores beside its Gaussians.
 
     Args:
         antialiased: trained with the 2D Mip filter.
-        notes: what a person should know about how it was read.
+        notes: remarks about how it was read.
     """
 
     antialiased: bool = False

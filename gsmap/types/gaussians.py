@@ -71,18 +71,18 @@ class Gaussians:
         return _SH_DEGREE[self.sh.shape[1]]
 
     def chunks(self) -> Iterator[Gaussians]:
-        """As a `gsmap.types.GaussianSource`; what is yielded are views."""
+        """Yield the Gaussians in chunks (views), as `gsmap.types.GaussianSource`."""
         for start in range(0, len(self), CHUNK_ROWS):
             yield self[start : start + CHUNK_ROWS]
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
-        """As a `gsmap.types.GaussianSource`; what is yielded are views."""
+        """Yield one field in chunks (views), as `gsmap.types.GaussianSource`."""
         column = getattr(self, name)
         for start in range(0, len(column), CHUNK_ROWS):
             yield column[start : start + CHUNK_ROWS]
 
     def load(self) -> Gaussians:
-        """Themselves."""
+        """Return the Gaussians themselves."""
         return self
 
     @property
@@ -105,7 +105,7 @@ class Gaussians:
         return out
 
     def about(self, origin: np.ndarray) -> Gaussians:
-        """The same Gaussians about another origin (3,), in the frame's coordinates."""
+        """Return the same Gaussians about another origin (3,), in the frame's coordinates."""
         if np.array_equal(origin, self.origin):
             return self
         means = (self.means + (self.origin - origin)).astype(np.float32)
@@ -116,7 +116,7 @@ class Gaussians:
         return sum(a.nbytes for a in (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh))
 
     def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
-        """The Gaussians at a boolean mask, integer array or slice."""
+        """Return the Gaussians at a boolean mask, integer array or slice."""
         if not isinstance(index, np.ndarray):
             return replace(self, **{name: getattr(self, name)[index] for name in FIELDS})
         if index.dtype == bool:
@@ -128,8 +128,7 @@ class Gaussians:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:
-        """All Gaussians of ``parts`` in order, about the origin of the first; lower SH degrees are padded with zeros to
-        the highest."""
+        """Concatenate parts in order, about the origin of the first; lower SH degrees are padded with zeros."""
         if not parts:
             return cls.empty()
         parts = [part.about(parts[0].origin) for part in parts]

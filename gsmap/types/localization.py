@@ -1,4 +1,4 @@
-"""Photographs, what a scene shows of itself to find them by, and where they were taken."""
+"""Photos, view features, and the results of localization."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from gsmap.types.cameras import Cameras
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photograph, and what is known of the lens that took it.
+    """A photo with its intrinsics and mask.
 
     Args:
-        rgb: (H, W, 3) uint8, upright as it was taken, undistorted.
-        intrinsics_px: (4,) ``fx fy cx cy``, in its pixels: as given, or the best guess.
-        focal_sigma: by which share the focal length may be off (one standard deviation): 0 where it is known, inf
-            where nothing is.
-        name: to speak of it.
-        known: (H, W) bool: pixels that show the place, and not who or what stood before it; None where all may.
+        rgb: (H, W, 3) uint8, upright, undistorted.
+        intrinsics_px: (4,) ``fx fy cx cy`` in its pixels, specified or guessed.
+        focal_sigma: relative standard deviation of the focal length: 0 if it is known, inf if unknown.
+        name: name for messages.
+        known: (H, W) bool mask of pixels that show the place and not a person or object in front; None for all.
 
     Raises:
         InputError: no picture, or intrinsics or a mask that cannot be.
@@ -58,14 +57,14 @@ class Photo:
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """What an extractor finds in one picture.
+    """The keypoints of one image.
 
     Args:
         pixels: (N, 2) float32 ``column row``; the first pixel's centre is 0.5 0.5.
         descriptors: (N, D) float32 unit vectors.
-        angles_rad: (N,) float32 by which each was turned before it was described; None of an extractor that turns none.
-        sizes_px: (N,) float32 how large each is (standard deviation of the blur that it was found in); None of an
-            extractor that does not say.
+        angles_rad: (N,) float32 orientation of each keypoint; None for an extractor without orientations.
+        sizes_px: (N,) float32 scale of each keypoint (standard deviation of its blur); None for an extractor without
+            scales.
     """
 
     pixels: np.ndarray
@@ -79,15 +78,15 @@ class Keypoints:
 
 @dataclass(frozen=True, eq=False)
 class SceneFeatures:
-    """What views of a scene show of it: local features with their places.
+    """Local features of a scene's views with their 3D points.
 
     Args:
-        scene: its id.
-        cameras: V that the views were rendered from, scene frame and unit.
-        starts: (V + 1,) int64 where the features of each view begin.
-        points: (N, 3) float32 places of the features, scene frame and unit.
-        descriptors: (N, D) int8 of unit vectors (`gsmap.localize.quantised`).
-        angles: (N,) uint8 by which each was turned before it was described, 256 to a full turn; zeros where none was.
+        scene: scene id.
+        cameras: V cameras of the rendered views, scene frame and unit.
+        starts: (V + 1,) int64 start of each view's features.
+        points: (N, 3) float32 points of the features, scene frame and unit.
+        descriptors: (N, D) int8 quantized unit vectors (`gsmap.localize.quantised`).
+        angles: (N,) uint8 orientation, 256 per full turn; zeros without orientations.
     """
 
     scene: str
@@ -107,20 +106,20 @@ class SceneFeatures:
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
-    """Where a photograph was taken, or why that is not said.
+class LocalizationResult:
+    """The pose of a photo, or the reason for refusing it.
 
     Args:
-        name: of the photo.
-        reason: why it is refused; empty where it is placed.
+        name: name of the photo.
+        reason: reason for the refusal; empty if it is placed.
         T_map_camera: (4, 4) camera-to-map in the frame and unit of its component (OpenCV axes); None where refused.
         covariance: (6, 6) over [rot_rad (3), trans (3)] on the camera's side, ``T = T_hat Exp(xi)``, map unit.
-        component: whose frame that is.
-        scenes: ids of those that support it, who supports most first.
-        intrinsics_px: (4,) of the photo's own size, as they were solved where they were not known.
-        probability: that it is right, of all evidence together; 0 where there was nothing to judge.
-        evidence: numbers behind that, by name.
-        num_gaussians: of the supporting scenes, that the photo's camera sees.
+        component: component of the pose.
+        scenes: ids of the supporting scenes, strongest first.
+        intrinsics_px: (4,) in the photo's own size, solved if they were unknown.
+        probability: probability that the pose is right; 0 without evidence.
+        evidence: evidence values by name.
+        num_gaussians: number of Gaussians of the supporting scenes in the photo's field of view.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What goes into a merge and what comes out."""
+"""Input and output of a merge."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from gsmap.types.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
-class KeptPhoto:
-    """A photograph that a map keeps, in the frame of the map (`PlacedScene`) or of its scene, and in the unit of that.
+class ReferencePhoto:
+    """A localized photo used as a reference view, in the map frame (`PosedScene`) or its scene's frame.
 
     Args:
-        camera: one; the picture that is kept may be smaller than it says.
-        read: reads that picture, (H, W, 3) uint8.
-        sigma_rad, sigma_m: how well its rotation and its place are known (standard deviation of the least known).
-        around: the Gaussians of its capture around its camera, same frame; None where those of the scene it is given
-            with are all there are.
+        camera: its camera; the stored image may be smaller.
+        read: reads the stored image, (H, W, 3) uint8.
+        sigma_rad, sigma_m: largest standard deviation of its rotation and of its position.
+        around: Gaussians around its camera, same frame; None if the scene's Gaussians are complete there.
     """
 
     camera: Cameras
@@ -32,19 +31,19 @@ class KeptPhoto:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedScene:
-    """One capture, or the piece of it that lies near a tile, in the map frame.
+class PosedScene:
+    """A capture, or the part of it near a tile, in the map frame.
 
     Args:
-        gaussians: its Gaussians, map frame.
-        cameras: its cameras, map frame; None or none where nothing is known of what it saw.
-        scene_id: which scene it is; scenes are merged in the order of their ids, whatever order they come in.
+        gaussians: Gaussians, map frame.
+        cameras: cameras, map frame; None or empty if unknown.
+        scene_id: scene id; scenes are merged in the order of their ids.
         captured_at: ISO 8601 time with zone, or None.
-        centroid: reads the whole capture and returns (3,) the mean of its means, map frame (None where it is empty);
-            given where `gaussians` is only a piece of it. See `whole_centroid`.
+        centroid: reads the whole capture and returns (3,) the mean of its means, map frame (None if it is empty); set
+            if `gaussians` is only a part of it. See `whole_centroid`.
         reference_views: renders of its views (`gsmap.merge.reference_view_cache.PlacedReferenceViews`), given the
             longest side of an image in pixels; None where they are to be rendered from `gaussians`.
-        photos: photographs that show the place as this capture does, each as far as it does.
+        photos: localized photos that show the place as this capture does.
     """
 
     gaussians: Gaussians
@@ -53,10 +52,10 @@ class PlacedScene:
     captured_at: str | None = None
     centroid: Callable[[], np.ndarray | None] | None = None
     reference_views: Callable[[int], Any] | None = None
-    photos: tuple[KeptPhoto, ...] = ()
+    photos: tuple[ReferencePhoto, ...] = ()
 
     def whole_centroid(self) -> np.ndarray | None:
-        """(3,) float64 unweighted mean of the means of the whole capture, map frame; None where it holds nothing.
+        """Return the (3,) float64 unweighted mean of the means of the whole capture, map frame; None if it is empty.
 
         Read when it is asked for: mergers that do not ask do not pay for it.
         """
@@ -67,16 +66,16 @@ class PlacedScene:
 
 @dataclass(frozen=True, eq=False)
 class MergeResult:
-    """The merged Gaussians and where they came from.
+    """The merged Gaussians and their origin.
 
     Args:
-        gaussians: in the map frame, only those whose mean lies in the bounds asked for.
-        origin: (N,) int32 index, in the order the scenes were given, of the scene each Gaussian came from (of the
-            heaviest one, where several became one).
+        gaussians: Gaussians in the map frame whose mean lies in the requested bounds.
+        origin: (N,) int32 index of the scene of each Gaussian, in the order of the input (of the heaviest one if
+            several were merged).
         num_input: Gaussians of all scenes within the bounds before merging.
-        steps: optimisation steps taken, 0 for the closed-form methods.
-        truncated: a time budget cut the optimisation short.
-        notes: what a person should know.
+        steps: optimization steps; 0 for closed-form methods.
+        truncated: true if a time budget cut the optimization short.
+        notes: remarks.
     """
 
     gaussians: Gaussians

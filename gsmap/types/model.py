@@ -1,4 +1,4 @@
-"""An ONNX model that was checked, as stages and workers are handed it."""
+"""A checked ONNX model, as stages and workers receive it."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Tensor:
 
 @dataclass(frozen=True)
 class ModelLimits:
-    """What a model may take: a file from elsewhere can ask for anything.
+    """Resource limits of a model.
 
     Args:
-        time_s: for loading it, and for each run.
-        memory_mb: beside what the libraries take; held on Linux.
+        time_s: maximum seconds to load it, and for each run.
+        memory_mb: maximum memory beside the libraries; enforced on Linux.
     """
 
     time_s: float = 300.0
@@ -40,13 +40,13 @@ class ModelSpec:
     """A checked ONNX model.
 
     Args:
-        kind: what it is for: one of the ``MODELS`` of a segmenter or embedder, such as ``sam-encoder`` or ``clip``.
-        path: where the file is.
-        sha256: of its bytes.
-        preset: how its pixels are scaled: a name, or ``mean=r,g,b;std=r,g,b``.
-        mean, std: of rgb in [0, 1].
-        inputs, outputs: as the file declares them.
-        limits: what it may take where it runs; no part of what it is.
+        kind: kind of model: one of the ``MODELS`` of a segmenter or embedder, such as ``sam-encoder`` or ``clip``.
+        path: path of the file.
+        sha256: digest of the file.
+        preset: pixel normalization: a name, or ``mean=r,g,b;std=r,g,b``.
+        mean, std: normalization of rgb in [0, 1].
+        inputs, outputs: tensors declared by the file.
+        limits: resource limits where it runs; not part of its identity.
     """
 
     kind: str
@@ -60,10 +60,10 @@ class ModelSpec:
     limits: ModelLimits = field(default_factory=ModelLimits)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, for a catalog."""
+        """Return plain values for a catalog."""
         return {name: value for name, value in asdict(self).items() if name != "limits"}
 
     @property
     def digest(self) -> str:
-        """What it contributes to a recipe: the same file scaled otherwise gives other features."""
+        """Contribution to a recipe: file and normalization."""
         return f"{self.kind}:{self.sha256}:{self.mean}:{self.std}"

@@ -1,4 +1,4 @@
-"""Tables and facts in HTML, as a notebook shows them; what people wrote stays text."""
+"""Format tables and facts as HTML for notebooks; user text is escaped."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _SHORT = 12  # digits of a digest that tell a map's things apart
 
 
 def cell_text(name: str, value: Any) -> str:
-    """A field as a table shows it, on a terminal or in a notebook: of a content digest the first dozen digits."""
+    """Format a field for a table, on a terminal or in a notebook; digests are shortened."""
     return short(value) if name in _DIGESTS else shown(value)
 
 
 def short(value: Any) -> str:
-    """As `shown`, but of a content digest the first dozen digits."""
+    """Format a value as `shown`; digests are shortened."""
     return value[:_SHORT] if isinstance(value, str) and _DIGEST.fullmatch(value) else shown(value)
 
 
 def html_table(columns: Mapping[str, str], rows: Sequence[Any]) -> str:
-    """The named fields of rows (``columns``: field to heading), a line each."""
+    """Format the named fields of rows (``columns``: field to heading) as an HTML table."""
     head = "".join(f"<th>{escape(heading)}</th>" for heading in columns.values())
     lines = (
         "".join(_cell(cell_text(name, getattr(row, name)), getattr(row, name)) for name in columns)
@@ -39,7 +39,7 @@ def html_table(columns: Mapping[str, str], rows: Sequence[Any]) -> str:
 
 
 def html_facts(title: str, facts: Iterable[tuple[str, Any]]) -> str:
-    """Facts, one a line, under a title; those that are None or empty are left out."""
+    """Format facts under a title, one per line; None and empty values are left out."""
     lines = (
         f"<tr>{_cell(shown(name), name)}{_cell(short(value), '')}</tr>"
         for name, value in facts

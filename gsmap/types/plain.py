@@ -1,4 +1,4 @@
-"""Values as JSON can hold them."""
+"""Convert values to plain JSON types."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """Dicts, lists, text and numbers for any value: dataclasses and mappings become dicts, tuples and arrays lists.
+    """Convert any value to dicts, lists, text and numbers.
 
     Floats keep their bits; NaN and infinity stay what they are. What is unknown becomes its text.
     """
@@ -31,10 +31,10 @@ def plain(value: Any) -> Any:
 
 
 def canonical(value: Any) -> str:
-    """One text for equal values, whatever the order of keys: what digests are taken of."""
+    """Return the canonical JSON text of a value, with sorted keys, for digests."""
     return of_plain(plain(value))
 
 
 def of_plain(value: Any) -> str:
-    """`canonical` of what is plain already: for long ones, most of whose time is in making sure of that."""
+    """Return the canonical JSON text of a value that is plain already."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))

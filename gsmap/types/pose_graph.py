@@ -9,12 +9,12 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.types.sim3 import Sim3
-from gsmap.types.world import WorldTie
+from gsmap.types.world import Georeference
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A measured pose between two scenes, as the optimiser takes it.
+    """A measured relative pose between two scenes.
 
     Args:
         target, source: scene ids.
@@ -65,7 +65,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class ScenePose:
-    """Where one scene lies after optimising.
+    """The optimized pose of one scene.
 
     Args:
         scene: scene id.
@@ -87,13 +87,13 @@ EDGE_USES = ("used", "tentative", "unused")
 
 @dataclass(frozen=True)
 class EdgeOutcome:
-    """What an optimisation made of one edge.
+    """The result of an optimization for one edge.
 
     Args:
         use: ``used``, ``tentative`` (no agreeing cycle confirms it) or ``unused``.
-        residual_chi2: chi-square of the edge under the answer (7 dof), None where it could not be computed.
-        reason: why it is not used, or why it is tentative; empty where it is used.
-        undecided: nothing could decide whether it is right: another group of edges contradicts it.
+        residual_chi2: chi-square of the edge under the solution (7 dof); None if it could not be computed.
+        reason: reason why it is unused or tentative; empty if it is used.
+        undecided: true if another group of edges contradicts it and nothing decides between them.
     """
 
     use: str
@@ -110,15 +110,15 @@ class EdgeOutcome:
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a pose graph came about.
+    """The method and inputs of a pose graph solution.
 
     Args:
-        method: ``batch`` (everything solved anew) or ``incremental`` (new scenes placed in the last answer).
-        recipe: digest of the recipe it was solved by (`gsmap.optimize.recipe_key`); empty where unknown. Only an answer
-            of the same recipe is built upon.
-        batch_scenes: how many scenes the last batch solve had.
-        measured: fingerprint of the edges and priors that the answer rests on (`gsmap.optimize`); empty where unknown.
-        contradicted_priors: scenes whose prior the edges outweighed.
+        method: ``batch`` (all poses solved) or ``incremental`` (new scenes added to the last solution).
+        recipe: digest of its recipe (`gsmap.optimize.recipe_key`), or empty; incremental solutions need the same
+            recipe.
+        batch_scenes: number of scenes of the last batch solution.
+        measured: fingerprint of the edges and priors (`gsmap.optimize`), or empty.
+        contradicted_priors: scenes whose prior contradicts the edges.
     """
 
     method: str = "batch"
@@ -130,15 +130,15 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """The answer of one optimisation.
+    """The solution of one optimization.
 
     Args:
         poses: by scene id.
-        outcomes: by (target, source), of every edge that was given.
-        settings: the parameters it was computed with, as plain values.
-        provenance: how it came about.
-        notes: what a person should know (covariances that could not be computed, ...).
-        world: where components lie in the world, of those of which anything was observed.
+        outcomes: result for every edge, by (target, source).
+        settings: parameters as plain values.
+        provenance: method and inputs.
+        notes: remarks (covariances that could not be computed, ...).
+        world: georeferences of the components with observations of the world.
     """
 
     poses: dict[str, ScenePose]
@@ -146,20 +146,20 @@ class PoseGraph:
     settings: dict[str, Any] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
     notes: tuple[str, ...] = ()
-    world: tuple[WorldTie, ...] = ()
+    world: tuple[Georeference, ...] = ()
 
-    def tie(self, component: int) -> WorldTie | None:
-        """Where a component lies in the world; None where nothing was observed of it."""
+    def tie(self, component: int) -> Georeference | None:
+        """Return the georeference of a component; None without observations."""
         return next((tie for tie in self.world if tie.component == component), None)
 
     def use(self, target: str, source: str) -> str:
-        """How an edge was used; ``unused`` where it was not given."""
+        """Return the use of an edge; ``unused`` if it was not given."""
         outcome = self.outcomes.get((target, source))
         return "unused" if outcome is None else outcome.use
 
     @property
     def undecided(self) -> tuple[tuple[str, str], ...]:
-        """(target, source) of the edges that nothing could decide."""
+        """Pairs (target, source) of undecided edges."""
         return tuple(pair for pair, outcome in self.outcomes.items() if outcome.undecided)
 
 
@@ -168,16 +168,16 @@ POSE_CHANGES = ("added", "removed", "moved", "same")
 
 @dataclass(frozen=True)
 class PoseChange:
-    """How one scene differs between two pose graphs.
+    """The difference of one scene's pose between two pose graphs.
 
     Args:
         scene: scene id.
         kind: ``added``, ``removed``, ``moved`` or ``same`` (pose and component both as before).
-        rotation_deg: angle turned; None where the scene is in only one of the two.
-        translation: how far the scene's middle went, in map units; None as above.
-        scale_ratio: new scale by old; None as above.
-        components: its component before and after, None where it is absent.
-        statuses: its status before and after, None where it is absent.
+        rotation_deg: rotation angle; None if the scene is in only one of the two.
+        translation: displacement of the scene's centre in map units; None if the scene is in only one of the two.
+        scale_ratio: new scale divided by old; None if the scene is in only one of the two.
+        components: component before and after, None if absent.
+        statuses: status before and after, None if absent.
     """
 
     scene: str

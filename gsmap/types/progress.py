@@ -1,4 +1,4 @@
-"""How long work tells how far it is."""
+"""Callbacks that report progress."""
 
 from __future__ import annotations
 
@@ -12,4 +12,4 @@ StageProgress = Callable[[str, float, str], None]
 
 
 def silent(fraction: float, text: str) -> None:
-    """A `Progress` that tells nobody."""
+    """Ignore progress."""

@@ -1,4 +1,4 @@
-"""The result of registering one pair of scenes, and the poses that were proposed on the way."""
+"""The result of registering a pair of scenes, and the proposed poses."""
 
 from __future__ import annotations
 
@@ -15,34 +15,35 @@ STATUSES = ("accepted", "rejected", "no_match")
 
 
 class Support(Protocol):
-    """The correspondences that a proposal rests on, and the candidates by which any pose of the pair can be counted."""
+    """The correspondences of a proposal, and the candidates to count the inliers of any pose of the pair."""
 
     @property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """(K, 3) points of the target and (K, 3) of the source that correspond, each in its scene's own unit."""
+        """Corresponding points of the target (K, 3) and source (K, 3), each in its scene's own unit."""
 
     def count(self, S_target_source: Sim3) -> tuple[int, float]:
-        """How many candidates agree with a pose (scenes' own units), and its log10 number of false alarms."""
+        """Return the number of inliers of a pose (scenes' own units) and its log10 number of false alarms."""
 
     def rival(self, S_target_source: Sim3, log_nfa: float, others: Sequence[Sim3] = ()) -> Proposal | None:
-        """Another pose, none of the others, that about as many correspondences of nodes as similar propose, if any."""
+        """Return a rival pose with about as many inliers that is similar to none of ``others``; None if there is
+        none."""
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A pose of a pair of scenes, to be refined and judged.
+    """A proposed pose of a pair of scenes, to be refined and verified.
 
     Args:
-        proposer: which method proposed it, and from what, such as ``graph:landmarks``.
+        proposer: method and node layer, such as ``graph:landmarks``.
         S_target_source: the pose, in the scenes' own units.
-        with_scale: the scale is free; otherwise it is 1, or near it, in one metre for both.
-        num_inliers: correspondences that it rests on.
-        num_correspondences: candidates that they were chosen from; 0 where none were counted.
-        exact: whether the search proved its answer largest.
-        log_nfa: log10 of the number of false alarms; NaN where nothing was counted.
-        runner_up: size of the best set of correspondences that disagrees, as a share of this one's; 0 where none comes
-            near, NaN where none was sought.
-        flaw: why the pose cannot be used, or empty.
+        with_scale: true if the scale is free; else it is about 1, with both scenes in metres.
+        num_inliers: number of inliers.
+        num_correspondences: number of candidate correspondences; 0 if not counted.
+        exact: true if the clique search proved its result largest.
+        log_nfa: log10 of the number of false alarms; NaN if not counted.
+        runner_up: size of the best set of inliers of a rival pose, relative to this one's; 0 if there is none, NaN if
+            none was searched.
+        flaw: reason why the pose cannot be used, or empty.
         support: the correspondences; None where there are none.
     """
 
@@ -60,22 +61,22 @@ class Proposal:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """What is known of how ``source`` lies in ``target``.
+    """The registration of ``source`` in ``target``.
 
     Args:
         target, source: scene ids.
         status: ``accepted`` (use it), ``rejected`` (a pose was found and contradicted), ``no_match`` (no pose).
-        reason: one short sentence for people; empty when accepted without remark.
-        S_target_source: the pose; None unless one was found. Never identity for "I don't know".
+        reason: one short sentence; may be empty if accepted.
+        S_target_source: the pose; None if none was found.
         information: (7, 7) float64 SPD over the tangent [rot_rad (3), trans (3), log_scale] applied on the source
             side (``S = S_hat * Exp(xi)``, gtsam's order, translation in the source's unit); that of a rigid edge says
             how surely its scale is 1.
-        num_inliers: size of the accepted set of correspondences.
-        num_correspondences: candidates it was chosen from.
-        overlap: share of the smaller scene's surface that coincides, in [0, 1].
+        num_inliers: number of inliers.
+        num_correspondences: number of candidate correspondences.
+        overlap: fraction of the smaller scene's surface that coincides, in [0, 1].
         proposer: which method's pose it is, and what that rests on: ``graph:landmarks``, ``graph:objects``,
             ``kiss_matcher``; ``manual`` where a person measured it; empty where there is none.
-        exact: whether the clique search proved its answer largest.
+        exact: true if the clique search proved its result largest.
         seconds: wall seconds by step (``match``, ``refine``, ``verdict``; ``fallback`` and ``polish`` where they ran).
         evidence: the figures that the verdict rests on, those of the best pose; empty where no pose was proposed. By
             name, all of them floats:
@@ -100,7 +101,7 @@ class Registration:
             ``log_scale``: natural logarithm of the scale as the surfaces measure it: that of the pose only where
             the pose is not rigid; NaN where too little coincides to measure it.
             ``log_scale_sigma``: its standard deviation.
-        notes: what a person should know of how it was computed (a package that is missing, ...).
+        notes: remarks on how it was computed (a package that is missing, ...).
     """
 
     target: str

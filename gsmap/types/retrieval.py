@@ -1,4 +1,4 @@
-"""What a map keeps of its retrieval: which scenes an index holds, and what it said of those that asked."""
+"""Index entries and retrieval results that a map stores."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Member:
+class IndexedScene:
     """A scene of an index.
 
     Args:
-        scene: its id.
-        graph: key of the graph that its nodes are of; in an index of views, of its features, and nothing more is said.
-        upright: whether the third coordinate of its nodes is their height.
-        metric: whether its unit is, or may be, the metre.
-        coarseness: metres that look like one does in a room (`SceneGraph.working_m`).
+        scene: scene id.
+        graph: key of the graph of its nodes; in a view index, key of its features.
+        upright: true if the third coordinate of its nodes is height.
+        metric: true if its unit is, or may be, the metre.
+        coarseness: working metres per unit (`SceneGraph.working_m`).
     """
 
     scene: str
@@ -28,12 +28,12 @@ class Member:
 
 @dataclass(frozen=True, eq=False)
 class IndexArrays:
-    """The nodes of an index's segment, in lists.
+    """The inverted lists of an index segment.
 
     Args:
-        keys: (W,) int64 rising, of the lists.
-        starts: (W + 1,) int64 where each begins among the nodes.
-        nodes: (M, B) uint8 a node's code, position, and the place of its scene among the members.
+        keys: (W,) int64 ascending keys of the lists.
+        starts: (W + 1,) int64 start of each list.
+        nodes: (M, B) uint8 code, position, and index of the node's scene.
     """
 
     keys: np.ndarray
@@ -43,12 +43,12 @@ class IndexArrays:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene that may show a place of the one that asked.
+    """A candidate scene for a query.
 
     Args:
-        scene: its id.
-        score: by how much more lies alike in both scenes than is usual of scenes that lie there, in deviations.
-        votes: what all matches say.
+        scene: scene id.
+        score: z-score of the verified similarity, relative to neighbouring scenes.
+        votes: tf-idf score.
     """
 
     scene: str

@@ -15,11 +15,11 @@ class Room:
     """A room, in a level frame in metres (z up).
 
     Args:
-        low: (2,) corner of its cells.
-        cells: (X, Y) bool, which of them are of it.
-        cell_m: their edge.
-        floor_m, ceiling_m: heights; of a ceiling that nobody saw a guess.
-        doors: numbers, in the list of rooms, of those that one can walk to from it.
+        low: (2,) lower corner of its cells.
+        cells: (X, Y) bool mask of its cells.
+        cell_m: cell size.
+        floor_m, ceiling_m: heights; a ceiling that was not observed is guessed.
+        doors: indices of the rooms that are connected by doors.
     """
 
     low: np.ndarray
@@ -35,19 +35,19 @@ class Room:
 
     @property
     def box(self) -> np.ndarray:
-        """(2, 3) around it."""
+        """(2, 3) bounding box."""
         high = self.low + np.array(self.cells.shape) * self.cell_m
         return np.array([[*self.low, self.floor_m], [*high, self.ceiling_m]])
 
     @property
     def middle(self) -> np.ndarray:
-        """(3,) the middle of its floor."""
+        """(3,) centre of its floor."""
         at = np.argwhere(self.cells).mean(0) + 0.5
         return np.array([*(self.low + at * self.cell_m), self.floor_m])
 
     @property
     def outline(self) -> np.ndarray:
-        """(K, 2, 3) the ends of the straight pieces of line around its floor, in no order."""
+        """(K, 2, 3) end points of the unordered line segments around its floor."""
         cells = np.pad(self.cells, 1).astype(np.int8)
         pieces = []
         for axis in (0, 1):
@@ -63,7 +63,7 @@ class Room:
         return np.concatenate([at, np.full((*at.shape[:2], 1), self.floor_m)], axis=2)
 
     def holds(self, point: np.ndarray) -> bool:
-        """Whether a point (3,) lies in it, or in its floor or ceiling."""
+        """Return true if a point (3,) lies in the room, its floor or its ceiling."""
         if not self.floor_m - _SLACK_M <= point[2] <= self.ceiling_m + _SLACK_M:
             return False
         cell = np.floor((point[:2] - self.low) / self.cell_m).astype(int)

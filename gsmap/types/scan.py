@@ -1,4 +1,4 @@
-"""What a scanner measured of a place: points, with colours or without."""
+"""A scan of a place: points with or without colours."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _ROUND = 100.0
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Points of a surface, in the frame of the file they come from but for an origin.
+    """Points of a surface, in the frame of their file about an origin.
 
     Args:
         points: (N, 3) float64 about ``origin``, in the file's unit; at least one, all finite.
-        colours: (N, 3) float32 sRGB in [0, 1]; None where the scanner saw none.
-        kind: ``points``, ``mesh`` (points are samples of its area) or ``depth`` (points are pixels of one picture).
+        colours: (N, 3) float32 sRGB in [0, 1]; None without colours.
+        kind: ``points``, ``mesh`` (samples of its surface) or ``depth`` (pixels of one image).
         origin: (3,) float64 of the file's frame; ``points + origin`` are the file's own coordinates.
-        camera: the one that took it, in the frame of ``points``; None where there was none.
-        notes: what a person should know.
+        camera: camera of the scan, in the frame of ``points``; None if there was none.
+        notes: remarks.
 
     Raises:
         InputError: no points, or arrays that do not fit together.
@@ -56,7 +56,7 @@ class Scan:
         return len(self.points)
 
     def about_its_middle(self) -> Scan:
-        """The same scan about an origin near its points, rounded to whole hundreds, where they lie far from zero."""
+        """Return the scan about an origin near its points, rounded to hundreds, if they lie far from zero."""
         middle = np.median(self.points, axis=0)
         if self.camera is not None or np.abs(middle).max() < _SHIFT:
             return self

@@ -1,4 +1,4 @@
-"""A capture, as the catalog knows it."""
+"""A capture in the catalog."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCALE_POLICIES = ("auto", "known", "unknown")
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One ingested capture: everything about it but its arrays.
+    """One ingested capture without its arrays.
 
     Args:
         id: content digest (hex) of Gaussians and cameras; the same content has the same id in every map.
@@ -24,13 +24,13 @@ class Scene:
         scale_policy: ``known`` (metres), ``unknown`` (any unit), ``auto`` (registration votes).
         captured_at: ISO 8601 time with zone, or None.
         ingested_at: ISO 8601 time with zone.
-        source: where it was read from, for people.
+        source: path it was read from.
         cameras_synthesised: true when the source had no cameras.
         antialiased: true when trained with the 2D Mip filter (noted, not yet rendered differently).
-        tags: words that people gave it, sorted.
-        thinning: how it is kept where newer captures supersede it; None for one that is kept as it came.
-        origin: (3,) float64 of its frame in the coordinates of its file: a point of the scene and this are the file's
-            own coordinates. Zeros unless these are too large for float32, as map coordinates are.
+        tags: tags, sorted.
+        thinning: compact form of a superseded capture; None if it is whole.
+        origin: (3,) float64 origin of its frame in the coordinates of its file; zeros unless these exceed float32, as
+            map coordinates do.
     """
 
     id: str

@@ -139,7 +139,7 @@ class SceneGraph:
             scenes that do not.
         up: (3,) unit vector against gravity in the scene frame, or None where it could not be told.
         unit_m: guess of metres per scene unit (good to a factor of about 2); 1 where the scale is known.
-        notes: what a person should know (few nodes, no gravity, ...).
+        notes: remarks (few nodes, no gravity, ...).
         things: which Gaussians are one thing; None where it was not asked, as in graphs of older releases.
         working_m: working metres per scene unit: the lengths of landmarks, refinement and evidence hold in them. The
             metre, where that may be the unit and the scene is seen as rooms are; else what makes it look like one.

@@ -1,4 +1,4 @@
-"""Lists of rows in a few segments that never change, only become one: how an index lies on a disk.
+"""Index segments: immutable inverted lists that are merged as they grow (log-structured).
 
 A row is bytes of which the last four say whose it is: the place of its scene among the segment's members.
 """
@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from gsmap.errors import CorruptError
-from gsmap.types.retrieval import IndexArrays, Member
+from gsmap.types.retrieval import IndexArrays, IndexedScene
 
 LEVEL = 16
 """A segment holds from a power of this many scenes to the next; there is at most one of each size."""
@@ -21,32 +21,32 @@ PLACE_BYTES = 4
 
 
 class Segment(Protocol):
-    """A part of an index, as it lies on a disk.
+    """A part of an index on disk.
 
     Args:
-        members: its scenes; None in the place of one that does not count (any more).
-        num_nodes: how many rows there are.
+        members: its scenes; None for scenes that no longer count.
+        num_nodes: number of rows.
     """
 
     @property
-    def members(self) -> Sequence[Member | None]: ...
+    def members(self) -> Sequence[IndexedScene | None]: ...
     @property
     def num_nodes(self) -> int: ...
 
     def lists(self) -> tuple[np.ndarray, np.ndarray]:
-        """(W,) int64 rising keys of its lists, and (W + 1,) int64 where each begins in the rows."""
+        """Return the (W,) int64 ascending list keys and the (W + 1,) int64 start of each list."""
         ...
 
     def rows(self, start: int, stop: int) -> np.ndarray:
-        """(stop - start, B) uint8."""
+        """Return rows (stop - start, B) uint8."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class InMemory:
-    """A segment that lies in memory."""
+    """A segment in memory."""
 
-    members: Sequence[Member | None]
+    members: Sequence[IndexedScene | None]
     arrays: IndexArrays
 
     @property
@@ -60,8 +60,8 @@ class InMemory:
         return self.arrays.nodes[start:stop]
 
 
-def in_lists(members: Sequence[Member | None], keys: np.ndarray, rows: np.ndarray) -> InMemory:
-    """A segment of rows (M, B) uint8, each in the list that its key (M,) names."""
+def in_lists(members: Sequence[IndexedScene | None], keys: np.ndarray, rows: np.ndarray) -> InMemory:
+    """Build a segment from rows (M, B) uint8 and the list key (M,) of each."""
     order = np.argsort(keys, kind="stable")
     names, counts = np.unique(keys, return_counts=True)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -69,7 +69,7 @@ def in_lists(members: Sequence[Member | None], keys: np.ndarray, rows: np.ndarra
 
 
 def places_of(rows: np.ndarray, num_members: int) -> np.ndarray:
-    """(M,) int32 the scene of each row among the members.
+    """Return (M,) int32 the index of each row's scene among the members.
 
     Raises:
         CorruptError: a row of a scene that is not there.
@@ -81,14 +81,14 @@ def places_of(rows: np.ndarray, num_members: int) -> np.ndarray:
 
 
 def write_places(rows: np.ndarray, places: np.ndarray | int) -> None:
-    """Say whose rows (M, B) uint8 are."""
+    """Write the scene index of rows (M, B) uint8."""
     held = np.broadcast_to(np.asarray(places, "<i4"), len(rows))
     rows[:, -PLACE_BYTES:] = np.ascontiguousarray(held)[:, None].view(np.uint8)
 
 
 def merged(segments: Iterable[Segment]) -> InMemory:
-    """One segment of what counts in several."""
-    members: list[Member | None] = []
+    """Merge segments into one, without scenes that no longer count."""
+    members: list[IndexedScene | None] = []
     keys, parts = [], []
     for segment in segments:
         names, starts = lists_of(segment)
@@ -107,11 +107,11 @@ def merged(segments: Iterable[Segment]) -> InMemory:
 
 
 def to_merge(sizes: Sequence[int], added: int) -> list[int]:
-    """Which segments a new one is to become one with, so that of each size there is one; by the scenes that count.
+    """Choose the segments to merge with a new one, so that there is one of each size.
 
     Args:
-        sizes: of the segments that there are.
-        added: scenes of the new one.
+        sizes: number of scenes of each segment.
+        added: number of scenes of the new segment.
 
     Returns:
         Their places among ``sizes``.
@@ -126,7 +126,7 @@ def to_merge(sizes: Sequence[int], added: int) -> list[int]:
 
 
 def lists_of(segment: Segment) -> tuple[np.ndarray, np.ndarray]:
-    """`Segment.lists`, none of which leads outside of the rows.
+    """Return `Segment.lists` after checking that they lie within the rows.
 
     Raises:
         CorruptError: no segment has such.

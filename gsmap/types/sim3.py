@@ -56,7 +56,7 @@ class Sim3:
 
     @classmethod
     def many(cls, rotations: np.ndarray, translations: np.ndarray, scales: np.ndarray) -> list[Sim3]:
-        """From (N, 3, 3), (N, 3) and (N,), checked all at once; raises `InputError` as for one."""
+        """Build from (N, 3, 3), (N, 3) and (N,), checked together; raises `InputError` as for one."""
         rotations, translations = np.array(rotations, dtype=np.float64), np.array(translations, dtype=np.float64)
         scales = np.asarray(scales, dtype=np.float64)
         finite = np.isfinite(rotations).all() and np.isfinite(translations).all() and np.isfinite(scales).all()
@@ -78,7 +78,7 @@ class Sim3:
 
     @classmethod
     def from_matrix(cls, matrix: np.ndarray) -> Sim3:
-        """From a (4, 4) matrix ``[sR t; 0 1]``. The rotation part is projected to SO(3) if it is within 1e-3 of it."""
+        """Build from a (4, 4) matrix ``[sR t; 0 1]``. A rotation within 1e-3 of SO(3) is projected to it."""
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise InputError(
@@ -97,14 +97,14 @@ class Sim3:
         return cls(u @ vt, matrix[:3, 3], scale)
 
     def matrix(self) -> np.ndarray:
-        """(4, 4) float64 ``[sR t; 0 1]``."""
+        """Return (4, 4) float64 ``[sR t; 0 1]``."""
         out = np.eye(4)
         out[:3, :3] = self.scale * self.rotation
         out[:3, 3] = self.translation
         return out
 
     def inverse(self) -> Sim3:
-        """``S_b_a`` of an ``S_a_b``."""
+        """Return ``S_b_a`` of an ``S_a_b``."""
         return Sim3(self.rotation.T, -(self.rotation.T @ self.translation) / self.scale, 1.0 / self.scale)
 
     def __matmul__(self, other: Sim3) -> Sim3:

@@ -1,4 +1,4 @@
-"""How a capture is kept that newer ones supersede."""
+"""The compact form of a superseded capture."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Thinning:
-    """A capture that is kept compact: rounded Gaussians, those that its own pictures show, and no graph.
+    """A thinned capture: rounded Gaussians that are visible in its own images, without a graph.
 
     Args:
         thinned_at: ISO 8601 time with zone.
-        num_gaussians: Gaussians it had before.
-        up: (3,) against gravity in its frame, as its graph said; or None.
-        has_row_map: its arrays tell which of its Gaussians are kept; false where an older gsmap thinned it.
+        num_gaussians: number of Gaussians before.
+        up: (3,) up direction in its frame by its former graph; or None.
+        has_row_map: true if its arrays map old rows to kept ones; false if an older gsmap thinned it.
     """
 
     thinned_at: str

@@ -12,7 +12,7 @@ from gsmap.types.sim3 import Sim3
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """A box of the map, what it was made from, and where it was written.
+    """A box of the map with its inputs and its file.
 
     Args:
         key: digest of everything that decides its content but the poses.
@@ -20,12 +20,12 @@ class Tile:
         bounds: (2, 3) float64 lowest and highest corner, map frame; a Gaussian belongs where its mean is
             (``low <= x < high``).
         poses: the ``S_map_scene`` it was made with, by scene id.
-        num_gaussians: how many it holds.
+        num_gaussians: number of it holds.
         recipe: `gsmap.methods.RecipeKey.to_json` of what made it; ``{"method": text}`` in maps of schema 0001.
         truncated: a time budget cut its optimisation short.
         path: relative to the export's folder.
         sha256: of the file written.
-        notes: what a person should know of how it was merged.
+        notes: remarks on how it was merged.
     """
 
     key: str

@@ -1,4 +1,4 @@
-"""What is seen of a scene: its surface, renders of it, and parts of those."""
+"""Observations of a scene: its surface, rendered views, and masks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsmap.types.model import ModelSpec
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class PointCloud:
     """Points of a surface.
 
     Args:
@@ -31,18 +31,20 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    def evenly(self, count: int) -> Cloud:
-        """At most about so many of the points, each of which then stands for more surface."""
+    def evenly(self, count: int) -> PointCloud:
+        """Return about ``count`` points at most, each standing for more surface."""
         step = -(-len(self) // count)
         rows = slice(None, None, step)
         return (
-            self if step <= 1 else Cloud(self.points[rows], self.lab[rows], step * self.areas[rows], self.index[rows])
+            self
+            if step <= 1
+            else PointCloud(self.points[rows], self.lab[rows], step * self.areas[rows], self.index[rows])
         )
 
 
 @dataclass(frozen=True, eq=False)
 class SceneContext:
-    """What segmenters and embedders may know of a scene before they see its first view.
+    """The data of a scene for segmenters and embedders, before the first view.
 
     Args:
         cloud: the surface, with its colours; scene frame and unit.
@@ -52,7 +54,7 @@ class SceneContext:
         models: checked ONNX models by kind; those that the method names are there.
     """
 
-    cloud: Cloud
+    cloud: PointCloud
     num_gaussians: int
     up: np.ndarray | None
     unit_m: float
@@ -84,8 +86,8 @@ class Mask:
 
     Args:
         pixels: (H, W) bool.
-        confidence: how sure the segmenter is of it, in [0, 1].
-        part: masks of one part show one thing in all views, where the segmenter knows; they need not be associated.
+        confidence: confidence of the segmenter, in [0, 1].
+        part: masks with the same part show the same object in all views; None if the segmenter does not track objects.
     """
 
     pixels: np.ndarray

@@ -25,7 +25,7 @@ class WorldFrame:
     """The Euclidean frame that the map is solved in: metres along east, north and up at an origin.
 
     Args:
-        crs: that the map speaks to people in, ``EPSG:N`` or WKT.
+        crs: the CRS of the map's input and output, ``EPSG:N`` or WKT.
         latitude_deg, longitude_deg, height_m: the origin, on the ellipsoid of that CRS's datum.
     """
 
@@ -54,7 +54,7 @@ class ControlPoint:
         crs: of ``position``; ``local`` once it is in the world frame.
         position: (3,) x y z in it.
         sigma_m: (2,) standard deviations of the survey, horizontal (per axis) and vertical.
-        check: held out, to be compared with and not to be solved from.
+        check: true for a check point, which is not used in the solve.
     """
 
     name: str
@@ -70,7 +70,7 @@ class ControlPoint:
 
 @dataclass(frozen=True, eq=False)
 class ImagePoint:
-    """A control point as a photo shows it. It holds its camera, so that it outlives whatever named the photo.
+    """The pixel of a control point in a photo, with the photo's camera.
 
     Args:
         point: name of the control point.
@@ -82,7 +82,7 @@ class ImagePoint:
         intrinsics_px: (4,) ``fx fy cx cy``.
         camera_covariance: (6, 6) of the camera over [rotation (3, rad), translation (3, scene unit)] on the camera's
             side; None where the camera is a scene's own.
-        depth: of the surface seen there, along the camera's z, in the scene's unit; None where nothing was rendered.
+        depth: depth of the surface along the camera's z, in the scene's unit; None if nothing was rendered.
         depth_sigma: its standard deviation.
     """
 
@@ -110,8 +110,8 @@ class ImagePoint:
 
 
 @dataclass(frozen=True, eq=False)
-class Fix:
-    """A point of a scene whose world coordinates were measured: a camera's GNSS position, a survey of its origin.
+class PositionFix:
+    """A measured world position of a point of a scene: a camera's GNSS fix, or a survey of the scene's origin.
 
     Args:
         name: unique within its scene: of the photo, or ``survey``.
@@ -120,10 +120,10 @@ class Fix:
         crs: of ``position``; ``local`` once it is in the world frame.
         position: (3,) x y z in it.
         sigma_m: (2,) standard deviations, horizontal (per axis) and vertical, each fix by itself.
-        common_sigma_m: (2,) the same of what all fixes of a scene are off by together: satellites, antenna. It may
-            drift by half of that from the first to the last fix of the scene, in the order of their names.
-        sea_level_sigma_m: how far the surface that heights are counted from may be from that of the CRS, which is the
-            same for all fixes of a map; 0 where it is none other.
+        common_sigma_m: (2,) standard deviations of the error shared by all fixes of a scene (satellites, antenna). It
+            may drift by half of that from the first to the last fix, in the order of their names.
+        sea_level_sigma_m: standard deviation of the height reference against that of the CRS, shared by all fixes of a
+            map; 0 if they agree.
     """
 
     name: str
@@ -173,23 +173,23 @@ class ScaleBar:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """All observations of a map. Where they are solved from, positions are in the world frame (``crs`` is ``local``).
+    """All observations of the world. For a solve, positions are in the world frame (``crs`` is ``local``).
 
     Args:
-        frame: the world frame; None as long as no CRS was named.
+        frame: the world frame; None until a CRS is specified.
     """
 
     frame: WorldFrame | None = None
     points: tuple[ControlPoint, ...] = ()
     images: tuple[ImagePoint, ...] = ()
-    fixes: tuple[Fix, ...] = ()
+    fixes: tuple[PositionFix, ...] = ()
     bars: tuple[ScaleBar, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.points or self.fixes or self.bars)
 
     def scenes(self) -> set[str]:
-        """Ids of all scenes that anything was observed of."""
+        """Return the ids of all scenes with observations."""
         found = {image.scene for image in self.images} | {fix.scene for fix in self.fixes}
         return found.union(*(bar.scenes for bar in self.bars))
 
@@ -205,21 +205,20 @@ RESIDUAL_USES = ("used", "outlier", "check", "unused")
 
 @dataclass(frozen=True)
 class Residual:
-    """How one observation fits.
+    """The residual of one observation.
 
     Args:
         kind: ``point``, ``image`` (a point in one photo), ``fix`` or ``bar``.
         name: of the point, photo or bar.
         scene: id of the scene; empty for a point, which may be seen from several.
         use: ``used``, ``outlier`` (it contradicts the others, and was left out), ``check`` (held out) or ``unused``.
-        error_m: east, north, up from where the survey has it to where the map has it; of a bar the map's length less
-            the measured one; empty where the map cannot tell.
-        sigma_m: standard deviations of these by what the solve knows.
-        error_px: of an image: column, row from where it was picked to where the map has it.
-        statistic: chi-square of the observation against all others, by Baarda's data snooping; None where nothing else
-            checks it.
+        error_m: east, north, up from the surveyed to the estimated position; for a bar the estimated minus the measured
+            length; empty if unknown.
+        sigma_m: standard deviations of these.
+        error_px: for an image: column, row from the picked to the estimated position.
+        statistic: chi-square against all other observations, by Baarda's data snooping; None without redundancy.
         dof: its degrees of freedom.
-        reason: why it is an outlier or unused; empty where it is neither.
+        reason: reason why it is an outlier or unused, or empty.
     """
 
     kind: str
@@ -297,20 +296,20 @@ class Contradiction:
 
 
 @dataclass(frozen=True, eq=False)
-class WorldTie:
-    """Where a component of the map lies in the world.
+class Georeference:
+    """The pose of a component in the world.
 
     Args:
         component: its index in the pose graph.
-        S_world_map: takes the component's frame to the world frame; None where the observations do not determine it.
+        S_world_map: component to world frame; None if the observations do not determine it.
         covariance: (7, 7) of it over [rotation (3, rad), translation (3, map unit), log scale] on the map's side, with
             the scene that holds the component's frame taken as exact; None as above.
-        metres_per_unit: metres in a unit of the component's frame; None where nothing tells.
+        metres_per_unit: metres per unit of the component's frame; None if unknown.
         scale_sigma: standard deviation of its logarithm.
-        frame: the world frame; None where only lengths were observed.
-        residuals: of all observations of this component.
-        problem: what is missing for ``S_world_map``; empty where it is there.
-        notes: what a person should know.
+        frame: the world frame; None if only lengths were observed.
+        residuals: residuals of all observations of the component.
+        problem: reason why ``S_world_map`` is missing, or empty.
+        notes: remarks.
         problem_code: ``undetermined`` (observations are missing), ``contradiction`` (groups of observations contradict
             each other and none is to be preferred), ``unsolved`` (no finite solution), or empty where there is no
             problem.
@@ -334,7 +333,7 @@ class WorldTie:
             raise InputError(f"no such problem: {self.problem_code!r}", code="invalid_observation")
 
     def left_out(self) -> set[tuple[str, str, str]]:
-        """(kind, name, scene) of the observations that were not solved from."""
+        """Return (kind, name, scene) of the observations that were not used."""
         return {(r.kind, r.name, r.scene) for r in self.residuals if r.use != "used"}
 
 

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
-from gsmap.types import Cameras, PlacedScene
+from gsmap.types import Cameras, PosedScene
 
 _TRIED = 6  # cameras that are looked through before one is chosen
 _TRIED_PX = 120
@@ -31,7 +31,7 @@ class _Crop:
 
 
 def draw_change(
-    older: PlacedScene, newer: PlacedScene, box: np.ndarray, points: np.ndarray, side_px: int = 320
+    older: PosedScene, newer: PosedScene, box: np.ndarray, points: np.ndarray, side_px: int = 320
 ) -> np.ndarray:
     """Before on the left, after on the right, (H, W, 3) uint8; the box of the change is outlined.
 
@@ -47,7 +47,7 @@ def draw_change(
     return np.concatenate([halves[0], gap, halves[1]], axis=1)
 
 
-def draw_place(scene: PlacedScene, box: np.ndarray, side_px: int = 320) -> np.ndarray:
+def draw_place(scene: PosedScene, box: np.ndarray, side_px: int = 320) -> np.ndarray:
     """What a capture shows in a box, (H, W, 3) uint8, from the camera that sees most of it; the box is outlined.
 
     Args:
@@ -60,7 +60,7 @@ def draw_place(scene: PlacedScene, box: np.ndarray, side_px: int = 320) -> np.nd
     return _picture(scene, _sized(_best(scene, scene, box, points), side_px), box)
 
 
-def _picture(scene: PlacedScene, camera: Cameras, box: np.ndarray) -> np.ndarray:
+def _picture(scene: PosedScene, camera: Cameras, box: np.ndarray) -> np.ndarray:
     colour = render(scene.gaussians, camera).colour[0]
     picture = Image.fromarray((np.clip(np.nan_to_num(colour), 0, 1) * 255 + 0.5).astype(np.uint8))
     corners = box_corners(box)
@@ -73,7 +73,7 @@ def _picture(scene: PlacedScene, camera: Cameras, box: np.ndarray) -> np.ndarray
     return np.asarray(picture)
 
 
-def _best(older: PlacedScene, newer: PlacedScene, box: np.ndarray, points: np.ndarray) -> Cameras:
+def _best(older: PosedScene, newer: PosedScene, box: np.ndarray, points: np.ndarray) -> Cameras:
     """Of the cameras of both captures the one that sees most of what changed, cut to where it is."""
     cameras = [
         scene.cameras[i] for scene in (older, newer) if scene.cameras is not None for i in range(len(scene.cameras))
@@ -106,7 +106,7 @@ def _crop(camera: Cameras, box: np.ndarray, points: np.ndarray) -> _Crop | None:
     return _Crop(cut, float(shown.mean()) + min(1.0, float(half * 2 / size.max())))
 
 
-def _num_seen(scene: PlacedScene, camera: Cameras, points: np.ndarray) -> int:
+def _num_seen(scene: PosedScene, camera: Cameras, points: np.ndarray) -> int:
     """How many of the points lie on the surface that a camera sees of a capture."""
     small = _sized(camera, _TRIED_PX)
     depth = render(scene.gaussians, small).depth[0]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmap.render import render
-from gsmap.types import Cameras, PlacedScene
+from gsmap.types import Cameras, PosedScene
 
 _TOLERANCE_M, _TOLERANCE = 0.10, 0.02  # depths that differ by more, and this share of the depth, are not the same
 _GAP_PX = 4
@@ -15,7 +15,7 @@ _MARK = np.array([1.0, 0.25, 0.25])
 
 
 def draw_pair(
-    target: PlacedScene, source: PlacedScene, cameras: Sequence[Cameras], unit_m: float = 1.0, side_px: int = 320
+    target: PosedScene, source: PosedScene, cameras: Sequence[Cameras], unit_m: float = 1.0, side_px: int = 320
 ) -> np.ndarray:
     """A row for each camera, (H, W, 3) uint8: the target, the source, and the target with what is not the same marked.
 
@@ -35,7 +35,7 @@ def draw_pair(
 
 
 def looks_at(
-    target: PlacedScene, source: PlacedScene, camera: Cameras, unit_m: float = 1.0
+    target: PosedScene, source: PosedScene, camera: Cameras, unit_m: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The target, the source, and the target with what is not the same marked, from one camera: (H, W, 3) uint8 each.
 
@@ -53,7 +53,7 @@ def looks_at(
     return seen, other_seen, difference
 
 
-def _row(target: PlacedScene, source: PlacedScene, camera: Cameras, unit_m: float) -> np.ndarray:
+def _row(target: PosedScene, source: PosedScene, camera: Cameras, unit_m: float) -> np.ndarray:
     looks = looks_at(target, source, camera, unit_m)
     gap = np.full((looks[0].shape[0], _GAP_PX, 3), 255, np.uint8)
     return np.concatenate([looks[0], gap, looks[1], gap, looks[2]], axis=1)

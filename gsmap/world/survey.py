@@ -9,11 +9,11 @@ from typing import TypeVar
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.types.world import LOCAL, ControlPoint, Fix, Survey, WorldFrame
+from gsmap.types.world import LOCAL, ControlPoint, PositionFix, Survey, WorldFrame
 from gsmap.world.crs import crs
 from gsmap.world.frame import frame_at, to_frame
 
-_T = TypeVar("_T", ControlPoint, Fix)
+_T = TypeVar("_T", ControlPoint, PositionFix)
 
 
 def in_frame(survey: Survey) -> Survey:
@@ -49,15 +49,15 @@ def frame_for(crs_text: str, survey: Survey) -> WorldFrame:
     return frame_at(system.text, near)
 
 
-def check_area(items: Sequence[ControlPoint | Fix], margin_deg: float) -> None:
+def check_area(items: Sequence[ControlPoint | PositionFix], margin_deg: float) -> None:
     """Raise `InputError` for the first of observations outside of where its system is meant for."""
     for group in _by_crs(items).values():
         names = [f"control point {one.name}" if isinstance(one, ControlPoint) else one.name for one in group]
         crs(group[0].crs).check_area(np.array([one.position for one in group]), names, margin_deg)
 
 
-def _by_crs(items: Sequence[ControlPoint | Fix]) -> dict[str, list[ControlPoint | Fix]]:
-    found: dict[str, list[ControlPoint | Fix]] = {}
+def _by_crs(items: Sequence[ControlPoint | PositionFix]) -> dict[str, list[ControlPoint | PositionFix]]:
+    found: dict[str, list[ControlPoint | PositionFix]] = {}
     for one in items:
         found.setdefault(one.crs, []).append(one)
     return found

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsmap.types import Cameras, Gaussians, PlacedScene, Sim3
+from gsmap.types import Cameras, Gaussians, PosedScene, Sim3
 
 SPACING_M = 0.05
 _SH = 0.28209479177387814
@@ -100,7 +100,7 @@ def cameras(seed, count=12, toward=(1.3, 1.5, 0.4), angles=(-1.9, 0.35)):
 
 def capture(rectangles, seed, gain=1.0, **views):
     """One capture of a room: its own grain and its own path."""
-    return PlacedScene(gaussians(rectangles, seed, gain), cameras(seed, **views), f"c{seed}")
+    return PosedScene(gaussians(rectangles, seed, gain), cameras(seed, **views), f"c{seed}")
 
 
 def moved_by(yaw, middle, to):

@@ -8,7 +8,7 @@ from raising import raises
 from gsmap import change
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.types import PlacedScene, Sim3
+from gsmap.types import PosedScene, Sim3
 from gsmap.view.change_picture import draw_change
 
 STAYS = box(2.2, 2.5, 0.6, 0.5, 0.7, 5)
@@ -110,7 +110,7 @@ def test_what_one_capture_did_not_see_has_not_changed():
     away = change.compare(capture([*room, *box(0.5, 0.5, 0.4, 0.4, 0.5, 6)], 1), newer)
     assert segments(away) == []
     assert away.seen_share < 0.9
-    blind = change.compare(capture(room, 1), PlacedScene(capture(room, 2).gaussians, None, "b"))
+    blind = change.compare(capture(room, 1), PosedScene(capture(room, 2).gaussians, None, "b"))
     assert blind.changes == ()
     assert "no cameras" in blind.notes[0]
 
@@ -118,7 +118,7 @@ def test_what_one_capture_did_not_see_has_not_changed():
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_capture_that_shows_nothing_or_a_wall_alone_says_nothing(count):
     whole = capture(shell(), 1)
-    none = PlacedScene(whole.gaussians[:count], whole.cameras, "b")
+    none = PosedScene(whole.gaussians[:count], whole.cameras, "b")
     assert segments(change.compare(whole, none)) == []
     assert segments(change.compare(none, whole)) == []
 
@@ -131,7 +131,7 @@ def test_any_vertical_and_any_frame():
     ]
     # y down, as many trainers have it.
     S = Sim3(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([3.0, -2, 5]))
-    turned = [PlacedScene(transform_gaussians(s.gaussians, S), transform_cameras(s.cameras, S)) for s in scenes]
+    turned = [PosedScene(transform_gaussians(s.gaussians, S), transform_cameras(s.cameras, S)) for s in scenes]
     (found,) = segments(change.compare(*turned, up=np.array([0, -2.0, 0])))
     truth = S @ moved_by(1.2, (0.9, 1.2), (1.9, 1.0)) @ S.inverse()
     middle = S.apply(np.array([[0.9, 1.2, 0.25]]))

@@ -21,7 +21,7 @@ from gsmap import formats
 from gsmap.cli.app import build
 from gsmap.cli.objects import OBJECTS, Many, Maybe
 from gsmap.store import trust
-from gsmap.types.photo_sighting import PhotoSighting
+from gsmap.types.localized_photo import LocalizedPhoto
 from tools.make.tiny_encoder import image_encoder
 
 Run = Callable[..., Any]
@@ -113,7 +113,7 @@ SILENT = {
 def save_photo(site: Path) -> None:
     """Keep a photograph of the scene `left`, as localising one does."""
     with gsmap.map.open(site) as m:
-        sighting = PhotoSighting(
+        sighting = LocalizedPhoto(
             digest="1" * 64,
             name="photo.jpg",
             captured_at=None,

@@ -7,7 +7,7 @@ from gsmap import compare
 from gsmap.compare import AGREE, COLOUR, GONE, HIDDEN, OTHER_BEHIND, OTHER_IN_FRONT, REPAINTED, SAME, UNSEEN
 from gsmap.compare.capture_views import MAX_TOLERANCE_M, MIN_TOLERANCE_M
 from gsmap.compare.colours import IDENTITY, balance
-from gsmap.types import Cameras, Gaussians, PlacedScene
+from gsmap.types import Cameras, Gaussians, PosedScene
 
 SH_C0 = 0.28209479177387814
 
@@ -40,7 +40,7 @@ def cameras(xs, distance=1.2):
 
 def looks(*parts, xs=None, distance=1.2):
     own = cameras(np.linspace(-0.6, 0.6, 7) if xs is None else xs, distance)
-    return compare.render_views(PlacedScene(Gaussians.concatenate(list(parts)), own))
+    return compare.render_views(PosedScene(Gaussians.concatenate(list(parts)), own))
 
 
 def wall(seed, **options):
@@ -154,12 +154,12 @@ def test_a_line_of_colours_is_not_bent_by_what_was_painted():
 
 
 def test_a_capture_without_cameras_says_nothing_and_is_told():
-    blind = compare.render_views(PlacedScene(Gaussians.concatenate([wall(0), box(5)])))
+    blind = compare.render_views(PosedScene(Gaussians.concatenate([wall(0), box(5)])))
     seeing = looks(wall(1))
     assert not blind.views
     found = compare.compare(blind, seeing)
     assert (found.older.state[blind.gaussians.means[:, 2] < -0.3] == GONE).all()
     assert (compare.compare(seeing, blind).older.state == UNSEEN).all()
     assert compare.compare(blind, blind).balance.slope.tolist() == [1, 1, 1]
-    nothing = compare.render_views(PlacedScene(Gaussians.empty(), cameras([0.0])))
+    nothing = compare.render_views(PosedScene(Gaussians.empty(), cameras([0.0])))
     assert (compare.compare(seeing, nothing).older.state == UNSEEN).all()

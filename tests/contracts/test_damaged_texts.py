@@ -14,7 +14,7 @@ from gsmap.errors import ConfigError, GsmapError, InputError
 from gsmap.export import streamed_sog, tileset
 from gsmap.export.manifest import Manifest
 from gsmap.formats import g2o
-from gsmap.map.evaluating import _read_truth
+from gsmap.map.evaluation import _read_truth
 from gsmap.map.settings import map_settings
 from gsmap.settings import parse
 

@@ -26,7 +26,7 @@ from gsmap.describe.objects.views import render_views
 from gsmap.errors import ConfigError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.merge import PlacedScene, merge, recipe_key
+from gsmap.merge import PosedScene, merge, recipe_key
 from gsmap.methods import MethodParams, families, family
 from gsmap.register import Params as RegisterParams
 from gsmap.register import SceneView, register_pair
@@ -76,7 +76,7 @@ def _outside_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 class World:
     """Two captures of one flat in one frame, the second one's own frame and what is made of both."""
 
-    scenes: tuple[PlacedScene, PlacedScene]
+    scenes: tuple[PosedScene, PosedScene]
     target: SceneView
     source: SceneView
     S_target_source: Sim3
@@ -93,7 +93,7 @@ def world() -> World:
         graph = describe(capture.name, capture.gaussians, capture.cameras, DescribeParams(objects=False))
         views.append(SceneView(capture.name, capture.gaussians, capture.cameras, graph, "known"))
     moved = transform_gaussians(made[1].gaussians, S_target_source), transform_cameras(made[1].cameras, S_target_source)
-    scenes = PlacedScene(made[0].gaussians, made[0].cameras, "a"), PlacedScene(*moved, "b")
+    scenes = PosedScene(made[0].gaussians, made[0].cameras, "a"), PosedScene(*moved, "b")
     return World(scenes, *views, S_target_source)
 
 

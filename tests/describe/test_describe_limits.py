@@ -23,7 +23,7 @@ from gsmap.networks import ModelProcess, session
 from gsmap.networks.session import open_session, run
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.model import ModelLimits, ModelSpec, Tensor
-from gsmap.types.views import Cloud, SceneContext
+from gsmap.types.views import PointCloud, SceneContext
 
 networks = pytest.importorskip("describe_networks", reason="needs the onnx package")
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
@@ -190,7 +190,7 @@ def test_the_settings_of_a_map_hold_when_a_model_is_added(tmp_path):
 def test_the_settings_hold_when_a_scene_is_described(tmp_path):
     spec = spec_of(networks.endless(tmp_path / "m.onnx"), ModelLimits(time_s=15))
     one = Gaussians(np.zeros((1, 3)), [[1.0, 0, 0, 0]], np.full((1, 3), -3.0), [3.0], np.ones((1, 1, 3)))
-    cloud = Cloud(np.zeros((1, 3)), np.zeros((1, 3), np.float32), np.ones(1), np.zeros(1, np.int64))
+    cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.float32), np.ones(1), np.zeros(1, np.int64))
     context = SceneContext(cloud, 1, None, 1.0, {"clip": spec})
     cameras = Cameras(np.eye(4)[None], [[100.0, 100, 50, 50]], [[100, 100]])
     with raises(InputError, code="model_timeout"):

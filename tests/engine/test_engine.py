@@ -15,7 +15,7 @@ import pytest
 from raising import raises
 
 from gsmap import engine
-from gsmap.engine import SetAside, pool
+from gsmap.engine import QuarantinedJob, pool
 from gsmap.engine.executors.local import Params, start
 from gsmap.errors import ConfigError, GsmapError
 
@@ -96,7 +96,7 @@ def test_same_results_for_one_and_many_workers() -> None:
 def test_a_job_that_kills_its_worker_twice_is_set_aside_and_the_rest_is_done() -> None:
     found = dict(run_jobs(die_of_three, [(i,) for i in range(6)], Params(workers=2)))
     assert {i: value for i, value in found.items() if i != 3} == {0: 0, 1: 1, 2: 2, 4: 4, 5: 5}
-    assert isinstance(found[3], SetAside)
+    assert isinstance(found[3], QuarantinedJob)
     assert "killed, most likely for lack of memory" in found[3].reason
 
 

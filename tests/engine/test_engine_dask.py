@@ -21,7 +21,7 @@ import gsmap.map
 from gsmap import engine
 from gsmap.engine.executors.dask import Params, start
 from gsmap.errors import ConfigError, GsmapError, MissingDependencyError
-from gsmap.methods.executor import SetAside
+from gsmap.methods.executor import QuarantinedJob
 from gsmap_synthetic import make_captures, write_captures
 
 distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
@@ -77,7 +77,7 @@ def test_arguments_are_taken_as_there_is_room(workers: Any) -> None:
 def test_a_job_that_kills_its_worker_twice_is_set_aside_and_the_rest_is_done(workers: Any, tmp_path: Path) -> None:
     found = dict(workers.run(dask_jobs.die_of_three, [(i, str(tmp_path / "tries")) for i in range(6)]))
     assert {i: value for i, value in found.items() if i != 3} == {0: 0, 1: 1, 2: 2, 4: 4, 5: 5}
-    assert isinstance(found[3], SetAside)
+    assert isinstance(found[3], QuarantinedJob)
     assert (tmp_path / "tries").read_text() == "xx"
 
 
@@ -153,4 +153,4 @@ def test_a_map_s_own_settings_choose_no_cluster(tmp_path: Path, caplog: pytest.L
         assert site.settings.engine.executor == engine.AUTO
         assert site.settings.engine.executors["dask"].scheduler == ""
         assert site.settings.engine.executors["local"].workers == 3
-    assert "left out" in caplog.text
+    assert "engine.executors.dask.scheduler is ignored" in caplog.text

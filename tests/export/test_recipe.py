@@ -17,7 +17,7 @@ from gsmap.merge.mergers import tto, voxel
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.methods import family
 from gsmap.settings import changed, leaves
-from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
+from gsmap.types import Cameras, Gaussians, MergeResult, PosedScene, Sim3
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
 FAR = "a"  # touches none of the tiles that the last scene lies in
@@ -243,7 +243,7 @@ def added(tmp_path, monkeypatch):
 
 def test_a_merger_of_another_package_merges_exports_and_has_settings(added, row):
     assert added in methods()
-    scenes = [PlacedScene(cloud(0), scene_id="a"), PlacedScene(cloud(0), scene_id="b")]
+    scenes = [PosedScene(cloud(0), scene_id="a"), PosedScene(cloud(0), scene_id="b")]
     assert len(merge(scenes, added, default_params(added)).gaussians) < len(scenes[0].gaussians)
     merging = changed(Params(added), {f"mergers.{added}.cell_m": 0.05})
     first = row.export(merging)
@@ -265,8 +265,8 @@ def test_steps_are_the_setting_that_the_contract_names():
 
 @pytest.mark.parametrize("method", ["tto", "voxel", "union", "distance"])
 def test_a_scene_without_anything_in_it_merges(method):
-    nobody = PlacedScene(Gaussians.empty(), Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2))), "z")
-    result = merge([PlacedScene(cloud(0), scene_id="a"), nobody], method)
+    nobody = PosedScene(Gaussians.empty(), Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2))), "z")
+    result = merge([PosedScene(cloud(0), scene_id="a"), nobody], method)
     assert len(result.gaussians) > 400
     lazy = [
         LazyScene("a", Sim3.identity(), lambda box: cloud(0)),

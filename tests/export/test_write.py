@@ -13,7 +13,7 @@ from gsmap.errors import ConfigError, InputError, StoreError
 from gsmap.export import Params, TileRecipe, export_tiles, plan_tiles
 from gsmap.merge import recipe_key
 from gsmap.merge.tile import LazyScene, merge_tile
-from gsmap.methods.executor import SetAside
+from gsmap.methods.executor import QuarantinedJob
 from gsmap.types import Gaussians, Sim3
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -169,7 +169,7 @@ def test_tiles_made_elsewhere_are_the_same_files(street):
 def test_a_tile_that_cannot_be_made_is_left_out_and_tried_again_by_the_next_export(street):
     def all_but_one(job, arguments):
         for index, args in enumerate(arguments):
-            yield index, SetAside("killed") if index == 1 else job(*args)
+            yield index, QuarantinedJob("killed") if index == 1 else job(*args)
 
     whole = Street(street.out.parent / "whole").export()
     result = street.export(run=all_but_one)

@@ -13,7 +13,7 @@ from raising import raises
 import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map import Map
-from gsmap.map.pictures import Pictures
+from gsmap.map.comparison_pictures import PictureFolder
 from gsmap.types.rows import FindHit, FindReport
 from tools.make.tiny_encoder import image_encoder
 from tools.make.tiny_text import text_tower, tokenizer
@@ -89,7 +89,7 @@ def test_hits_are_drawn(site: Map, tmp_path: Path) -> None:
     drawn = {path.name for path in (tmp_path / "found").glob("find-*.png")}
     assert len(drawn) == 2
     scenes = {scene.id for scene in site.scenes()}
-    kept = Pictures.load(tmp_path / "found", site.store.id).scenes
+    kept = PictureFolder.load(tmp_path / "found", site.store.id).scenes
     assert set(kept) == drawn  # so that a purge finds them
     assert {scene for ids in kept.values() for scene in ids} <= scenes
 

@@ -25,7 +25,7 @@ from gsmap.formats.scans import read_depth
 from gsmap.ingest import dates
 from gsmap.localize import read_photo
 from gsmap.localize.photos import read_mask
-from gsmap.map import placed_photos
+from gsmap.map import photo_poses
 from gsmap.world import exif
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\n%%EndComments\nshowpage\n%%EOF\n"
@@ -54,7 +54,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "evaluate": read_image,
     "depth": lambda path: read_depth(path, (100.0, 100.0, 4.0, 4.0)),
     "nerfstudio": frames,
-    "placed photos": placed_photos._size,
+    "placed photos": photo_poses._size,
     "find": query_embedding._picture,
 }
 QUIET: dict[str, Callable[[Path], object]] = {"exif": exif.read, "dates": dates._exif_date}
@@ -154,7 +154,7 @@ def test_a_photo_is_turned_upright(tmp_path: Path) -> None:
     tags = picture.getexif()
     tags[0x0112] = 6
     picture.save(tmp_path / "a.jpg", exif=tags)
-    assert read_photo(tmp_path / "a.jpg").size_px == placed_photos._size(tmp_path / "a.jpg") == (16, 24)
+    assert read_photo(tmp_path / "a.jpg").size_px == photo_poses._size(tmp_path / "a.jpg") == (16, 24)
 
 
 def test_large_photographs_are_opened_without_a_warning(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:

@@ -7,7 +7,7 @@ from gsmap.geometry.metric_scale import SceneUnit, _majority, estimate_metric_sc
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, ScenePose, Sim3
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 
 
 def pose(scale=1.0, sigma=None):
@@ -101,11 +101,11 @@ def test_where_nothing_tells_one_is_taken_and_said_to_be():
 
 
 def test_people_can_read_it():
-    assert Metre(0.25, 0.01, "told").text() == "0.25 m a unit, told, to 1 %"
-    assert Metre(0.25, float(np.log(2)), "guessed").text() == "0.25 m a unit, guessed, to a factor of 2"
+    assert MetricScale(0.25, 0.01, "told").text() == "0.25 m a unit, told, to 1 %"
+    assert MetricScale(0.25, float(np.log(2)), "guessed").text() == "0.25 m a unit, guessed, to a factor of 2"
     for wrong in (0.0, -1.0, float("nan")):
         with raises(InputError, code="invalid_metre"):
-            Metre(wrong, 0.01, "told")
+            MetricScale(wrong, 0.01, "told")
 
 
 def test_a_scene_in_metres_is_the_scene_in_the_map_times_metres_per_unit():

@@ -33,7 +33,7 @@ from gsmap.types import (
     ScenePose,
     Sim3,
 )
-from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, WorldFrame
+from gsmap.types.world import ControlPoint, ImagePoint, PositionFix, ScaleBar, WorldFrame
 
 MAX_MEMORY = 6 << 30  # of address space beyond what is mapped already; far below what a bomb would take
 
@@ -86,7 +86,7 @@ def make_world(root: Path) -> None:
                 WorldFrame("EPSG:25832", 48.0, 11.0, 500.0),
                 ControlPoint("G1", "EPSG:25832", np.array([691234.5, 5334567.125, 519.3])),
                 ImagePoint("G1", "1.jpg", a.id, np.ones(2), 1.0, np.eye(4), K),
-                Fix("2.jpg", a.id, np.zeros(3), "EPSG:4979", np.array([11.0, 48, 500]), (1.0, 1.0)),
+                PositionFix("2.jpg", a.id, np.zeros(3), "EPSG:4979", np.array([11.0, 48, 500]), (1.0, 1.0)),
                 ScaleBar("bar", (a.id, b.id), np.arange(6.0).reshape(2, 3), (0.1, 0.1), 2.0, 0.01),
             ]
         )

@@ -22,7 +22,7 @@ from hostile_world import CASES, MAX_MEMORY, VERBS, Case, World, everything_in
 import gsmap.map
 from gsmap.cli import app as command_line
 from gsmap.errors import GsmapError
-from gsmap.map.viewing import MapDoors
+from gsmap.map.page_source import MapPageSource
 from gsmap.texts import escaped
 from gsmap.view.content import Served, summary
 
@@ -74,7 +74,7 @@ def _look(arguments: list[str]) -> NoReturn:
     """Make what a browser would ask the page of `gsmap view` for; an error goes to the page as it is."""
     try:
         with gsmap.map.open(arguments[1]) as m:
-            doors = MapDoors(m.store, m.settings)
+            doors = MapPageSource(m.store, m.settings)
             view = doors.content()
             summary(view, Served())
             for one in view.scenes:

@@ -21,11 +21,11 @@ import gsmap.map
 from gsmap.cli.app import run
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, ReadOnlyError, StoreError
 from gsmap.localize import Lens, index_recipe, read_photo
-from gsmap.map.localizing_small import localize_small
+from gsmap.map.page_source import view_of
 from gsmap.map.settings import settings_of
 from gsmap.map.small_map import SmallLocalizer
+from gsmap.map.small_map_localization import localize_small
 from gsmap.map.stages.localize import Localizer, feature_keys
-from gsmap.map.viewing import view_of
 from gsmap.store import Store
 from gsmap.types import Sim3
 

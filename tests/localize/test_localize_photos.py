@@ -12,16 +12,16 @@ from gsmap.geometry.rotations import angle_between
 from gsmap.localize import Params, covariance, localize_photo, localizing
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.extractors import sift
-from gsmap.types.localization import Photo, Placement
+from gsmap.types.localization import LocalizationResult, Photo
 
 SIFT = sift.make({}, sift.Params())
 
 
-def found(world, photo: Photo, metres: float = 1.0) -> Placement:
+def found(world, photo: Photo, metres: float = 1.0) -> LocalizationResult:
     return localize_photo(photo, world.index, {"scene": world.placed}, SIFT, Params(), {0: metres})
 
 
-def off(placement: Placement, truth: np.ndarray) -> tuple[float, float]:
+def off(placement: LocalizationResult, truth: np.ndarray) -> tuple[float, float]:
     pose = placement.T_map_camera
     assert pose is not None, placement.reason
     angle = np.degrees(angle_between(pose[:3, :3], truth[:3, :3]))

@@ -19,7 +19,7 @@ from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.rotations import exp_so3
 from gsmap.map import Map
 from gsmap.map.visits import Params, Visit, has_moved, pairs_of_visits
-from gsmap.types import Cameras, Change, ChangeReport, Gaussians, PlacedScene, PoseGraph, ScenePose, Sim3
+from gsmap.types import Cameras, Change, ChangeReport, Gaussians, PosedScene, PoseGraph, ScenePose, Sim3
 
 DATES = {"may": "2026-05-31T15:00:00Z", "june": "2026-06-30", "july": "2026-07-31"}
 CHAIR = np.array([[0.0, 0, 0], [0.5, 0.5, 1]])
@@ -38,7 +38,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
     """Stands in for what finds changes: a chair moved by a metre, and less surely the wall was painted."""
     found = Seen()
 
-    def compare(older: PlacedScene, newer: PlacedScene, params: object = None, progress: object = None) -> ChangeReport:
+    def compare(older: PosedScene, newer: PosedScene, params: object = None, progress: object = None) -> ChangeReport:
         assert older.cameras is not None
         assert older.captured_at < newer.captured_at
         found.pairs.append((older.scene_id, newer.scene_id))

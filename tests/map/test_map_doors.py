@@ -17,6 +17,7 @@ from raising import raises
 import gsmap.map
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, StoreError
 from gsmap.map import Map
+from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
 from gsmap.map.stages.export import Request
 from gsmap.map.stages.register import read_pairs
@@ -234,9 +235,7 @@ def test_the_up_of_a_graph_that_does_not_know_it_is_not_taken_from_an_older_one(
     assert set(pose_inputs(site.store, site.settings).ups) == {other.id for other in site.scenes()[1:]}
 
 
-@pytest.mark.parametrize(
-    "text", ["register.max_poses = 'many'", "[registr]\nmax_poses = 2", "preset = 'napkin'", "not toml"]
-)
+@pytest.mark.parametrize("text", ["merge.method = 3", "merge = 2", "preset = 'napkin'", "not toml"])
 def test_a_map_can_be_looked_at_whatever_its_settings_say(
     site: Map, tried: list[tuple[str, str]], text: str, tmp_path: Path
 ) -> None:
@@ -263,14 +262,37 @@ def test_a_map_can_be_looked_at_whatever_its_settings_say(
 
 def test_settings_that_cannot_be_are_named_and_taken_back(site: Map) -> None:
     path = site.store.folder / "settings.toml"
-    path.write_text("[register]\nmax_poses = 'many'\n")
-    with raises(ConfigError, code="invalid_setting_value", match="max_poses"):
+    path.write_text("[merge]\nmethod = 3\n")
+    with raises(ConfigError, code="invalid_setting_value", match="merge.method"):
         site.change_settings({"retrieve.top_k": 3})
     assert "top_k" not in path.read_text()
-    assert site.with_settings({"register.max_poses": 2}).settings.register.max_poses == 2  # this run says otherwise
-    site.change_settings(unset=["register.max_poses"])
+    assert site.with_settings({"merge.method": "union"}).settings.merge.method == "union"  # in this run
+    site.change_settings(unset=["merge.method"])
     with gsmap.map.open(site.store.folder) as m:
-        assert m.settings.register.max_poses == 3
+        assert m.settings == Settings()
+
+
+def test_a_map_whose_file_names_a_removed_setting_opens_with_one_warning(
+    site: Map, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = site.store.folder / "settings.toml"
+    path.write_text("# mine\n[merge]\nmethod = 'union'\nformer = 0.3\n[gone.away]\nkin_share = 2\n")
+    site.__dict__.pop("settings", None)
+    assert site.settings.merge.method == "union"
+    with gsmap.map.open(site.store.folder) as m:
+        assert m.settings == site.settings
+        m.change_settings({"merge.method": "voxel"})
+    for name in ("merge.former", "gone.away.kin_share"):
+        (warning,) = [one.getMessage() for one in caplog.records if name in one.getMessage()]
+        assert str(path) in warning
+        assert "constant" in warning
+    with raises(ConfigError, code="unknown_setting"):
+        site.with_settings({"merge.former": 0.4})
+    with raises(ConfigError, code="unknown_setting"):
+        site.change_settings({"merge.former": 0.4})
+    site.change_settings(unset=["merge.former", "gone.away.kin_share"])
+    assert path.read_text().startswith("# mine")
+    assert "former" not in path.read_text()
 
 
 def test_show_takes_the_newest_graph_where_the_present_one_is_missing(site: Map) -> None:

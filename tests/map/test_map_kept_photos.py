@@ -16,7 +16,7 @@ from gsmap.errors import GsmapError
 from gsmap.map import Map
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PoseGraph, ScenePose, Sim3
-from gsmap.types.photo_sighting import PhotoSighting
+from gsmap.types.localized_photo import LocalizedPhoto
 from gsmap.types.rows import ExportReport
 
 LENS, SIZE = np.array([120.0, 120, 48, 36]), (96, 72)
@@ -82,11 +82,11 @@ def scale_of(pose: np.ndarray, scale: float) -> np.ndarray:
     return out
 
 
-def sighting(m: Map, number: int, name: str, pose: np.ndarray, when: str | None) -> PhotoSighting:
+def sighting(m: Map, number: int, name: str, pose: np.ndarray, when: str | None) -> LocalizedPhoto:
     scene = next(one.id for one in m.scenes() if one.name == name)
     lens = 2 * LENS  # of the photo itself, which is twice as large as what is kept of it
     size = (2 * SIZE[0], 2 * SIZE[1])
-    return PhotoSighting(f"{number:064x}", f"photo{number}.jpg", when, scene, pose, np.eye(6) * 1e-6, lens, size, 0.99)
+    return LocalizedPhoto(f"{number:064x}", f"photo{number}.jpg", when, scene, pose, np.eye(6) * 1e-6, lens, size, 0.99)
 
 
 def export(m: Map, out: Path, **options) -> ExportReport:

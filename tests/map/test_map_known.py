@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy import delete
 
 from gsmap.map.stages.describe import graph_keys
-from gsmap.map.stages.register import Known, _Work
+from gsmap.map.stages.register import RegisteredPairs, _RegistrationContext
 from gsmap.methods import RecipeKey
 from gsmap.store.schema import registrations, reviews
 from gsmap.types import Registration, Sim3
@@ -24,19 +24,19 @@ def street(tmp_path: Path) -> Iterator[Filled]:
         yield one
 
 
-def work(street: Filled) -> _Work:
+def work(street: Filled) -> _RegistrationContext:
     store, settings = street.map.store, street.map.settings
     scenes = store.scenes.brief()
-    return _Work(store, scenes, graph_keys(store, scenes, settings), settings, lambda *_: None)
+    return _RegistrationContext(store, scenes, graph_keys(store, scenes, settings), settings, lambda *_: None)
 
 
-def found(known: Known, street: Filled) -> tuple[object, ...]:
+def found(known: RegisteredPairs, street: Filled) -> tuple[object, ...]:
     has = [pair for pair in combinations(sorted(street.order), 2) if known.has(*pair)]
     return has, sorted(known.held.items()), known.stale
 
 
 def test_a_second_look_finds_what_a_first_one_would(street: Filled) -> None:
-    store, rng, known = street.map.store, np.random.default_rng(3), Known()
+    store, rng, known = street.map.store, np.random.default_rng(3), RegisteredPairs()
     seen = set()
     for step in range(60):
         mine = work(street)
@@ -59,9 +59,9 @@ def test_a_second_look_finds_what_a_first_one_would(street: Filled) -> None:
                     connection.execute(delete(table).where(table.c.pair == f"{a}:{b}"))
         else:
             street.map.with_settings({"register.verdict.max_log_nfa": float(rng.choice([-9.5, -9.0]))})
-        fresh = Known()
-        known.look(work(street))
-        fresh.look(work(street))
+        fresh = RegisteredPairs()
+        known.update(work(street))
+        fresh.update(work(street))
         assert found(known, street) == found(fresh, street)
         seen |= {kind for kind, one in enumerate(found(fresh, street)) if one}
     assert seen == {0, 1, 2}
@@ -69,7 +69,7 @@ def test_a_second_look_finds_what_a_first_one_would(street: Filled) -> None:
 
 def test_a_second_look_judges_what_has_changed(street: Filled, monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[tuple[str, ...]] = []
-    known, mine, digest_of = Known(), work(street), RecipeKey.digest_of
+    known, mine, digest_of = RegisteredPairs(), work(street), RecipeKey.digest_of
 
     def noted(key: RecipeKey, *inputs: str) -> str:
         judged.append(inputs)
@@ -79,7 +79,7 @@ def test_a_second_look_judges_what_has_changed(street: Filled, monkeypatch: pyte
         judged.clear()
         with monkeypatch.context() as patch:
             patch.setattr(RecipeKey, "digest_of", noted)
-            known.look(mine)
+            known.update(mine)
         return len(judged)
 
     assert look() >= len(street.order) * (len(street.order) - 1) / 2

@@ -23,14 +23,14 @@ from gsmap.errors import ConfigError, InputError, NotFoundError, StoreError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
-from gsmap.map.persisting import has_passed
+from gsmap.map.page_source import MapPageSource
 from gsmap.map.small_map import SmallLocalizer
-from gsmap.map.viewing import MapDoors
+from gsmap.map.static_filter import is_dynamic
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, schema
 from gsmap.store.graphs import Graphs
 from gsmap.store.scenes import Scenes
-from gsmap.types import Change, ChangeReport, MapObject, PoseGraph, ScenePose, Segments, Sighting, Sim3
+from gsmap.types import Change, ChangeReport, MapObject, ObjectObservation, PoseGraph, ScenePose, Segments, Sim3
 
 FRAMES = {
     "may": Sim3(exp_so3(np.array([0, 0, 0.4])), np.array([3.0, 1, 0.2])),
@@ -128,7 +128,7 @@ def test_the_graph_is_written_and_is_what_networkx_gets(site: Map, tmp_path: Pat
     np.testing.assert_allclose(room.position, [2, 1.5, 0], atol=0.2)
     low, high = room.outline.min((0, 1)), room.outline.max((0, 1))
     np.testing.assert_allclose([low, high], [[0, 0, 0], [4, 3, 0]], atol=0.2)
-    shown = MapDoors(site.store, site.settings).graph()
+    shown = MapPageSource(site.store, site.settings).graph()
     assert [row["room"] for row in shown["objects"]] == [room.id] * len(report.objects)
     (drawn,) = shown["rooms"]
     assert drawn["outline"] == room.outline.tolist()
@@ -469,10 +469,12 @@ def test_what_persists_is_told_by_the_looks_that_there_were(states: str, shift: 
     """What nobody looked at again is kept, and so is what another capture shows a part of."""
     box = np.array([[0.0, 0, 0], [1, 0.5, 0.8]])
     sightings = tuple(
-        Sighting(str(i), state, i, box + np.array([shift * i, 0, 0])) if state == "seen" else Sighting(str(i), state)
+        ObjectObservation(str(i), state, i, box + np.array([shift * i, 0, 0]))
+        if state == "seen"
+        else ObjectObservation(str(i), state)
         for i, state in enumerate(states.split())
     )
-    assert has_passed(MapObject("o1", 0, box, box.mean(0), np.zeros(3, np.float32), sightings)) is passed
+    assert is_dynamic(MapObject("o1", 0, box, box.mean(0), np.zeros(3, np.float32), sightings)) is passed
 
 
 def test_a_small_map_is_without_what_came_and_went(site: Map, tmp_path: Path) -> None:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from gsmap.localize import Differences, Region, sighted
-from gsmap.map.objects import Known, history_report, objects_report
-from gsmap.map.photos import things_in, with_photos
+from gsmap.map.objects import MapObjects, history_report, objects_report
+from gsmap.map.photos import add_photo_observations, objects_in_photo
 from gsmap.objects import estimate_persistence
 from gsmap.store.photos import StoredPhoto
-from gsmap.types import MapObject, Sighting, Sim3
-from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
+from gsmap.types import MapObject, ObjectObservation, Sim3
+from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 
 LENS = np.array([100.0, 100, 50, 40])
 HEIGHT, WIDTH = 80, 100
@@ -51,22 +51,24 @@ def middle() -> np.ndarray:
     return (np.abs(u - 50) < 8) & (np.abs(v - 40) < 8)
 
 
-def an_object(*sightings: Sighting, at=(0.0, 0.0, DEPTH), name="aaaaaaaa") -> MapObject:
+def an_object(*sightings: ObjectObservation, at=(0.0, 0.0, DEPTH), name="aaaaaaaa") -> MapObject:
     box = np.array([np.array(at) - 0.25, np.array(at) + 0.25])
     return MapObject(name, 0, box, np.array(at), np.zeros(3, np.float32), sightings)
 
 
-def seen(scene: str, at=(0.0, 0.0, DEPTH)) -> Sighting:
-    return Sighting(scene, "seen", 0, np.array([np.array(at) - 0.25, np.array(at) + 0.25]))
+def seen(scene: str, at=(0.0, 0.0, DEPTH)) -> ObjectObservation:
+    return ObjectObservation(scene, "seen", 0, np.array([np.array(at) - 0.25, np.array(at) + 0.25]))
 
 
-def said(found: Differences, samples: np.ndarray, params: sighted.Params | None = None) -> list[ThingInPhoto]:
+def said(found: Differences, samples: np.ndarray, params: sighted.Params | None = None) -> list[PhotoObjectObservation]:
     params = params or sighted.Params()
     things = OneThing(samples, np.array([len(samples)]))
     row = SimpleNamespace(T_map_camera=np.eye(4), intrinsics_px=LENS, component=0)
     graph = SimpleNamespace(things=things)
     poses = {"a": Sim3.identity()}
-    return things_in(SimpleNamespace(found=found), row, 1.0, [an_object(seen("a"))], lambda scene: graph, poses, params)
+    return objects_in_photo(
+        SimpleNamespace(found=found), row, 1.0, [an_object(seen("a"))], lambda scene: graph, poses, params
+    )
 
 
 def test_how_much_must_be_in_sight_is_a_setting():
@@ -96,8 +98,8 @@ def test_nor_of_what_the_map_itself_hides_or_the_photo_does_not_show():
     assert said(Sketch().found(), beside) == []
 
 
-def kept(digest: str, when: str | None, *things: ThingInPhoto, scene="a") -> StoredPhoto:
-    one = PhotoSighting(digest * 64, f"{digest}.jpg", when, scene, np.eye(4), np.eye(6), LENS, (100, 80), 0.99, things)
+def kept(digest: str, when: str | None, *things: PhotoObjectObservation, scene="a") -> StoredPhoto:
+    one = LocalizedPhoto(digest * 64, f"{digest}.jpg", when, scene, np.eye(4), np.eye(6), LENS, (100, 80), 0.99, things)
     return StoredPhoto(1, one, "2026-05-05T00:00:00+00:00")
 
 
@@ -108,15 +110,15 @@ def scene(name: str, when: str | None):
 SCENES = {"a": scene("a", "2026-01-01T00:00:00+00:00"), "b": scene("b", "2026-06-01T00:00:00+00:00")}
 
 
-def known(*photos: StoredPhoto, S: Sim3 | None = None) -> Known:
+def known(*photos: StoredPhoto, S: Sim3 | None = None) -> MapObjects:
     thing = an_object(seen("a"), seen("b"))
     at = {"a": S or Sim3.identity(), "b": Sim3.identity()}
-    objects = with_photos([thing], photos, SCENES, at, {0: 1.0}, {"a": 0, "b": 0}, sighted.Params())
+    objects = add_photo_observations([thing], photos, SCENES, at, {0: 1.0}, {"a": 0, "b": 0}, sighted.Params())
     names = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in photos}
-    return Known(objects, SCENES, (), {0: 1.0}, names)
+    return MapObjects(objects, SCENES, (), {0: 1.0}, names)
 
 
-ABSENT = ThingInPhoto(np.array([0.1, 0, DEPTH]), "absent", 0.8)
+ABSENT = PhotoObjectObservation(np.array([0.1, 0, DEPTH]), "absent", 0.8)
 
 
 def test_photos_stand_among_captures_in_the_order_of_dates():
@@ -146,11 +148,11 @@ def test_a_later_photo_ends_what_stood_there():
 
 
 def test_what_is_said_of_another_place_is_of_another_thing():
-    far = ThingInPhoto(np.array([3.0, 0, DEPTH]), "absent", 0.8)
+    far = PhotoObjectObservation(np.array([3.0, 0, DEPTH]), "absent", 0.8)
     assert len(known(kept("1", None, far)).objects[0].sightings) == 2
 
 
 def test_places_are_taken_along_when_the_map_moves():
     moved = Sim3(np.eye(3), np.array([-3.0, 0, 0]))
-    far = ThingInPhoto(np.array([3.0, 0, DEPTH]), "absent", 0.8)
+    far = PhotoObjectObservation(np.array([3.0, 0, DEPTH]), "absent", 0.8)
     assert len(known(kept("1", None, far), S=moved).objects[0].sightings) == 3

@@ -11,7 +11,7 @@ from unittest import mock
 import pytest
 from sqlalchemy import select
 
-from gsmap.map import Map, sharing
+from gsmap.map import Map, shared_jobs
 from gsmap.map.stages import optimize, register
 from gsmap.store.matrices import pose_bytes
 from gsmap.store.registrations import Registrations, StoredRegistration
@@ -109,7 +109,7 @@ def alone(tmp_path: Path) -> Iterator[Filled]:
 
 
 def test_pairs_share_their_statements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sharing, "TOGETHER_S", 600.0)  # on a machine however slow
+    monkeypatch.setattr(shared_jobs, "TOGETHER_S", 600.0)  # on a machine however slow
     counts = {}
     for num, pairs in ((3, 3), (5, 10)):
         with filled(tmp_path / f"{num}.gsmap", num, tiny_pattern()) as one:
@@ -124,7 +124,7 @@ def test_pairs_share_their_statements(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_who_is_stopped_keeps_the_pairs_that_are_done(alone: Filled, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sharing, "TOGETHER_S", 600.0)
+    monkeypatch.setattr(shared_jobs, "TOGETHER_S", 600.0)
     done = 3
 
     def stops(job: object, arguments: Iterable[Any], *_: Any, **__: Any) -> Iterator[tuple[int, Any]]:

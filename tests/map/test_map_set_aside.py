@@ -15,7 +15,7 @@ from map_sharers import describe_scene
 import gsmap.map
 from gsmap.cli import console
 from gsmap.cli.app import run
-from gsmap.engine import SetAside
+from gsmap.engine import QuarantinedJob
 from gsmap.map import Map
 from gsmap.types import Cameras, Gaussians, SceneGraph
 
@@ -45,7 +45,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Map]:
         ) -> Iterator[tuple[int, Any]]:
             for i, args in enumerate(arguments):
                 is_heavy = os.environ["GSMAP_TEST_HEAVY"] in args
-                yield i, SetAside(REASON) if is_heavy else describe_scene(*args)
+                yield i, QuarantinedJob(REASON) if is_heavy else describe_scene(*args)
 
         monkeypatch.setattr("gsmap.map.stages.describe.run_jobs", jobs)
         yield m

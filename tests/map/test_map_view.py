@@ -17,7 +17,7 @@ import gsmap
 from gsmap import formats
 from gsmap.errors import ConfigError, GsmapError, NotFoundError
 from gsmap.map import create
-from gsmap.map.viewing import MapDoors, cache_folder, content_key, view_of
+from gsmap.map.page_source import MapPageSource, cache_folder, content_key, view_of
 from gsmap.types import Gaussians, Sim3
 from gsmap.view.built import built_page
 from gsmap.view.tree_cache import TreeCache
@@ -223,7 +223,7 @@ def test_a_thinned_scene_has_other_levels_of_detail(folder):
         shown_before = view_of(m.store, m.settings).scenes[0].key
         m.with_settings({"view.tree.coarsening": 4})
         assert view_of(m.store, m.settings).scenes[0].key != shown_before
-        source = MapDoors(m.store, m.settings).source(scene.id)
+        source = MapPageSource(m.store, m.settings).source(scene.id)
         whole = m.store.scenes.gaussians(scene.id)
         assert source.num_gaussians == len(whole) == shown.sum()
         for name in ("means", "sh", "logit_opacities"):

@@ -12,9 +12,9 @@ import pytest
 
 import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
-from gsmap.map.placed_photos import PlacedPhoto
+from gsmap.map.photo_poses import PhotoPose
 from gsmap.map.stages.georeference import Request
-from gsmap.types.world import Fix
+from gsmap.types.world import PositionFix
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
@@ -218,10 +218,10 @@ def test_a_photo_that_was_localised_counts_with_its_covariance(site: Site, tmp_p
     with made_map(tmp_path / "m.gsmap", site) as m:
         ids = {scene.name: scene.id for scene in m.scenes()}
 
-        def localise(names: list[str]) -> dict[str, PlacedPhoto]:
+        def localise(names: list[str]) -> dict[str, PhotoPose]:
             sigma = np.diag([1e-3**2] * 3 + [0.02**2] * 3)
             return {
-                name: PlacedPhoto(
+                name: PhotoPose(
                     ids[photos[name][0]],
                     photos[name][1].T_frame_camera[0],
                     photos[name][1].intrinsics_px[0],
@@ -363,7 +363,7 @@ def test_a_localised_photo_is_put_into_its_scene_s_frame(site: Site, tied: Path,
     from PIL import Image
 
     from gsmap.geometry.rotations import exp_so3
-    from gsmap.map.placed_photos import localiser, placed_photo
+    from gsmap.map.photo_poses import photo_localizer, photo_pose_of
     from gsmap.types import ScenePose, Sim3
 
     S = Sim3(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2, 3]), 4.0)
@@ -375,13 +375,13 @@ def test_a_localised_photo_is_put_into_its_scene_s_frame(site: Site, tied: Path,
         intrinsics_px=np.array([100.0, 100, 32, 24]),
     )  # fmt: skip
     poses = {"1": ScenePose("1", S, 0, "placed"), "2": ScenePose("2", S, 1, "placed")}
-    found = placed_photo(row, (64, 48), poses, {"far": "1", "near": "2"})
+    found = photo_pose_of(row, (64, 48), poses, {"far": "1", "near": "2"})
     assert found is not None
     assert found.scene == "2", "of its own component"
     assert found.T_scene_camera[:3, 3] == pytest.approx([0.5, 0.6, 0.7])
     assert np.diag(found.covariance) == pytest.approx([1.0] * 6)
     row.T_map_camera = None
-    assert placed_photo(row, (64, 48), poses, {"near": "2"}) is None
+    assert photo_pose_of(row, (64, 48), poses, {"near": "2"}) is None
 
     Image.new("RGB", (64, 48)).save(tmp_path / "in.jpg")
     (tmp_path / "below").mkdir()
@@ -392,9 +392,9 @@ def test_a_localised_photo_is_put_into_its_scene_s_frame(site: Site, tied: Path,
         return SimpleNamespace(results=[row for _ in files])
 
     with gsmap.map.open(tied) as m:
-        localise = localiser(m.store, localize, tmp_path / "below")
+        localise = photo_localizer(m.store, localize, tmp_path / "below")
         assert localise(["../in.jpg", "none.jpg"]) == {}, "a list of points leads to no file elsewhere"
-        assert localiser(m.store, localize, tmp_path)(["in.jpg"]) == {}
+        assert photo_localizer(m.store, localize, tmp_path)(["in.jpg"]) == {}
     assert asked == [tmp_path / "in.jpg"]
 
 
@@ -437,7 +437,7 @@ def test_a_photo_that_cannot_be_placed_is_left_out(tied: Path, site: Site, tmp_p
     """Through `Map.localize` itself: noise is refused, and its points with it."""
     from PIL import Image
 
-    from gsmap.map.placed_photos import localiser
+    from gsmap.map.photo_poses import photo_localizer
 
     noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / "noise.jpg")
@@ -449,7 +449,7 @@ def test_a_photo_that_cannot_be_placed_is_left_out(tied: Path, site: Site, tmp_p
     with gsmap.map.open(tied) as m:
         m.clone(tmp_path / "c.gsmap")
     with gsmap.map.open(tmp_path / "c.gsmap") as m:
-        localise = localiser(m.store, m.localize, tmp_path)
+        localise = photo_localizer(m.store, m.localize, tmp_path)
         report = m.georeference(Request(gcp=tmp_path / "g.txt"), localise=localise)
         assert any("noise.jpg" in note for note in report.notes)
         assert all(image.image != "noise.jpg" for image in m.store.world.survey().images)
@@ -468,7 +468,7 @@ def test_photos_above_take_off_are_named_and_tie_nothing_anew(tied: Path, site: 
         for name, S, cameras in zip(site.names, site.truth, site.cameras, strict=True):
             low = of_frame(site.frame, S.apply(cameras.centers) - [0, 0, 520])
             fixes += [
-                Fix(photo, ids[name], point, site.frame.crs, position, (1.5, 3.0), (3.0, 6.0), 40.0)
+                PositionFix(photo, ids[name], point, site.frame.crs, position, (1.5, 3.0), (3.0, 6.0), 40.0)
                 for photo, point, position in zip(cameras.names, cameras.centers, low, strict=True)
             ]
         m.store.world.add(fixes)

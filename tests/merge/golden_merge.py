@@ -11,7 +11,7 @@ from gsmap.merge import default_params, merge
 from gsmap.merge.changes import resolve_changes
 from gsmap.merge.exposure import apply_gain, balance_exposure
 from gsmap.merge.tile import LazyScene, merge_tile
-from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
+from gsmap.types import Cameras, Gaussians, MergeResult, PosedScene, Sim3
 
 TILE = np.array([[-0.5, -1, -1], [0.5, 1, 1]])
 
@@ -36,13 +36,13 @@ def cameras(xs: np.ndarray) -> Cameras:
     return Cameras(T, np.tile([40.0, 40, 24, 16], (len(xs), 1)), np.tile([48, 32], (len(xs), 1)))
 
 
-def scenes() -> list[PlacedScene]:
+def scenes() -> list[PosedScene]:
     """Two captures of one wall; the later one is brighter, and a box that stood before the wall is gone."""
     before = Gaussians.concatenate([wall(0, -1.2, 0.5), wall(2, -0.2, 0.2, z=-0.4, half_height=0.12)])
     after = apply_gain(wall(1, -0.5, 1.2, z=0.01), np.array([1.15, 1.05, 0.95]))
     return [
-        PlacedScene(before, cameras(np.linspace(-0.9, 0.2, 5)), "a", "2026-01-01T00:00:00+00:00"),
-        PlacedScene(after, cameras(np.linspace(-0.2, 0.9, 5)), "b", "2026-02-01T00:00:00+00:00"),
+        PosedScene(before, cameras(np.linspace(-0.9, 0.2, 5)), "a", "2026-01-01T00:00:00+00:00"),
+        PosedScene(after, cameras(np.linspace(-0.2, 0.9, 5)), "b", "2026-02-01T00:00:00+00:00"),
     ]
 
 

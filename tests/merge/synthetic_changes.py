@@ -3,7 +3,7 @@
 import numpy as np
 from synthetic_walls import cameras_facing, texture, wall
 
-from gsmap.merge import PlacedScene
+from gsmap.merge import PosedScene
 from gsmap.types import Gaussians
 
 BOX = {"low": -0.2, "high": 0.2, "z": -0.5, "half_height": 0.15}
@@ -28,4 +28,4 @@ def patched(x, y):
 def dated(name, year, *parts, cameras=None):
     """A capture of a year, of what stands there."""
     cameras = cameras_facing(np.linspace(-0.6, 0.6, 7)) if cameras is None else cameras
-    return PlacedScene(Gaussians.concatenate(list(parts)), cameras, name, f"{year}-01-01T00:00:00+00:00")
+    return PosedScene(Gaussians.concatenate(list(parts)), cameras, name, f"{year}-01-01T00:00:00+00:00")

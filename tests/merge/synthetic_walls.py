@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsmap.merge import PlacedScene
+from gsmap.merge import PosedScene
 from gsmap.types import Cameras, Gaussians
 
 
@@ -36,6 +36,6 @@ def cameras_facing(xs, distance=1.2, width=64, height=48):
 
 def two_scenes(grain=0.15):
     """Captures a and b, who share the middle of the wall; b stands 1 cm off."""
-    a = PlacedScene(wall(0, -1.5, 0.5, grain=grain), cameras_facing(np.linspace(-1.1, 0.1, 7)), "a")
-    b = PlacedScene(wall(1, -0.5, 1.5, z=0.01, grain=grain), cameras_facing(np.linspace(-0.1, 1.1, 7)), "b")
+    a = PosedScene(wall(0, -1.5, 0.5, grain=grain), cameras_facing(np.linspace(-1.1, 0.1, 7)), "a")
+    b = PosedScene(wall(1, -0.5, 1.5, z=0.01, grain=grain), cameras_facing(np.linspace(-0.1, 1.1, 7)), "b")
     return [a, b]

@@ -7,13 +7,13 @@ import pytest
 from synthetic_walls import cameras_facing, texture, two_scenes, wall
 
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.merge import PlacedScene, default_params, merge, photos, photos_m, references
+from gsmap.merge import PosedScene, default_params, merge, photos, photos_m, references
 from gsmap.merge.exposure import apply_gain, balance_exposure
 from gsmap.merge.photos import make_photo_reference
 from gsmap.merge.references import render_references
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.render import render
-from gsmap.types import Gaussians, KeptPhoto, Sim3
+from gsmap.types import Gaussians, ReferencePhoto, Sim3
 
 WIDTH, GRAIN = 64, 0.05
 TRUTH = wall(9, -1.8, 1.8, spacing=0.02)  # finer than what was trained
@@ -32,7 +32,7 @@ def picture_at(x, gain=1.0, somebody=False):
 
 
 def photo_at(x, **options):
-    return KeptPhoto(cameras_facing([x]), lambda: picture_at(x, **options), 0.001, 0.003)
+    return ReferencePhoto(cameras_facing([x]), lambda: picture_at(x, **options), 0.001, 0.003)
 
 
 def ask(photo, scene=None):
@@ -62,7 +62,7 @@ def test_what_stands_before_the_place_does_not_count():
 
 
 def test_a_picture_of_something_else_or_from_who_knows_where_is_left_out(monkeypatch):
-    other = KeptPhoto(cameras_facing([-0.5]), lambda: picture_at(1.1)[:, ::-1].copy())
+    other = ReferencePhoto(cameras_facing([-0.5]), lambda: picture_at(1.1)[:, ::-1].copy())
     assert ask(other) is None
     assert ask(replace(photo_at(-0.5), sigma_m=0.1)) is None  # 480 / 64 * 60 px * .1 / 1.2
     assert ask(replace(photo_at(-0.5), sigma_rad=0.02)) is None
@@ -72,10 +72,10 @@ def test_a_picture_of_something_else_or_from_who_knows_where_is_left_out(monkeyp
 
 def test_before_a_plain_wall_a_picture_of_another_place_is_told_by_following_nothing():
     plain = wall(0, -1.5, 0.5, colour=lambda x, y: 0.5 + 0.3 * (texture(x, y) - 0.5))
-    scene = PlacedScene(plain, cameras_facing([-0.5]), "a")
+    scene = PosedScene(plain, cameras_facing([-0.5]), "a")
     shows = np.round(np.clip(render(plain, cameras_facing([-0.5])).colour[0], 0, 1) * 255).astype(np.uint8)
-    assert ask(KeptPhoto(cameras_facing([-0.5]), lambda: shows), scene) is not None
-    assert ask(KeptPhoto(cameras_facing([-0.5]), lambda: shows[..., ::-1].copy()), scene) is None
+    assert ask(ReferencePhoto(cameras_facing([-0.5]), lambda: shows), scene) is not None
+    assert ask(ReferencePhoto(cameras_facing([-0.5]), lambda: shows[..., ::-1].copy()), scene) is None
 
 
 def test_a_larger_picture_is_reduced_and_a_smaller_one_taken_as_it_is():
@@ -132,7 +132,7 @@ def test_photographs_of_balanced_captures_are_brought_to_the_balanced_colours():
     a, b = two_scenes(grain=0.0)
     brighter = apply_gain(b.gaussians, np.array([1.25, 1.1, 0.9]))
     photo = replace(photo_at(0.5), around=lambda: brighter)
-    scenes, log_gains = balance_exposure([a, PlacedScene(brighter, b.cameras, "b", photos=(photo,))])
+    scenes, log_gains = balance_exposure([a, PosedScene(brighter, b.cameras, "b", photos=(photo,))])
     found = make_photo_reference(scenes[1].photos[0], scenes[1], WIDTH)
     colours = found.image[found.counts].mean(0) / 255
     balanced = render(scenes[1].gaussians, cameras_facing([0.5])).colour[0][found.counts].mean(0)

@@ -6,7 +6,7 @@ from raising import raises
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.boxes import inside
-from gsmap.merge import PlacedScene, default_params, merge, methods
+from gsmap.merge import PosedScene, default_params, merge, methods
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.types import Cameras, Gaussians, Sim3
 
@@ -32,7 +32,7 @@ TILES = [np.array([[x, y, -2], [x + 1.005, y + 1.005, 2]]) for x in (-1.005, 0.0
 
 
 def test_union_keeps_everything_with_its_origin():
-    parts = [PlacedScene(cloud(0), scene_id="b"), PlacedScene(cloud(1, n=500), scene_id="a")]
+    parts = [PosedScene(cloud(0), scene_id="b"), PosedScene(cloud(1, n=500), scene_id="a")]
     result = merge(parts, "union")
     assert result.num_input == len(result.gaussians) == 3500
     np.testing.assert_array_equal(result.gaussians.means[result.origin == 1], parts[1].gaussians.means)
@@ -40,7 +40,7 @@ def test_union_keeps_everything_with_its_origin():
 
 def test_distance_keeps_exactly_what_is_nearer_to_its_own_centroid():
     a, b = cloud(0), cloud(1, low=(0, -1, -1), high=(3, 1, 1))
-    result = merge([PlacedScene(a, scene_id="a"), PlacedScene(b, scene_id="b")], "distance")
+    result = merge([PosedScene(a, scene_id="a"), PosedScene(b, scene_id="b")], "distance")
     centre_a, centre_b = a.means.mean(0), b.means.mean(0)
     nearer_a = lambda p: np.linalg.norm(p - centre_a, axis=1) < np.linalg.norm(p - centre_b, axis=1)  # noqa: E731
     np.testing.assert_array_equal(result.gaussians.means[result.origin == 0], a.means[nearer_a(a.means)])
@@ -49,10 +49,10 @@ def test_distance_keeps_exactly_what_is_nearer_to_its_own_centroid():
 
 def test_distance_alone_keeps_everything_and_a_tile_uses_the_whole_captures_centroid():
     a, b = cloud(0), cloud(1, low=(0, -1, -1), high=(3, 1, 1))
-    assert len(merge([PlacedScene(a)], "distance").gaussians) == len(a)
-    whole = merge([PlacedScene(a, scene_id="a"), PlacedScene(b, scene_id="b")], "distance")
+    assert len(merge([PosedScene(a)], "distance").gaussians) == len(a)
+    whole = merge([PosedScene(a, scene_id="a"), PosedScene(b, scene_id="b")], "distance")
     parts = [
-        PlacedScene(g, scene_id=s, centroid=lambda g=g: g.means.mean(0, dtype=float)) for g, s in ((a, "a"), (b, "b"))
+        PosedScene(g, scene_id=s, centroid=lambda g=g: g.means.mean(0, dtype=float)) for g, s in ((a, "a"), (b, "b"))
     ]
     boxes = [np.array([[-9, -9, -9], [0.4, 9, 9]]), np.array([[0.4, -9, -9], [9, 9, 9]])]
     tiles = [merge(parts, "distance", bounds=box).gaussians for box in boxes]
@@ -61,7 +61,7 @@ def test_distance_alone_keeps_everything_and_a_tile_uses_the_whole_captures_cent
 
 @pytest.mark.parametrize("method", ["union", "voxel"])
 def test_tiles_made_apart_are_the_whole(method):
-    parts = [PlacedScene(cloud(s, n=20_000), scene_id=str(s)) for s in range(2)]
+    parts = [PosedScene(cloud(s, n=20_000), scene_id=str(s)) for s in range(2)]
     params = default_params(method)
     if method == "voxel":
         params = type(params)(voxel_m=0.07)
@@ -75,7 +75,7 @@ def test_tiles_made_apart_are_the_whole(method):
 
 @pytest.mark.parametrize("method", ["union", "distance", "voxel"])
 def test_order_of_parts_does_not_matter(method):
-    a, b = PlacedScene(cloud(0), scene_id="a"), PlacedScene(cloud(1), scene_id="b")
+    a, b = PosedScene(cloud(0), scene_id="a"), PosedScene(cloud(1), scene_id="b")
     one, other = merge([a, b], method), merge([b, a], method)
     np.testing.assert_array_equal(one.gaussians.means, other.gaussians.means)
     np.testing.assert_array_equal(one.origin, 1 - other.origin)
@@ -84,7 +84,7 @@ def test_order_of_parts_does_not_matter(method):
 def test_voxel_merges_a_capture_with_its_copy_into_one():
     g = cloud(0)
     result = merge(
-        [PlacedScene(g, scene_id="a"), PlacedScene(g, scene_id="b")],
+        [PosedScene(g, scene_id="a"), PosedScene(g, scene_id="b")],
         "voxel",
         type(default_params("voxel"))(voxel_m=1e-4),
     )
@@ -94,7 +94,7 @@ def test_voxel_merges_a_capture_with_its_copy_into_one():
 
 
 def test_bad_input_is_refused_in_words():
-    part = PlacedScene(cloud(0))
+    part = PosedScene(cloud(0))
     with raises(InputError, code="nothing_to_merge"):
         merge([], "union")
     with raises(ConfigError, code="unknown_method"):
@@ -109,7 +109,7 @@ def test_bad_input_is_refused_in_words():
 
 
 def test_a_tile_without_anything_in_it_is_empty():
-    result = merge([PlacedScene(cloud(0))], "voxel", bounds=np.array([[50, 50, 50], [51, 51, 51]]))
+    result = merge([PosedScene(cloud(0))], "voxel", bounds=np.array([[50, 50, 50], [51, 51, 51]]))
     assert len(result.gaussians) == len(result.origin) == result.num_input == 0
 
 

@@ -16,7 +16,7 @@ from gsmap.merge.reference_view_cache import ReferenceView, ReferenceViewCache, 
 from gsmap.merge.references import render_references
 from gsmap.merge.tile import LazyScene, _read, _Reading, merge_tile
 from gsmap.render import render
-from gsmap.types import Gaussians, PlacedScene, Sim3
+from gsmap.types import Gaussians, PosedScene, Sim3
 
 S = Sim3(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5.0, 1, -2]), 2.0)
 """Takes the map to a scene's own frame."""
@@ -83,7 +83,7 @@ def test_sights_tell_what_the_whole_capture_shows() -> None:
     reading = _Reading(1.0, 1.0, 11.0, 12)
     tile = np.array([[0.0, -2, -2], [0.75, 2, 2]])
     whole = [
-        PlacedScene(
+        PosedScene(
             transform_gaussians(scene.load(None), scene.S_map_scene),
             transform_cameras(scene.cameras, scene.S_map_scene),
             scene.scene_id,

@@ -1,7 +1,7 @@
 import numpy as np
 from synthetic_walls import cameras_facing, two_scenes, wall
 
-from gsmap.merge import PlacedScene
+from gsmap.merge import PosedScene
 from gsmap.merge.exposure import apply_gain, balance_exposure
 from gsmap.merge.reference_view_cache import surface_axes
 from gsmap.merge.references import render_references, view_schedule
@@ -53,7 +53,7 @@ def test_a_gain_multiplies_every_colour():
 def test_exposure_is_balanced_where_captures_meet():
     a, b = two_scenes(grain=0.0)
     gain = np.array([1.25, 1.1, 0.9])
-    brighter = PlacedScene(apply_gain(b.gaussians, gain), b.cameras, "b")
+    brighter = PosedScene(apply_gain(b.gaussians, gain), b.cameras, "b")
     _, log_gains = balance_exposure([a, brighter])
     np.testing.assert_allclose(log_gains[1] - log_gains[0], -np.log(gain), atol=0.02)
     np.testing.assert_allclose(log_gains.sum(0), 0, atol=1e-9)
@@ -63,15 +63,15 @@ def test_exposure_is_balanced_where_captures_meet():
 
 
 def test_captures_that_do_not_meet_keep_their_exposure():
-    a = PlacedScene(wall(0, -3, -2), cameras_facing([-2.5]), "a")
-    b = PlacedScene(apply_gain(wall(1, 2, 3), np.full(3, 1.5)), cameras_facing([2.5]), "b")
+    a = PosedScene(wall(0, -3, -2), cameras_facing([-2.5]), "a")
+    b = PosedScene(apply_gain(wall(1, 2, 3), np.full(3, 1.5)), cameras_facing([2.5]), "b")
     assert not balance_exposure([a, b])[1].any()
 
 
 def test_of_many_views_those_are_reproduced_that_add_most():
     scene = wall(0, -1.5, 1.5)
-    crowd = PlacedScene(scene, cameras_facing(np.full(20, -0.9)), "a", "2020-01-01")
-    newer = PlacedScene(scene, cameras_facing(np.linspace(-0.9, 0.9, 5)), "b", "2021-01-01")
+    crowd = PosedScene(scene, cameras_facing(np.full(20, -0.9)), "a", "2020-01-01")
+    newer = PosedScene(scene, cameras_facing(np.linspace(-0.9, 0.9, 5)), "b", "2021-01-01")
     views = render_references([crowd, newer], None, 0.0, 64, None, quiet, max_views=6)
     assert len(views) == 6
     # One place that twenty cameras look at needs few of them; the others each see what no other does.

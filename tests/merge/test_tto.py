@@ -10,7 +10,7 @@ from gsmap.errors import ConfigError
 from gsmap.evaluate.images import ssim
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.voxels import voxel_labels
-from gsmap.merge import PlacedScene, default_params, merge
+from gsmap.merge import PosedScene, default_params, merge
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.mergers import tto
 from gsmap.merge.selection import select_owners
@@ -51,15 +51,15 @@ def halves():
     """Two captures that show one wall, each a half of it."""
     whole, cameras = wall(0, -1, 1), cameras_facing(np.linspace(-0.6, 0.6, 5))
     left = whole.means[:, 0] < 0
-    return [PlacedScene(whole[left], cameras, "a"), PlacedScene(whole[~left], cameras, "b")]
+    return [PosedScene(whole[left], cameras, "a"), PosedScene(whole[~left], cameras, "b")]
 
 
 def test_one_capture_alone_is_neither_thinned_nor_fitted():
-    one = PlacedScene(wall(0, -1, 1), cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")
+    one = PosedScene(wall(0, -1, 1), cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")
     result = merge([one], "tto", Params(kept_fraction=0.3, voxel_m=1e-3))
     assert result.steps == 0
     assert likeness(result.gaussians, [one]) > 40
-    far = PlacedScene(wall(0, 50, 52), cameras_facing(np.linspace(50.4, 51.6, 5)), "b")
+    far = PosedScene(wall(0, 50, 52), cameras_facing(np.linspace(50.4, 51.6, 5)), "b")
     here = np.array([[-2.0, -2, -2], [2, 2, 2]])
     tile = merge([one, far], "tto", Params(kept_fraction=0.3, voxel_m=1e-3), bounds=here)
     assert tile.steps == 0
@@ -80,7 +80,7 @@ def test_a_budget_is_a_ceiling_and_says_so():
 
 
 def test_without_cameras_it_still_merges():
-    parts = [PlacedScene(p.gaussians, None, p.scene_id) for p in two_scenes()]
+    parts = [PosedScene(p.gaussians, None, p.scene_id) for p in two_scenes()]
     result = merge(parts, "tto")
     assert result.steps == 0
     assert "no camera" in result.notes[0]
@@ -116,7 +116,7 @@ def test_tiles_fit_together_in_any_order():
 
 def test_differing_exposure_is_removed_when_asked_and_noted():
     a, b = two_scenes()
-    brighter = PlacedScene(apply_gain(b.gaussians, np.full(3, 1.4)), b.cameras, "b")
+    brighter = PosedScene(apply_gain(b.gaussians, np.full(3, 1.4)), b.cameras, "b")
     result = merge([a, brighter], "tto", Params(steps=5, balance_exposure=True))
     assert any("stops" in note for note in result.notes)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gsmap.objects import estimate_persistence, graphml, object_graph, relations
-from gsmap.types import MapObject, Sighting
+from gsmap.types import MapObject, ObjectObservation
 
 DATES = {
     "a": "2024-01-01T00:00:00+00:00",
@@ -20,7 +20,8 @@ def thing(name, low, high, states="seen", component=0) -> MapObject:
     box = np.array([low, high], float)
     words = states.split()
     sightings = tuple(
-        Sighting(scene, state, 0, box if state == "seen" else None) for scene, state in zip("abcd", words, strict=False)
+        ObjectObservation(scene, state, 0, box if state == "seen" else None)
+        for scene, state in zip("abcd", words, strict=False)
     )
     return MapObject(name, component, box, box.mean(0), np.zeros(3, np.float32), sightings)
 

@@ -15,7 +15,7 @@ from gsmap.geometry.similarities import Similarities
 from gsmap.optimize import joint_covariance, optimize
 from gsmap.optimize.survey_terms import SurveyTerms, Unknowns
 from gsmap.types import PoseGraph, Sim3
-from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldTie
+from gsmap.types.world import ControlPoint, Georeference, ImagePoint, PositionFix, ScaleBar, Survey
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
@@ -24,13 +24,13 @@ from made_sites import survey_of
 SMALL = SiteParams(rows=4, columns=4, num_check=6)
 
 
-def solved(site: Site, survey: Survey) -> tuple[PoseGraph, WorldTie]:
+def solved(site: Site, survey: Survey) -> tuple[PoseGraph, Georeference]:
     answer = optimize(site.names, site.edges, survey=survey)
     (tie,) = answer.world
     return answer, tie
 
 
-def errors(site: Site, answer: PoseGraph, tie: WorldTie) -> np.ndarray:
+def errors(site: Site, answer: PoseGraph, tie: Georeference) -> np.ndarray:
     """(marks, 3) of where the map has all marks, in the world frame."""
     assert tie.S_world_map is not None
     truth = dict(zip(site.names, site.truth, strict=True))
@@ -56,7 +56,7 @@ def test_what_is_surveyed_bends_a_map_that_drifts() -> None:
     frame, found = survey_of(site).frame, []
     for sigma in (0.005, 0.5):
         fixes = tuple(
-            Fix("origin", name, np.zeros(3), "local", S.translation, (sigma, sigma))
+            PositionFix("origin", name, np.zeros(3), "local", S.translation, (sigma, sigma))
             for name, S in list(zip(site.names, site.truth, strict=True))[::3]
         )
         answer, tie = solved(site, Survey(frame, fixes=fixes))
@@ -127,7 +127,7 @@ def test_too_few_points_are_refused_by_name(keep: list[str], said: str) -> None:
         scene = truth["G4"].scene
         S = dict(zip(site.names, site.truth, strict=True))
         fixes = tuple(
-            Fix(n, S_scene, S[S_scene].inverse().apply(p), "local", p, (0.01, 0.01))
+            PositionFix(n, S_scene, S[S_scene].inverse().apply(p), "local", p, (0.01, 0.01))
             for n, S_scene, p in (
                 ("A", truth["G0"].scene, truth["G0"].true_m),
                 ("B", truth["G1"].scene, truth["G1"].true_m),
@@ -176,7 +176,7 @@ def test_positions_of_cameras_tie_a_map_with_an_honest_sigma() -> None:
         own = rng.normal(size=3) * 3.0
         for photo, centre in zip(cameras.names, cameras.centers, strict=True):
             at = S.apply(centre) + own + rng.normal(size=3) * 0.5
-            fixes.append(Fix(photo, name, centre, "local", at, (0.5, 0.5), (3.0, 3.0)))
+            fixes.append(PositionFix(photo, name, centre, "local", at, (0.5, 0.5), (3.0, 3.0)))
     frame = survey_of(site).frame
     answer, tie = solved(site, Survey(frame, fixes=tuple(fixes)))
     assert tie.S_world_map is not None
@@ -226,7 +226,7 @@ def test_derivatives() -> None:
         for k, i in enumerate(survey.images)
     )
     a, b = site.names[:2]
-    fixes = (Fix("f", a, rng.normal(size=3), "local", rng.normal(size=3), (1.0, 2.0), (3.0, 4.0), 40.0),)
+    fixes = (PositionFix("f", a, rng.normal(size=3), "local", rng.normal(size=3), (1.0, 2.0), (3.0, 4.0), 40.0),)
     bars = (ScaleBar("b", (a, b), rng.normal(size=(2, 3)), (1e-4, 1e-4), 3.0, 0.1),)
     for dim in (6, 7):
         terms = SurveyTerms.of(replace(survey, images=images, fixes=fixes, bars=bars), site.names, dim)

@@ -12,7 +12,7 @@ from gsmap.optimize import optimize
 from gsmap.optimize.survey_common_points import CommonPoints
 from gsmap.store.ties import tie_value, ties_of
 from gsmap.types import Sim3
-from gsmap.types.world import CAUSES, Contradiction, Survey, WorldFrame, WorldTie
+from gsmap.types.world import CAUSES, Contradiction, Georeference, Survey, WorldFrame
 from gsmap_synthetic.surveyed import SiteParams, surveyed_site
 from tools.bench import survey_groups as bench
 
@@ -31,12 +31,12 @@ def higher(at: np.ndarray) -> np.ndarray:
     return at + np.array([0, 0, 45.0])
 
 
-def solved(m: bench.Made, *surveys: Survey) -> tuple[WorldTie, float]:
+def solved(m: bench.Made, *surveys: Survey) -> tuple[Georeference, float]:
     tie, off, _ = bench.solved(m.site, bench.both(*surveys))
     return tie, off
 
 
-def uses(tie: WorldTie, kind: str) -> set[str]:
+def uses(tie: Georeference, kind: str) -> set[str]:
     return {row.use for row in tie.residuals if row.kind == kind}
 
 
@@ -203,7 +203,7 @@ def test_contradictions_are_kept_with_the_tie() -> None:
         "t",
     )
     bars = Contradiction("bars", "points", "feet", (), "against", ratio=3.28, count=2)
-    tie = WorldTie(0, problem="x", problem_code="contradiction", contradictions=(one, bars))
+    tie = Georeference(0, problem="x", problem_code="contradiction", contradictions=(one, bars))
     value = tie_value(tie)
     (again,) = ties_of([value])
     assert again.contradictions == (one, bars)

@@ -9,7 +9,7 @@ import pytest
 
 from gsmap.report import EdgeEntry, Island, Report, SceneEntry, page
 from gsmap.report.words import angle, chi_square, cut_pair, length, number, probability, size, some, verdict
-from gsmap.types.metre import KNOWN_BY, KnownBy, Metre
+from gsmap.types.metric_scale import KNOWN_BY, KnownBy, MetricScale
 from gsmap.types.rows import EdgeRow, MapStatus, RevisionRow, SceneRow, TodoRow
 from gsmap.types.rows.maps import TodoKind
 
@@ -72,7 +72,7 @@ def report(*scenes: SceneEntry, edges: tuple[EdgeEntry, ...] = (), solved: bool 
         status,
         scenes,
         edges,
-        (Island(0, tuple(one.row.name for one in scenes), Metre()),) if solved else (),
+        (Island(0, tuple(one.row.name for one in scenes), MetricScale()),) if solved else (),
         (revision,) if solved else (),
     )
 
@@ -106,7 +106,7 @@ def test_the_verdict_says_how_a_map_stands(made: Report, standing: str, says: st
 @pytest.mark.parametrize("known_by", KNOWN_BY)
 def test_every_way_to_know_a_metre_is_said(known_by: KnownBy) -> None:
     made = report(scene("a"), scene("b"))
-    island = replace(made.islands[0], metre=Metre(0.5, 0.01, known_by))
+    island = replace(made.islands[0], metre=MetricScale(0.5, 0.01, known_by))
     said = " ".join(verdict(replace(made, islands=(island,)))[1])
     assert ("lengths have no known unit" in said.lower()) == (known_by == "unknown")
     assert ("to 1 %" in said) == (known_by != "unknown")

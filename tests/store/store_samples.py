@@ -4,8 +4,8 @@ import numpy as np
 
 from gsmap.methods import RecipeKey
 from gsmap.store.objects import Computed, ObjectSet
-from gsmap.types import Cameras, Change, ChangeReport, Gaussians, MapObject, Sighting, Sim3
-from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
+from gsmap.types import Cameras, Change, ChangeReport, Gaussians, MapObject, ObjectObservation, Sim3
+from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 
 
 def key(stage: str, *inputs: str, **settings: object) -> RecipeKey:
@@ -50,14 +50,14 @@ def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newe
 JPEG = b"\xff\xd8\xff\xe0" + bytes(range(200))
 
 
-def kept_photo(scene: str, number: int = 0, **values) -> PhotoSighting:
+def kept_photo(scene: str, number: int = 0, **values) -> LocalizedPhoto:
     """A photograph of a scene; others by number."""
     pose = np.eye(4)
     pose[:3, 3] = [1.0, 2.0, number]
     told = {"captured_at": "2026-03-01T12:00:00+00:00", "probability": 0.99}
-    things = (ThingInPhoto(np.array([0.5, 0.25, 1.0]), "absent", 0.75),)
+    things = (PhotoObjectObservation(np.array([0.5, 0.25, 1.0]), "absent", 0.75),)
     lens = np.array([500.0, 500, 320, 240])
-    return PhotoSighting(
+    return LocalizedPhoto(
         digest=f"{number:064x}",
         name=f"photo{number}.jpg",
         scene=scene,
@@ -87,7 +87,9 @@ def computed(*places, seed="") -> Computed:
             np.zeros(3),
             np.zeros(3, np.float32),
             tuple(
-                Sighting(scene, "seen", i, one[scene]) if scene in one else Sighting(scene, "absent", -1, None, 0.75)
+                ObjectObservation(scene, "seen", i, one[scene])
+                if scene in one
+                else ObjectObservation(scene, "absent", -1, None, 0.75)
                 for scene in scenes
             ),
         )

@@ -414,7 +414,7 @@ def test_one_whose_lease_was_taken_away_stops(filled, place):
 
 @pytest.mark.parametrize("task", [SAVE, SWEEP])
 def test_who_died_on_this_machine_is_not_waited_for(place, task):
-    code = "import json; from dataclasses import asdict; from gsmap.types.holder import this_process as me\n"
+    code = "import json; from dataclasses import asdict; from gsmap.types.lock_owner import this_process as me\n"
     code += "print(json.dumps(asdict(me('backup'))))"
     dead = json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout)
     elsewhere = dead | {"process": " ".join([*dead["process"].split()[:2], "another-machine"])}

@@ -26,7 +26,7 @@ from gsmap.store.copying import copy_catalog, copy_rows, empty_catalog, one_stat
 from gsmap.store.indexes import Lookup
 from gsmap.types import Prior, SceneGraph, Sim3
 from gsmap.types.localization import SceneFeatures
-from gsmap.types.retrieval import Candidate, IndexArrays, Member
+from gsmap.types.retrieval import Candidate, IndexArrays, IndexedScene
 from gsmap.types.world import ControlPoint
 
 
@@ -45,7 +45,7 @@ def fill(store):
     store.world.add([ControlPoint("G1", "EPSG:25832", np.array([691234.5, 5334567.125, 519.3]))])
     store.exports.add_tile(store.exports.begin("/tmp/out", revision=1), tile("a.ply", [a, b]))
     nodes = IndexArrays(np.zeros(1, np.int64), np.arange(2, dtype=np.int64), np.zeros((1, 58), np.uint8))
-    store.indexes.put("0" * 32, [Member(a.id, "1" * 32, True, False, 1.5)], nodes, ())
+    store.indexes.put("0" * 32, [IndexedScene(a.id, "1" * 32, True, False, 1.5)], nodes, ())
     store.indexes.note([Lookup(a.id, "0" * 32, (Candidate(b.id, 1.0, 2.0),))])
     cameras = make_cameras()
     starts = np.zeros(len(cameras) + 1, np.int64)

@@ -10,7 +10,7 @@ from gsmap.errors import CorruptError
 from gsmap.store import Store, purging
 from gsmap.store.indexes import Lookup
 from gsmap.types import SceneGraph
-from gsmap.types.retrieval import Candidate, IndexArrays, Member
+from gsmap.types.retrieval import Candidate, IndexArrays, IndexedScene
 
 A, B = "a" * 32, "b" * 32
 
@@ -22,7 +22,7 @@ def arrays(count=5, seed=0):
 
 
 def members(*scenes):
-    return [Member(scene, scene[::-1], True, False, 1.5) for scene in scenes]
+    return [IndexedScene(scene, scene[::-1], True, False, 1.5) for scene in scenes]
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from sqlalchemy import insert, select, update
 from gsmap.errors import BusyError, StoreError
 from gsmap.store import Store, schema
 from gsmap.store.leases import Leases
-from gsmap.types.holder import Holder, this_process
+from gsmap.types.lock_owner import LockOwner, this_process
 
 HOLD = """
 import sys, time
@@ -107,10 +107,10 @@ def test_a_later_process_of_the_same_number_is_another_one() -> None:
     me = this_process("update")
     number, started, machine = me.process.split(" ")
     assert not me.is_gone
-    assert Holder("update", me.host, f"{number} {int(started) - 1} {machine}", me.since).is_gone
-    assert not Holder("update", me.host, f"{number} {int(started) - 1} elsewhere", me.since).is_gone
+    assert LockOwner("update", me.host, f"{number} {int(started) - 1} {machine}", me.since).is_gone
+    assert not LockOwner("update", me.host, f"{number} {int(started) - 1} elsewhere", me.since).is_gone
     for nonsense in ("", "x", "-1 1", f"0 1 {machine}", "99999999999 1"):
-        assert not Holder("update", me.host, nonsense, me.since).is_gone
+        assert not LockOwner("update", me.host, nonsense, me.since).is_gone
 
 
 def test_a_lease_of_another_machine_holds_until_it_runs_out(store: Store) -> None:
@@ -225,7 +225,7 @@ def test_of_many_one_gets_each(store: Store) -> None:
 
 
 def test_words_of_a_stranger_do_not_reach_the_terminal_raw() -> None:
-    assert "\x1b" not in Holder("up\x1b[2Jdate", "h\nost", "1 2 3", "\x1b]0;x\x07").who
+    assert "\x1b" not in LockOwner("up\x1b[2Jdate", "h\nost", "1 2 3", "\x1b]0;x\x07").who
 
 
 def test_on_postgres_the_server_s_clock_counts(

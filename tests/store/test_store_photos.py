@@ -12,7 +12,7 @@ from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.store import Store, merging, schema
 from gsmap.store.photos import MAX_BYTES
 from gsmap.store.superseding import inherit
-from gsmap.types.photo_sighting import ThingInPhoto
+from gsmap.types.localized_photo import PhotoObjectObservation
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def test_what_cannot_be_is_refused(scene, values):
 
 def test_a_thing_is_seen_or_absent():
     with pytest.raises(InputError):
-        ThingInPhoto(np.zeros(3), "unseen", 0.5)
+        PhotoObjectObservation(np.zeros(3), "unseen", 0.5)
 
 
 @pytest.mark.parametrize(

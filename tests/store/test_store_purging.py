@@ -21,7 +21,7 @@ from gsmap.map.stages import purge
 from gsmap.store import Store, purging
 from gsmap.store.merging import merge
 from gsmap.types import EdgeOutcome, PoseGraph, Prior, Provenance, Registration, SceneGraph, ScenePose, Sim3
-from gsmap.types.world import Fix, Residual, WorldTie
+from gsmap.types.world import Georeference, PositionFix, Residual
 
 NAME, NOTE, SOURCE = "secret-garden", "the key is under the mat", "/home/ann/private/garden.ply"
 
@@ -47,7 +47,7 @@ def make(path):
         store.scenes.edit(secret, name=f"{NAME}-2")
         store.scenes.edit(secret, name=NAME)
         store.priors.set(Prior(secret, Sim3.identity(), np.full(7, 0.1)))
-        store.world.add([Fix("f.jpg", secret, np.zeros(3), "EPSG:4979", np.array([11.0, 48, 500]), (1.0, 1.0))])
+        store.world.add([PositionFix("f.jpg", secret, np.zeros(3), "EPSG:4979", np.array([11.0, 48, 500]), (1.0, 1.0))])
         left_out = Residual("fix", "f.jpg", secret, "outlier", (1.0, 0.0, 0.0), (1.0, 1.0, 1.0), reason=f"{NAME} lies")
         outcomes = {
             (ids[0], secret): EdgeOutcome("used", 1.0),
@@ -56,7 +56,7 @@ def make(path):
         placed = {s: ScenePose(s, Sim3.identity(), 0, "placed") for s in ids}
         told = Provenance(contradicted_priors=(secret, ids[0]))
         graph = PoseGraph(placed, outcomes, provenance=told, notes=(f"{NAME} lies far out", "all is well"))
-        graph = replace(graph, world=(WorldTie(0, residuals=(left_out,), problem=f"{NAME} is alone"),))
+        graph = replace(graph, world=(Georeference(0, residuals=(left_out,), problem=f"{NAME} is alone"),))
         store.revisions.save(graph)
         store.revisions.save(graph)
     return secret

@@ -11,23 +11,23 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.render import render
 from gsmap.thin import Params, find_visible, measure_fidelity_db, observed_fraction, render_views
-from gsmap.types import Gaussians, PlacedScene, Sim3
+from gsmap.types import Gaussians, PosedScene, Sim3
 
 
 @pytest.fixture
 def older():
-    return PlacedScene(wall(1, -2, 2), cameras_facing(np.linspace(-1.5, 1.5, 9)), "old")
+    return PosedScene(wall(1, -2, 2), cameras_facing(np.linspace(-1.5, 1.5, 9)), "old")
 
 
 @pytest.mark.parametrize(("middles", "low", "high"), [((-1.5, 1.5), 0.75, 1.0), ((-1.5, -1.0), 0.1, 0.6)])
 def test_how_much_newer_captures_saw(older, middles, low, high):
-    newer = PlacedScene(wall(2, -2, 2), cameras_facing(np.linspace(*middles, 9)), "new")
+    newer = PosedScene(wall(2, -2, 2), cameras_facing(np.linspace(*middles, 9)), "new")
     assert low <= observed_fraction(older, [render_views(newer)]) <= high
 
 
 def test_captures_add_up_and_none_saw_nothing(older):
     halves = [
-        PlacedScene(wall(2, -2, 2), cameras_facing(np.linspace(low, high, 9)), f"new{low}")
+        PosedScene(wall(2, -2, 2), cameras_facing(np.linspace(low, high, 9)), f"new{low}")
         for low, high in ((-1.5, -0.5), (0.5, 1.5))
     ]
     alone = [observed_fraction(older, [render_views(half)]) for half in halves]
@@ -38,22 +38,22 @@ def test_captures_add_up_and_none_saw_nothing(older):
 def test_what_is_behind_a_wall_was_not_looked_at():
     along = np.linspace(-1.5, 1.5, 9)
     beyond = transform_cameras(cameras_facing(along), Sim3(np.eye(3), np.array([0, 0, 0.6])))
-    older = PlacedScene(wall(3, -2, 2, z=0.6), beyond, "the next room")
-    newer = PlacedScene(wall(2, -2, 2), cameras_facing(along), "before the wall")
+    older = PosedScene(wall(3, -2, 2, z=0.6), beyond, "the next room")
+    newer = PosedScene(wall(2, -2, 2), cameras_facing(along), "before the wall")
     assert observed_fraction(older, [render_views(newer)]) == 0.0
 
 
 def test_what_lies_a_little_behind_a_surface_that_was_seen_is_of_it(older):
     means = older.gaussians.means.copy()
     means[np.floor(means[:, 0] / 0.08) % 4 == 0, 2] += 0.05  # narrow grooves, that a newer training smoothed
-    rough = PlacedScene(replace(older.gaussians, means=means), older.cameras, "rough")
-    newer = PlacedScene(wall(2, -2, 2), older.cameras, "new")
+    rough = PosedScene(replace(older.gaussians, means=means), older.cameras, "rough")
+    newer = PosedScene(wall(2, -2, 2), older.cameras, "new")
     assert observed_fraction(rough, [render_views(newer)]) > 0.9
 
 
 def test_what_no_picture_shows_goes_and_the_pictures_stay(older):
     behind = wall(3, -2, 2, z=0.4)
-    both = PlacedScene(Gaussians.concatenate([older.gaussians, behind]), older.cameras, "both")
+    both = PosedScene(Gaussians.concatenate([older.gaussians, behind]), older.cameras, "both")
     stays = find_visible(both, Params())
     n = len(older.gaussians)
     assert stays[:n].mean() > 0.5
@@ -70,7 +70,7 @@ def test_what_no_picture_shows_goes_and_the_pictures_stay(older):
 
 
 def test_without_cameras_all_stays_and_nothing_is_known():
-    bare = PlacedScene(wall(1, -1, 1), None, "bare")
+    bare = PosedScene(wall(1, -1, 1), None, "bare")
     assert find_visible(bare, Params()).all()
     assert np.isnan(measure_fidelity_db(bare, bare.gaussians, Params()))
 
@@ -78,7 +78,7 @@ def test_without_cameras_all_stays_and_nothing_is_known():
 def test_with_made_up_cameras_all_stays(older):
     behind = Gaussians.concatenate([older.gaussians, wall(3, -2, 2, z=0.4)])
     made_up = replace(older.cameras, synthesised=True)
-    assert find_visible(PlacedScene(behind, made_up, "both"), Params()).all()
+    assert find_visible(PosedScene(behind, made_up, "both"), Params()).all()
 
 
 def test_settings_that_cannot_be():

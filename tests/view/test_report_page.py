@@ -20,7 +20,7 @@ from gsmap.report import (
     make_plan,
     page,
 )
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import EdgeRow, MapStatus, RevisionRow, SceneRow, TodoRow
 
 HOSTILE = "<img src=//evil.example/x onerror=alert(1)>\"'"
@@ -67,7 +67,8 @@ def made() -> Report:
     return Report(
         title=HOSTILE, map_id="0" * 32, made_at="2026-05-04T10:00:00+00:00", version="0", scenes=scenes,
         status=MapStatus(todo=(todo,), scenes=3, components=1, islands=1, tentative=1, revision=3, metres_per_unit=1.0),
-        edges=tuple(edges), islands=(Island(0, tuple(names), Metre(1.0, 0.01, "told"), plan),), revisions=revisions,
+        edges=tuple(edges), islands=(Island(0, tuple(names), MetricScale(1.0, 0.01, "told"), plan),),
+        revisions=revisions,
         num_revisions=3, pair_pictures=(picture,), storage=(StorageEntry("captures", 3, 12345),), notes=(HOSTILE,),
     )  # fmt: skip
 

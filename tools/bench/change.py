@@ -34,7 +34,7 @@ import numpy as np
 from gsmap import formats
 from gsmap import map as maps
 from gsmap.errors import ConfigError
-from gsmap.types import Gaussians, PlacedScene, Sim3
+from gsmap.types import Gaussians, PosedScene, Sim3
 from tools.bench import change_scores as scores
 
 PARTS = ("register", "merge", "changes", "as-of")
@@ -106,14 +106,14 @@ class Place:
     def place_map(self, S_map_newest: Sim3) -> Sim3:
         return self.truth.T_place_scene(self.times[-1]) @ S_map_newest.inverse()
 
-    def placed(self, time: str, S_place_scene: Sim3) -> PlacedScene:
+    def placed(self, time: str, S_place_scene: Sim3) -> PosedScene:
         """A capture in the place's frame, where the map puts it."""
         from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 
         folder = self.truth.folder
         gaussians = transform_gaussians(formats.read(folder / f"{time}.ply"), S_place_scene)
         cameras = transform_cameras(formats.read_cameras(folder / f"{time}.cameras.json"), S_place_scene)
-        return PlacedScene(gaussians, cameras, time, self.truth.captured_at(time))
+        return PosedScene(gaussians, cameras, time, self.truth.captured_at(time))
 
     def exported(self, way: str, **options: Any) -> tuple[Gaussians, Sim3, float] | None:
         """The merged map, its pose in the place's frame, and CPU seconds; None where gsmap has no such way."""

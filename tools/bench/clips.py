@@ -37,7 +37,7 @@ from gsmap.localize import localize_photo, localize_together
 from gsmap.localize.looks import look
 from gsmap.localize.params import Params
 from gsmap.methods import family
-from gsmap.types.localization import Photo, Placement
+from gsmap.types.localization import LocalizationResult, Photo
 from gsmap_synthetic.capture import default_routes
 from gsmap_synthetic.streets import make_street
 from tools.bench.localize import World, house_shots, unknown_focal, world
@@ -137,7 +137,7 @@ def house_clips(data: Path, held: World) -> Iterator[tuple[list[Frame], set[str]
             yield frames, shots[0].allowed
 
 
-def answer(frame: Frame, said: Placement, truth: np.ndarray, metres_per_unit: float) -> Answer:
+def answer(frame: Frame, said: LocalizationResult, truth: np.ndarray, metres_per_unit: float) -> Answer:
     if said.T_map_camera is None:
         return Answer(frame.coverage)
     xi = camera_error(said.T_map_camera, truth)

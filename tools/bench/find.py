@@ -22,7 +22,7 @@ import numpy as np
 
 import gsmap
 from gsmap.find import Model
-from gsmap.map.objects import known_objects
+from gsmap.map.objects import compute_objects
 from tools.bench.find_scores import QUERIES, average_precisions, by_cosine, by_model, items_of, precision
 from tools.make import find_places
 
@@ -62,7 +62,7 @@ def by_map(seed: int) -> None:
             m.ingest(capture.gaussians, cameras=capture.cameras, name=f"place_{row}", scale="known")
         m.update()
         number = {scene.id: int(scene.name.removeprefix("place_")) for scene in m.scenes()}
-        objects = {thing.id: thing for thing in known_objects(m.store, m.settings, lambda *_: None).objects}
+        objects = {thing.id: thing for thing in compute_objects(m.store, m.settings, lambda *_: None).objects}
         shown = {
             name: [(number[s.scene], s.thing) for s in thing.sightings if s.thing >= 0]
             for name, thing in objects.items()

@@ -49,7 +49,7 @@ from gsmap.render import (
     render,
     set_num_threads,
 )
-from gsmap.types import Cameras, Gaussians, PlacedScene, Sim3
+from gsmap.types import Cameras, Gaussians, PosedScene, Sim3
 
 PARTS = ("kernels", "fit", "merge", "describe", "pairs", "tile", "memory")
 BACKENDS = ("native", "gsplat")
@@ -121,9 +121,9 @@ class Capture:
         self.name, self.gaussians, self.cameras, self.S_scene_world = name, gaussians, cameras, S_scene_world
         self.folder = folder
 
-    def placed(self) -> PlacedScene:
+    def placed(self) -> PosedScene:
         S = self.S_scene_world.inverse()
-        return PlacedScene(transform_gaussians(self.gaussians, S), transform_cameras(self.cameras, S), self.name)
+        return PosedScene(transform_gaussians(self.gaussians, S), transform_cameras(self.cameras, S), self.name)
 
 
 def captures_in(folder: Path) -> dict[str, Capture]:

@@ -66,12 +66,12 @@ from gsmap.localize.retrieval import most_alike
 from gsmap.localize.settling import Picture
 from gsmap.localize.together import words_of
 from gsmap.localize.words import Words, words_for
-from gsmap.map.logs import logged
+from gsmap.map.progress_logging import log_progress
 from gsmap.map.small_map import SmallLocalizer, export_small
 from gsmap.map.stages.localize import Localizer
 from gsmap.render import render
 from gsmap.types import Cameras, Sim3
-from gsmap.types.localization import Photo, Placement, SceneFeatures
+from gsmap.types.localization import LocalizationResult, Photo, SceneFeatures
 from gsmap.types.segments import merged
 from tools.fit.localize import places
 
@@ -95,7 +95,9 @@ class World:
     ids: dict[str, str]  # by name
     crowd: set[str] = field(default_factory=set)  # ids of scenes that show nothing that is asked for
 
-    def localize(self, photo: Photo, allowed: set[str], within: Localizer | None = None) -> tuple[Placement, float]:
+    def localize(
+        self, photo: Photo, allowed: set[str], within: Localizer | None = None
+    ) -> tuple[LocalizationResult, float]:
         """In a map of some of its scenes; and CPU seconds.
 
         Args:
@@ -208,7 +210,7 @@ def world(data: Path, work: Path, names: list[str]) -> World:
         m.update(*(data / f"{name}.ply" for name in names))
         print(f"{path.name}: {time.process_time() - began:.0f} CPU s in this process")
     began = time.process_time()
-    localizer = Localizer(m.store, m.settings, logged(None))
+    localizer = Localizer(m.store, m.settings, log_progress(None))
     print(f"{len(localizer.scenes)} scenes, {time.process_time() - began:.1f} CPU s here")
     truth, ids = {}, {}
     for scene in localizer.scenes.values():
@@ -337,7 +339,7 @@ PERTURBED: dict[str, Callable[[Photo], Photo]] = {
 def retrieval_alone(held: World) -> Localise:
     """The pose of the view that looks most alike."""
 
-    def localise(photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
+    def localise(photo: Photo, allowed: set[str]) -> tuple[LocalizationResult, float]:
         began = time.process_time()
         localizer = held.localizer
         index = localizer.index.only(allowed)
@@ -345,11 +347,11 @@ def retrieval_alone(held: World) -> Localise:
         found = photo_features(picture, localizer.extractor, localizer.params.matching.smooth_px)
         views = most_alike(index, found, picture.intrinsics_px, 1, localizer.params.retrieval)
         if not views:
-            return Placement(photo.name, "no view is like it"), time.process_time() - began
+            return LocalizationResult(photo.name, "no view is like it"), time.process_time() - began
         scene, view = views[0]
         placed = localizer.placed[scene]
         pose = _in_map(held, scene, placed.features.cameras.T_frame_camera[view])
-        return Placement(photo.name, "", pose, None, placed.component, (scene,)), time.process_time() - began
+        return LocalizationResult(photo.name, "", pose, None, placed.component, (scene,)), time.process_time() - began
 
     return localise
 
@@ -369,7 +371,7 @@ class Started:
     def __init__(self, held: World, shots: list[Shot]) -> None:
         self.held, self.shots, self.rng = held, {shot.photo.name: shot for shot in shots}, np.random.default_rng(0)
 
-    def localize(self, photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
+    def localize(self, photo: Photo, allowed: set[str]) -> tuple[LocalizationResult, float]:
         shot, localizer = self.shots[photo.name], self.held.localizer
         begin = time.process_time()
         picture, scale = prepared(photo, localizer.params)
@@ -384,12 +386,12 @@ class Started:
         found = judged_pose(picture, start, localizer.placed, localizer.params)
         seconds = time.process_time() - begin
         if found.covariance is None:
-            return Placement(photo.name, "nothing was found again"), seconds
+            return LocalizationResult(photo.name, "nothing was found again"), seconds
         answer = found.settled.T_metric_camera.copy()
         answer[:3, 3] /= unit
         side = np.r_[np.ones(3), np.full(3, 1 / unit)]
         known = found.covariance * np.outer(side, side)
-        return Placement(
+        return LocalizationResult(
             photo.name, "", answer, known, component, tuple(scenes), picture.intrinsics_px / scale
         ), seconds
 
@@ -457,7 +459,7 @@ class PosedPhotos:
             self.features.append((scene, described, words_of(found), at))
         print(f"features of {len(self.features)} posed photographs: {time.process_time() - began:.0f} CPU s")
 
-    def __call__(self, photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
+    def __call__(self, photo: Photo, allowed: set[str]) -> tuple[LocalizationResult, float]:
         import pycolmap
 
         began = time.process_time()
@@ -473,7 +475,7 @@ class PosedPhotos:
             rows, columns = matched(mine, described, localizer.params.matching)
             component = localizer.placed[scene].component
             parts.setdefault(component, []).append((scene, found.pixels[rows], points[columns]))
-        best, why = None, Placement(photo.name, "too few agree")
+        best, why = None, LocalizationResult(photo.name, "too few agree")
         for component, held in parts.items():
             pixels, points = (np.concatenate([part[n] for part in held]).astype(np.float64) for n in (1, 2))
             if len(pixels) < 4:
@@ -491,7 +493,7 @@ class PosedPhotos:
             pose[:3, 3] /= localizer.metres.get(component, 1.0)
             ids = np.repeat(np.arange(len(held)), [len(part[1]) for part in held])
             most = np.bincount(ids[answer["inlier_mask"]], minlength=len(held)).argmax()
-            why = Placement(photo.name, "", pose, None, component, (held[most][0],))
+            why = LocalizationResult(photo.name, "", pose, None, component, (held[most][0],))
         return why, time.process_time() - began
 
 
@@ -512,7 +514,7 @@ def _photographs(data: Path, held: World) -> Iterator[tuple[Shot, str]]:
 # --- what is said ----------------------------------------------------------------------------------------------------
 
 
-Localise = Callable[[Photo, set[str]], tuple[Placement, float]]
+Localise = Callable[[Photo, set[str]], tuple[LocalizationResult, float]]
 
 
 def measure(
@@ -637,7 +639,7 @@ def small_map(held: World, data: Path, work: Path, share: float) -> SmallLocaliz
     whole = sum((data / f"{name}.ply").stat().st_size for name in held.ids)
     store, settings = held.localizer.store, held.localizer.settings
     began = time.process_time()
-    report = export_small(store, out, int(share * whole), settings, logged(None))
+    report = export_small(store, out, int(share * whole), settings, log_progress(None))
     print(
         f"small map: {report.num_bytes / 1e6:.2f} MB of {whole / 1e6:.1f} ({report.num_bytes / whole:.1%}), "
         f"{time.process_time() - began:.1f} CPU s"

@@ -26,7 +26,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import Capture, read_captures
 from gsmap.merge import default_params, merge, methods, reach_m
 from gsmap.merge.tile import LazyScene, merge_tile
-from gsmap.types import Gaussians, MergeResult, PlacedScene, Sim3
+from gsmap.types import Gaussians, MergeResult, PosedScene, Sim3
 
 
 def main() -> None:
@@ -105,7 +105,7 @@ def oracle_row(captures: list[Capture], images: Path) -> dict:
 
 def merge_row(captures, S_map_scene, images, method, params, name, *, run=None) -> dict:
     scenes = [
-        PlacedScene(
+        PosedScene(
             transform_gaussians(c.gaussians, S_map_scene[c.name]),
             transform_cameras(c.cameras, S_map_scene[c.name]),
             c.name,

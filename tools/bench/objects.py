@@ -31,7 +31,7 @@ from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.objects.segments import find_segments
 from gsmap.objects import RenderedViews, SegmentedScene, find_changed_segment, make_objects, render_views
-from gsmap.types import MapObject, PlacedScene, Segments
+from gsmap.types import MapObject, PosedScene, Segments
 from tools.make.change_truth import Truth, owners
 
 _SHOWN = 60  # Gaussians of a piece that a capture shows, or else it says little of it
@@ -86,7 +86,7 @@ def score(truth: Truth, with_changes: bool) -> Counter[str]:
 def _told(truth: Truth, captures: list[SegmentedScene]) -> tuple[list[Any], list[Any]]:
     """What the changes between the first two captures say of their things, as `make_objects` takes it."""
     sides = [
-        PlacedScene(truth.gaussians(when), truth.cameras(when), when, f"2026-01-0{i + 1}T00:00:00+00:00")
+        PosedScene(truth.gaussians(when), truth.cameras(when), when, f"2026-01-0{i + 1}T00:00:00+00:00")
         for i, when in enumerate(truth.times[:2])
     ]
     moved: list[Any] = []

@@ -53,7 +53,7 @@ from gsmap.register.metric_scene import MetricPair
 from gsmap.register.pose import fit_pose
 from gsmap.register.proposers import graph
 from gsmap.register.refiners import icp
-from gsmap.types import PlacedScene, Sim3
+from gsmap.types import PosedScene, Sim3
 from gsmap.types.registration import Proposal
 from tools.bench import paper_networks
 from tools.bench.merge import oracle_row, ply_mb
@@ -360,7 +360,7 @@ def merging(options: argparse.Namespace, folder: Path, found: dict[str, dict]) -
         scenes = []
         for c in captures:
             placed = transform_gaussians(c.gaussians, S[c.name]), transform_cameras(c.cameras, S[c.name])
-            scenes.append(PlacedScene(*placed, c.name, c.captured_at))
+            scenes.append(PosedScene(*placed, c.name, c.captured_at))
         start = time.process_time()
         result = merge(scenes, method, params)
         seconds = time.process_time() - start

@@ -35,7 +35,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import read_captures
 from gsmap.merge import default_params, merge
 from gsmap.render import render
-from gsmap.types import Cameras, Gaussians, KeptPhoto, PlacedScene
+from gsmap.types import Cameras, Gaussians, PosedScene, ReferencePhoto
 from tools.bench.merge import true_pose
 
 OFF_DEG, OFF_M = 0.15, 0.009
@@ -51,25 +51,25 @@ class Taken:
     scene: int
 
 
-def house(folder: Path, names: Sequence[str]) -> tuple[list[PlacedScene], list[Taken], list[Taken]]:
+def house(folder: Path, names: Sequence[str]) -> tuple[list[PosedScene], list[Taken], list[Taken]]:
     """The scenes, the photographs that are kept, and those that are not."""
     scenes, every = [], []
     for number, capture in enumerate(read_captures([folder / f"{name}.ply" for name in names])):
         S = true_pose(folder / "truth" / f"{capture.name}.json")
         cameras = transform_cameras(capture.cameras, S)
-        scenes.append(PlacedScene(transform_gaussians(capture.gaussians, S), cameras, capture.name))
+        scenes.append(PosedScene(transform_gaussians(capture.gaussians, S), cameras, capture.name))
         found = find_images(capture.cameras, folder / "frames")
         every.append([Taken(cameras[[row]], path, number) for row, path in found.items()])
     return scenes, [one for mine in every for one in mine[::2]], [one for mine in every for one in mine[1::2]]
 
 
-def made(folder: Path) -> tuple[list[PlacedScene], list[Taken], list[Taken]]:
+def made(folder: Path) -> tuple[list[PosedScene], list[Taken], list[Taken]]:
     """The same of a made place."""
     scenes = []
     for capture in read_captures([folder / "c0.ply", folder / "c1.ply"]):
         S = true_pose(folder / "truth" / f"{capture.name}.json")
         placed = transform_gaussians(capture.gaussians, S), transform_cameras(capture.cameras, S)
-        scenes.append(PlacedScene(*placed, capture.name))
+        scenes.append(PosedScene(*placed, capture.name))
     kept, others = [], []
     for number, told in enumerate(json.loads((folder / "photos.json").read_text())):
         pose, lens = np.array(told["T_world_camera"])[None], np.array(told["intrinsics"])[None]
@@ -107,14 +107,14 @@ def psnr_db(gaussians: Gaussians, one: Taken, *, gained: bool) -> float:
 
 def measure(
     name: str,
-    made_of: Callable[[], tuple[list[PlacedScene], list[Taken], list[Taken]]],
+    made_of: Callable[[], tuple[list[PosedScene], list[Taken], list[Taken]]],
     shares: Sequence[float],
     gained: bool,
 ) -> list[tuple[float, float, float]]:
     """By share: PSNR of the photographs that were kept and of the others, and CPU seconds; a line of each."""
     scenes, kept, others = made_of()
     rng, out = np.random.default_rng(1), []
-    photos = [KeptPhoto(off(one.camera, rng), partial(picture, one.path)) for one in kept]
+    photos = [ReferencePhoto(off(one.camera, rng), partial(picture, one.path)) for one in kept]
     given = [
         replace(scene, photos=tuple(p for p, one in zip(photos, kept, strict=True) if one.scene == number))
         for number, scene in enumerate(scenes)

@@ -41,7 +41,7 @@ _SIZE_PX = (240, 180)
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class PointCloud:
     """A scan as a file, and where its world lies in it.
 
     Args:
@@ -93,7 +93,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         maps: dict[str, tuple[Path, np.ndarray]] = {}
-        clouds: dict[str, list[Cloud]] = {}
+        clouds: dict[str, list[PointCloud]] = {}
         if args.kitchen:
             maps["kitchen"] = kitchen_map(folder, args.kitchen[1])
             clouds["kitchen"] = list(kitchen_scans(folder, args.kitchen[0], args.colourless))
@@ -118,7 +118,7 @@ def main() -> None:
             print(f"    wrong: {wrong}")
 
 
-def judge(m: Map, cloud: Cloud, S_map_world: np.ndarray | None, tally: Tally) -> str:
+def judge(m: Map, cloud: PointCloud, S_map_world: np.ndarray | None, tally: Tally) -> str:
     """Look for a scan, and count what was said; without truth it lies elsewhere."""
     row = m.localize_scan(cloud.path, **cloud.options)  # type: ignore[arg-type]
     tally.seconds.append(row.seconds)
@@ -141,7 +141,7 @@ def judge(m: Map, cloud: Cloud, S_map_world: np.ndarray | None, tally: Tally) ->
     return f"WRONG: {text}"
 
 
-def errors(row: ScanRow, cloud: Cloud, S_map_world: np.ndarray) -> tuple[float, float, float]:
+def errors(row: ScanRow, cloud: PointCloud, S_map_world: np.ndarray) -> tuple[float, float, float]:
     """Degrees, metres at the scan's middle, and the squared error over the covariance, 6 degrees of freedom."""
     assert row.S_map_scan is not None
     assert row.covariance is not None
@@ -208,7 +208,7 @@ def kitchen_map(folder: Path, splats: Path) -> tuple[Path, np.ndarray]:
         return path, poses.poses[first.id].S_map_scene.matrix() @ truth
 
 
-def kitchen_scans(folder: Path, frames: Path, colourless: bool) -> Iterator[Cloud]:
+def kitchen_scans(folder: Path, frames: Path, colourless: bool) -> Iterator[PointCloud]:
     """Frames by themselves, and clouds of some of them."""
     K = np.loadtxt(frames / "camera-intrinsics.txt")
     intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
@@ -223,7 +223,9 @@ def kitchen_scans(folder: Path, frames: Path, colourless: bool) -> Iterator[Clou
             options: dict[str, object] = {"intrinsics": tuple(intrinsics)}
             options |= {} if grey else {"colour": frames / f"{name}.color.jpg"}
             middle = np.linalg.inv(pose) @ [*points.mean(0), 1.0]
-            yield Cloud(name + " grey" * grey, frames / f"{name}.depth.png", np.linalg.inv(pose), middle[:3], options)
+            yield PointCloud(
+                name + " grey" * grey, frames / f"{name}.depth.png", np.linalg.inv(pose), middle[:3], options
+            )
     for k, some in enumerate((names, names[:4], names[4:], names[::2], names[1::2], names[:2], names[-2:])):
         points = np.concatenate([parts[name][0] for name in some])
         colours = np.concatenate([parts[name][1] for name in some])
@@ -232,13 +234,13 @@ def kitchen_scans(folder: Path, frames: Path, colourless: bool) -> Iterator[Clou
 
 def _clouds(
     folder: Path, name: str, points: np.ndarray, colours: np.ndarray, seed: int, colourless: bool
-) -> Iterator[Cloud]:
+) -> Iterator[PointCloud]:
     T = own_frame(seed)
     moved = points @ T[:3, :3].T + T[:3, 3]
     for grey in (False, True)[: 1 + colourless]:
         title = name + " grey" * grey
         path = write_ply(folder / f"{title.replace(' ', '_')}.ply", moved, None if grey else colours)
-        yield Cloud(title, path, T, moved.mean(0))
+        yield PointCloud(title, path, T, moved.mean(0))
 
 
 # --- made flats -------------------------------------------------------------------------------------------------------
@@ -271,7 +273,7 @@ def made_map(folder: Path, name: str, seed: int, place: Place) -> tuple[Path, np
     return path, np.array(json.loads(about.read_text()))
 
 
-def made_scans(folder: Path, name: str, seed: int, place: Place, colourless: bool) -> Iterator[Cloud]:
+def made_scans(folder: Path, name: str, seed: int, place: Place, colourless: bool) -> Iterator[PointCloud]:
     """A scan of each room, and one of a part of it."""
     for room in range(len(place.rooms)):
         for count in (10, 3):

@@ -28,8 +28,8 @@ import numpy as np
 
 import gsmap.map
 from gsmap import formats
-from gsmap.map import persisting
-from gsmap.map.persisting import Passing
+from gsmap.map import static_filter
+from gsmap.map.static_filter import DynamicContent
 from gsmap.types import PoseGraph, ScenePose
 from tools.make.change_truth import Truth, owners
 
@@ -68,9 +68,9 @@ def score(truth: Truth) -> tuple[dict[str, Counter[str]], float]:
         poses = {ids[when]: ScenePose(ids[when], truth.T_place_scene(when), 0, "placed") for when in truth.times}
         m.store.revisions.save(PoseGraph(poses))
         started = time.process_time()
-        known, _ = m.what_stays()
+        known, _ = m.static_content()
         seconds = time.process_time() - started
-        passing = persisting.what_passes(m.store, known)
+        passing = static_filter.find_dynamic_content(m.store, known)
         changed = set()
         for a, b in combinations(truth.times, 2):
             for change in truth.changes(a, b):
@@ -82,7 +82,7 @@ def score(truth: Truth) -> tuple[dict[str, Counter[str]], float]:
             owner = owners(truth, when, means)
             kinds = {state["id"]: state["kind"] for state in truth.states(when)}
             for way in WAYS:
-                gone = persisting.rows(m.store, scene, _only(passing[scene], way))
+                gone = static_filter.dynamic_rows(m.store, scene, _only(passing[scene], way))
                 for piece in np.unique(owner[owner >= 0]).tolist():
                     mine = owner == piece
                     what = "changed" if piece in changed else "stayed" if kinds[piece] in _THINGS else "building"
@@ -93,7 +93,7 @@ def score(truth: Truth) -> tuple[dict[str, Counter[str]], float]:
     return counts, seconds
 
 
-def _only(passing: Passing, way: str) -> Passing:
+def _only(passing: DynamicContent, way: str) -> DynamicContent:
     without = {"both": {}, "objects": {"changes": ()}, "changes": {"things": ()}}[way]
     return replace(passing, **without)
 

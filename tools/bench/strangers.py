@@ -34,7 +34,7 @@ from gsmap.localize import localize_photo
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.methods import family
-from gsmap.types.localization import Photo, Placement
+from gsmap.types.localization import LocalizationResult, Photo
 from gsmap_synthetic.capture import unused_doors
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.streets import make_street, street_routes
@@ -53,7 +53,7 @@ class Map:
         self.index = index_of(scenes, params)
         self.extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
 
-    def ask(self, image: np.ndarray, intrinsics: list[float], name: str) -> Placement:
+    def ask(self, image: np.ndarray, intrinsics: list[float], name: str) -> LocalizationResult:
         photo = Photo(image, np.array(intrinsics), 0.0, name)
         return localize_photo(photo, self.index, self.scenes, self.extractor, self.params)
 
@@ -93,7 +93,7 @@ def street(work: Path):
     return place, folder
 
 
-def report(name: str, rows: list[tuple[str, Placement, float]], seconds: float) -> None:
+def report(name: str, rows: list[tuple[str, LocalizationResult, float]], seconds: float) -> None:
     """How many were placed, those by name, and how probable the most probable others were."""
     placed = [(who, one, differs) for who, one, differs in rows if one.is_placed]
     refused = sorted((one.probability for _, one, _ in rows if not one.is_placed), reverse=True)

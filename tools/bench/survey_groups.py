@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.optimize import optimize
-from gsmap.types.world import LOCAL, ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldFrame, WorldTie
+from gsmap.types.world import LOCAL, ControlPoint, Georeference, ImagePoint, PositionFix, ScaleBar, Survey, WorldFrame
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 FEET = 0.3048
@@ -78,7 +78,7 @@ class Made:
             at += np.outer(np.linspace(-0.5, 0.5, len(at)), self.rng.normal(size=3) * common[[0, 0, 1]] * drift)
             at = at if change is None else change(at)
             fixes += [
-                Fix(name, self.site.names[k], centre, LOCAL, p, tuple(own), tuple(common), float(sea))
+                PositionFix(name, self.site.names[k], centre, LOCAL, p, tuple(own), tuple(common), float(sea))
                 for name, centre, p in zip(cameras.names, cameras.centers, at, strict=True)
             ]
         return Survey(self.site.frame, fixes=tuple(fixes))
@@ -91,7 +91,7 @@ class Made:
         fixes = []
         for k in chosen:
             at = self.site.truth[k].translation + self.rng.normal(size=3) * sigma_m + shift
-            fixes.append(Fix("survey", self.site.names[k], np.zeros(3), LOCAL, at, (sigma_m, sigma_m)))
+            fixes.append(PositionFix("survey", self.site.names[k], np.zeros(3), LOCAL, at, (sigma_m, sigma_m)))
         return Survey(self.site.frame, fixes=tuple(fixes))
 
     def bars(self, factor: float = 1.0) -> Survey:
@@ -272,7 +272,7 @@ def made(seed: int) -> Made:
     return Made(surveyed_site(seed, params, frame), rng)
 
 
-def solved(site: Site, survey: Survey) -> tuple[WorldTie, float, float]:
+def solved(site: Site, survey: Survey) -> tuple[Georeference, float, float]:
     """The tie, how far off it has the first capture's origin, and the standard deviation of that, m."""
     answer = optimize(site.names, site.edges, survey=survey)
     tie = answer.world[0]

@@ -197,7 +197,7 @@ def trees(args: argparse.Namespace) -> None:
 
 def catalog(args: argparse.Namespace) -> None:
     from gsmap.map import create
-    from gsmap.map.viewing import MapDoors
+    from gsmap.map.page_source import MapPageSource
     from gsmap.types import Cameras
 
     none = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2)), (), True)
@@ -207,7 +207,7 @@ def catalog(args: argparse.Namespace) -> None:
             scene, _ = m.store.scenes.add(made_room(i, 50), none, name=f"room {i}")
             poses[scene.id] = ScenePose(scene.id, Sim3(np.eye(3), np.array([7.0 * i, 0, 0])), 0, "placed", np.eye(7))
         m.store.revisions.save(PoseGraph(poses))
-        doors = MapDoors(m.store, m.settings)
+        doors = MapPageSource(m.store, m.settings)
         for name in ("first", "same", "changed"):
             if name == "changed":
                 m.edit("room 3", name="another")
@@ -238,9 +238,9 @@ def fidelity(args: argparse.Namespace) -> None:
             '<!doctype html><html><head><link rel="icon" href="data:," /><link rel="stylesheet" href="style.css" />'
             '</head><body><canvas tabindex="0"></canvas><script type="module" src="page.js"></script></body></html>'
         )
-        from gsmap.map.viewing import MapDoors, cache_folder
+        from gsmap.map.page_source import MapPageSource, cache_folder
 
-        doors = MapDoors(m.store, m.settings)
+        doors = MapPageSource(m.store, m.settings)
         placed = [entry for entry in doors.content().scenes if entry.pose is not None and entry.pose.component == 0]
         union = Gaussians.concatenate(
             [transform_gaussians(m.store.scenes.gaussians(e.scene.id), e.S_map_scene) for e in placed]

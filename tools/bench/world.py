@@ -28,7 +28,7 @@ from gsmap.map import Map
 from gsmap.map.stages.georeference import Request
 from gsmap.optimize import joint_covariance, optimize
 from gsmap.types import PoseGraph
-from gsmap.types.world import ControlPoint, ImagePoint, Survey, WorldTie
+from gsmap.types.world import ControlPoint, Georeference, ImagePoint, Survey
 from gsmap.world.crs import ECEF
 from gsmap.world.frame import of_frame, to_frame
 from gsmap.world.survey import in_frame
@@ -49,7 +49,7 @@ def survey_of(site: Site, sigma_m: float = 0.01, sigma_px: float = 0.5) -> Surve
     return in_frame(Survey(site.frame, tuple(points), tuple(images)))
 
 
-def errors(site: Site, answer: PoseGraph, tie: WorldTie, marks: str) -> np.ndarray:
+def errors(site: Site, answer: PoseGraph, tie: Georeference, marks: str) -> np.ndarray:
     """(N, 3) m: where the map has marks of a kind (``G``, ``C``), less where they are."""
     assert tie.S_world_map is not None
     truth, out = dict(zip(site.names, site.truth, strict=True)), []

@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 
 from gsmap.change import VERSION, Params, compare
 from gsmap.change.confidence import pieces
-from gsmap.types import PlacedScene
+from gsmap.types import PosedScene
 from tools.bench import change_scores as scores
 from tools.make.change_truth import VOXEL_M, Truth, changed_voxels
 
@@ -101,7 +101,7 @@ def _pairs(truth: Truth) -> list[tuple[str, str]]:
 
 
 def _rows(truth: Truth, before: str, after: str) -> list[Row]:
-    scenes = (PlacedScene(truth.gaussians(t), truth.cameras(t), t, truth.captured_at(t)) for t in (before, after))
+    scenes = (PosedScene(truth.gaussians(t), truth.cameras(t), t, truth.captured_at(t)) for t in (before, after))
     report = compare(*scenes, replace(Params(), min_confidence=0.0))
     true = [(change["name"], voxels) for change, voxels in changed_voxels(truth, before, after) if len(voxels)]
     every = np.concatenate([voxels for _, voxels in true]) if true else np.zeros((0, 3))

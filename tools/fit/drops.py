@@ -23,7 +23,7 @@ import numpy as np
 
 from gsmap.compare import segments
 from gsmap.merge.changes import resolve_changes
-from gsmap.types import PlacedScene
+from gsmap.types import PosedScene
 from tools.bench import change_scores as scores
 from tools.make.change_truth import Truth
 
@@ -60,8 +60,8 @@ def main() -> int:
     return 0
 
 
-def _placed(truth: Truth, time: str) -> PlacedScene:
-    return PlacedScene(truth.gaussians(time), truth.cameras(time), time, truth.captured_at(time))
+def _placed(truth: Truth, time: str) -> PosedScene:
+    return PosedScene(truth.gaussians(time), truth.cameras(time), time, truth.captured_at(time))
 
 
 if __name__ == "__main__":

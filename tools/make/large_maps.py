@@ -30,7 +30,7 @@ import gsmap.retrieve
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import exp
 from gsmap.map import Map
-from gsmap.map.looking_up import keys_of_lookups
+from gsmap.map.scene_lookup import keys_of_lookups
 from gsmap.map.stages import describe, register
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key

@@ -172,15 +172,15 @@ def keep_objects(m: Map) -> None:
     """Two objects, one of them seen in two captures and named; a room."""
     from gsmap.objects import recipe_key as object_recipe
     from gsmap.store.objects import Computed, ObjectSet
-    from gsmap.types import MapObject, Room, Sighting
+    from gsmap.types import MapObject, ObjectObservation, Room
 
     placed = m.pose_graph().poses
     a, b = (m.store.scenes.get(name).id for name in ("hall", "stairwell"))
     box = np.array([[0.0, 0, 0], [1.0, 0.5, 0.75]])
-    seen, none = Sighting(a, "seen", 0, box), Sighting(b, "absent", -1, None, 0.75, a)
+    seen, none = ObjectObservation(a, "seen", 0, box), ObjectObservation(b, "absent", -1, None, 0.75, a)
     grey = np.array([50.0, 0, 0], np.float32)
-    sofa = MapObject("0" * 8, 0, box, box.mean(0), grey, (seen, Sighting(b, "seen", 1, box)))
-    lamp = MapObject("1" * 8, 0, box + 2, box.mean(0) + 2, grey, (Sighting(a, "seen", 1, box + 2), none))
+    sofa = MapObject("0" * 8, 0, box, box.mean(0), grey, (seen, ObjectObservation(b, "seen", 1, box)))
+    lamp = MapObject("1" * 8, 0, box + 2, box.mean(0) + 2, grey, (ObjectObservation(a, "seen", 1, box + 2), none))
     cells = np.ones((20, 30), bool)
     cells[:5, :5] = False
     room = Room(np.array([-1.0, -1.5]), cells, 0.125, 0.0, 2.5)
@@ -194,10 +194,10 @@ def keep_objects(m: Map) -> None:
 
 def keep_photo(m: Map) -> None:
     """A photograph as it might have been localised in the hall, and one that was taken back."""
-    from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
+    from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 
     for number in (1, 2):
-        sighting = PhotoSighting(
+        sighting = LocalizedPhoto(
             digest=f"{number:064x}",
             name=f"phone{number}.jpg",
             captured_at="2026-01-05T03:04:05+00:00",
@@ -207,7 +207,7 @@ def keep_photo(m: Map) -> None:
             intrinsics_px=np.array([500.0, 500, 320, 240]),
             size_px=(640, 480),
             probability=0.984375,
-            things=(ThingInPhoto(np.array([1.0, 0.5, 0.25]), "absent", 0.75),),
+            things=(PhotoObjectObservation(np.array([1.0, 0.5, 0.25]), "absent", 0.75),),
         )
         content = BytesIO()
         Image.new("RGB", (64, 48), (200, 180, 20 * number)).save(content, "JPEG")

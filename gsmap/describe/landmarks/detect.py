@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmap.geometry.cells import cell_means
 from gsmap.geometry.neighbours import spatial_order
-from gsmap.types.views import Cloud
+from gsmap.types.views import PointCloud
 
 CELL_M = 0.025  # grid of the finest octave, metres under the layer's unit; its blobs have a scale of 1.6 cells
 NUM_OCTAVES = 4  # number of scales, doubling; those finer than the capture's Gaussians are skipped
@@ -60,7 +60,7 @@ class OctaveCache:
         self._levelled: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
 
-    def levelled(self, cloud: Cloud, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def levelled(self, cloud: PointCloud, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return points, L*a*b* and areas of the cloud, rotated by ``level`` (3, 3) and in spatial order, which is
         cache-friendly. Every call must pass the same cloud.
         """

@@ -20,7 +20,7 @@ from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey
 from gsmap.types import NodeLayer
 from gsmap.types.plain import plain
-from gsmap.types.views import Cloud
+from gsmap.types.views import PointCloud
 
 VERSION = 7
 
@@ -60,7 +60,11 @@ def descriptor_id(params: Params, *, upright: bool = True) -> str:
 
 
 def landmark_layer(
-    cloud: Cloud, up: np.ndarray | None, unit_m: float, params: Params | None = None, octaves: OctaveCache | None = None
+    cloud: PointCloud,
+    up: np.ndarray | None,
+    unit_m: float,
+    params: Params | None = None,
+    octaves: OctaveCache | None = None,
 ) -> NodeLayer:
     """Compute the landmarks of a surface cloud.
 
@@ -105,7 +109,7 @@ def landmark_layer(
     )
 
 
-def gravity_free(layer: NodeLayer, cloud: Cloud, params: Params | None = None) -> NodeLayer:
+def gravity_free(layer: NodeLayer, cloud: PointCloud, params: Params | None = None) -> NodeLayer:
     """Recompute an upright scene's landmarks with shell contexts, comparable with scenes of unknown vertical.
 
     Args:

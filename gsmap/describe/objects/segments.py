@@ -17,7 +17,7 @@ from gsmap.geometry.neighbours import nearest_neighbours, nearest_of
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians, Segments
-from gsmap.types.views import Cloud
+from gsmap.types.views import PointCloud
 
 VERSION = 1
 
@@ -47,7 +47,7 @@ _MIN_AREA_M2 = 0.03  # hanging segments that are smaller are dropped
 _ASSIGN_M = 0.06  # Gaussians off the surface belong to the segment of the nearest surface within this distance
 
 
-def find_segments(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: float) -> Segments:
+def find_segments(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None, unit_m: float) -> Segments:
     """Segment a capture into physical objects, the largest first; none where up is unknown.
 
     Deterministic for Gaussians in the same order. Takes half a CPU second for 50,000.
@@ -83,7 +83,7 @@ def find_segments(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, uni
     )
 
 
-def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: float) -> np.ndarray:
+def _members(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None, unit_m: float) -> np.ndarray:
     """Return the segment (N,) int32 of each Gaussian, -1 for none."""
     out = np.full(len(gaussians), -1, np.int32)
     if up is None or len(cloud) < 4 * _NEIGHBOURS:
@@ -113,7 +113,7 @@ def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: 
     return out
 
 
-def _thinned(cloud: Cloud) -> np.ndarray:
+def _thinned(cloud: PointCloud) -> np.ndarray:
     """Select rows of the cloud, one per grid cell so that about `_MAX_POINTS` are left; all where it is small."""
     if len(cloud) <= _MAX_POINTS:
         return np.arange(len(cloud))

@@ -14,7 +14,7 @@ import numpy as np
 from gsmap._native import graph_parts
 from gsmap.describe.cloud import downsample, local_planes
 from gsmap.geometry.neighbours import nearest_neighbours, nearest_of
-from gsmap.types.views import Cloud, Mask, SceneContext, View
+from gsmap.types.views import Mask, PointCloud, SceneContext, View
 
 VERSION = 1
 MODELS: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ def make(context: SceneContext, params: Params) -> BuiltinSegmenter:
 class BuiltinSegmenter:
     """Masks of the surface's parts."""
 
-    def __init__(self, params: Params, cloud: Cloud, num_gaussians: int) -> None:
+    def __init__(self, params: Params, cloud: PointCloud, num_gaussians: int) -> None:
         self.part_of_gaussian = np.full(num_gaussians + 1, -1)  # the last row is for pixels where nothing was drawn
         if len(cloud):
             self.part_of_gaussian[cloud.index] = cut_surface(cloud, params)
@@ -72,7 +72,7 @@ class BuiltinSegmenter:
         return masks
 
 
-def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
+def cut_surface(cloud: PointCloud, params: Params) -> np.ndarray:
     """Segment the cloud into parts (N,) int, numbered from 0."""
     # A cell so large that the surface covers about _NUM_SAMPLES of them.
     cell = float(np.sqrt(cloud.areas.sum() / _NUM_SAMPLES)) or 1e-9

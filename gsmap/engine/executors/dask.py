@@ -19,7 +19,7 @@ from typing import Any
 
 from gsmap.engine.worker import answer
 from gsmap.errors import ConfigError, GsmapError, MissingDependencyError
-from gsmap.methods.executor import SetAside
+from gsmap.methods.executor import QuarantinedJob
 
 VERSION = 1
 
@@ -140,7 +140,7 @@ class DaskWorkers:
         try:
             packed = future.result(timeout=self._params.timeout_s)
         except KilledWorker as error:
-            return True, SetAside(f"the workers that tried it died, most likely for lack of memory ({error})")
+            return True, QuarantinedJob(f"the workers that tried it died, most likely for lack of memory ({error})")
         except (CancelledError, TimeoutError) as error:
             if self._client is None or self._client.status != "running":
                 raise self._lost() from error
@@ -198,7 +198,7 @@ def do(run: str, key: str, message: bytes) -> bytes:
     before = begun()
     if before >= _ATTEMPTS:
         reason = f"{before} workers that tried it died, most likely for lack of memory"
-        return zlib.compress(pickle.dumps((True, SetAside(reason))), 1)
+        return zlib.compress(pickle.dumps((True, QuarantinedJob(reason))), 1)
     begun(before + 1)
     packed = zlib.compress(answer(message), 1)
     begun(0)  # losses from now on do not count as attempts

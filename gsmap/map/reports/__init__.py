@@ -1,10 +1,17 @@
-"""What the map answers, as typed rows (`gsmap.types.rows`), read from the store."""
+"""Read typed rows (`gsmap.types.rows`) from the store."""
 
 from gsmap.map.reports.common import checked_pair, names, pair_of, scenes_by_id
 from gsmap.map.reports.notebook import map_html
 from gsmap.map.reports.one_scene import graph_row, prior_row, scene_report
 from gsmap.map.reports.pairs import EDGE_STATUSES, edge_row, edge_rows, pair_report, rows_of_edges
-from gsmap.map.reports.revisions import made_after, mark, pose_change_rows, revision_row, revision_rows, update_report
+from gsmap.map.reports.revisions import (
+    history_position,
+    made_after,
+    pose_change_rows,
+    revision_row,
+    revision_rows,
+    update_report,
+)
 from gsmap.map.reports.scenes import SCENE_STATUSES, ingest_row, pose_rows, scene_row, scene_rows
 from gsmap.map.reports.upkeep import check_report, export_report, model_rows, prune_report, setting_rows, tile_rows
 from gsmap.map.reports.world import world_report
@@ -21,7 +28,7 @@ __all__ = [
     "ingest_row",
     "made_after",
     "map_html",
-    "mark",
+    "history_position",
     "model_rows",
     "names",
     "pair_of",

@@ -1,4 +1,4 @@
-"""What all reports share: names by id, and words that may be asked for."""
+"""Helpers shared by all reports: names by id, checked filters, pairs."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
-from gsmap.map.one_state import of_one_state
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.types import Scene
 from gsmap.types.rows import SceneRef
 
 
-@of_one_state
+@snapshot_read
 def names(store: Store) -> dict[str, str]:
-    """The name of every scene by its id, removed ones included."""
-    return ByScene(store.scenes.names())
+    """Return the name of every scene by id, removed scenes included."""
+    return SceneMapping(store.scenes.names())
 
 
 def scenes_by_id(store: Store) -> dict[str, Scene]:
-    """Every scene by its id, removed ones included."""
-    return ByScene((scene.id, scene) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])
+    """Return every scene by id, removed scenes included."""
+    return SceneMapping((scene.id, scene) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])
 
 
-class ByScene(dict[str, Any]):
-    """What is known of every scene, by its id. A row that names another one is not gsmap's."""
+class SceneMapping(dict[str, Any]):
+    """A mapping by scene id that raises `CorruptError` for unknown ids."""
 
     def __missing__(self, scene: str) -> NoReturn:
         raise CorruptError(
@@ -43,7 +43,7 @@ def one_of(value: str | None, known: Sequence[str]) -> None:
 
 
 def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
-    """The scenes of ``A:B``; a name may itself hold a colon.
+    """Return the scenes of ``A:B``; a name may contain a colon.
 
     Raises:
         NotFoundError: no two scenes are called so.
@@ -61,7 +61,7 @@ def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
 
 
 def checked_pair(a: Scene, b: Scene) -> tuple[Scene, Scene]:
-    """Return two scenes.
+    """Return two scenes after checking that they differ.
 
     Raises:
         ConfigError: they are one.

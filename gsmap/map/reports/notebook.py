@@ -1,4 +1,4 @@
-"""A map as a notebook shows it."""
+"""Show a map in a notebook."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmap.types.rows import MapStatus, SceneRow, TodoRow
 
 
 def map_html(store: Store, status: MapStatus, scenes: Sequence[SceneRow]) -> str:
-    """What the map holds, what is to be done, and its scenes."""
+    """Return the content of a map, its open tasks and its scenes as HTML."""
     facts = [(heading, getattr(status, name)) for name, heading in MapStatus.columns.items()]
     parts = [html_facts(f"Map {PurePosixPath(store.location).name}", facts)]
     if status.todo:

@@ -1,4 +1,4 @@
-"""Everything known of one scene."""
+"""Report one scene in full."""
 
 from __future__ import annotations
 
@@ -6,36 +6,36 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.pairs import edges_of_scene
 from gsmap.map.reports.scenes import row_of_scene
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
 from gsmap.types import Scene, SceneGraph, ScenePose
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import FactRow, GraphRow, LayerRow, NodeRow, PriorRow, SceneEdgeRow, SceneReport
 
 
-@of_one_state
+@snapshot_read
 def scene_report(
     store: Store,
     scene: Scene,
     graph: SceneGraph | None,
     graph_note: str = "",
-    metres: Mapping[int, Metre] | None = None,
+    metres: Mapping[int, MetricScale] | None = None,
 ) -> SceneReport:
-    """Everything known of one scene.
+    """Report a scene with its pose, graph, edges and annotations.
 
     Args:
-        graph: its graph; None where there is none.
-        graph_note: what is to be known of which graph that is.
-        metres: of every component of the newest poses; not told where None.
+        graph: its scene graph; None if there is none.
+        graph_note: remark on the choice of the graph.
+        metres: metric scale of every component of the newest poses; left out if None.
     """
     placed = store.revisions.poses(scene.id)
     pose = placed.get(scene.id)
     known = pose is not None and pose.covariance is not None
     facts = store.scenes.facts(scene.id)
-    metre = (metres or {}).get(pose.component, Metre()) if pose else None
+    metre = (metres or {}).get(pose.component, MetricScale()) if pose else None
     noted = next((fact.value for fact in reversed(facts) if fact.kind == "note"), "")
     return SceneReport(
         **vars(row_of_scene(scene, placed, graph.num_nodes if graph else None, noted, metres)),
@@ -75,7 +75,7 @@ def _translation_sigma(pose: ScenePose) -> float:
 
 
 def prior_row(store: Store, scene: Scene) -> PriorRow | None:
-    """What is known of a scene's pose from outside, and what the newest poses made of it."""
+    """Return the pose prior of a scene and its outcome in the newest poses."""
     prior, newest = store.priors.of(scene.id), store.revisions.newest()
     if prior is None:
         return None
@@ -117,7 +117,7 @@ def _layer_rows(graph: SceneGraph) -> tuple[LayerRow, ...]:
 
 
 def _node_rows(graph: SceneGraph) -> tuple[NodeRow, ...]:
-    """Objects first: they are the ones people browse; then the landmarks of the scene's own unit."""
+    """Return the nodes: objects first, then landmarks of the scene's own unit."""
     shown = [name for name in ("objects", "landmarks") if name in graph.layers] or list(graph.layers)[:1]
     return tuple(
         NodeRow(
@@ -136,7 +136,7 @@ def _node_rows(graph: SceneGraph) -> tuple[NodeRow, ...]:
 
 
 def graph_row(store: Store, scene: Scene, key: RecipeKey) -> GraphRow:
-    """The graph of a scene under a key, which was made."""
+    """Return the row of a stored graph."""
     graph = store.graphs.load(scene.id, key)
     assert graph is not None
     return GraphRow(

@@ -1,14 +1,14 @@
-"""Pairs of scenes: their edges, and all that was found and said of one."""
+"""Report pairs of scenes: edges, evidence and reviews."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
-from gsmap.map.dates import is_after, parsed
-from gsmap.map.one_state import of_one_state
+from gsmap.map.date_filter import is_after, parse_moment
 from gsmap.map.reports.common import names, one_of
 from gsmap.map.reports.scenes import scene_rows
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.store.registrations import StoredRegistration
 from gsmap.types import EdgeOutcome, Registration, Scene
@@ -25,7 +25,7 @@ EDGE_USES: Mapping[str, Callable[[EdgeRow], bool]] = {
 """Words for what the last optimize made of an edge; edges are filtered by them, too."""
 
 
-@of_one_state
+@snapshot_read
 def edge_rows(
     store: Store,
     *,
@@ -35,19 +35,19 @@ def edge_rows(
     tag: str | None = None,
     as_of: str | None = None,
 ) -> list[EdgeRow]:
-    """The current edge of every pair that was tried.
+    """List the current edge of every registered pair.
 
     Args:
-        component, tag: only those both of whose scenes are in it, or have it.
-        status: only those of this status or use: one of `EDGE_STATUSES` or `EDGE_USES`.
-        after: ISO 8601; only those registered after it.
-        as_of: ISO 8601; only those both of whose scenes are dated at or before it.
+        component, tag: restrict to edges with both scenes in the component or with the tag.
+        status: restrict to a status or use: one of `EDGE_STATUSES` or `EDGE_USES`.
+        after: ISO 8601; restrict to edges registered later.
+        as_of: ISO 8601; restrict to edges with both scenes dated at or before it.
 
     Raises:
         ConfigError: no such status, or a date that is none.
     """
     one_of(status, (*EDGE_STATUSES, *EDGE_USES))
-    since = None if after is None else parsed(after)
+    since = None if after is None else parse_moment(after)
     inside = None
     if component is not None or tag is not None or as_of is not None:
         inside = {row.id for row in scene_rows(store, component=component, tag=tag, as_of=as_of)}
@@ -60,38 +60,38 @@ def edge_rows(
     ]
 
 
-@of_one_state
+@snapshot_read
 def edges_of_pairs(store: Store, pairs: Collection[tuple[str, str]]) -> list[EdgeRow]:
-    """The current edges of some pairs of scenes (ids), by the pair's first registration."""
+    """List the current edges of some pairs of scenes (ids), by the pair's first registration."""
     if not pairs:
         return []
     scenes = {scene for pair in pairs for scene in pair}
     return _edge_rows(store, store.registrations.current_of_pairs(pairs), *sorted(scenes))
 
 
-@of_one_state
+@snapshot_read
 def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
-    """The current edges of the pairs of these registrations, in their order."""
+    """List the current edges of the pairs of these registrations, in their order."""
     made = list(made)
     found = edges_of_pairs(store, [(edge.target, edge.source) for edge in made])
     rows = {frozenset((row.target, row.source)): row for row in found}
     return [rows[frozenset((edge.target, edge.source))] for edge in made]
 
 
-@of_one_state
+@snapshot_read
 def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
-    """The current edge of a pair; one that has none (a lone measurement was withdrawn) is ``never registered``."""
+    """Return the current edge of a pair, or a ``never registered`` row."""
     current = store.registrations.get(a.id, b.id)
     return EdgeRow(**_never_registered(a, b)) if current is None else _edge_rows(store, [current], a.id)[0]
 
 
 def edges_of_scene(store: Store, scene: Scene) -> list[EdgeRow]:
-    """The current edge of every pair that one scene was tried in."""
+    """List the current edge of every registered pair of a scene."""
     return _edge_rows(store, store.registrations.current_of(scene.id), scene.id)
 
 
 def _edge_rows(store: Store, edges: Iterable[StoredRegistration], *scenes: str) -> list[EdgeRow]:
-    """Rows of registrations.
+    """Return the rows of registrations.
 
     Args:
         scenes: ids, at least one of each pair; all where none is named.
@@ -135,9 +135,9 @@ def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[s
 _USED: dict[str, bool | str] = {"used": True, "tentative": "tentative", "unused": False}
 
 
-@of_one_state
+@snapshot_read
 def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
-    """Everything known of one pair: its current edge, the evidence it rests on, and all that was said before."""
+    """Report a pair: its current edge, evidence, and history of registrations and reviews."""
     current = store.registrations.get(a.id, b.id)
     events = [
         PairEventRow(at=old.created_at, what=old.registration.status, reason=old.registration.reason)
@@ -163,7 +163,7 @@ def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
 
 
 def _never_registered(a: Scene, b: Scene) -> dict[str, Any]:
-    """The fields of `EdgeRow` of a pair without an edge."""
+    """Return the fields of `EdgeRow` for a pair without an edge."""
     return {
         "target": a.id,
         "target_name": a.name,

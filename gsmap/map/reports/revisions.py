@@ -1,4 +1,4 @@
-"""What the optimiser answered, and how answers differ."""
+"""Report revisions and the differences between them."""
 
 from __future__ import annotations
 
@@ -6,41 +6,41 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gsmap.map.dates import is_after, parsed
-from gsmap.map.metres import metres_of_scenes
-from gsmap.map.one_state import of_one_state
+from gsmap.map.date_filter import is_after, parse_moment
+from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.map.reports.common import names, refs, scenes_by_id
 from gsmap.map.reports.pairs import edges_of_pairs
 from gsmap.map.reports.scenes import scene_rows
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import IngestRow, PairRef, PoseChangeRow, RevisionRow, UpdateReport
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
 
 
-@of_one_state
+@snapshot_read
 def revision_rows(store: Store) -> list[RevisionRow]:
-    """Every answer of the optimiser, oldest first."""
+    """List all revisions, oldest first."""
     name_of, undecided = names(store), store.revisions.undecided()
     return [_revision_row(revision, undecided.get(revision.number, ()), name_of) for revision in store.revisions.list()]
 
 
 def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionRow]:
-    """Those made after a date (ISO 8601); all where it is None.
+    """Keep the revisions made after a date (ISO 8601); all if it is None.
 
     Raises:
         ConfigError: a date that is none.
     """
-    since = None if after is None else parsed(after)
+    since = None if after is None else parse_moment(after)
     return [row for row in rows if since is None or is_after(row.created_at, since)]
 
 
-@of_one_state
+@snapshot_read
 def revision_row(store: Store, number: int) -> RevisionRow:
-    """One answer of the optimiser."""
+    """Return the row of a revision."""
     undecided = store.revisions.undecided(number).get(number, ())
     return _revision_row(store.revisions.one(number), undecided, names(store))
 
@@ -68,9 +68,9 @@ def _revision_row(revision: Revision, undecided: Sequence[tuple[str, str]], name
     )
 
 
-@of_one_state
+@snapshot_read
 def pose_change_rows(store: Store, before: int, after: int, settings: Settings) -> list[PoseChangeRow]:
-    """How each scene differs between two revisions, measured at its middle.
+    """List how each scene's pose differs between two revisions, measured at the scene's centre.
 
     Raises:
         NotFoundError: no such revision.
@@ -100,28 +100,28 @@ def pose_change_rows(store: Store, before: int, after: int, settings: Settings) 
 
 
 @dataclass(frozen=True)
-class Mark:
-    """How far a map's history had come: its newest revision and registration (0 before the first), and its graphs."""
+class HistoryPosition:
+    """A position in a map's history: newest revision and registration (0 before the first), and graphs."""
 
     revision: int
     registration: int
     graphs: Collection[str]
 
 
-@of_one_state
-def mark(store: Store) -> Mark:
-    """How far its history has come."""
-    return Mark(store.revisions.current() or 0, store.registrations.newest(), store.graphs.groups().keys())
+@snapshot_read
+def history_position(store: Store) -> HistoryPosition:
+    """Return the current position in the history."""
+    return HistoryPosition(store.revisions.current() or 0, store.registrations.newest(), store.graphs.groups().keys())
 
 
-@of_one_state
+@snapshot_read
 def update_report(
-    store: Store, ingested: Sequence[IngestRow], since: Mark, metres: Callable[[], Mapping[int, Metre]]
+    store: Store, ingested: Sequence[IngestRow], since: HistoryPosition, metres: Callable[[], Mapping[int, MetricScale]]
 ) -> UpdateReport:
-    """What an update took in, and what of the map has changed since; nothing is read of the rest.
+    """Report what an update ingested and which results changed since a position in the history.
 
     Args:
-        metres: tells those of every component of the newest poses.
+        metres: returns the metric scale of every component of the newest poses.
     """
     scenes, pairs = store.revisions.changed_after(since.revision)
     scenes |= {scene for group, scene in store.graphs.groups().items() if group not in since.graphs}

@@ -1,4 +1,4 @@
-"""The scenes of a map, and where they lie."""
+"""Report the scenes of a map and their poses."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from gsmap.map.dates import is_after, is_until, last_of, parsed
-from gsmap.map.one_state import of_one_state
+from gsmap.map.date_filter import end_of_date, is_after, is_until, parse_moment
 from gsmap.map.reports.common import one_of
 from gsmap.map.reports.world import world_positions
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.types import Scene, ScenePose, Sim3
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import IngestRow, PoseRow, SceneRow
 
 SCENE_STATUSES = ("ingested", "described", "placed", "tentative", "isolated")
 
 
-@of_one_state
+@snapshot_read
 def scene_rows(
     store: Store,
     *,
@@ -27,26 +27,26 @@ def scene_rows(
     after: str | None = None,
     tag: str | None = None,
     as_of: str | None = None,
-    metres: Mapping[int, Metre] | None = None,
+    metres: Mapping[int, MetricScale] | None = None,
     among: Collection[str] | None = None,
 ) -> list[SceneRow]:
-    """The living scenes, oldest first.
+    """List the living scenes, oldest first.
 
     Args:
-        among: only those of these ids; nothing is read of the others.
-        component: only those of this one.
-        status: only those of this one, see `SceneRow`.
-        after: ISO 8601; only those captured (or else ingested) after it.
-        tag: only those that have it.
-        as_of: ISO 8601; only those dated at or before it, those without a date left out.
-        metres: of every component of the newest poses; not told where None.
+        among: restrict to these ids; the other scenes are not read.
+        component: restrict to this component.
+        status: restrict to this status, see `SceneRow`.
+        after: ISO 8601; restrict to scenes captured (if undated: ingested) later.
+        tag: restrict to scenes with this tag.
+        as_of: ISO 8601; restrict to scenes dated at or before it.
+        metres: metric scale of every component of the newest poses; left out if None.
 
     Raises:
         ConfigError: no such status, or a date that is none.
     """
     one_of(status, SCENE_STATUSES)
-    since = None if after is None else parsed(after)
-    until = None if as_of is None else last_of(as_of)
+    since = None if after is None else parse_moment(after)
+    until = None if as_of is None else end_of_date(as_of)
     if among is not None and not among:
         return []
     placed, nodes = store.revisions.poses(*(among or ())), store.graphs.node_counts()
@@ -67,9 +67,9 @@ def scene_rows(
     ]
 
 
-@of_one_state
-def scene_row(store: Store, scene: Scene, metres: Mapping[int, Metre]) -> SceneRow:
-    """The row of one scene."""
+@snapshot_read
+def scene_row(store: Store, scene: Scene, metres: Mapping[int, MetricScale]) -> SceneRow:
+    """Return the row of a scene."""
     placed, nodes = store.revisions.poses(scene.id), store.graphs.node_counts()
     note, (system, found) = store.scenes.latest_notes().get(scene.id, ""), world_positions(store, placed)
     return row_of_scene(scene, placed, nodes.get(scene.id), note, metres, found, system)
@@ -80,7 +80,7 @@ def row_of_scene(
     placed: Mapping[str, ScenePose],
     num_nodes: int | None,
     note: str,
-    metres: Mapping[int, Metre] | None = None,
+    metres: Mapping[int, MetricScale] | None = None,
     in_world: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
     system: tuple[str, str] | None = None,
 ) -> SceneRow:
@@ -109,9 +109,9 @@ def row_of_scene(
     )
 
 
-@of_one_state
+@snapshot_read
 def pose_rows(store: Store, crs: str | None = None) -> list[PoseRow]:
-    """Where every placed living scene lies, oldest scene first.
+    """List the pose of every placed living scene, oldest scene first.
 
     Args:
         crs: of the world coordinates; None for the map's own.
@@ -143,7 +143,7 @@ def _in_world(tied: Mapping[int, Sim3], pose: ScenePose) -> Sim3 | None:
 
 
 def ingest_row(scene: Scene, *, new: bool, dated: bool, notes: Sequence[str]) -> IngestRow:
-    """What became of one capture that was given."""
+    """Return the result of ingesting one capture."""
     return IngestRow(
         scene=scene.id,
         scene_name=scene.name,

@@ -1,4 +1,4 @@
-"""Exports, models, settings, and what keeps a map sound."""
+"""Report exports, models, settings and maintenance."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import names, refs
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.settings import leaves
 from gsmap.store import Store
 from gsmap.store.integrity import Check, Pruned
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from gsmap.map.settings import Settings
 
 
-@of_one_state
+@snapshot_read
 def tile_rows(store: Store) -> list[TileRow]:
-    """Every tile of every folder exported to."""
+    """List every exported tile."""
     name_of = names(store)
     return [
         _tile_row(Path(target), tile, name_of)
@@ -30,9 +30,9 @@ def tile_rows(store: Store) -> list[TileRow]:
     ]
 
 
-@of_one_state
+@snapshot_read
 def export_report(store: Store, out: Path, made: ExportResult, notes: Sequence[str] = ()) -> ExportReport:
-    """What an export did."""
+    """Return the result of an export."""
     name_of = names(store)
     return ExportReport(
         out=str(out),
@@ -61,7 +61,7 @@ def _tile_row(out: Path, tile: Tile, name_of: Mapping[str, str]) -> TileRow:
 
 
 def model_rows(store: Store) -> list[ModelRow]:
-    """The map's ONNX models."""
+    """List the ONNX models of a map."""
     return [
         ModelRow(
             kind=model.kind,
@@ -75,7 +75,7 @@ def model_rows(store: Store) -> list[ModelRow]:
 
 
 def setting_rows(settings: Settings) -> list[SettingRow]:
-    """Every setting with its default, unit and meaning."""
+    """List every setting with its default, unit and meaning."""
     defaults = {leaf.name: leaf.value for leaf in leaves(type(settings)())}
     return [
         SettingRow(name=leaf.name, value=leaf.value, default=defaults.get(leaf.name), unit=leaf.unit, doc=leaf.meaning)
@@ -84,7 +84,7 @@ def setting_rows(settings: Settings) -> list[SettingRow]:
 
 
 def check_report(found: Check) -> CheckReport:
-    """What reading every byte found."""
+    """Return the result of a check of every stored byte."""
     return CheckReport(
         ok=found.ok,
         problems=found.problems,
@@ -96,7 +96,7 @@ def check_report(found: Check) -> CheckReport:
 
 
 def prune_report(pruned: Pruned, dry_run: bool) -> PruneReport:
-    """What was reclaimed, or would be."""
+    """Return what was, or would be, reclaimed."""
     return PruneReport(
         dry_run=dry_run,
         scene_names=tuple(pruned.scenes),

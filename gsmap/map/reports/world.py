@@ -1,4 +1,4 @@
-"""How a map is tied to the world."""
+"""Report the georeference of a map."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import names
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.types import ScenePose
-from gsmap.types.rows.world import ContradictionRow, ResidualRow, TieRow, WorldReport
-from gsmap.types.world import Contradiction, Residual, Survey, WorldTie
+from gsmap.types.rows.world import ContradictionRow, GeoreferenceRow, ResidualRow, WorldReport
+from gsmap.types.world import Contradiction, Georeference, Residual, Survey
 
 
-@of_one_state
+@snapshot_read
 def world_report(store: Store, *, stale: bool, notes: Sequence[str] = ()) -> WorldReport:
-    """The newest answer, and what it was solved from.
+    """Report the newest georeference and its observations.
 
     Args:
-        stale: whether observations, or anything else, came or went since.
+        stale: true if its inputs have changed since.
     """
     survey, ties, placed = store.world.survey(), store.revisions.world(), store.revisions.poses()
     name_of = names(store)
@@ -49,7 +49,7 @@ def world_report(store: Store, *, stale: bool, notes: Sequence[str] = ()) -> Wor
 
 
 def _sea_level_note(survey: Survey) -> list[str]:
-    """A remark where nothing but EXIF heights above sea level tells how high a map lies."""
+    """Return a remark if only EXIF heights above sea level give the map's height."""
     sigmas = [fix.sea_level_sigma_m for fix in survey.fixes]
     if not sigmas or min(sigmas) == 0 or any(not point.check for point in survey.points):
         return []
@@ -60,10 +60,10 @@ def _sea_level_note(survey: Survey) -> list[str]:
     ]
 
 
-def _tie_row(tie: WorldTie, num_scenes: int, name_of: Mapping[str, str]) -> TieRow:
+def _tie_row(tie: Georeference, num_scenes: int, name_of: Mapping[str, str]) -> GeoreferenceRow:
     controls = [row.error_m for row in tie.residuals if row.use == "used" and row.kind != "image"]
     checks = [row.error_m for row in tie.residuals if row.use == "check" and row.kind == "point"]
-    return TieRow(
+    return GeoreferenceRow(
         component=tie.component,
         num_scenes=num_scenes,
         S_world_map=tie.S_world_map,
@@ -86,7 +86,7 @@ def _contradiction_row(one: Contradiction, name_of: Mapping[str, str]) -> Contra
 
 
 def residual_row(row: Residual, name_of: Mapping[str, str]) -> ResidualRow:
-    """One line of the residual table."""
+    """Return a residual as a row."""
     return ResidualRow(
         kind=row.kind,
         name=row.name,
@@ -111,8 +111,7 @@ def _rms(errors: Sequence[tuple[float, ...]]) -> float | None:
 def world_positions(
     store: Store, poses: Mapping[str, ScenePose], crs_text: str | None = None
 ) -> tuple[tuple[str, str] | None, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """The CRS with how it counts heights, and by scene where its origin lies: metres of the world frame, and
-    coordinates in the CRS.
+    """Return the CRS with its height reference, and each scene's origin: metres in the world frame and
 
     Args:
         crs_text: another CRS than the map's.

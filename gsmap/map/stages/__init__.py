@@ -1,1 +1,1 @@
-"""One file a stage: load from the store, call the pure stage, save what it returns under what made it."""
+"""The stages, one file each: read from the store, call a pure stage, save the result under its recipe."""

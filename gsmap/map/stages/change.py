@@ -1,4 +1,4 @@
-"""Changes: which captures are compared, and what changed between those that the present recipe has not compared."""
+"""Change stage: choose pairs of visits and compare the pairs that lack a current comparison."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from gsmap.change import recipe_key
 from gsmap.engine import run_jobs
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.metric_scale import in_metres
-from gsmap.map.dates import NO_DATE, parsed
+from gsmap.map.date_filter import NO_DATE, parse_moment
 from gsmap.map.jobs import compare_scenes
-from gsmap.map.metres import metres_of_scenes
+from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.map.settings import Settings
-from gsmap.map.sharing import SharedJobs, noting
+from gsmap.map.shared_jobs import SharedJobs, note_interruption
 from gsmap.map.visits import Visit, has_moved, pairs_of_visits
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
@@ -26,13 +26,13 @@ _NAMED = 5  # scenes that a remark names
 
 
 @dataclass(frozen=True, eq=False)
-class Wanted:
-    """The comparisons that a map asks for.
+class ComparisonPlan:
+    """The comparisons that a map needs.
 
     Args:
-        visits: the dated captures that have a place, by scene id.
+        visits: dated scenes with a pose, by scene id.
         pairs: (older, newer) scene ids.
-        notes: who is left out, and why.
+        notes: scenes that are left out, with the reason.
     """
 
     visits: dict[str, Visit]
@@ -40,8 +40,8 @@ class Wanted:
     notes: tuple[str, ...]
 
 
-def wanted(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = None) -> Wanted:
-    """Which captures are to be compared (`gsmap.map.visits`), or the two that are named; no array is read.
+def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = None) -> ComparisonPlan:
+    """Choose the pairs of visits to compare (`gsmap.map.visits`), or one given pair; no array is read.
 
     Raises:
         NotFoundError: the map has no poses yet, or a scene that is named has no place.
@@ -58,7 +58,7 @@ def wanted(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = 
     visits = {
         scene.id: Visit(
             scene.id,
-            parsed(scene.captured_at),
+            parse_moment(scene.captured_at),
             pose.component,
             in_metres(pose.S_map_scene, metres[scene.id]),
             scene.bounds,
@@ -72,7 +72,7 @@ def wanted(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = 
         notes = [f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})"] if undated else []
         if unplaced:
             notes.append(f"{_names(unplaced)} no place in the map yet: run gsmap update")
-        return Wanted(visits, pairs_of_visits(list(visits.values()), settings.visits), tuple(notes))
+        return ComparisonPlan(visits, pairs_of_visits(list(visits.values()), settings.visits), tuple(notes))
     for scene in pair:
         if scene.id not in graph.poses:
             raise NotFoundError(
@@ -93,20 +93,22 @@ def wanted(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = 
             f"{pair[0].name} and {pair[1].name} lie in two components: nothing ties one to the other",
             code="different_components",
         )
-    return Wanted(visits, [(older.scene, newer.scene)], ())
+    return ComparisonPlan(visits, [(older.scene, newer.scene)], ())
 
 
-def lacking(store: Store, asked: Wanted, settings: Settings) -> list[tuple[str, str]]:
-    """Those of the pairs that have to be compared: for the first time, by another recipe, or at other poses."""
+def missing_comparisons(store: Store, asked: ComparisonPlan, settings: Settings) -> list[tuple[str, str]]:
+    """Return the pairs without a current comparison: new, by another recipe, or at other poses."""
     done = {(one.older, one.newer) for one in _valid(store.changes.current(), asked, settings)}
     return [pair for pair in asked.pairs if pair not in done]
 
 
-def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProgress, *, verify: bool = False) -> int:
-    """Compare what has to be compared; returns how many pairs were.
+def compare(
+    store: Store, asked: ComparisonPlan, settings: Settings, progress: StageProgress, *, verify: bool = False
+) -> int:
+    """Compare the pairs that lack a current comparison; return their number.
 
     Args:
-        verify: read the arrays of the comparisons that are there, and make those again that are damaged.
+        verify: also read stored comparisons and repeat damaged ones.
     """
     keys = {_key(settings, asked, *pair).digest: pair for pair in asked.pairs}
 
@@ -121,7 +123,7 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
     names = {scene.id: scene.name for scene in store.scenes.list()}
     shared = SharedJobs(store, "changes", "comparison", jobs, keys, done, progress, again=verify)
     results = shared.results(lambda arguments: run_jobs(compare_scenes, arguments, settings.engine))
-    kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are compared and kept")
+    kept = note_interruption(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are compared and kept")
     with kept, closing(results):
         for key, (report, counted) in results:
             older, newer = (asked.visits[scene] for scene in keys[key])
@@ -138,8 +140,8 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
     return len(jobs)
 
 
-def _valid(current: Iterable[Comparison], asked: Wanted, settings: Settings) -> list[Comparison]:
-    """The comparisons that are what would be found now."""
+def _valid(current: Iterable[Comparison], asked: ComparisonPlan, settings: Settings) -> list[Comparison]:
+    """Return the comparisons that are up to date."""
     pairs = set(asked.pairs)
     return [
         one
@@ -151,19 +153,19 @@ def _valid(current: Iterable[Comparison], asked: Wanted, settings: Settings) -> 
     ]
 
 
-def _key(settings: Settings, asked: Wanted, older: str, newer: str) -> RecipeKey:
-    """Of the report of a pair: captures are compared in metres, so that another metre is another report."""
+def _key(settings: Settings, asked: ComparisonPlan, older: str, newer: str) -> RecipeKey:
+    """Return the key of a pair's comparison, which depends on the metric scale."""
     metres = asked.visits[newer].metres_per_unit
     return recipe_key(settings.change).of(older, newer, *([] if metres == 1.0 else [f"metres_per_unit {metres!r}"]))
 
 
-def _job(store: Store, asked: Wanted, settings: Settings, pair: tuple[str, str]) -> tuple[object, ...]:
-    """The arguments of `compare_scenes`."""
+def _job(store: Store, asked: ComparisonPlan, settings: Settings, pair: tuple[str, str]) -> tuple[object, ...]:
+    """Return the arguments of `compare_scenes`."""
     sides = [(visit.scene, visit.S_map_scene, visit.when.isoformat()) for visit in (asked.visits[s] for s in pair)]
     return (store.location, *sides, settings.change)
 
 
 def _names(names: Sequence[str]) -> str:
-    """Names, and the verb ``have`` that goes with them."""
+    """Return names with the matching form of ``have``."""
     shown = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
     return f"{shown} {'has' if len(names) == 1 else 'have'}"

@@ -1,4 +1,4 @@
-"""Describe: every scene's graph, made where the present recipe has not made it yet."""
+"""Describe stage: make the scene graphs that the current recipe lacks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsmap.engine import run_jobs
 from gsmap.map import models
 from gsmap.map.jobs import describe_scene
 from gsmap.map.settings import Settings
-from gsmap.map.sharing import SharedJobs, noting
+from gsmap.map.shared_jobs import SharedJobs, note_interruption
 from gsmap.methods import RecipeKey
 from gsmap.render import backend
 from gsmap.store import Store
@@ -24,30 +24,29 @@ AnyScene = TypeVar("AnyScene", Scene, BriefScene)
 
 
 def graph_keys(store: Store, scenes: Sequence[AnyScene], settings: Settings) -> dict[str, RecipeKey]:
-    """What names each scene's graph under these settings, by scene id: content and scale policy are its inputs."""
+    """Return the key of each scene's graph by scene id; content and scale policy are its inputs."""
     recipe = recipe_key(settings.describe, models.specs(store))
     return {scene.id: recipe.of(scene.id, scene.scale_policy) for scene in scenes}
 
 
 def without_graph(store: Store, keys: Mapping[str, RecipeKey]) -> list[str]:
-    """Ids of the scenes that have no graph under their key, in the order of the keys; no array is read."""
+    """Return the ids of scenes without a graph under their key, in the order of the keys; no array is read."""
     present = store.graphs.kept(keys.values())
     return [scene for scene, key in keys.items() if key.digest not in present]
 
 
 def unthinned(scenes: Sequence[AnyScene]) -> list[AnyScene]:
-    """Those of the scenes that are described unasked: newer ones stand for a thinned one."""
+    """Return the scenes that are described by default; thinned ones are not."""
     return [scene for scene in scenes if scene.thinning is None]
 
 
 def describe(
     store: Store, scenes: Sequence[AnyScene], settings: Settings, progress: StageProgress, *, verify: bool = False
 ) -> dict[str, RecipeKey]:
-    """Make the graphs that are missing; returns the key of each scene's graph, but of those that were set aside.
+    """Make the missing graphs; return the key of each scene's graph, without quarantined ones.
 
     Args:
-        verify: read the graphs that are there, and make those again that are damaged, and try again those that were set
-            aside; else none of them is read.
+        verify: read stored graphs, repeat damaged ones and retry quarantined ones.
     """
     keys: dict[str, RecipeKey] = graph_keys(store, scenes, settings)
     damaged: set[str] = store.graphs.damaged(keys.values()) if verify else set()
@@ -67,7 +66,7 @@ def describe(
     shared = SharedJobs(store, "describe", "graph", jobs, about, done, progress, again=verify)
     results = shared.results(lambda arguments: run_jobs(describe_scene, arguments, settings.engine))
     there = len(scenes) - len(missing)
-    kept = noting(lambda: f"{there + shared.num_kept()} of {len(scenes)} scenes are described and kept")
+    kept = note_interruption(lambda: f"{there + shared.num_kept()} of {len(scenes)} scenes are described and kept")
     with kept, closing(results):
         for key, graph in results:
             store.graphs.save(graph, keys[graph.scene_id])

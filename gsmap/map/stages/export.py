@@ -1,4 +1,4 @@
-"""Export: which scenes, with which poses, merged how; the tiles themselves are `gsmap.export` and `gsmap.merge`."""
+"""Export stage: choose scenes, poses and merger; `gsmap.export` and `gsmap.merge` make the tiles."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ from gsmap.export.pyramid import TreeLayout, is_stale
 from gsmap.export.streamed_sog import StreamedSog, write_streams
 from gsmap.export.tileset import Tiles3D, write_tilesets
 from gsmap.geometry.transforms import transform_cameras
-from gsmap.map.dates import is_until, last_of, undated_note
+from gsmap.map.date_filter import end_of_date, is_until, undated_note
 from gsmap.map.jobs import TileMaker
-from gsmap.map.metres import map_metres, metre_notes
-from gsmap.map.persisting import Passing, what_passes
-from gsmap.map.persisting import notes as persisting_notes
+from gsmap.map.metric_scales import map_metres, metre_notes
 from gsmap.map.settings import Settings
-from gsmap.map.sharing import noting
-from gsmap.map.world import InWorld, in_world, world_notes
+from gsmap.map.shared_jobs import note_interruption
+from gsmap.map.static_filter import DynamicContent, dynamic_notes, find_dynamic_content
+from gsmap.map.world import GeoreferencedComponent, georeferenced_components, world_notes
 from gsmap.merge import photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.reference_view_cache import ReferenceViewCache
 from gsmap.methods import text_digest
@@ -36,26 +35,26 @@ from gsmap.store import Store
 from gsmap.store.photos import StoredPhoto
 from gsmap.texts import escaped
 from gsmap.types import Cameras, PoseGraph, Scene, ScenePose, Tile
-from gsmap.types.metre import Metre
+from gsmap.types.metric_scale import MetricScale
 from gsmap.types.plain import canonical, plain
 from gsmap.types.progress import Progress
 
 if TYPE_CHECKING:
-    from gsmap.map.objects import Known
+    from gsmap.map.objects import MapObjects
 
 _log = logging.getLogger("gsmap.export")
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of an export; see `gsmap.Map.export`.
+    """The options of an export; see `gsmap.Map.export`.
 
     Args:
-        merge: the merger; None takes the one of the settings.
-        steps: optimisation steps per tile; None takes what the merger's settings say.
-        prefer: whom to believe where captures disagree; None takes what the merger's settings say.
-        as_of: only captures dated at or before this take part.
-        static: without what moved, or came and went.
+        merge: merger; None for the one in the settings.
+        steps: optimization steps per tile; None for the merger's setting.
+        prefer: preferred capture where captures disagree; None for the merger's setting.
+        as_of: use only scenes dated at or before this.
+        static: export static content only.
     """
 
     format: str = "ply"
@@ -73,7 +72,7 @@ class Request:
     static: bool = False
 
     def options(self) -> list[str]:
-        """The options of ``gsmap export`` that ask for the same."""
+        """Return the options of ``gsmap export`` for this request."""
         default = Request()
         words: list[str] = []
         for name, option in _OPTIONS.items():
@@ -102,20 +101,20 @@ _OPTIONS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Planned:
-    """The tiles of an export, and how each is made.
+class ExportPlan:
+    """The tiles of an export and how each is made.
 
     Args:
-        revision: whose poses.
-        scenes: those that are exported, by id.
+        revision: revision of the poses.
+        scenes: exported scenes by id.
         method, params: the merger and its settings.
-        recipe: how every tile is made.
-        tiles: what the folder is to hold.
-        notes: what a person should know of what takes part.
-        metres: how long a metre is in the frame of each component of the poses.
-        world: where those lie that are tied to the world.
-        passing: what of each scene is left out.
-        photos: photographs that tiles are to look like, by the component and the name of the tile.
+        recipe: recipe of every tile.
+        tiles: planned tiles of the folder.
+        notes: remarks for the user.
+        metres: metric scale of each component.
+        world: georeferenced components.
+        passing: dynamic content to leave out of each scene.
+        photos: reference photos by component and tile name.
     """
 
     revision: int | None
@@ -125,17 +124,17 @@ class Planned:
     recipe: TileRecipe
     tiles: list[PlannedTile]
     notes: tuple[str, ...] = ()
-    metres: Mapping[int, Metre] = field(default_factory=dict)
-    world: Mapping[int, InWorld] = field(default_factory=dict)
-    passing: Mapping[str, Passing] = field(default_factory=dict)
+    metres: Mapping[int, MetricScale] = field(default_factory=dict)
+    world: Mapping[int, GeoreferencedComponent] = field(default_factory=dict)
+    passing: Mapping[str, DynamicContent] = field(default_factory=dict)
     photos: Mapping[tuple[int, str], Sequence[StoredPhoto]] = field(default_factory=dict)
 
 
-def plan(store: Store, request: Request, settings: Settings, known: Known | None = None) -> Planned:
-    """Which tiles an export consists of; nothing is read but the catalog.
+def plan(store: Store, request: Request, settings: Settings, known: MapObjects | None = None) -> ExportPlan:
+    """Plan the tiles of an export from the catalog.
 
     Args:
-        known: the objects of the map, for what persists; what is kept of them by default.
+        known: objects of the map, for dynamic content; default: the stored ones.
     """
     method = request.merge or settings.merge.method
     params = settings.merge.mergers[method]
@@ -158,18 +157,18 @@ def plan(store: Store, request: Request, settings: Settings, known: Known | None
         placed = {scene: placed[scene] for scene in scenes}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
-    passing: dict[str, Passing] = {}
+    passing: dict[str, DynamicContent] = {}
     if request.static:
-        from gsmap.map.objects import kept_objects
+        from gsmap.map.objects import load_objects
 
-        known = kept_objects(store, settings) if known is None else known
-        passing = {scene: one for scene, one in what_passes(store, known).items() if scene in scenes}
+        known = load_objects(store, settings) if known is None else known
+        passing = {scene: one for scene, one in find_dynamic_content(store, known).items() if scene in scenes}
         recipe = replace(recipe, without={scene: one.digest for scene, one in passing.items() if one.digest})
-        notes += tuple(persisting_notes(known, passing))
+        notes += tuple(dynamic_notes(known, passing))
     exported = {pose.component for pose in placed.values()}
     metres = {component: metre for component, metre in metres.items() if component in exported}
     notes += metre_notes(metres)
-    world = in_world(graph, exported)
+    world = georeferenced_components(graph, exported)
     notes += world_notes(world, request.format)
     tiles = plan_tiles(
         {scene: pose.S_map_scene for scene, pose in placed.items()},
@@ -183,23 +182,22 @@ def plan(store: Store, request: Request, settings: Settings, known: Known | None
     )
     photos = _photos(store, tiles, photos_m(method, params), request.as_of)
     recipe = replace(recipe, photos={tile: _digest(kept) for tile, kept in photos.items()})
-    return Planned(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing, photos)
+    return ExportPlan(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing, photos)
 
 
 def _photos(
     store: Store, tiles: Sequence[PlannedTile], within_m: float | None, as_of: str | None
 ) -> dict[tuple[int, str], list[StoredPhoto]]:
-    """The photographs that may show each tile, of those tiles that there are any of; in whatever order they were added,
-    in one order.
+    """Return the stored photos that may show each tile, in an order independent of when they were added.
 
     Args:
-        within_m: of a tile's bounds cameras are looked for; None where the merger takes no photographs.
+        within_m: distance from a tile's bounds within which cameras count; None if the merger takes no photos.
     """
     if within_m is None:
         return {}
     kept = sorted(store.photos.list(), key=lambda photo: photo.sighting.digest)
     if as_of is not None:
-        until = last_of(as_of)
+        until = end_of_date(as_of)
         kept = [photo for photo in kept if is_until(photo.sighting.captured_at, until)]
     out = {}
     for tile in tiles if kept else ():
@@ -220,7 +218,7 @@ def _stands_in(box: np.ndarray, photo: StoredPhoto, tile: PlannedTile) -> bool:
 
 
 def _digest(kept: Sequence[StoredPhoto]) -> str:
-    """Names pictures as they are kept, where they stand in their scenes, and how well that is known."""
+    """Return a digest of photos as stored: pixels, poses and uncertainties."""
     rows = [
         [photo.picture, one.scene, one.T_scene_camera, one.covariance, one.intrinsics_px, one.size_px]
         for photo, one in ((photo, photo.sighting) for photo in kept)
@@ -236,15 +234,15 @@ def export(
     progress: Progress,
     *,
     wait: bool = False,
-    known: Known | None = None,
+    known: MapObjects | None = None,
 ) -> tuple[ExportResult, tuple[str, ...]]:
-    """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what.
+    """Plan the tiles, make the dirty ones, write them, and record their recipes in the store.
 
     A map that was opened for reading, or whose disk is full, is exported too; then only the folder's own manifest says
     what was made.
 
     Args:
-        wait: where another export is at work in the folder, until it has ended.
+        wait: wait while another export runs in the folder.
         known: see `plan`.
 
     Returns:
@@ -268,9 +266,9 @@ def export(
 
 
 def _export(
-    store: Store, out: Path, request: Request, planned: Planned, settings: Settings, progress: Progress
+    store: Store, out: Path, request: Request, planned: ExportPlan, settings: Settings, progress: Progress
 ) -> ExportResult:
-    """The export itself, in a folder that is ours alone."""
+    """Export into a locked folder."""
     asked = plain(asdict(replace(request, merge=planned.method)))
     number: list[int] = []
     refused = "" if store.catalog.writable else f"{store.location} is read-only"
@@ -291,7 +289,7 @@ def _export(
         except (DiskFullError, ReadOnlyError) as error:
             refused = str(error)
 
-    with noting(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
+    with note_interruption(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
         result = export_tiles(
             planned.tiles,
             partial(_maker, store, planned, request, settings),
@@ -299,7 +297,7 @@ def _export(
             map_id=store.id,
             recipe=planned.recipe,
             metres=planned.metres,
-            world={component: one.told() for component, one in planned.world.items()},
+            world={component: one.to_json() for component, one in planned.world.items()},
             offsets={scene: found.origin.tolist() for scene, found in planned.scenes.items() if found.origin.any()},
             params=settings.export,
             run=lambda job, arguments: run_jobs(job, arguments, settings.engine),
@@ -336,7 +334,7 @@ def _export(
 
 
 def _maker(
-    store: Store, planned: Planned, request: Request, settings: Settings, tile: PlannedTile, folder: str
+    store: Store, planned: ExportPlan, request: Request, settings: Settings, tile: PlannedTile, folder: str
 ) -> TileMaker:
     return TileMaker(
         store.location,
@@ -357,8 +355,8 @@ def _by_scene(photos: Sequence[StoredPhoto]) -> dict[str, tuple[StoredPhoto, ...
     return {scene: tuple(photo for photo in photos if photo.sighting.scene == scene) for scene in scenes}
 
 
-def _cameras(store: Store, planned: Planned, component: int) -> Cameras | None:
-    """Of all captures of a component, in its frame; None where there are none."""
+def _cameras(store: Store, planned: ExportPlan, component: int) -> Cameras | None:
+    """Return the cameras of all scenes of a component, in its frame; None if there are none."""
     poses = {scene: S for tile in planned.tiles if tile.component == component for scene, S in tile.poses.items()}
     found = [transform_cameras(store.scenes.cameras(scene), S) for scene, S in sorted(poses.items())]
     found = [cameras for cameras in found if len(cameras)]
@@ -371,8 +369,8 @@ def _cameras(store: Store, planned: Planned, component: int) -> Cameras | None:
     )
 
 
-def _put_aside(store: Store, out: Path, planned: Planned, result: ExportResult) -> None:
-    """Let the map know which tiles could not be made, and of no others in this folder."""
+def _put_aside(store: Store, out: Path, planned: ExportPlan, result: ExportResult) -> None:
+    """Record the tiles of this folder that could not be made, replacing earlier records."""
     about = escaped(str(out.resolve()))
     now = {f"tile {planned.recipe.key(tile)}": (tile, reason) for tile, reason in result.set_aside}
     for tile, reason in now.values():
@@ -387,7 +385,7 @@ def _put_aside(store: Store, out: Path, planned: Planned, result: ExportResult) 
 
 
 def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Request]]:
-    """How many tiles the same export would make again now or take away, and that export, by the folder exported to.
+    """Return, per export folder, the number of tiles that the same export would make or remove, and that export.
 
     Read from the catalog alone, which does not say which tiles are empty: new ones are not counted. A folder whose
     export named a revision stays as it is, whatever the map does.
@@ -415,7 +413,7 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
 
 
 def _check(request: Request, recipe: TileRecipe) -> None:
-    """Refuse what makes no sense before anything is read."""
+    """Refuse invalid options before anything is read."""
     if request.budget_s is not None and not request.budget_s > 0:
         raise ConfigError(
             f"the budget must be a positive number of seconds, got {request.budget_s}", code="invalid_budget"
@@ -428,7 +426,7 @@ def _check(request: Request, recipe: TileRecipe) -> None:
 
 
 def _placed(store: Store, revision: int | None, component: int | None) -> tuple[PoseGraph, dict[str, ScenePose]]:
-    """A revision, and of it the poses of the scenes to export."""
+    """Return a revision and the poses of the scenes to export."""
     graph = store.revisions.get(revision)
     if graph is None:
         raise NotFoundError("the map has no poses yet: run gsmap update or gsmap optimize first", code="no_poses")
@@ -449,8 +447,8 @@ def _placed(store: Store, revision: int | None, component: int | None) -> tuple[
 
 
 def _as_of(scenes: dict[str, Scene], as_of: str) -> tuple[dict[str, Scene], tuple[str, ...]]:
-    """The scenes that were there by a date, and a remark on those of which nobody knows."""
-    until = last_of(as_of)
+    """Return the scenes dated at or before a date, and a remark on undated ones."""
+    until = end_of_date(as_of)
     found = {scene: one for scene, one in scenes.items() if is_until(one.captured_at, until)}
     note = undated_note(list(scenes.values()), as_of)
     if not found:

@@ -1,4 +1,4 @@
-"""Georeference: observations of the world read, checked and kept; the poses solved with them."""
+"""Georeference stage: read, check and store observations of the world, and solve the poses with them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
 from gsmap.formats import gcp_list
 from gsmap.ingest.dates import photo_date
-from gsmap.map.dates import parsed
+from gsmap.map.date_filter import parse_moment
 from gsmap.map.photo_names import PhotoMatches, match_photos
-from gsmap.map.placed_photos import Localise
-from gsmap.map.places import Place, place_in_scene
-from gsmap.map.seeing import surface_at
+from gsmap.map.photo_poses import LocalizePhotos
+from gsmap.map.pixel_points import surface_at
 from gsmap.map.settings import Settings
+from gsmap.map.specified_points import SpecifiedPoint, parse_scene_point
 from gsmap.map.stages.optimize import Solution, solve_observed
 from gsmap.store import Store
 from gsmap.store.world import Observation
 from gsmap.types import Cameras
-from gsmap.types.world import UNSOLVED, ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldFrame
+from gsmap.types.world import UNSOLVED, ControlPoint, ImagePoint, PositionFix, ScaleBar, Survey, WorldFrame
 from gsmap.world.crs import WGS84, crs
 from gsmap.world.exif import read_folder
 from gsmap.world.frame import frame_at, of_frame, to_frame
@@ -38,17 +38,17 @@ _OTHER_DAYS = 2  # more than clocks and zones are off, and than a night that a s
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What is to be noted.
+    """The observations to add.
 
     Args:
-        crs: that the map is to speak in; None leaves it as it is.
+        crs: CRS of the map; None leaves it unchanged.
         gcp: a ``gcp_list.txt``.
-        exif: a folder of photos whose EXIF says where they were taken.
-        bars: (A, B, metres) distances between places.
-        check: names of control points to hold out; None leaves them as they are, an empty one holds out none.
-        sigma_m: (horizontal, vertical) standard deviations of control points; None for the setting's.
-        bar_sigma_m: standard deviation of the distances; None for the setting's.
-        photo_size_px: width and height of the photos that pixels were picked in, where the captures have them smaller.
+        exif: folder of photos with GNSS positions in EXIF.
+        bars: (A, B, metres) distances between points.
+        check: names of control points to hold out; None leaves them unchanged, an empty one holds out none.
+        sigma_m: (horizontal, vertical) standard deviations of control points; None for the setting.
+        bar_sigma_m: standard deviation of the distances; None for the setting.
+        photo_size_px: width and height of the photos in which pixels were picked, if the captures have smaller ones.
     """
 
     crs: str | None = None
@@ -62,20 +62,20 @@ class Request:
 
 
 @dataclass(eq=False)
-class _Noted:
-    """What goes into the catalog, and what a person should know of it."""
+class _NewObservations:
+    """Observations to store, and remarks for the user."""
 
     items: list[Observation] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
 def georeference(
-    store: Store, request: Request, settings: Settings, localise: Localise | None = None
+    store: Store, request: Request, settings: Settings, localise: LocalizePhotos | None = None
 ) -> tuple[tuple[str, ...], Solution | None]:
-    """Read, check and solve observations, and then note them. Where any is wrong nothing is noted.
+    """Read, check and solve observations, then store them; nothing is stored if any of them is wrong.
 
     Args:
-        localise: finds photos that are no scene's camera in the map.
+        localise: localizes photos that are not cameras of a scene.
 
     Returns:
         Remarks for the person, and the poses with these observations, not kept yet; None where the newest are that.
@@ -85,7 +85,7 @@ def georeference(
             be one of several cameras, a point that no photo of the map shows, a place that does not exist, or
             observations that have no solution.
     """
-    noted = _Noted()
+    noted = _NewObservations()
     before = store.world.survey()
     if request.crs is not None:
         crs(request.crs)
@@ -97,7 +97,7 @@ def georeference(
         noted.items.append(_bar(store, *one, request.bar_sigma_m))
     if request.check is not None:
         _hold_out(before, set(request.check), noted)
-    places = [one for one in noted.items if isinstance(one, (ControlPoint, Fix))]
+    places = [one for one in noted.items if isinstance(one, (ControlPoint, PositionFix))]
     check_area(places, settings.world.area_margin_deg)
     frame = _frame(before, request.crs, places)
     if frame is not None:
@@ -115,7 +115,7 @@ def georeference(
 
 
 def _solved(store: Store, items: Sequence[Observation], settings: Settings) -> Solution | None:
-    """Solve as if observations had been noted.
+    """Solve the poses as if observations had been stored.
 
     Raises:
         InputError: a component that had a solution has none with them.
@@ -142,13 +142,15 @@ def _solved(store: Store, items: Sequence[Observation], settings: Settings) -> S
 def survey_position(
     store: Store, ref: str, position: Sequence[float], crs_text: str, sigma_m: tuple[float, float], settings: Settings
 ) -> None:
-    """Note where the origin of a scene's frame lies in the world.
+    """Store the world position of the origin of a scene's frame.
 
     Raises:
         ConfigError, InputError: an unknown CRS, or a point outside of its area.
     """
     scene = store.scenes.get(ref)
-    fix = Fix(SURVEYED, scene.id, np.zeros(3), crs(crs_text).text, np.array(position, dtype=np.float64), sigma_m)
+    fix = PositionFix(
+        SURVEYED, scene.id, np.zeros(3), crs(crs_text).text, np.array(position, dtype=np.float64), sigma_m
+    )
     check_area([fix], settings.world.area_margin_deg)
     before = store.world.survey()
     frame = _frame(before, None, [fix])
@@ -157,7 +159,7 @@ def survey_position(
 
 
 def forget_position(store: Store, ref: str) -> bool:
-    """Take a scene's surveyed position back; whether it had one."""
+    """Remove the surveyed position of a scene; return true if it had one."""
     scene = store.scenes.get(ref)
     if not any(fix.scene == scene.id and fix.name == SURVEYED for fix in store.world.survey().fixes):
         return False
@@ -165,10 +167,10 @@ def forget_position(store: Store, ref: str) -> bool:
     return True
 
 
-def _refuse_unreachable(before: Survey, frame: WorldFrame | None, new: Sequence[ControlPoint | Fix]) -> None:
-    """Raise where PROJ has no way from what is or will be noted to the map's CRS: no solve would end from then on."""
+def _refuse_unreachable(before: Survey, frame: WorldFrame | None, new: Sequence[ControlPoint | PositionFix]) -> None:
+    """Raise if PROJ cannot transform an observation to the map's CRS."""
     points = tuple(one for one in (*before.points, *new) if isinstance(one, ControlPoint))
-    fixes = tuple(one for one in (*before.fixes, *new) if isinstance(one, Fix))
+    fixes = tuple(one for one in (*before.fixes, *new) if isinstance(one, PositionFix))
     in_frame(Survey(frame, points, (), fixes))
 
 
@@ -176,13 +178,13 @@ def _origin(frame: WorldFrame) -> np.ndarray:
     return of_frame(frame, np.zeros((1, 3)))
 
 
-def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | Fix]) -> WorldFrame | None:
-    """The world frame that is to be noted; None where that which there is stays, or none can be made yet."""
+def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | PositionFix]) -> WorldFrame | None:
+    """Return the world frame to store; None if it stays or cannot be chosen yet."""
     known = before.frame
     if known is not None and (crs_text is None or crs(crs_text).text == known.crs):
         return None
     points = {one.name: one for one in (*before.points, *new) if isinstance(one, ControlPoint)}
-    fixes = {(one.name, one.scene): one for one in (*before.fixes, *new) if isinstance(one, Fix)}
+    fixes = {(one.name, one.scene): one for one in (*before.fixes, *new) if isinstance(one, PositionFix)}
     if not points and not fixes:
         if crs_text is None:
             return None
@@ -190,7 +192,7 @@ def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | Fi
             f"nothing of this map lies in {crs_text} yet: give --gcp FILE or --exif DIR with it",
             code="not_georeferenced",
         )
-    first: ControlPoint | Fix = next(iter(points.values())) if points else next(iter(fixes.values()))
+    first: ControlPoint | PositionFix = next(iter(points.values())) if points else next(iter(fixes.values()))
     return frame_for(crs_text or first.crs, Survey(None, tuple(points.values()), (), tuple(fixes.values())))
 
 
@@ -202,9 +204,9 @@ def _read_gcp(
     path: Path,
     request: Request,
     settings: Settings,
-    localise: Localise | None,
+    localise: LocalizePhotos | None,
     before: Survey,
-    noted: _Noted,
+    noted: _NewObservations,
 ) -> None:
     found = gcp_list.read(path)
     crs(found.crs)
@@ -270,7 +272,7 @@ def _read_gcp(
 def _pixel(
     pixel: tuple[float, float], size: Sequence[int], full: tuple[int, int] | None, where: str, image: str
 ) -> np.ndarray:
-    """As the capture has the photo."""
+    """Scale a pixel to the size of the capture's photo."""
     at = np.array(pixel, dtype=np.float64)
     if full is not None:
         if abs(full[0] / size[0] * size[1] / full[1] - 1) > 0.01:
@@ -289,14 +291,14 @@ def _pixel(
 
 
 class _Cameras:
-    """The cameras of all scenes that have real ones; read once each."""
+    """The real cameras of all scenes, read once."""
 
     def __init__(self, store: Store) -> None:
         scenes = {scene.name: (scene.id, store.scenes.cameras(scene.id)) for scene in store.scenes.list()}
         self._of_scene = {name: one for name, one in scenes.items() if not one[1].synthesised}
 
     def match(self, photos: Mapping[str, str]) -> PhotoMatches:
-        """Match photos, by where each was named, to cameras; see `gsmap.map.photo_names`."""
+        """Match photos to cameras; the values are their sources, see `gsmap.map.photo_names`."""
         return match_photos(photos, {name: one.names for name, (_, one) in self._of_scene.items()}, photos)
 
     def __getitem__(self, camera: tuple[str, int]) -> tuple[str, Cameras]:
@@ -306,7 +308,7 @@ class _Cameras:
 
 
 def _with_depth(store: Store, image: ImagePoint) -> ImagePoint:
-    """A point that one photo alone shows is where its ray meets the rendered surface."""
+    """Add the rendered depth to an image point that only one photo shows."""
     size = np.ceil(np.maximum(image.pixel + 1, 2 * image.intrinsics_px[2:])).astype(np.int64)
     camera = Cameras(image.T_scene_camera[None], image.intrinsics_px[None], size[None], (image.image,))
     try:
@@ -317,8 +319,8 @@ def _with_depth(store: Store, image: ImagePoint) -> ImagePoint:
     return image if seen is None else replace(image, depth=seen[0], depth_sigma=seen[1])
 
 
-def _hold_out(before: Survey, names: set[str], noted: _Noted) -> None:
-    """Which points are check points, of those that stand and those that come."""
+def _hold_out(before: Survey, names: set[str], noted: _NewObservations) -> None:
+    """Choose the check points among stored and new points."""
     fresh = {one.name for one in noted.items if isinstance(one, ControlPoint)}
     known = fresh | {point.name for point in before.points}
     if unknown := sorted(names - known):
@@ -334,20 +336,20 @@ def _hold_out(before: Survey, names: set[str], noted: _Noted) -> None:
 # --- positions and lengths --------------------------------------------------------------------------------------------
 
 
-def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, noted: _Noted) -> None:
+def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, noted: _NewObservations) -> None:
     cameras, positions = _Cameras(store), read_folder(folder)
     # Photos without a position take part: they may be those that a camera is of.
     matches = cameras.match(dict.fromkeys(positions, str(folder)))
     placed = {photo: one for photo, one in positions.items() if one is not None and photo in matches.cameras}
     bare = {photo for photo in matches.by_file_name if photo in placed}
-    by_file_name: list[tuple[str, Fix]] = []
+    by_file_name: list[tuple[str, PositionFix]] = []
     for photo, one in placed.items():
         if one.height_m is None:
             continue
         scene, camera = cameras[matches.cameras[photo]]
         sigma, common, sea_level = one.sigmas(settings.world)
         position = np.array([one.longitude_deg, one.latitude_deg, one.height_m])
-        fix = Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level)
+        fix = PositionFix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level)
         noted.items.append(fix)
         if photo in bare:
             by_file_name.append((photo, fix))
@@ -368,7 +370,7 @@ def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, n
             f"{len(matches.left_out)} photos in {folder} share only their file name with a camera of this map and were "
             f"left out, such as {photo}; {other} lies where its scene's photos do"
         )
-    if not any(isinstance(one, Fix) for one in noted.items):
+    if not any(isinstance(one, PositionFix) for one in noted.items):
         raise NotFoundError(
             f"no photo in {folder} with a position and a height is a camera of this map: {'; '.join(told)}; photos go "
             "by the names that their captures' cameras have for them, and by folders called as their scenes",
@@ -384,8 +386,8 @@ def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, n
     noted.notes += told
 
 
-def _refuse_moved(before: Survey, photos: Sequence[tuple[str, Fix]]) -> None:
-    """Raise where a photo that only its file name ties to a camera lies far from where that camera is known to be."""
+def _refuse_moved(before: Survey, photos: Sequence[tuple[str, PositionFix]]) -> None:
+    """Raise if a photo matched by file name lies far from the known position of that camera."""
     known = {(fix.name, fix.scene): fix for fix in before.fixes if fix.crs == WGS84}
     again = [(photo, known[fix.name, fix.scene], fix) for photo, fix in photos if (fix.name, fix.scene) in known]
     if not again:
@@ -404,18 +406,18 @@ def _refuse_moved(before: Survey, photos: Sequence[tuple[str, Fix]]) -> None:
         )
 
 
-def _refuse_other_days(store: Store, photos: Sequence[tuple[str, Fix]]) -> None:
-    """Raise where all photos that only file names tie to a scene were taken days before or after it."""
+def _refuse_other_days(store: Store, photos: Sequence[tuple[str, PositionFix]]) -> None:
+    """Raise if all photos matched to a scene by file name were taken on other days."""
     of_scene: dict[str, list[str]] = {}
     for photo, fix in photos:
         of_scene.setdefault(fix.scene, []).append(photo)
     for scene in map(store.scenes.get, of_scene):
         if scene.captured_at is None:
             continue
-        captured, off = parsed(scene.captured_at), dict[str, int]()
+        captured, off = parse_moment(scene.captured_at), dict[str, int]()
         for photo in of_scene[scene.id]:
             if (taken := photo_date(photo).when) is not None:
-                off[photo] = abs(parsed(taken) - captured).days
+                off[photo] = abs(parse_moment(taken) - captured).days
                 if off[photo] < _OTHER_DAYS:
                     break
         else:
@@ -432,7 +434,7 @@ def _refuse_other_days(store: Store, photos: Sequence[tuple[str, Fix]]) -> None:
 def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None) -> ScaleBar:
     if not (np.isfinite(metres) and metres > 0):
         raise ConfigError(f"a scale bar is so many metres long, got {metres:g}", code="invalid_observation")
-    ends: list[Place] = [place_in_scene(store, text) for text in (a, b)]
+    ends: list[SpecifiedPoint] = [parse_scene_point(store, text) for text in (a, b)]
     scenes = (str(ends[0].scene), str(ends[1].scene))
     sigmas = [float(np.sqrt(np.trace(end.covariance) / 3)) for end in ends]
     # Nothing is picked to better than a ten-thousandth of what it is picked on.
@@ -445,7 +447,7 @@ def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None) -> 
 
 
 def take_back(store: Store, names: Iterable[str]) -> int:
-    """Forget observations by name, or all of them with the CRS; how many.
+    """Remove observations by name, or all of them with the CRS; return their number.
 
     Raises:
         NotFoundError: one of the names is none.

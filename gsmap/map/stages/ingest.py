@@ -1,4 +1,4 @@
-"""Ingest: captures in files or in memory become scenes. Captures that cannot be read are set aside."""
+"""Ingest stage: add captures in files or memory as scenes; unreadable captures are quarantined."""
 
 from __future__ import annotations
 
@@ -12,8 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.errors import ConfigError, GsmapError, NotGaussiansError, StoreError
-from gsmap.ingest import Capture, LeftOut, Search, check_scale, given_date, read_capture, search_captures, take_capture
-from gsmap.map.sharing import noting
+from gsmap.ingest import (
+    Capture,
+    SearchResult,
+    SkippedPath,
+    check_scale,
+    given_date,
+    read_capture,
+    search_captures,
+    take_capture,
+)
+from gsmap.map.shared_jobs import note_interruption
 from gsmap.store import Store
 from gsmap.store.set_aside import CAPTURE
 from gsmap.texts import escaped
@@ -26,13 +35,13 @@ _log = logging.getLogger("gsmap.map")
 
 
 @dataclass(frozen=True)
-class Reader:
-    """A capture that was found.
+class CaptureReader:
+    """A capture that was found but not read yet.
 
     Args:
-        name: of the capture.
+        name: capture name.
         read: reads and checks it.
-        path: its file; None where it is in memory.
+        path: capture file; None for a capture in memory.
     """
 
     name: str
@@ -41,14 +50,14 @@ class Reader:
 
 
 @dataclass(frozen=True)
-class Ingested:
-    """What became of one capture.
+class IngestResult:
+    """The result of ingesting one capture.
 
     Args:
-        scene: as it is in the map now.
-        new: whether it was added.
-        dated: whether the map had it already, and it has another date now.
-        notes: what a person should know.
+        scene: the scene in the map.
+        new: true if it was added.
+        dated: true if the map had it already and its date changed.
+        notes: remarks for the user.
     """
 
     scene: Scene
@@ -66,14 +75,14 @@ def ingest(
     captured_at: str | None,
     scale: str,
     progress: StageProgress,
-) -> list[Ingested]:
-    """Every capture found; see `gsmap.map.Map.ingest`."""
+) -> list[IngestResult]:
+    """Ingest every capture found; see `gsmap.map.Map.ingest`."""
     dates = {scene.id: scene.captured_at for scene in store.scenes.list()}
     found, search = readers(sources, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
     skipped, bad, good = list(search.skipped), list(search.unreadable), list[Path]()
     is_only_one = len(found) == 1 and not bad and _is_named(found[0], sources)
-    results: list[Ingested] = []
-    with noting(lambda: f"{len(results)} of {len(found)} captures are in the map"):
+    results: list[IngestResult] = []
+    with note_interruption(lambda: f"{len(results)} of {len(found)} captures are in the map"):
         for i, one in enumerate(found):
             progress("ingest", i / len(found), one.name)
             try:
@@ -83,7 +92,7 @@ def ingest(
             except GsmapError as error:
                 if is_only_one or one.path is None:
                     raise
-                (skipped if isinstance(error, NotGaussiansError) else bad).append(LeftOut(one.path, str(error)))
+                (skipped if isinstance(error, NotGaussiansError) else bad).append(SkippedPath(one.path, str(error)))
             else:
                 good += [] if one.path is None else [one.path]
     if len(skipped) > len(search.skipped) and not results and not bad:
@@ -95,16 +104,16 @@ def ingest(
     return results
 
 
-def _is_named(one: Reader, sources: Sequence[Source]) -> bool:
-    """Whether a capture's file, and no folder around it, was named."""
+def _is_named(one: CaptureReader, sources: Sequence[Source]) -> bool:
+    """Return true if a capture's file itself, and not a folder around it, was given."""
     return one.path in [Path(source) for source in sources if not isinstance(source, Gaussians)]
 
 
-def _set_aside(store: Store, bad: Sequence[LeftOut], done: Sequence[Path]) -> None:
-    """Keep which captures could not be read, for `gsmap status`, and forget those that were mended or deleted.
+def _set_aside(store: Store, bad: Sequence[SkippedPath], done: Sequence[Path]) -> None:
+    """Record unreadable captures for `gsmap status`, and drop records of repaired or deleted ones.
 
     Args:
-        done: the files and folders that were gone through, all of whose other captures are in the map.
+        done: files and folders that were searched; their other captures are in the map.
     """
     for one in bad:
         _log.warning("a capture is set aside: %s", one.reason)
@@ -126,7 +135,7 @@ def _set_aside(store: Store, bad: Sequence[LeftOut], done: Sequence[Path]) -> No
 
 
 def _what(path: Path) -> str:
-    """The name under which a capture is set aside."""
+    """Return the key of a quarantined capture."""
     return f"{CAPTURE} {hashlib.sha256(os.fsencode(path.absolute())).hexdigest()[:32]}"
 
 
@@ -138,7 +147,7 @@ def check_captures(
     captured_at: str | None = None,
     scale: str = "auto",
 ) -> None:
-    """Refuse what `ingest` would refuse, before a map is made for it.
+    """Refuse invalid captures before a map is created.
 
     Raises:
         NotFoundError, InputError, ConfigError: see `gsmap.map.Map.ingest`.
@@ -155,8 +164,8 @@ def readers(
     name: str | None,
     captured_at: str | None,
     scale: str,
-) -> tuple[list[Reader], Search]:
-    """A reader of each capture found, and the search that found them; see `gsmap.map.Map.ingest`."""
+) -> tuple[list[CaptureReader], SearchResult]:
+    """Find captures; return a reader of each, and the search result; see `gsmap.map.Map.ingest`."""
     given_date(captured_at)  # refuses what is none before anything is searched
     check_scale(scale)
     memory = [source for source in sources if isinstance(source, Gaussians)]
@@ -167,7 +176,7 @@ def readers(
             raise ConfigError("Gaussians in memory go with gsmap.Cameras, or with none", code="in_memory_mismatch")
         called = name or "capture"
         take = partial(take_capture, memory[0], cameras, name=called, captured_at=captured_at, scale_policy=scale)
-        return [Reader(called, take)], Search()
+        return [CaptureReader(called, take)], SearchResult()
     if isinstance(cameras, Cameras):
         raise ConfigError(
             "cameras in memory go with Gaussians in memory; for a file name a file of cameras",
@@ -181,11 +190,11 @@ def readers(
             code="many_captures",
         )
     options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale_policy": scale}
-    return [Reader(files.name, partial(read_capture, files, **options), files.path) for files in found], search
+    return [CaptureReader(files.name, partial(read_capture, files, **options), files.path) for files in found], search
 
 
-def _add(store: Store, capture: Capture, dates: dict[str, str | None]) -> Ingested:
-    """Store a capture; ``dates`` of the scenes in the map are brought up to date."""
+def _add(store: Store, capture: Capture, dates: dict[str, str | None]) -> IngestResult:
+    """Store a capture and update ``dates``."""
     scene, new = store.scenes.add(
         capture.content,
         capture.cameras,
@@ -202,4 +211,4 @@ def _add(store: Store, capture: Capture, dates: dict[str, str | None]) -> Ingest
     notes = capture.notes
     if not new and not dated and capture.captured_at not in (None, scene.captured_at):
         notes = (*notes, f"its date stays {scene.captured_at or 'unknown'}, as was said before; --captured-at sets it")
-    return Ingested(scene, new, dated and not new, notes)
+    return IngestResult(scene, new, dated and not new, notes)

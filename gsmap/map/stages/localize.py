@@ -1,4 +1,4 @@
-"""Localize: the features of every scene's views, made where they are missing, and photographs found by them."""
+"""Localize stage: make missing view features, then localize photos with them."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ import numpy as np
 
 from gsmap import localize as localizing
 from gsmap import retrieve
-from gsmap.engine import SetAside, run_jobs
+from gsmap.engine import QuarantinedJob, run_jobs
 from gsmap.errors import ConfigError, CorruptError, GsmapError, NotFoundError, ReadOnlyError
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.localize import PlacedFeatures, ViewIndex, new_segment, view_index
 from gsmap.map import models
-from gsmap.map.indexing import AT_ONCE, PATIENCE, SceneIndex
 from gsmap.map.jobs import features_of_scene
-from gsmap.map.metres import map_metres
+from gsmap.map.metric_scales import map_metres
+from gsmap.map.scene_index import AT_ONCE, PATIENCE, SceneIndex
 from gsmap.map.settings import Settings
-from gsmap.map.sharing import SharedJobs, noting
+from gsmap.map.shared_jobs import SharedJobs, note_interruption
 from gsmap.methods import RecipeKey, family
 from gsmap.methods.extractor import Extractor
 from gsmap.store import Store
 from gsmap.types import Gaussians, PoseGraph, Scene
-from gsmap.types.localization import Photo, Placement, SceneFeatures
+from gsmap.types.localization import LocalizationResult, Photo, SceneFeatures
 from gsmap.types.progress import StageProgress
 from gsmap.types.segments import InMemory
 
@@ -37,13 +37,13 @@ _KEPT = 12  # scenes whose arrays stay in memory while photographs come: about a
 
 
 @dataclass(frozen=True)
-class Near:
-    """Where a person thinks that the photographs were taken.
+class SearchRegion:
+    """The region in which photos are searched.
 
     Args:
-        scene: only places that this scene (id) shows; None where a point is given.
-        point: (3,) map, unit of the map.
-        radius: around it, in the same unit.
+        scene: restrict to places that this scene (id) shows; None if a point is given.
+        point: (3,) point of the map, map unit.
+        radius: radius around it, map unit.
     """
 
     scene: str | None = None
@@ -51,8 +51,8 @@ class Near:
     radius: float = 0.0
 
 
-def parse_near(store: Store, text: str) -> Near:
-    """``SCENE``, or ``X,Y,Z,R``.
+def parse_near(store: Store, text: str) -> SearchRegion:
+    """Parse ``SCENE`` or ``X,Y,Z,R``.
 
     Raises:
         ConfigError: neither four numbers with a radius above 0, nor a scene.
@@ -61,24 +61,24 @@ def parse_near(store: Store, text: str) -> Near:
     return near_of(text, lambda name: store.scenes.get(name).id)
 
 
-def near_of(text: str, id_of: Callable[[str], str]) -> Near:
-    """The same, where scenes are told by ``id_of`` their names."""
+def near_of(text: str, id_of: Callable[[str], str]) -> SearchRegion:
+    """Parse ``SCENE`` or ``X,Y,Z,R`` with a function that resolves scene names."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        return Near(id_of(text))
+        return SearchRegion(id_of(text))
     if len(numbers) != 4 or not np.isfinite(numbers).all() or numbers[3] <= 0:
         raise ConfigError(f"near is a scene, or X,Y,Z,R with a radius above 0, got {text!r}", code="invalid_point")
-    return Near(None, (numbers[0], numbers[1], numbers[2]), numbers[3])
+    return SearchRegion(None, (numbers[0], numbers[1], numbers[2]), numbers[3])
 
 
 class Localizer:
-    """The scenes of a map, ready for photographs; arrays are read when a photograph asks for them.
+    """The placed scenes of a map, ready to localize photos; arrays are loaded on demand.
 
     Args:
-        store: of the map.
-        settings: in force.
-        progress: told of features that are made.
+        store: the store of the map.
+        settings: the settings in force.
+        progress: progress of feature extraction.
 
     Raises:
         NotFoundError: the map holds nothing that has a place.
@@ -112,14 +112,14 @@ class Localizer:
             for scene in self.scenes
         }
         self._used: list[str] = []
-        self._eyes: dict[str, localizing.Eyes] = {}
+        self._views: dict[str, localizing.Eyes] = {}
         self.index = self._index(progress)
         specs = models.specs(store)
         method = family("extractor").get(self.params.extractor)
         self.extractor: Extractor = method.make(specs, self.params.extractors[self.params.extractor])
 
     def _scene_index(self) -> SceneIndex:
-        """The index of the scenes that have features: a scene whose job was given up has none."""
+        """Return the index of the scenes with features; quarantined jobs leave scenes without."""
         kept = self.store.view_features.kept(self.keys.values())
         return SceneIndex(
             self.store,
@@ -130,12 +130,12 @@ class Localizer:
         )
 
     def _index(self, progress: StageProgress) -> ViewIndex:
-        """The index of all views, brought up to date; scenes that cannot be put in are put in memory."""
+        """Return the updated index of all views; scenes that cannot be stored are indexed in memory."""
         index = self._scene_index()
         for left in reversed(range(PATIENCE)):
             try:
                 if self.store.catalog.writable and not self._held:
-                    kept = index.brought_up_to_date(lambda told: progress("localize", 0.0, f"{told} of views"))
+                    kept = index.update(lambda told: progress("localize", 0.0, f"{told} of views"))
                 else:
                     kept = index.segments()
                 missing = index.missing(kept)
@@ -156,8 +156,8 @@ class Localizer:
             self.placed[scene].drop()
         return new_segment(found, self.params.features.indexed)
 
-    def _asked(self, near: Near | None, ask: Callable[[ViewIndex], _Said]) -> _Said:
-        """What is said by the index; once more where others have changed it meanwhile, or it was damaged."""
+    def _query(self, near: SearchRegion | None, ask: Callable[[ViewIndex], _Said]) -> _Said:
+        """Query the index; once more after a repair if it was changed or damaged meanwhile."""
         try:
             return ask(self.index if near is None else localizing_near(self, near))
         except (NotFoundError, CorruptError) as error:
@@ -165,7 +165,7 @@ class Localizer:
         return ask(self.index if near is None else localizing_near(self, near))
 
     def _renewed(self, error: GsmapError) -> ViewIndex:
-        """The index as it is now, where that may help.
+        """Reload the index after an error if that may help.
 
         Raises:
             GsmapError: the error, where it will not.
@@ -191,34 +191,34 @@ class Localizer:
         return found
 
     def _use(self, scene: str) -> None:
-        """Note that arrays of a scene are in memory; let go of those that were read longest ago."""
+        """Mark a scene's arrays as used, and drop those used longest ago."""
         self._used = [one for one in self._used if one != scene] + [scene]
         while len(self._used) > _KEPT:
             self.placed[self._used.pop(0)].drop()
 
-    def eyes(self, scene: str) -> localizing.Eyes:
-        """What a scene's own cameras saw, for those that photos are compared with."""
-        if scene not in self._eyes:
+    def reference_views(self, scene: str) -> localizing.Eyes:
+        """Return the reference views of a scene, for comparison with photos."""
+        if scene not in self._views:
             cameras = self.store.scenes.cameras(scene)
             own = None if cameras is None or cameras.synthesised else cameras
-            self._eyes[scene] = localizing.open_eyes(self.placed[scene], own, self.params.differences)
-        return self._eyes[scene]
+            self._views[scene] = localizing.open_eyes(self.placed[scene], own, self.params.differences)
+        return self._views[scene]
 
-    def localize(self, photo: Photo, near: Near | None = None) -> Placement:
-        """Find one photograph."""
+    def localize(self, photo: Photo, near: SearchRegion | None = None) -> LocalizationResult:
+        """Localize one photo."""
         options = (self.placed, self.extractor, self.params, self.metres)
-        found = self._asked(near, lambda index: localizing.localize_photo(photo, index, *options))
+        found = self._query(near, lambda index: localizing.localize_photo(photo, index, *options))
         return _within(found, near)
 
-    def localize_together(self, photos: Sequence[Photo], near: Near | None = None) -> list[Placement]:
-        """Find photographs of one place that overlap."""
+    def localize_together(self, photos: Sequence[Photo], near: SearchRegion | None = None) -> list[LocalizationResult]:
+        """Localize overlapping photos of one place."""
         options = (self.placed, self.extractor, self.params, self.metres)
-        found = self._asked(near, lambda index: localizing.localize_together(photos, index, *options))
+        found = self._query(near, lambda index: localizing.localize_together(photos, index, *options))
         return [_within(one, near) for one in found]
 
 
-def _within(found: Placement, near: Near | None) -> Placement:
-    """The placement, or that it is not where it was to be.
+def _within(found: LocalizationResult, near: SearchRegion | None) -> LocalizationResult:
+    """Return the result, refused if it lies outside the search region.
 
     A person who says where photographs are from rules out what is elsewhere.
     """
@@ -231,8 +231,8 @@ def _within(found: Placement, near: Near | None) -> Placement:
     return replace(found, reason=reason, T_map_camera=None, covariance=None)
 
 
-def localizing_near(localizer: Localizer, near: Near) -> ViewIndex:
-    """The views of scenes that reach to where photographs are thought to be from."""
+def localizing_near(localizer: Localizer, near: SearchRegion) -> ViewIndex:
+    """Return the index restricted to scenes that reach into the search region."""
     metres = localizer.metres
     if near.scene is not None:
         if near.scene not in localizer.placed:
@@ -254,7 +254,7 @@ def localizing_near(localizer: Localizer, near: Near) -> ViewIndex:
 
 
 def _overlap(localizer: Localizer, around: PlacedFeatures, scene: str) -> bool:
-    """Whether the middle of a scene lies within the box of another, or the other way round."""
+    """Return true if the centre of one scene lies in the box of the other."""
     other = localizer.placed[scene]
     if other.component != around.component:
         return False
@@ -268,7 +268,7 @@ def _overlap(localizer: Localizer, around: PlacedFeatures, scene: str) -> bool:
 
 
 def feature_keys(store: Store, scenes: Sequence[Scene], settings: Settings) -> dict[str, RecipeKey]:
-    """What names the features of each scene under these settings, by scene id.
+    """Return the key of each scene's features by scene id; thinned scenes have other features.
 
     A scene that is kept compact shows less than it did: its features are others.
 
@@ -295,7 +295,7 @@ def ensure(
     progress: StageProgress,
     held: dict[str, SceneFeatures],
 ) -> None:
-    """Make the features that are missing; they are kept in the map, or in ``held`` where it cannot be written."""
+    """Make the missing features and store them, or keep them in ``held`` if the map is read-only."""
     kept = store.view_features.kept(keys.values())
     missing = [scene for scene in scenes if keys[scene.id].digest not in kept]
     if not missing:
@@ -306,7 +306,7 @@ def ensure(
     if not store.catalog.writable:
         running = run_jobs(features_of_scene, iter(jobs.values()), settings.engine)
         for count, (number, found) in enumerate(running):
-            if not isinstance(found, SetAside):
+            if not isinstance(found, QuarantinedJob):
                 held[missing[number].id] = found
             progress("localize", (count + 1) / len(jobs), f"{missing[number].name}: read-only, made for this run alone")
         return
@@ -318,7 +318,10 @@ def ensure(
     shared = SharedJobs(store, "localize", "views", jobs, about, done, progress)
     results = shared.results(lambda arguments: run_jobs(features_of_scene, arguments, settings.engine))
     there = len(scenes) - len(missing)
-    with noting(lambda: f"the views of {there + shared.num_kept()} of {len(scenes)} scenes are kept"), closing(results):
+    with (
+        note_interruption(lambda: f"the views of {there + shared.num_kept()} of {len(scenes)} scenes are kept"),
+        closing(results),
+    ):
         for key, found in results:
             try:
                 store.view_features.save(found, keys[found.scene])
@@ -328,9 +331,9 @@ def ensure(
 
 
 def localize(
-    localizer: Localizer, photos: Sequence[Photo], near: Near | None, progress: StageProgress
-) -> Iterator[tuple[Placement, float]]:
-    """Each photo's place and the seconds that it took, in order."""
+    localizer: Localizer, photos: Sequence[Photo], near: SearchRegion | None, progress: StageProgress
+) -> Iterator[tuple[LocalizationResult, float]]:
+    """Localize photos one by one; yield each result with its wall time."""
     for number, photo in enumerate(photos):
         began = time.monotonic()
         found = localizer.localize(photo, near)
@@ -338,8 +341,10 @@ def localize(
         yield found, time.monotonic() - began
 
 
-def localize_all(localizer: Localizer, photos: Sequence[Photo], near: Near | None) -> Iterator[tuple[Placement, float]]:
-    """Each photo's place with the help of the others, and its share of the seconds that they took."""
+def localize_all(
+    localizer: Localizer, photos: Sequence[Photo], near: SearchRegion | None
+) -> Iterator[tuple[LocalizationResult, float]]:
+    """Localize photos together; yield each result with its share of the wall time."""
     began = time.monotonic()
     found = localizer.localize_together(photos, near)
     seconds = (time.monotonic() - began) / max(len(photos), 1)

@@ -1,4 +1,4 @@
-"""Localise a scan: looked for in the map as a capture would be, and nothing of it is kept."""
+"""Localize a scan: register it with scenes of the map without storing it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from gsmap.ingest import read_captures
 from gsmap.localize.scan import AGREE_SIGMAS, as_gaussians
 from gsmap.localize.scan_joining import Joined, OnePlace, Support, join
 from gsmap.map import models
-from gsmap.map.looking_up import ask_once
-from gsmap.map.metres import metres_of_scenes
+from gsmap.map.metric_scales import metres_of_scenes
+from gsmap.map.scene_lookup import look_up_graph
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.map.stages.localize import parse_near
@@ -41,15 +41,15 @@ _OF_NO_UNIT = (".obj", ".stl")  # formats whose files are in whatever unit their
 
 @dataclass(frozen=True)
 class Request:
-    """What is looked for.
+    """The scan to localize.
 
     Args:
-        file: a cloud, a mesh, a splat, or a depth picture.
-        intrinsics_px: ``fx fy cx cy``, which make a depth picture of the file.
-        colour: picture of the same view as a depth picture.
-        units_per_m: values of a depth picture that make a metre.
-        scale: ``known`` (the scan is in metres), ``unknown`` or ``auto``; None for what its kind of file is in.
-        near: only scenes near one (its name), or near ``X,Y,Z,R``, a ball in the frame and unit of component 0.
+        file: a point cloud, mesh, splat or depth image.
+        intrinsics_px: ``fx fy cx cy`` of a depth image.
+        colour: colour image of the same view as a depth image.
+        units_per_m: depth value of one metre.
+        scale: ``known`` (the scan is in metres), ``unknown`` or ``auto``; None for the default of the file type.
+        near: restrict to scenes near a scene (name) or a ball ``X,Y,Z,R`` in the frame of component 0.
     """
 
     file: Path
@@ -71,8 +71,8 @@ class Request:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sought:
-    """A scan as captures are: Gaussians and cameras in one frame."""
+class _ScanQuery:
+    """A scan as Gaussians and cameras in one frame."""
 
     gaussians: Gaussians
     cameras: Cameras
@@ -114,7 +114,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     )
     source = SceneView(_ID, sought.gaussians, sought.cameras, graph, sought.policy)
     told(0.3, "asking the index")
-    candidates = [one.scene for one in ask_once(store, known, graph, settings.retrieve)[: settings.retrieve.top_k]]
+    candidates = [one.scene for one in look_up_graph(store, known, graph, settings.retrieve)[: settings.retrieve.top_k]]
     notes: list[str] = []
     if not sought.coloured:
         # The index knows scenes by their colours, and shapes repeat: all are asked, and all have a say.
@@ -149,8 +149,8 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     return _row(request, sought, remarks, found, supports, joined, poses, scenes, source.centre, seconds)
 
 
-def _read(request: Request, settings: Settings) -> _Sought:
-    """The scan, from whatever it is."""
+def _read(request: Request, settings: Settings) -> _ScanQuery:
+    """Read the scan from any supported file."""
     if request.intrinsics_px is not None:
         scan = scans.read_depth(
             request.file,
@@ -166,12 +166,12 @@ def _read(request: Request, settings: Settings) -> _Sought:
         capture = captures[0]
         notes = capture.notes
         gaussians, cameras = capture.gaussians, capture.cameras
-        return _Sought(gaussians, cameras, "splat", capture.scale_policy, True, gaussians.origin, notes)
+        return _ScanQuery(gaussians, cameras, "splat", capture.scale_policy, True, gaussians.origin, notes)
     policy = "auto" if request.file.suffix.lower() in _OF_NO_UNIT else "known"
     return _of_scan(scans.read(request.file, settings.scan.reading), request.scale or policy, settings)
 
 
-def _of_scan(scan: Scan, policy: str, settings: Settings) -> _Sought:
+def _of_scan(scan: Scan, policy: str, settings: Settings) -> _ScanQuery:
     few = scan.points[:: max(1, len(scan) // 20_000)]
     unit_m = 1.0 if policy == "known" else estimate_unit_m(few, None, None, settings.describe.view_distance_m)
     gaussians = as_gaussians(scan, settings.scan.cell_m / unit_m)
@@ -179,11 +179,11 @@ def _of_scan(scan: Scan, policy: str, settings: Settings) -> _Sought:
     notes = list(scan.notes)
     if scan.colours is None:
         notes.append("the scan has no colours: it is told by its shape alone, which says less")
-    return _Sought(gaussians, cameras, scan.kind, policy, scan.colours is not None, scan.origin, tuple(notes))
+    return _ScanQuery(gaussians, cameras, scan.kind, policy, scan.colours is not None, scan.origin, tuple(notes))
 
 
 def _asked(store: Store, scenes: dict[str, Scene], poses: PoseGraph | None, settings: Settings) -> dict[str, RecipeKey]:
-    """The key of the graph of every scene that can be asked: described by the present recipe, and with a place."""
+    """Return the graph key of every placed scene described by the current recipe."""
     placed = [scene for scene in scenes.values() if poses is not None and scene.id in poses.poses]
     keys = graph_keys(store, placed, settings)
     lacking = set(without_graph(store, keys))
@@ -197,7 +197,7 @@ def _asked(store: Store, scenes: dict[str, Scene], poses: PoseGraph | None, sett
 
 
 def _near(store: Store, near: str) -> set[str]:
-    """Ids of the scenes near a scene, or near a ball ``X,Y,Z,R`` in the frame of component 0.
+    """Return the ids of scenes near a scene, or near a ball ``X,Y,Z,R`` in the frame of component 0.
 
     Raises:
         NotFoundError: no such scene, or none is there.
@@ -233,7 +233,7 @@ def _view(store: Store, scene: Scene, graph_key: str) -> SceneView:
 
 def _row(
     request: Request,
-    sought: _Sought,
+    sought: _ScanQuery,
     remarks: Sequence[str],
     found: Sequence[Registration],
     supports: Sequence[Support],
@@ -300,7 +300,7 @@ def _why_not(found: Sequence[Registration], joined: Joined | None, scenes: dict[
 
 
 def _sigmas(covariance: np.ndarray | None, middle: np.ndarray) -> tuple[float | None, float | None]:
-    """Degrees about the least known axis, and the unit of the scan in the least known direction at its middle."""
+    """Return the largest rotation sigma in degrees, and the largest position sigma at the scan's centre."""
     if covariance is None:
         return None, None
     x, y, z = middle

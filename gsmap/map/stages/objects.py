@@ -1,4 +1,4 @@
-"""Objects: what is kept of each component of the map, or what is made of it now."""
+"""Object stage: load or compute the objects of each component."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from gsmap.errors import NotFoundError
 from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.directions import level_frame
 from gsmap.geometry.transforms import transform_gaussians
-from gsmap.map.dates import parsed
-from gsmap.map.metres import map_metres
-from gsmap.map.one_state import of_one_state
+from gsmap.map.date_filter import parse_moment
+from gsmap.map.metric_scales import map_metres
 from gsmap.map.settings import Settings
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.visits import MAX_SHIFT_M
 from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects import (
@@ -31,18 +31,18 @@ from gsmap.objects.fuse import SegmentId
 from gsmap.store import Store
 from gsmap.store.objects import ObjectSet, Places
 from gsmap.texts import few
-from gsmap.types import Gaussians, PoseGraph, Room, Scene, SceneGraph, Segments, SightingState, Sim3
+from gsmap.types import Gaussians, ObservationState, PoseGraph, Room, Scene, SceneGraph, Segments, Sim3
 from gsmap.types.progress import Progress, StageProgress
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ComponentObjects:
     """The objects of one component.
 
     Args:
-        made: what was made now, ids without numbers; or what is kept.
-        places: where captures show each object, of what was made now; None of what is kept.
-        key: of what was made now, to be kept under; None where it is not to be kept.
+        made: new objects without numbers, or the stored ones.
+        places: extents of each new object per scene; None for stored objects.
+        key: key under which to store new objects; None if they are not to be stored.
     """
 
     component: int
@@ -51,7 +51,7 @@ class Part:
     key: RecipeKey | None
 
 
-@of_one_state
+@snapshot_read
 def objects_of_components(
     store: Store,
     settings: Settings,
@@ -59,8 +59,8 @@ def objects_of_components(
     graphs: Mapping[str, SceneGraph] | None,
     *,
     make: bool = True,
-) -> tuple[PoseGraph, dict[str, Scene], dict[int, float], list[Part], list[str]]:
-    """The newest poses, the placed captures, metres, the objects of each component, and who tells nothing."""
+) -> tuple[PoseGraph, dict[str, Scene], dict[int, float], list[ComponentObjects], list[str]]:
+    """Return newest poses, placed scenes, metres per unit, the objects of each component, and notes."""
     placed = store.revisions.get()
     if placed is None:
         raise NotFoundError(
@@ -90,7 +90,7 @@ def objects_of_components(
             kept = None  # an older gsmap gave numbers twice
         still = {} if kept is None else _unmoved(kept.poses, poses, scenes, unit)
         if kept is not None and still.keys() == poses.keys():
-            parts.append(Part(component, kept, None, None))
+            parts.append(ComponentObjects(component, kept, None, None))
             given |= {thing.id for thing in kept.objects}
         elif not make:
             raise NotFoundError(
@@ -131,7 +131,7 @@ def objects_of_components(
 def _key(
     store: Store, settings: Settings, captures: Sequence[Scene], described: Mapping[str, str], unit: float
 ) -> RecipeKey:
-    """What names the objects of a component; what was rejected of its changes takes part, and no array is read."""
+    """Return the key of a component's objects; no array is read."""
     ids = {scene.id for scene in captures}
     told = [
         f"{one.key} {one.created_at} {[change.status == 'rejected' for change in one.changes]}"
@@ -149,7 +149,7 @@ def _key(
 def _unmoved(
     then: Mapping[str, Sim3], now: Mapping[str, Sim3], scenes: Mapping[str, Scene], unit: float
 ) -> dict[str, Sim3]:
-    """The captures of now that lie where they lay, within what visits are taken to be unmoved by."""
+    """Return the current poses of scenes that moved less than the threshold for visits."""
     out = {}
     for scene, pose in now.items():
         if scene in then:
@@ -171,19 +171,19 @@ def _made(
     key: RecipeKey | None,
     sets: Sequence[ObjectSet],
     told: Progress,
-) -> Part:
-    """The objects of a component, made now; what captures were found to show when they were asked before holds.
+) -> ComponentObjects:
+    """Compute the objects of a component; earlier observations are reused where they are still valid.
 
     Args:
-        poses: ``S_map_scene`` of its captures, oldest first.
-        key: None where captures are not asked what they saw.
+        poses: ``S_map_scene`` of its scenes, oldest first.
+        key: None if scenes are not rendered to look for objects of other scenes.
     """
     things = {
         scene: graph.things for scene in poses if (graph := graphs[scene]) is not None and graph.things is not None
     }
     captures = [SegmentedScene(scene, poses[scene], mine) for scene, mine in things.items()]
     digests = {scene: _digest(things[scene]) if scene in things else "" for scene in poses}
-    before: dict[tuple[str, str, int], tuple[SightingState, float]] = {}
+    before: dict[tuple[str, str, int], tuple[ObservationState, float]] = {}
     for old in sets:
         if key is None or old.recipe != key.recipe or old.metres != unit:
             continue
@@ -195,7 +195,7 @@ def _made(
                 if one.asked in still and one.scene in still and same:
                     before[one.scene, one.asked, shown[one.asked]] = one.state, one.looked
 
-    def looked(capture: int, node: SegmentId) -> tuple[SightingState, float] | None:
+    def looked(capture: int, node: SegmentId) -> tuple[ObservationState, float] | None:
         return before.get((captures[capture].scene, captures[node[0]].scene, node[1]))
 
     def could_see(capture: SegmentedScene, points: np.ndarray) -> bool:
@@ -232,17 +232,19 @@ def _made(
         told(1.0, "rooms")
         rooms = _rooms(store, settings, poses, up, unit)
     names = ("", "") if key is None else (key.digest, key.recipe)
-    return Part(component, ObjectSet(*names, unit, dict(poses), digests, tuple(objects), up, tuple(rooms)), places, key)
+    return ComponentObjects(
+        component, ObjectSet(*names, unit, dict(poses), digests, tuple(objects), up, tuple(rooms)), places, key
+    )
 
 
 _SHAPE = ("means", "quats", "log_scales", "logit_opacities")
 
 
 def _rooms(store: Store, settings: Settings, poses: Mapping[str, Sim3], up: np.ndarray, unit: float) -> list[Room]:
-    """The rooms that captures show, in the level frame of ``up`` and in metres; nothing is rendered.
+    """Return the rooms in the level frame of ``up``, in metres; nothing is rendered.
 
     Args:
-        unit: metres per unit of the map.
+        unit: metres per map unit.
     """
     S_level_map = Sim3(level_frame(up), np.zeros(3), unit)
     captures, eyes = [], [np.zeros((0, 3))]
@@ -262,16 +264,16 @@ def _digest(things: Segments) -> str:
 
 
 def _when(scene: Scene) -> tuple[bool, float, str]:
-    """Dated captures by their date; then the others, as they came."""
+    """Return a sort key: dated scenes by date, then undated ones by arrival."""
     if scene.captured_at is None:
         return True, 0.0, scene.ingested_at or ""
-    return False, parsed(scene.captured_at).timestamp(), scene.ingested_at or ""
+    return False, parse_moment(scene.captured_at).timestamp(), scene.ingested_at or ""
 
 
 def _told(
     store: Store, captures: Sequence[SegmentedScene]
 ) -> tuple[list[tuple[SegmentId, SegmentId]], list[tuple[SegmentId, int]]]:
-    """What changes say of things, but for those that a person rejected.
+    """Return object identities from changes that were not rejected.
 
     Returns:
         Things that are one though they moved; and things, each with a capture that does not show it where it stood.

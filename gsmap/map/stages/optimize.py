@@ -1,4 +1,4 @@
-"""Optimize: poses of all scenes from the edges in use, kept as a revision under what they were solved from."""
+"""Optimize stage: solve the poses of all scenes and store them as a revision."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 
 from gsmap import optimize as solver
-from gsmap.map.dates import parsed
-from gsmap.map.one_state import of_one_state
+from gsmap.map.date_filter import parse_moment
 from gsmap.map.settings import Settings
-from gsmap.map.sharing import POLL_S
+from gsmap.map.shared_jobs import POLL_S
+from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
@@ -29,16 +29,16 @@ from gsmap.world.survey import in_frame
 
 @dataclass(frozen=True, eq=False)
 class PoseBasis:
-    """What names the poses of a map: all that decides them, without the figures of any edge.
+    """Everything that identifies the poses of a map, without the measurements of the edges.
 
     Args:
-        scenes: ids, in the order they came.
-        named: what names each edge that may be used, by (target, source), in their order.
-        same_visits: those of them between captures that are known to be of about one time.
-        priors: outside knowledge.
-        ups: (3,) direction against gravity in the scene's frame, by scene id, where it is known.
-        observed: what was observed of the world, as it was told.
-        recipe: how they are solved.
+        scenes: scene ids in order of arrival.
+        named: identifier of each usable edge, by (target, source), sorted.
+        same_visits: the edges between scenes of about the same time.
+        priors: pose priors.
+        ups: (3,) up direction in the scene's frame, by scene id, if known.
+        observed: observations of the world as specified.
+        recipe: recipe of the solver.
     """
 
     scenes: list[str]
@@ -51,11 +51,11 @@ class PoseBasis:
 
     @cached_property
     def key(self) -> RecipeKey:
-        """The recipe with all of these as its inputs."""
+        """Recipe key with all of these as inputs."""
         return self.key_of(self.scenes)
 
     def key_of(self, scenes: Collection[str]) -> RecipeKey:
-        """The same of some of the scenes, as if the map had no others."""
+        """Return the key for a subset of the scenes."""
         some = set(scenes)
         named = [name for (a, b), name in self.named.items() if a in some and b in some]
         told = [(p.scene, p.S_map_scene.matrix(), p.sigmas, p.up, p.up_sigma_rad) for p in self.priors]
@@ -66,15 +66,15 @@ class PoseBasis:
         return self.recipe.of(*mine, *named, canonical(told), ups, *seen)
 
 
-@of_one_state
+@snapshot_read
 def pose_basis(store: Store, settings: Settings, observed: Survey | None = None) -> PoseBasis:
-    """Read what names the poses; a few statements, and microseconds a scene.
+    """Read what identifies the poses; microseconds per scene.
 
     Args:
-        observed: in place of what the map knows to be observed of the world.
+        observed: replaces the stored observations of the world.
     """
     living, priors = store.scenes.brief(), store.priors.list()
-    captured = {scene.id: None if scene.captured_at is None else parsed(scene.captured_at) for scene in living}
+    captured = {scene.id: None if scene.captured_at is None else parse_moment(scene.captured_at) for scene in living}
     hours = settings.optimize.same_visit_h
     named, same_visits = {}, set()
     # By id, not in the order in which workers happened to finish: the same key whenever they were made.
@@ -90,20 +90,20 @@ def pose_basis(store: Store, settings: Settings, observed: Survey | None = None)
 
 @dataclass(frozen=True, eq=False)
 class PoseInputs(PoseBasis):
-    """What decides the poses of a map.
+    """The inputs of a solve.
 
     Args:
-        edges: those that may be used, by (target, source).
-        survey: what was observed of the world, in its frame.
+        edges: usable edges, by (target, source).
+        survey: observations in the world frame.
     """
 
     edges: list[Edge]
     survey: Survey
 
 
-@of_one_state
+@snapshot_read
 def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
-    """Read what decides the poses."""
+    """Read the inputs of a solve."""
     return _with_edges(store, pose_basis(store, settings))
 
 
@@ -113,7 +113,7 @@ def _with_edges(store: Store, basis: PoseBasis) -> PoseInputs:
 
 
 def _edges(store: Store, basis: PoseBasis, among: Collection[str] | None = None) -> list[Edge]:
-    """The edges that may be used, or those of them among some scenes."""
+    """Return the usable edges, or those among some scenes."""
     return [
         Edge(
             target=stored.registration.target,
@@ -131,14 +131,14 @@ def _edges(store: Store, basis: PoseBasis, among: Collection[str] | None = None)
 
 
 @dataclass(frozen=True, eq=False)
-class _Growth:
-    """What placing new scenes in the newest answer asks, where nothing else has come or gone since that.
+class _IncrementalInputs:
+    """The inputs to add new scenes to the newest revision when nothing else has changed.
 
     Args:
-        basis: what names the poses then.
-        revision, previous: the newest answer.
-        inside, rim: scenes that it looks at, and the outermost of them (`gsmap.optimize.surroundings`).
-        edges: those among both that may be used.
+        basis: identification of the new poses.
+        revision, previous: number and poses of the newest revision.
+        inside, rim: scenes to solve, and the outermost scenes that stay fixed (`gsmap.optimize.surroundings`).
+        edges: usable edges among these.
     """
 
     basis: PoseBasis
@@ -149,24 +149,24 @@ class _Growth:
     edges: list[Edge]
 
 
-@of_one_state
-def _inputs(store: Store, settings: Settings) -> PoseInputs | _Growth:
-    """Read what decides the poses: of a map that only has grown, what lies around the new scenes."""
+@snapshot_read
+def _inputs(store: Store, settings: Settings) -> PoseInputs | _IncrementalInputs:
+    """Read the inputs of a solve; for a map that only has grown, those around the new scenes."""
     basis, newest = pose_basis(store, settings), store.revisions.newest()
     if newest is not None and (previous := store.revisions.get(newest.number)) is not None:
         near, rim = solver.surroundings(basis.scenes, list(basis.named), previous, settings.optimize)
         if near and basis.key_of(previous.poses).digest == newest.key:
-            return _Growth(basis, newest.number, previous, near - rim, rim, _edges(store, basis, near))
+            return _IncrementalInputs(basis, newest.number, previous, near - rim, rim, _edges(store, basis, near))
     return _with_edges(store, basis)
 
 
 def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool:
-    """Whether two captures are known to be of about one time."""
+    """Return true if two scenes are known to be of about the same time."""
     return a is not None and b is not None and abs(a - b).total_seconds() < 3600 * hours
 
 
 def _ups(store: Store, living: Sequence[BriefScene], settings: Settings) -> dict[str, np.ndarray]:
-    """What each scene's present graph says is up; where it has none yet, its newest one, or what that said."""
+    """Return the up direction of each scene by its current graph, else its newest one."""
     said = store.graphs.says()
     times = Counter(graph.scene for graph in said)
     several = [scene for scene in living if times[scene.id] > 1]
@@ -178,7 +178,7 @@ def _ups(store: Store, living: Sequence[BriefScene], settings: Settings) -> dict
 
 
 def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
-    """Solve for all poses and keep the answer as a new revision; returns its number."""
+    """Solve all poses and store them as a new revision; return its number."""
     return _optimize(store, pose_inputs(store, settings), settings, progress)
 
 
@@ -197,10 +197,10 @@ def _answer(given: PoseInputs, previous: PoseGraph | None, settings: Settings) -
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Poses that were solved and not kept.
+    """Solved poses that are not stored yet.
 
     Args:
-        answer: the poses. key: what they were solved from. after: the revision that was the newest then.
+        answer: the poses. key: key of their inputs. after: newest revision at that time.
     """
 
     answer: PoseGraph
@@ -209,7 +209,7 @@ class Solution:
 
 
 def solve_observed(store: Store, settings: Settings, observed: Survey) -> Solution | None:
-    """Solve for all poses as if other observations of the world were known; None where the newest revision is that.
+    """Solve all poses with other observations of the world; None if the newest revision has these.
 
     Nothing is kept: `solve` keeps it.
     """
@@ -226,8 +226,8 @@ def _upright(answer: PoseGraph, basis: PoseBasis, params: solver.Params) -> Pose
     return solver.gravity_align(answer, basis.ups, {prior.scene for prior in basis.priors}, params)
 
 
-def _grow(store: Store, given: _Growth, settings: Settings, progress: StageProgress) -> bool:
-    """Place the new scenes as `_optimize` would, whether that can be done by what lies around them."""
+def _grow(store: Store, given: _IncrementalInputs, settings: Settings, progress: StageProgress) -> bool:
+    """Place new scenes by solving around them; return false if that is not possible."""
     basis, params = given.basis, settings.optimize
     answer = solver.grow(basis.scenes, given.edges, given.previous, params)
     if answer is None:
@@ -241,12 +241,12 @@ def _grow(store: Store, given: _Growth, settings: Settings, progress: StageProgr
 
 
 def solve(store: Store, settings: Settings, progress: StageProgress, solution: Solution | None = None) -> bool:
-    """Optimize unless the newest revision is what that would make; returns whether there is a new one.
+    """Optimize unless the newest revision is current; return true if there is a new one.
 
     One process does it at a time: others wait, and then need not.
 
     Args:
-        solution: kept in place of solving once more, where nothing has come or gone since it was solved.
+        solution: stored instead of solving again if its inputs are still current.
     """
     told = False
     while not _is_of(store, pose_basis(store, settings)):
@@ -257,8 +257,8 @@ def solve(store: Store, settings: Settings, progress: StageProgress, solution: S
                     progress("optimize", 1.0, f"revision {number}")
                     return True
                 given = _inputs(store, settings)
-                if not _is_of(store, given.basis if isinstance(given, _Growth) else given):
-                    if isinstance(given, _Growth) and not _grow(store, given, settings, progress):
+                if not _is_of(store, given.basis if isinstance(given, _IncrementalInputs) else given):
+                    if isinstance(given, _IncrementalInputs) and not _grow(store, given, settings, progress):
                         given = pose_inputs(store, settings)
                     if isinstance(given, PoseInputs):
                         _optimize(store, given, settings, progress)
@@ -273,20 +273,20 @@ def solve(store: Store, settings: Settings, progress: StageProgress, solution: S
     return told
 
 
-@of_one_state
+@snapshot_read
 def _is_present(store: Store, solution: Solution, settings: Settings) -> bool:
-    """Whether a solution is what solving now would give."""
+    """Return true if the inputs of a solution are current."""
     newest = store.revisions.newest()
     same = (None if newest is None else newest.number) == solution.after
     return same and pose_basis(store, settings).key.digest == solution.key.digest
 
 
 def is_solved(store: Store, settings: Settings) -> bool:
-    """Whether the newest revision is what this recipe makes of what the map knows now."""
+    """Return true if the newest revision is current."""
     return _is_of(store, pose_basis(store, settings))
 
 
 def _is_of(store: Store, basis: PoseBasis) -> bool:
-    """Whether the newest revision is what was solved from this."""
+    """Return true if the newest revision was solved from this basis."""
     newest = store.revisions.newest()
     return newest is not None and newest.key == basis.key.digest

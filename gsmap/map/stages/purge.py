@@ -1,4 +1,4 @@
-"""Purge: a scene forgotten for good, in the map, in its branches if asked, and in the folders it was exported to."""
+"""Purge stage: delete a scene for good from the map, its branches on request, and export folders."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from gsmap.export.pyramid import LEVELS_FOLDER, is_stale
 from gsmap.export.streamed_sog import StreamedSog
 from gsmap.export.tileset import Tiles3D
 from gsmap.export.write import leftovers
-from gsmap.map.pictures import FILE_NAME as PICTURES
-from gsmap.map.pictures import Pictures
-from gsmap.map.viewing import cache_folder
-from gsmap.map.viewing_site import SITE, remove_site, site_files, site_owner
+from gsmap.map.comparison_pictures import FILE_NAME as PICTURES
+from gsmap.map.comparison_pictures import PictureFolder
+from gsmap.map.page_export import SITE, remove_site, site_files, site_owner
+from gsmap.map.page_source import cache_folder
 from gsmap.report import owner_of
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
@@ -39,7 +39,7 @@ _TREES = (Tiles3D(), StreamedSog())
 
 
 def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, Purge]]:
-    """Forget a scene; whatever an interrupted purge left undone is done first.
+    """Purge a scene; interrupted purges are finished first.
 
     Args:
         ref: name, id, or the beginning of an id, of a living or a removed scene; of one that was purged its id.
@@ -111,7 +111,7 @@ def _finish(store: Store, begun: Purge) -> Purge:
                     begun = purging.note(store, begun, str(out), len(site_files(out)) + 1)
                     remove_site(out)
             elif os.path.lexists(out / PICTURES):
-                if gone := Pictures.load(out, store.id).forget(out, begun.scene):
+                if gone := PictureFolder.load(out, store.id).forget(out, begun.scene):
                     begun = purging.note(store, begun, str(out), gone)
             else:
                 unreachable.append(f"{out}: it is not there, or no report, and holds no {FILE_NAME} and no {PICTURES}")
@@ -123,13 +123,13 @@ def _finish(store: Store, begun: Purge) -> Purge:
 
 
 def _passing(error: OSError | GsmapError) -> type[GsmapError] | None:
-    """Which error says that a folder that is there could not be cleaned for now; None where it cannot be reached."""
+    """Return the error class of a temporary failure to clean a folder; None if the folder is unreachable."""
     kind = of_system(error) if isinstance(error, OSError) else type(error)
     return kind if kind in (DiskFullError, DiskError, BusyError) else None
 
 
 def _clean(store: Store, out: Path, begun: Purge) -> Purge:
-    """Delete what one folder holds of a scene, if it is this map's export; the purge, with how many files that were.
+    """Delete a scene's files from one export folder of this map; record their number.
 
     Tiles made with it; what no tile is any more, but an export had still to delete; and the coarser levels of trees
     and those of components that had either, or whose levels may be of earlier tiles. The manifest names no tile of
@@ -176,6 +176,6 @@ def _component_folders(out: Path) -> list[str]:
 
 
 def _num_levels(out: Path, folder: str) -> int:
-    """How many files of coarser levels a component has."""
+    """Return the number of files of coarser levels of a component."""
     refuse_links(out, folder, LEVELS_FOLDER)
     return len(files_below(out / folder / LEVELS_FOLDER))

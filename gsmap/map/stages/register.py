@@ -1,4 +1,4 @@
-"""Register: which pairs are tried, and the edges of those that the present recipe has not registered yet."""
+"""Register stage: choose pairs and register those that lack a result of the current recipe."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 from gsmap.engine import run_jobs
 from gsmap.errors import InputError, NotFoundError
 from gsmap.map.jobs import register_scenes
-from gsmap.map.looking_up import ask, keys_of_lookups
 from gsmap.map.reports import checked_pair, pair_of
+from gsmap.map.scene_lookup import keys_of_lookups, look_up_scenes
 from gsmap.map.settings import Settings
-from gsmap.map.sharing import SharedJobs, noting
+from gsmap.map.shared_jobs import SharedJobs, note_interruption
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
@@ -35,35 +35,35 @@ Pairs = str | Path | Sequence[Pair]
 
 
 def register(
-    store: Store, pairs: Pairs, settings: Settings, progress: StageProgress, known: Known | None = None
+    store: Store, pairs: Pairs, settings: Settings, progress: StageProgress, known: RegisteredPairs | None = None
 ) -> list[Registration]:
-    """Register the pairs asked for; those of ``auto`` and ``all`` only where this recipe has not done so yet.
+    """Register the given pairs; ``auto`` and ``all`` skip pairs already registered by this recipe.
 
     A result that this recipe made before, under settings that were changed meanwhile, becomes the pair's current one
     again without being computed. The target of a pair is the scene of lower id, however the pair was named: an edge is
     the same whichever scene came first.
 
     Args:
-        known: what was found of pairs before, in the same update; only what has changed since is looked at.
+        known: state from an earlier call in the same update; only later changes are read.
     """
     scenes = store.scenes.brief()
-    work = _Work(store, scenes, graph_keys(store, scenes, settings), settings, progress)
-    known = Known() if known is None else known
+    work = _RegistrationContext(store, scenes, graph_keys(store, scenes, settings), settings, progress)
+    known = RegisteredPairs() if known is None else known
     if pairs == "auto":
         return _register_candidates(work, known)
     if pairs == "all":
         everything = list(combinations(sorted(work.described), 2))
-        known.look(work)
+        known.update(work)
         return work.register([pair for pair in everything if not known.has(*pair)], after=0)
     # What is named is registered again: only what comes later counts.
     return work.register(_named(store, pairs, work), after=store.registrations.newest(), again=True)
 
 
-class _Work:
-    """What registering needs to know of a map.
+class _RegistrationContext:
+    """The scenes, graph keys and settings of a registration run.
 
     Args:
-        graphs: the key of each living scene's graph.
+        graphs: graph key of each living scene.
     """
 
     def __init__(
@@ -80,15 +80,15 @@ class _Work:
         self.described = {scene: key for scene, key in graphs.items() if scene not in self.lacking}
 
     def key(self, target: str, source: str) -> RecipeKey:
-        """What names the registration of a pair; the other direction is another registration."""
+        """Return the key of a pair's registration; the reverse direction has another key."""
         return self.recipe.of(self.graphs[target].digest, self.graphs[source].digest)
 
     def register(self, pairs: Sequence[Pair], after: int, *, again: bool = False) -> list[Registration]:
-        """Register pairs, but for those that others do meanwhile.
+        """Register pairs, shared with other processes.
 
         Args:
-            after: registrations up to this number do not count.
-            again: also those that were set aside.
+            after: ignore registrations up to this number.
+            again: retry quarantined pairs.
         """
         store, settings = self.store, self.settings
         edges = {self.key(a, b).digest: (a, b) for a, b in pairs}
@@ -100,7 +100,7 @@ class _Work:
         shared = SharedJobs(store, "register", "edge", jobs, edges, done, self.progress, again=again)
         made = shared.batches(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
         names = {scene.id: scene.name for scene in self.scenes}
-        kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
+        kept = note_interruption(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
         with kept, closing(made):
             for batch in made:
                 store.registrations.save_all([(edge, self.key(*edges[key])) for key, edge in batch])
@@ -109,15 +109,15 @@ class _Work:
         return store.registrations.found(edges)
 
 
-class Known:
-    """What the present recipe knows of pairs, in either direction: older maps hold both.
+class RegisteredPairs:
+    """The pairs registered by the current recipe, in either direction (old maps hold both).
 
     What it made before, under settings that were changed meanwhile, is made current again. Looked at once more, only
     those pairs are judged of which something else stands by now.
 
     Args:
-        held: pairs whose edge stands and is not in doubt, by `Standing.pair`.
-        stale: pairs of described scenes that other settings, or another version, registered.
+        held: pairs with a usable edge that is not doubtful, by `Standing.pair`.
+        stale: pairs of described scenes registered by other settings or versions.
     """
 
     def __init__(self) -> None:
@@ -126,8 +126,8 @@ class Known:
         self._by: tuple[str, float, dict[str, str]] = ("", 0.0, {})
         self._forget()
 
-    def look(self, work: _Work) -> None:
-        """See what stands by now."""
+    def update(self, work: _RegistrationContext) -> None:
+        """Read the current registrations."""
         self._read(work)
         adopted = [self._adopt(work, pair, keys) for pair, keys in self._replaced.values()]
         if any(adopted):
@@ -139,7 +139,7 @@ class Known:
         )
 
     def has(self, a: str, b: str) -> bool:
-        """Whether it has registered a pair."""
+        """Return true if a pair is registered."""
         return ":".join(directed(a, b)) in self._registered
 
     def _forget(self) -> None:
@@ -148,8 +148,8 @@ class Known:
         self._registered: set[str] = set()
         self._replaced: dict[str, tuple[Pair, frozenset[str]]] = {}
 
-    def _read(self, work: _Work) -> None:
-        """What stands of every pair, and whether it is what this recipe makes, or a person told."""
+    def _read(self, work: _RegistrationContext) -> None:
+        """Read all current registrations and classify those that changed."""
         by = (
             work.recipe.recipe,
             work.settings.optimize.max_disagreement,
@@ -164,7 +164,7 @@ class Known:
             self._forget()
             self._judge_all(work, tried)
 
-    def _judge_all(self, work: _Work, tried: Sequence[Standing]) -> None:
+    def _judge_all(self, work: _RegistrationContext, tried: Sequence[Standing]) -> None:
         judged, digest_of, (_, max_disagreement, graphs) = self._judged, work.recipe.digest_of, self._by
         for one in tried:
             pair = one.pair
@@ -190,7 +190,7 @@ class Known:
             elif one.usable and (one.is_told or not one.disagreement > max_disagreement):
                 self.held[pair] = (a, b)
 
-    def _adopt(self, work: _Work, pair: Pair, keys: frozenset[str]) -> bool:
+    def _adopt(self, work: _RegistrationContext, pair: Pair, keys: frozenset[str]) -> bool:
         mine = [key for key in _keys(work, pair) if key in keys]
         known = [work.store.registrations.find(key) for key in mine]
         if known:
@@ -198,23 +198,23 @@ class Known:
         return bool(known)
 
 
-def _keys(work: _Work, pair: Pair) -> tuple[str, str]:
-    """What the pair's registration would be kept under, in either direction."""
+def _keys(work: _RegistrationContext, pair: Pair) -> tuple[str, str]:
+    """Return the keys of a pair's registration in both directions."""
     a, b = pair
     return work.key(a, b).digest, work.key(b, a).digest
 
 
-def _register_candidates(work: _Work, known: Known) -> list[Registration]:
-    """Register what retrieval proposes, round by round, and what other settings had registered.
+def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> list[Registration]:
+    """Register the candidates of retrieval, round by round, and the stale pairs.
 
     Only scenes that have not been looked up by this recipe are, and nothing is read of the others.
     """
     store, params = work.store, work.settings.retrieve
-    known.look(work)
+    known.update(work)
     asked, keys = store.indexes.asked(), keys_of_lookups(work.described, params)
     new = sorted(scene for scene in work.described if asked.get(scene, ("", None))[0] != keys[scene])
     if new:
-        ask(store, work.described, new, params, work.progress)
+        look_up_scenes(store, work.described, new, params, work.progress)
     ties = Counter(scene for pair in known.held.values() for scene in pair)
     # Whose list was not gone down to its end, and who has lost edges since.
     short = {
@@ -249,11 +249,11 @@ def _register_candidates(work: _Work, known: Known) -> list[Registration]:
 
 
 def num_stale(pairs: Iterable[tuple[str, str]], graphs: Mapping[str, RecipeKey], settings: Settings) -> int:
-    """How many edges other settings or another version made; a person's own word is never stale.
+    """Count the edges made by other settings or versions; measured edges are never stale.
 
     Args:
-        pairs: each with the key of what counts of it (`gsmap.store.registrations.Registrations.keys`).
-        graphs: the key of each living scene's graph.
+        pairs: pairs with the key of their current registration (`gsmap.store.registrations.Registrations.keys`).
+        graphs: graph key of each living scene.
     """
     digest_of = recipe_key(settings.register).digest_of
     digests = {scene: key.digest for scene, key in graphs.items()}
@@ -267,7 +267,7 @@ def num_stale(pairs: Iterable[tuple[str, str]], graphs: Mapping[str, RecipeKey],
 
 
 def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np.ndarray, note: str) -> None:
-    """Keep a person's own measurement of where ``b`` lies in ``a`` as the pair's current edge.
+    """Store a measured pose of ``b`` in ``a`` as the pair's current edge.
 
     Args:
         sigmas: (7,) standard deviations [rot_rad (3), trans (3), log_scale] on the source side, in the source's unit.
@@ -294,7 +294,7 @@ def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np
 
 
 def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
-    """Pairs of a text file, one a line: ``A B`` or ``A:B``; ``#`` begins a remark. A name with spaces needs the colon.
+    """Read pairs from a text file, one per line: ``A B`` or ``A:B``; ``#`` starts a comment.
 
     Raises:
         NotFoundError: no such file, or a line that names a scene which is not there.
@@ -324,7 +324,7 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
 
 
 def _pair_on(store: Store, text: str) -> tuple[Scene, Scene]:
-    """The scenes of ``A B`` or ``A:B``; a space or colon may also belong to a name."""
+    """Return the scenes of ``A B`` or ``A:B``; names may contain a space or colon."""
     words = text.split()
     if len(words) == 2:
         with suppress(NotFoundError):
@@ -332,8 +332,8 @@ def _pair_on(store: Store, text: str) -> tuple[Scene, Scene]:
     return pair_of(store, text)
 
 
-def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> list[Pair]:
-    """The scene pairs that are named, each as (target, source), in a fixed order, each once."""
+def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _RegistrationContext) -> list[Pair]:
+    """Return the given pairs as (target, source), sorted within each, without repetition."""
     if isinstance(pairs, Path):
         named = read_pairs(store, pairs)
     elif isinstance(pairs, str):
@@ -354,7 +354,7 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> lis
 
 
 def placed_scenes(store: Store) -> dict[str, ScenePosition]:
-    """Where scenes lie by the newest poses, for finding neighbours."""
+    """Return centre and radius of each placed scene, to find neighbours."""
     bounds, poses = store.scenes.bounds(), store.revisions.poses()
     scenes = [scene for scene in poses if scene in bounds]
     if not scenes:

@@ -1,4 +1,4 @@
-"""Supersede: a capture that was trained again takes the place of the one that is in the map."""
+"""Supersede stage: replace a scene by a retrained capture of the same frames."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _SAME_FRAME_M = 0.05  # two trainings from one set of frames lie in each other w
 
 
 @dataclass(frozen=True)
-class Superseded:
-    """What became of a capture in the place of another.
+class SupersedeResult:
+    """The result of replacing a scene.
 
     Args:
-        scene: the new one.
-        notes: what a person should know.
+        scene: the new scene.
+        notes: remarks for the user.
     """
 
     scene: Scene
@@ -44,12 +44,12 @@ class Superseded:
 
 
 @dataclass(frozen=True, eq=False)
-class _Carried:
-    """An edge of the scene that goes, as one of the scene that comes.
+class _CarriedEdge:
+    """An edge of the replaced scene, rewritten for the new one.
 
     Args:
-        edge: as it is to be kept, under a key; None where a person measured it.
-        review, note: the word that stands on it.
+        edge: the registration to store under the key; None as key for a measured edge.
+        review, note: its review and note.
     """
 
     edge: Registration
@@ -60,12 +60,12 @@ class _Carried:
 
 def supersede(
     store: Store, capture: Capture, ref: str, settings: Settings, progress: StageProgress, *, named: bool
-) -> Superseded:
-    """Put a capture in the place of a scene, whole or not at all; see `gsmap.map.Map.ingest`.
+) -> SupersedeResult:
+    """Replace a scene by a capture, whole or not at all; see `gsmap.map.Map.ingest`.
 
     Args:
-        ref: the scene that goes.
-        named: the capture's name was given; else it takes that of the scene.
+        ref: the scene to replace.
+        named: true if the capture's name was specified; else it takes the scene's name.
 
     Raises:
         InputError: it lies in another frame than the scene, or is in the map already; nothing is changed.
@@ -112,11 +112,11 @@ def supersede(
     notes = [f"it took the place of scene {old.id[:12]} ({old.name})"]
     if held:
         notes.append(f"{held.count('accepted')} of {len(held)} edges hold: gsmap optimize {store.location} uses them")
-    return Superseded(scene, tuple(notes))
+    return SupersedeResult(scene, tuple(notes))
 
 
 def _about(capture: Capture, old: Scene) -> Capture:
-    """The capture about the origin of the scene that it is to supersede, where both have one."""
+    """Return the capture about the origin of the scene to replace, if both have one."""
     shift = capture.gaussians.origin - old.origin
     if not (capture.gaussians.origin.any() and old.origin.any() and shift.any()):
         return capture
@@ -125,7 +125,7 @@ def _about(capture: Capture, old: Scene) -> Capture:
 
 
 def _describe(store: Store, new_id: str, capture: Capture, settings: Settings) -> SceneGraph:
-    """The graph of a capture that is not in the map yet."""
+    """Compute the graph of a capture that is not in the map yet."""
     rendered_by = backend(settings.describe.object.render_backend)
     params = replace(settings.describe, object=replace(settings.describe.object, render_backend=rendered_by))
     return describing.describe(
@@ -134,7 +134,7 @@ def _describe(store: Store, new_id: str, capture: Capture, settings: Settings) -
 
 
 def _view(store: Store, scene: Scene, settings: Settings) -> SceneView:
-    """A scene of the map as registration sees it; its graph is made where it lacks one, and not kept."""
+    """Return a scene for registration; a missing graph is computed and not stored."""
     gaussians, cameras = store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id)
     graph = store.graphs.load(scene.id, graph_keys(store, [scene], settings)[scene.id])
     if graph is None:
@@ -144,7 +144,7 @@ def _view(store: Store, scene: Scene, settings: Settings) -> SceneView:
 
 
 def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings: Settings) -> None:
-    """Refuse a capture whose surfaces do not lie on those of the scene that it is to supersede."""
+    """Refuse a capture that is not aligned with the scene to replace."""
     as_they_lie = Proposal("superseding", Sim3.identity(), with_scale=False, num_inliers=0)
     found = registering.check_pose(old_view, new_view, as_they_lie, settings.register)
     advice = "ingest it without --supersedes, and registration finds where it lies"
@@ -164,8 +164,8 @@ def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings:
 
 def _carried(
     store: Store, old: Scene, coming: Scene, view: SceneView, settings: Settings, progress: StageProgress
-) -> Iterator[_Carried]:
-    """The edges of the scene that goes, for the one that comes: poses are checked, and none is searched."""
+) -> Iterator[_CarriedEdge]:
+    """Yield the edges of the replaced scene for the new one; poses are verified, not searched."""
     living = {scene.id: scene for scene in store.scenes.list()}
     known = [stored for stored in store.registrations.current() if old.id in _ends(stored)]
     recipe = recipe_key(settings.register)
@@ -179,11 +179,11 @@ def _carried(
         ends = [coming.id if scene == old.id else scene for scene in _ends(stored)]
         alike = replace(edge, target=ends[0], source=ends[1])
         if stored.manual:
-            yield _Carried(alike, None, *word)
+            yield _CarriedEdge(alike, None, *word)
             continue
         if S is None:
             alike = replace(alike, notes=(*edge.notes, f"known of scene {old.id[:12]}, which it superseded"))
-            yield _Carried(alike, recipe.of(*(keys[end].digest for end in ends)), *word)
+            yield _CarriedEdge(alike, recipe.of(*(keys[end].digest for end in ends)), *word)
             continue
         target, source = sorted(ends)
         views = {coming.id: view, other.id: _view(store, other, settings)}
@@ -192,7 +192,7 @@ def _carried(
         if stored.review == "confirm" and found.S_target_source is None:  # a person vouches for the pose as it was
             found = replace(alike, notes=(*edge.notes, f"confirmed of scene {old.id[:12]}; of this: {found.reason}"))
         key = recipe.of(keys[found.target].digest, keys[found.source].digest)
-        yield _Carried(found, key, *word)
+        yield _CarriedEdge(found, key, *word)
 
 
 def _ends(stored: StoredRegistration) -> Sequence[str]:
@@ -200,7 +200,7 @@ def _ends(stored: StoredRegistration) -> Sequence[str]:
 
 
 def _proposal(edge: Registration, S_target_source: Sim3) -> Proposal:
-    """An edge as a proposal, with what its correspondences said of it."""
+    """Return an edge as a proposal with the statistics of its correspondences."""
     return Proposal(
         edge.proposer,
         S_target_source,

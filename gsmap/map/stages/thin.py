@@ -1,4 +1,4 @@
-"""Thin: captures that newer ones supersede are kept compact, the oldest first."""
+"""Thin stage: store superseded scenes in compact form, the oldest first."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from gsmap.compare import CaptureViews
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.map.metres import metres_of_scenes
+from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.map.settings import Settings
-from gsmap.map.sharing import noting
+from gsmap.map.shared_jobs import note_interruption
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, compact
 from gsmap.thin import find_visible, measure_fidelity_db, observed_fraction, render_views
-from gsmap.types import PlacedScene, PoseGraph, Scene, SceneGraph
+from gsmap.types import PosedScene, PoseGraph, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import ThinReport, ThinRow
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a thinning.
+    """The options of a thinning.
 
     Args:
-        keep_days: what was captured in so many days before ``now`` stays whole; None: only the budget counts.
-        budget_bytes: thin no more than it takes for the arrays of living scenes to fit; None: all that may be.
+        keep_days: scenes captured in this many days before ``now`` stay whole; None for no limit by age.
+        budget_bytes: thin only until the arrays of living scenes fit; None thins all that may be.
         dry_run: change nothing.
-        now: ISO 8601; None for the present.
+        now: ISO 8601; None for the current time.
     """
 
     keep_days: float | None = None
@@ -39,7 +39,7 @@ class Request:
 
 
 def thin(store: Store, request: Request, settings: Settings, progress: StageProgress) -> ThinReport:
-    """Keep superseded captures compact, the oldest first, and reclaim what that frees.
+    """Thin superseded scenes, the oldest first, and reclaim the space.
 
     A capture is superseded where newer ones, dated and kept whole, looked at nearly all of its surface: they stand for
     it when a new capture is registered or a picture localised. Poses, registrations and words stay.
@@ -72,7 +72,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     sizes = {scene: _num_bytes(store, scene) for scene in living}
     shares = _superseded(store, known, before, graph, settings, progress)
     rows: list[ThinRow] = []
-    with noting(lambda: f"{sum(row.thinned for row in rows)} captures are thinned"):
+    with note_interruption(lambda: f"{sum(row.thinned for row in rows)} captures are thinned"):
         for done, scene in enumerate(scene for scene in known if scene.id in shares):
             if request.budget_bytes is not None and sum(sizes.values()) <= request.budget_bytes:
                 break
@@ -82,7 +82,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
                 why = f"newer captures that stay whole saw {share:.0%} of it"
                 rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why))
                 continue
-            own = PlacedScene(store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id), scene.id)
+            own = PosedScene(store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id), scene.id)
             stays = find_visible(own, settings.thin)
             kept = compact.rounded(own.gaussians[stays])
             fidelity = measure_fidelity_db(own, kept, settings.thin)
@@ -117,7 +117,7 @@ THINGS = RecipeKey("thin", "things", {"things": 1})
 
 
 def _keep_things(store: Store, graph: SceneGraph | None) -> None:
-    """Keep the things of a thinned capture, of which the graph that it was described by is dropped."""
+    """Keep the segments of a thinned scene without its node layers."""
     if graph is None or graph.things is None:
         return
     store.graphs.save(replace(graph, layers={}), THINGS.of(graph.scene_id))
@@ -131,14 +131,14 @@ def _superseded(
     settings: Settings,
     progress: StageProgress,
 ) -> dict[str, float]:
-    """What share of each old capture's surface newer ones looked at that stay whole, by scene id.
+    """Return the fraction of each old scene's surface that newer, whole scenes observed, by scene id.
 
     Decided from the newest back, so that no capture is superseded by one that is thinned itself. What was thinned
     before needs others to stand for it still: where those that stay do not, further ones must.
 
     Args:
         known: scenes with a date and a pose, oldest first.
-        before: what was captured earlier is old.
+        before: scenes captured earlier are old.
     """
     bar = settings.thin.min_seen_again
     metres = metres_of_scenes(store, settings, graph)
@@ -146,10 +146,10 @@ def _superseded(
     stay: list[Scene] = []
     shares: dict[str, float] = {}
 
-    def placed(scene: Scene) -> PlacedScene:
+    def placed(scene: Scene) -> PosedScene:
         S = in_metres(graph.poses[scene.id].S_map_scene, metres[scene.id])
         gaussians = transform_gaussians(store.scenes.gaussians(scene.id), S)
-        return PlacedScene(gaussians, transform_cameras(store.scenes.cameras(scene.id), S), scene.id)
+        return PosedScene(gaussians, transform_cameras(store.scenes.cameras(scene.id), S), scene.id)
 
     def share(scene: Scene) -> float:
         component = graph.poses[scene.id].component
@@ -192,7 +192,7 @@ def _row(scene: Scene, before: int, after: int, seen: float, reason: str, fideli
 
 
 def _num_bytes(store: Store, scene: str) -> int:
-    """Of a scene's arrays and its graphs'."""
+    """Return the size of a scene's arrays and graphs."""
     return store.scenes.num_bytes(scene) + store.graphs.num_bytes(scene)
 
 
@@ -201,7 +201,7 @@ def _when(scene: Scene) -> datetime:
 
 
 def _moment(text: str) -> datetime:
-    """An ISO 8601 time; UTC where it has no zone."""
+    """Parse an ISO 8601 time; UTC if it has no zone."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError as error:

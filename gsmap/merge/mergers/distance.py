@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.merge.overlap import concatenate_scenes
-from gsmap.types import MergeResult, PlacedScene
+from gsmap.types import MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
 VERSION = 1
@@ -42,7 +42,7 @@ def uses_dates(params: Params) -> bool:
 
 
 def merge(
-    scenes: Sequence[PlacedScene],
+    scenes: Sequence[PosedScene],
     params: Params,
     bounds: np.ndarray | None,
     budget_s: float | None,

@@ -27,7 +27,7 @@ from gsmap.merge.references import WEIGHT_UNIT, References, render_references, v
 from gsmap.merge.selection import near_other_scene, select_owners
 from gsmap.render.fit import make_fitter, with_enough_memory
 from gsmap.render.fitter import FitOptions, LearningRates
-from gsmap.types import Gaussians, MergeResult, PlacedScene
+from gsmap.types import Gaussians, MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
 VERSION = 8
@@ -143,7 +143,7 @@ def uses_dates(params: Params) -> bool:
 
 
 def merge(
-    scenes: Sequence[PlacedScene],
+    scenes: Sequence[PosedScene],
     params: Params,
     bounds: np.ndarray | None,
     budget_s: float | None,
@@ -197,7 +197,7 @@ def merge(
 
 
 def _start(
-    scenes: Sequence[PlacedScene],
+    scenes: Sequence[PosedScene],
     wanted: References,
     settled: ResolvedScenes,
     params: Params,

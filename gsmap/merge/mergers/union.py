@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, resolve_changes
 from gsmap.merge.overlap import concatenate_scenes
-from gsmap.types import MergeResult, PlacedScene
+from gsmap.types import MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
 VERSION = 1
@@ -50,7 +50,7 @@ def uses_dates(params: Params) -> bool:
 
 
 def merge(
-    scenes: Sequence[PlacedScene],
+    scenes: Sequence[PosedScene],
     params: Params,
     bounds: np.ndarray | None,
     budget_s: float | None,

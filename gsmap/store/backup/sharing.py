@@ -18,7 +18,7 @@ from types import TracebackType
 
 from gsmap.errors import MALFORMED, BusyError, GsmapError, NotFoundError, StoreError
 from gsmap.store.places import Place
-from gsmap.types.holder import Holder, this_process
+from gsmap.types.lock_owner import LockOwner, this_process
 
 LEASES = "leases/"
 SAVE = "save"
@@ -86,7 +86,7 @@ class Lease:
         """Whether who wrote a lease has ended, as far as this machine can tell; the lease goes with it then."""
         try:
             told = json.loads(b"".join(self._place.get(name)))
-            gone = Holder(**{key: str(told[key]) for key in ("task", "host", "process", "since")}).is_gone
+            gone = LockOwner(**{key: str(told[key]) for key in ("task", "host", "process", "since")}).is_gone
         except NotFoundError:
             return True
         except MALFORMED:

@@ -1,4 +1,4 @@
-"""What the map answers: one frozen dataclass for every row and report.
+"""Rows and reports: one frozen dataclass for everything that a map returns.
 
 Each is defined once. Its fields are what Python reads and, by the same names, the keys of the JSON that ``--json``
 prints; ``columns`` says which of them a table shows, and under which headings; ``Args:`` says what each means
@@ -11,18 +11,27 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row, Table
 from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
+from gsmap.types.rows.evaluation import (
+    BandRow,
+    ComponentErrorRow,
+    EdgeErrorRow,
+    EvaluationReport,
+    ImageErrorRow,
+    NeesRow,
+    PoseErrorRow,
+)
 from gsmap.types.rows.exports import ExportReport, SmallMapReport, SmallSceneRow, TileRow
 from gsmap.types.rows.find import FindHit, FindReport
-from gsmap.types.rows.leases import AtWorkRow
-from gsmap.types.rows.life import ThinReport, ThinRow
+from gsmap.types.rows.leases import LeaseRow
 from gsmap.types.rows.localize import LocalizeReport, LocalizeRow, PhotoChangeRow, PhotoRow
+from gsmap.types.rows.map_operations import BranchRow, MergeReport, PurgeReport, SplitReport
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
     DemoReport,
     InitReport,
     MapStatus,
-    MetreRow,
+    MetricScaleRow,
     MigrateReport,
     ModelRow,
     PruneReport,
@@ -33,13 +42,13 @@ from gsmap.types.rows.maps import (
 from gsmap.types.rows.objects import (
     HistoryReport,
     ObjectFactRow,
+    ObjectObservationRow,
     ObjectRow,
     ObjectsReport,
     RelationRow,
     RoomRow,
-    SightingRow,
 )
-from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairRef, PairReport, WhyReport, WhyStep
+from gsmap.types.rows.pairs import EdgeRow, ExplanationStep, PairEventRow, PairExplanation, PairRef, PairReport
 from gsmap.types.rows.reports import WrittenReport
 from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow, UpdateReport
 from gsmap.types.rows.scenes import (
@@ -55,22 +64,13 @@ from gsmap.types.rows.scenes import (
     SceneReport,
     SceneRow,
 )
+from gsmap.types.rows.thinning import ThinReport, ThinRow
 from gsmap.types.rows.trust import TrustReport
-from gsmap.types.rows.truth import (
-    BandRow,
-    ComponentErrorRow,
-    EdgeErrorRow,
-    EvaluationReport,
-    ImageErrorRow,
-    NeesRow,
-    PoseErrorRow,
-)
-from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
-from gsmap.types.rows.world import ContradictionRow, MeasureReport, PlaceRow, ResidualRow, TieRow, WorldReport
+from gsmap.types.rows.world import ContradictionRow, GeoreferenceRow, MeasureReport, PointRow, ResidualRow, WorldReport
 
 __all__ = [
     "SCHEMA",
-    "AtWorkRow",
+    "LeaseRow",
     "BackupReport",
     "BandRow",
     "BranchRow",
@@ -104,7 +104,7 @@ __all__ = [
     "MapStatus",
     "MeasureReport",
     "MergeReport",
-    "MetreRow",
+    "MetricScaleRow",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -115,7 +115,7 @@ __all__ = [
     "PairEventRow",
     "PairRef",
     "PairReport",
-    "PlaceRow",
+    "PointRow",
     "PoseChangeRow",
     "PoseErrorRow",
     "PoseRow",
@@ -133,13 +133,13 @@ __all__ = [
     "SceneReport",
     "SceneRow",
     "SettingRow",
-    "SightingRow",
+    "ObjectObservationRow",
     "SnapshotRow",
     "SplitReport",
     "Table",
     "ThinReport",
     "ThinRow",
-    "TieRow",
+    "GeoreferenceRow",
     "SmallMapReport",
     "SmallSceneRow",
     "TileRow",
@@ -147,8 +147,8 @@ __all__ = [
     "TrustReport",
     "UpdateReport",
     "ViewReport",
-    "WhyReport",
-    "WhyStep",
+    "PairExplanation",
+    "ExplanationStep",
     "WrittenReport",
     "WorldReport",
 ]

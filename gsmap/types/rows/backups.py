@@ -11,20 +11,20 @@ from gsmap.types.rows.base import Row
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SnapshotRow(Row):
-    """One state of a map in a backup.
+    """A snapshot of a map in a backup.
 
     Args:
-        snapshot: its name; ``gsmap restore --at`` takes its beginning, too.
-        created_at: the moment whose state it is; everything that was committed before is in it.
-        map_id: the map's own id.
+        snapshot: name; ``gsmap restore --at`` also accepts its beginning.
+        created_at: time of the saved state; everything committed before it is included.
+        map_id: id of the map.
         revision: number of the newest revision; null before the first.
-        counts: how many ``scenes`` (and ``removed`` ones), ``groups`` of arrays, ``graphs``, ``registrations`` and
-            ``revisions`` it holds.
-        num_files: how many files it consists of.
-        num_bytes: their size.
-        num_bytes_new: how much of that was sent for it; the rest was there.
+        counts: numbers of ``scenes`` (and ``removed`` ones), ``groups`` of arrays, ``graphs``, ``registrations`` and
+            ``revisions``.
+        num_files: number of files.
+        num_bytes: size of its files.
+        num_bytes_new: bytes sent for this snapshot; the rest was in the backup already.
         catalog_schema: number of its newest migration.
-        gsmap_version: which gsmap took it.
+        gsmap_version: version of gsmap that made it.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -49,23 +49,23 @@ class SnapshotRow(Row):
 
     @property
     def num_scenes(self) -> int | None:
-        """How many living scenes it holds."""
+        """Number of living scenes."""
         return self.counts.get("scenes")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BackupReport(Row):
-    """What a backup did.
+    """The result of a backup.
 
     Args:
-        dest: where it went, without secrets.
-        snapshot: the state that was saved.
-        num_files_new: how many files were sent; the rest was there.
+        dest: destination, without secrets.
+        snapshot: the saved snapshot.
+        num_files_new: number of files sent; the rest was in the backup already.
         deleted: names of snapshots that ``--keep`` deleted.
-        num_bytes_freed: by that.
-        num_verified: how many files in the backup were read again; null without ``--verify``.
-        problems: damage in the backup that the map could not mend, a line each.
-        notes: what a person should know.
+        num_bytes_freed: bytes freed by deleting snapshots.
+        num_verified: number of files in the backup that were read again; null without ``--verify``.
+        problems: damage in the backup that could not be repaired from the map, one line each.
+        notes: remarks.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"dest": "backup", "num_files_new": "files sent"}
@@ -82,13 +82,13 @@ class BackupReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RestoreReport(Row):
-    """What a restore made.
+    """The result of a restore.
 
     Args:
-        path: the map.
-        snapshot: the state that it has.
+        path: folder of the map.
+        snapshot: the restored snapshot.
         catalog_schema: number of its newest migration.
-        needs_migration: whether that is older than this gsmap's, so that ``gsmap migrate`` comes next.
+        needs_migration: true if its schema is older than this gsmap's, so that ``gsmap migrate`` is needed.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"path": "map", "catalog_schema": "schema"}
@@ -101,15 +101,15 @@ class RestoreReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CloneReport(Row):
-    """What a clone made.
+    """The result of a clone.
 
     Args:
-        path: the new map.
-        map_id: its id.
-        source_map_id: of the map that it was made from.
-        num_linked: how many files it shares with that map.
-        num_copied: how many were copied.
-        num_bytes_copied: their size.
+        path: folder of the new map.
+        map_id: id of the new map.
+        source_map_id: id of the source map.
+        num_linked: number of files shared with the source map.
+        num_copied: number of copied files.
+        num_bytes_copied: size of the copied files.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"path": "map", "num_linked": "files shared", "num_copied": "copied"}

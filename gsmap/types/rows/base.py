@@ -1,4 +1,4 @@
-"""What all rows and reports can do."""
+"""The base class of rows and reports."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ SCHEMA = 2
 
 
 class Row:
-    """What all rows and reports can do; each is a frozen dataclass, and two are equal where their JSON is."""
+    """Base of all rows and reports: a frozen dataclass that compares equal if its JSON does."""
 
     columns: ClassVar[Mapping[str, str]] = {}
     """The heading of each field (or property) that a table shows, in order."""
 
     def to_json(self) -> dict[str, Any]:
-        """Every field as JSON can hold it: poses are 4x4 matrices, arrays lists, NaN and infinity null."""
+        """Return every field as JSON: poses as 4x4 matrices, arrays as lists, NaN and infinity as null."""
         return {field.name: _json(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
     def cells(self) -> list[Any]:
-        """The values of a table's line, in the order of ``columns``."""
+        """Return the values of a table line, in the order of ``columns``."""
         return [getattr(self, name) for name in self.columns]
 
     def _repr_html_(self) -> str:
@@ -45,14 +45,14 @@ R = TypeVar("R", bound=Row)
 
 
 class Table(list[R]):
-    """Rows that a notebook shows as a table; in all else a list."""
+    """A list of rows that a notebook shows as a table."""
 
     def _repr_html_(self) -> str:
         return html_table(self[0].columns, self) if self else "<p>none</p>"
 
 
 def coordinates(world: np.ndarray | None) -> str | None:
-    """World coordinates as a table shows them: to a tenth of a millimetre, whatever their size."""
+    """Format world coordinates to a tenth of a millimetre, whatever their size."""
     if world is None:
         return None
     degrees = abs(world[0]) <= 360 and abs(world[1]) <= 90

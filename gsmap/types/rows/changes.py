@@ -1,4 +1,4 @@
-"""What changed between captures."""
+"""Changes between captures."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class VisitPairRef(Row):
 
     Args:
         older: id of the earlier capture.
-        older_name: its name.
-        older_at: when it was captured, ISO 8601 with zone; null where its date was taken back since.
-        newer: id of the later one.
-        newer_name: its name.
-        newer_at: when it was captured, as above.
+        older_name: name of the earlier capture.
+        older_at: date of the earlier capture, ISO 8601 with zone; null if its date was removed since.
+        newer: id of the later capture.
+        newer_name: name of the later capture.
+        newer_at: date of the later capture, ISO 8601 with zone; null if its date was removed since.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"pair": "pair"}
@@ -43,24 +43,25 @@ class VisitPairRef(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChangeRow(VisitPairRef):
-    """Something that changed between two captures.
+    """A change between two captures.
 
     Args:
-        id: what it is called (``c12``), also after its pair was compared again.
-        kind: ``appeared``, ``disappeared``, ``moved``, ``recoloured``, ``replaced`` (another thing in its place) or
-            ``lighting`` (the same surfaces, lit otherwise).
-        component: in whose frame the box lies; null where the newer capture has no place now.
-        box: (2, 3) lowest and highest corner around all that changed, map frame and unit; null as above.
-        box_m: the same in metres.
-        before: how many Gaussians of the older capture are no longer there, or no longer look so.
-        after: how many of the newer capture were not there, or did not look so.
-        S_after_before: of a thing that moved: takes a point of it from where it stood to where it stands, map frame.
-        symmetry: of a thing that moved: ``none``, or the turn about the vertical up to which its yaw is known: ``half``
-            or ``any``.
-        confidence: in [0, 1], how probable it is that something changed here, of as many right ones as wrong.
-        evidence: numbers behind it, by name.
-        status: what people say of it: ``open``, ``confirmed`` or ``rejected``.
-        picture: file with the thing before and after, where pictures were asked for; else null.
+        id: lasting id (``c12``), also kept when its pair is compared again.
+        kind: ``appeared``, ``disappeared``, ``moved``, ``recoloured``, ``replaced`` (another object in its place) or
+            ``lighting`` (same surfaces, other light).
+        component: component of the box; null if the newer capture has no pose.
+        box: (2, 3) lowest and highest corner around the change, map frame and unit; null if the newer capture has no
+            pose.
+        box_m: the box in metres; null if the newer capture has no pose.
+        before: number of Gaussians of the older capture that disappeared or look different.
+        after: number of Gaussians of the newer capture that appeared or look different.
+        S_after_before: old to new pose of an object that moved, map frame; else null.
+        symmetry: symmetry of an object that moved: ``none``, or the rotation about the vertical up to which its yaw is
+            known: ``half`` or ``any``.
+        confidence: probability in [0, 1] that something changed here, with a prior of one half.
+        evidence: evidence values by name.
+        status: review: ``open``, ``confirmed`` or ``rejected``.
+        picture: image file with the change before and after; null if none was requested.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -90,12 +91,12 @@ class ChangeRow(VisitPairRef):
 
     @property
     def at_m(self) -> str:
-        """The middle of its box."""
+        """Centre of its box, metres."""
         return "-" if self.box_m is None else _three(self.box_m.mean(0))
 
     @property
     def size_m(self) -> str:
-        """Of its box."""
+        """Size of its box, metres."""
         return "-" if self.box_m is None else _three(self.box_m[1] - self.box_m[0])
 
 
@@ -105,14 +106,14 @@ def _three(values: np.ndarray) -> str:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComparisonRow(VisitPairRef):
-    """Two captures that were compared.
+    """The comparison of two captures.
 
     Args:
-        num_changes: how many changes were found, of whatever confidence.
-        seen_share: share of the older capture's surface that the newer one looked at; of the rest nothing is said.
-        gains: (3,) by which the older capture's colours are to be multiplied to look like the newer's.
-        compared_at: when they were compared.
-        notes: what a person should know.
+        num_changes: number of changes of any confidence.
+        seen_share: fraction of the older capture's surface that the newer one observed.
+        gains: (3,) factors from the older capture's colours to the newer's.
+        compared_at: time of the comparison.
+        notes: remarks.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -132,12 +133,12 @@ class ComparisonRow(VisitPairRef):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChangesReport(Row):
-    """What changed between captures, and which of them were compared.
+    """Changes and the compared pairs of captures.
 
     Args:
-        changes: what changed; of each pair surest first, the latest pair first.
-        pairs: the pairs of captures that were compared.
-        notes: what a person should know, such as captures without a date.
+        changes: changes, latest pair first, within a pair most confident first.
+        pairs: compared pairs of captures.
+        notes: remarks, such as captures without a date.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"changes": "changes", "pairs": "pairs"}
@@ -149,13 +150,13 @@ class ChangesReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChangeDetail(ChangeRow):
-    """Everything known of one change.
+    """A change with its history.
 
     Args:
-        num_voxels: how many cells changed.
-        compared_at: when it was found last.
-        notes: what a person should know of how its pair was compared.
-        history: what people said of it, oldest first.
+        num_voxels: number of changed cells.
+        compared_at: time of the last comparison.
+        notes: remarks on the comparison.
+        history: reviews, oldest first.
     """
 
     columns: ClassVar[Mapping[str, str]] = ChangeRow.columns

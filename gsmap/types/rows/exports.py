@@ -17,18 +17,17 @@ class TileRow(Row):
     """One tile of an export.
 
     Args:
-        out: the folder exported to.
-        path: of the tile's file, relative to ``out``.
-        component: the connected component that it belongs to.
+        out: export folder.
+        path: path of the tile's file, relative to ``out``.
+        component: connected component of the tile.
         bounds: (2, 3) lowest and highest corner, map frame.
-        num_gaussians: how many Gaussians it holds.
-        scenes: the scenes it was made from.
-        merge: the merger.
-        recipe: how it was merged: ``stage``, ``method``, ``version`` of every piece that took part, ``settings``,
-            ``backend``.
-        truncated: whether a time budget cut its optimisation short.
-        sha256: of the file.
-        notes: what a person should know of how it was made.
+        num_gaussians: number of Gaussians it holds.
+        scenes: input scenes.
+        merge: name of the merger.
+        recipe: recipe of the merge: ``stage``, ``method``, ``version`` of every part, ``settings``, ``backend``.
+        truncated: true if a time budget cut its optimization short.
+        sha256: digest of the file.
+        notes: remarks on how it was made.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -55,17 +54,17 @@ class TileRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SmallSceneRow(Row):
-    """What a small map keeps of a scene.
+    """The content of a scene in a small map.
 
     Args:
         scene: id.
         scene_name: name.
-        num_views: views of it that photographs are found by.
-        num_features: features of these that are kept.
-        features_of: of so many.
-        num_gaussians: Gaussians that are kept.
-        gaussians_of: of so many.
-        num_bytes: of its file.
+        num_views: number of views for retrieval.
+        num_features: number of stored features.
+        features_of: number of features before reduction.
+        num_gaussians: number of stored Gaussians.
+        gaussians_of: number of Gaussians before reduction.
+        num_bytes: size of its file.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -90,13 +89,13 @@ class SmallSceneRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SmallMapReport(Row):
-    """A small map, for localisation alone.
+    """A small map for localization only.
 
     Args:
-        out: its folder.
-        scenes: what it keeps of each.
-        num_bytes: of all its files.
-        budget_bytes: that were allowed.
+        out: folder of the small map.
+        scenes: content of each scene.
+        num_bytes: size of all its files.
+        budget_bytes: maximum size that was allowed.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"scenes": "scenes", "num_bytes": "bytes"}
@@ -109,15 +108,15 @@ class SmallMapReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExportReport(Row):
-    """What an export did.
+    """The result of an export.
 
     Args:
-        out: the folder exported to.
-        tiles: the tiles that are in the folder now.
-        recomputed: how many of them were made.
-        reused: how many were unchanged.
-        removed: how many files were taken away.
-        notes: what a person should know of what took part; what of how a tile was made is in the tile's.
+        out: export folder.
+        tiles: tiles in the folder.
+        recomputed: number of tiles that were made.
+        reused: number of unchanged tiles.
+        removed: number of deleted files.
+        notes: remarks on the input; each tile has remarks on itself.
     """
 
     columns: ClassVar[Mapping[str, str]] = {

@@ -1,4 +1,4 @@
-"""What is found in a map."""
+"""Search results."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from gsmap.types.rows.base import Row
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FindHit(Row):
-    """A place that is like what was asked for.
+    """A place that matches the query.
 
     Args:
-        rank: from 1.
-        score: what it is ranked by: of likeness a probability, of embeddings a cosine, of names the share of its words
-            that were asked for; see ``by`` of the report.
-        object: id of the object there (`gsmap graph`); null where nothing was told apart from the building.
-        name: what people call it; null where they do not.
-        scene: id of the capture that shows what matched best.
-        scene_name: its name.
-        node: of its layer of objects, the one that matched best; null where things were compared.
-        component: of the map, whose frame ``position`` is in.
-        position: of the object where it was last seen, or of the node; map frame and unit.
-        position_m: the same in metres.
-        size_m: of the box around it, metres, along the map's axes; null where there is no object.
-        dates: of the captures that show it, oldest first, ISO 8601; null for those that have none.
-        picture: file that shows it; null where none was asked for, or no camera sees it.
+        rank: rank, from 1.
+        score: a probability for ``likeness``, a cosine for ``embedding``, the fraction of matching words for ``name``;
+            see ``by`` of the report.
+        object: id of the object (`gsmap graph`); null if no object was segmented there.
+        name: name of the object; null if it has none.
+        scene: id of the capture that matched best.
+        scene_name: name of the capture that matched best.
+        node: best matching node of its object layer; null if segments were compared.
+        component: component of ``position``.
+        position: position of the object where it was last seen, or of the node; map frame and unit.
+        position_m: the position in metres.
+        size_m: size of its bounding box along the map's axes, metres; null without an object.
+        dates: dates of the captures that show it, oldest first, ISO 8601; null for undated ones.
+        picture: image file that shows it; null if none was requested or no camera sees it.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -62,17 +62,17 @@ class FindHit(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FindReport(Row):
-    """What was found, best first.
+    """The hits of a search, best first.
 
     Args:
-        query: what was asked for, in words.
-        by: ``name`` (what people call objects), ``likeness`` (size, shape and colour of things) or ``embedding``.
-        recipe: digest of the one recipe whose graphs answered; empty where names did.
-        embedder: of that recipe.
-        described: how many placed captures it has described ...
-        placed: ... of so many; the others took no part.
-        hits: the places.
-        notes: what a person should know.
+        query: the query as text.
+        by: method: ``name`` (annotations), ``likeness`` (size, shape and colour of segments) or ``embedding``.
+        recipe: digest of the recipe of the searched graphs; empty for ``name``.
+        embedder: embedder of that recipe.
+        described: number of placed captures described by the recipe.
+        placed: number of all placed captures.
+        hits: the hits.
+        notes: remarks.
     """
 
     columns: ClassVar[Mapping[str, str]] = {

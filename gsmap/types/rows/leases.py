@@ -1,4 +1,4 @@
-"""Who is at work on a map."""
+"""Running processes of a map."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from gsmap.types.rows.base import Row
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class AtWorkRow(Row):
-    """Something that a process is at work on.
+class LeaseRow(Row):
+    """The work of a running process.
 
     Args:
-        what: ``map`` (as a whole, together with others), ``poses``, ``graph KEY`` or ``edge KEY`` (one job), or
-            ``export FOLDER``.
+        what: ``map`` (shared with other processes), ``poses``, ``graph KEY`` or ``edge KEY`` (one job), or ``export
+            FOLDER``.
         task: the verb.
         host: name of the process's machine.
-        process: its number there.
-        since: when it began this, ISO 8601, UTC.
+        process: process id.
+        since: start of this work, ISO 8601, UTC.
     """
 
     columns: ClassVar[Mapping[str, str]] = {

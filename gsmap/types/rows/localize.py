@@ -1,4 +1,4 @@
-"""Where photographs and scans were taken."""
+"""Localized photos and scans."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from gsmap.types.sim3 import Sim3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhotoChangeRow(Row):
-    """A part of a placed photo that shows something else than the map does there.
+    """A region of a localized photo that differs from the map.
 
     Args:
-        kind: as far as one photo can tell: ``appeared`` (something stands there that the map has not), ``disappeared``
-            (what the map has there is gone), ``recoloured`` or ``replaced``.
-        box_px: ``x0 y0 x1 y1`` around it, in pixels of the upright photo.
-        share: of the picture.
-        strength: its mean difference in units of what light and noise explain there; above 1.
-        position: the middle of what the map has there; frame and unit of the photo's component.
-        object: id of the nearest thing of the map there (`gsmap graph`); null where none was told apart.
-        scene: id of the capture that the photo was compared with there.
-        scene_name: its name.
+        kind: kind as far as one photo can tell: ``appeared`` (an object that is not in the map), ``disappeared``
+            (content of the map is gone), ``recoloured`` or ``replaced``.
+        box_px: bounding box ``x0 y0 x1 y1`` in pixels of the upright photo.
+        share: fraction of the image.
+        strength: mean difference relative to what light and noise explain; above 1.
+        position: centre of the map's content there; frame and unit of the photo's component.
+        object: id of the nearest object (`gsmap graph`); null if there is none.
+        scene: id of the capture that the photo was compared with.
+        scene_name: name of that capture.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -50,29 +50,29 @@ class PhotoChangeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalizeRow(Row):
-    """One photograph, frame of a clip, or scan.
+    """The result for one photo, video frame or scan.
 
     Args:
-        file: as it was given; of a frame of a clip, ``FILE#SECONDS``.
+        file: file as given; ``FILE#SECONDS`` for a video frame.
         status: ``placed`` or ``refused``.
-        reason: why it is refused; empty where it is placed.
+        reason: reason for the refusal; empty if it is placed.
         T_map_camera: (4, 4) camera-to-map of a photo (OpenCV axes), in the frame and unit of its component; else null.
-        S_map_scan: takes a scan, less ``origin``, to the map, in the same frame and unit; null for photos, and where
-            it is refused.
-        origin: what is taken from a scan's coordinates first: zeros unless they are large; null for photos.
+        S_map_scan: scan coordinates, less ``origin``, to the map, frame and unit of its component; null for photos and
+            refused scans.
+        origin: offset subtracted from the scan's coordinates: zeros unless they are large; null for photos.
         covariance: (6, 6) over [rot_rad (3), trans (3)], of a scan (7, 7) with the logarithm of its scale, on the
             camera's or scan's side: ``T = T_hat Exp(xi)``, translation in the map's unit (a scan's: in its own).
-        component: in whose frame that is; null where nothing was found.
-        scenes: names of the scenes that support it, those that support most first.
+        component: component of the pose; null if none was found.
+        scenes: names of the supporting scenes, strongest first.
         intrinsics_px: (4,) ``fx fy cx cy`` of the photo, given or solved for; null for a scan.
-        probability: that the pose is right, of all evidence together; 0 where there was none to judge.
-        evidence: numbers behind it, by name.
-        num_gaussians: of the supporting scenes, that the photo shows.
-        seconds: it took, of the wall clock.
-        changes: where a placed photo shows something else than the map, the clearest first; null where not asked.
-        compared: share of the picture that could be compared for it; null where it was not asked.
-        picture: file with these parts drawn; null where none was asked for.
-        added: whether the map keeps the photo from now on; false where it did already; null where it was not asked.
+        probability: probability that the pose is right; 0 without evidence.
+        evidence: evidence values by name.
+        num_gaussians: number of Gaussians of the supporting scenes in the photo's field of view.
+        seconds: wall time in seconds.
+        changes: regions that differ from the map, clearest first; null if not requested.
+        compared: fraction of the image that was compared; null if not requested.
+        picture: image file with these regions drawn; null if not requested.
+        added: true if the photo was stored in the map; false if it was there already; null if not requested.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -107,7 +107,7 @@ class LocalizeRow(Row):
 
     @property
     def position(self) -> str:
-        """Where the camera stood, or the scan's origin lies, map unit."""
+        """Camera centre or scan origin, map unit."""
         at = self.T_map_camera[:3, 3] if self.T_map_camera is not None else None
         if self.S_map_scan is not None:
             at = self.S_map_scan.translation
@@ -115,7 +115,7 @@ class LocalizeRow(Row):
 
     @property
     def sigma(self) -> str:
-        """Standard deviations of the worst direction: degrees, and map units."""
+        """Largest standard deviations: degrees, and map units."""
         if self.covariance is None:
             return "-"
         turn, shift = (np.sqrt(np.linalg.eigvalsh(self.covariance[p, p])[-1]) for p in (slice(3), slice(3, 6)))
@@ -124,25 +124,26 @@ class LocalizeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhotoRow(Row):
-    """A photograph that the map keeps, where it stands by the newest poses.
+    """A photo stored in the map, with its pose by the newest revision.
 
     Args:
         id: ``p`` and a number.
-        file: its name.
-        digest: SHA-256 of the file; of a frame of a clip, of its pixels.
-        captured_at: when it was taken, ISO 8601; null where nothing says it.
-        component: whose frame its pose is in; null where the scene that supports it has no pose now.
-        T_map_camera: (4, 4) camera-to-map (OpenCV axes), frame and unit of the component; null as above.
-        covariance: (6, 6) over [rot_rad (3), trans (3)] on the camera's side, in the map's unit, of its place in the
-            scene; null as above.
-        intrinsics_px: (4,) ``fx fy cx cy`` of the photo itself.
-        size_px: its width and height.
-        probability: that its pose is right, when it was added.
-        scene: id of the capture that it was placed by, and moves with.
-        scene_name: its name.
-        num_seen: objects that it shows.
-        num_absent: objects that it shows to be gone.
-        added_at: when it was added.
+        file: file name.
+        digest: SHA-256 of the file, or of a video frame's pixels.
+        captured_at: capture date, ISO 8601; null if unknown.
+        component: component of its pose; null if its supporting scene has no pose.
+        T_map_camera: (4, 4) camera-to-map (OpenCV axes), frame and unit of the component; null if its supporting scene
+            has no pose.
+        covariance: (6, 6) over [rot_rad (3), trans (3)] on the camera's side, map unit, relative to the scene; null if
+            its supporting scene has no pose.
+        intrinsics_px: (4,) ``fx fy cx cy`` in the photo's own size.
+        size_px: width and height of the photo.
+        probability: probability that its pose is right, at the time it was added.
+        scene: id of the supporting capture, with which it moves.
+        scene_name: name of the supporting capture.
+        num_seen: number of objects that it shows.
+        num_absent: number of objects that it shows to be absent.
+        added_at: time when it was added.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -174,7 +175,7 @@ class PhotoRow(Row):
 
     @property
     def position(self) -> str:
-        """Where the camera stood, map unit."""
+        """Camera centre, map unit."""
         if self.T_map_camera is None:
             return "-"
         return " ".join(f"{value:.3f}" for value in self.T_map_camera[:3, 3])
@@ -182,11 +183,11 @@ class PhotoRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalizeReport(Row):
-    """Where photographs, clips and scans were taken.
+    """The results of localization.
 
     Args:
-        results: one for each file, in the order in which they were given.
-        notes: what a person should know of the map.
+        results: one result per file, in the order of the input.
+        notes: remarks on the map.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"results": "results"}

@@ -1,4 +1,4 @@
-"""Where a scan lies in a map."""
+"""The localization of a scan."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from gsmap.types.sim3 import Sim3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanSupport(Row):
-    """What one scene says of a scan.
+    """The registration of a scan with one scene.
 
     Args:
         scene: id.
         scene_name: name.
         status: ``accepted`` (it shows the scan), ``rejected`` or ``no_match``.
-        reason: why not; empty where it was accepted.
-        probability: that the match is right; null where nothing was measured.
-        overlap: share of the smaller one's surface that coincides.
-        component: of the map.
-        S_map_scan: where it puts the scan; null where it says nothing.
+        reason: reason of a rejection, or empty.
+        probability: probability that the match is right; null without evidence.
+        overlap: fraction of the smaller surface that coincides.
+        component: component of the scene.
+        S_map_scan: pose of the scan by this scene; null without a match.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -47,27 +47,27 @@ class ScanSupport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanRow(Row):
-    """Where a scan lies in the map, or why nobody can say.
+    """The pose of a scan in the map, or the reason for refusing it.
 
     Args:
-        file: as it was given.
+        file: file as given.
         kind: ``points``, ``mesh``, ``depth`` or ``splat``.
         status: ``placed`` or ``refused``.
-        reason: why it was refused; empty where it was placed.
-        S_map_scan: takes points of the scan, less ``origin``, to the frame of the component; null where refused.
-        T_map_camera: of a depth picture, the camera's pose (OpenCV axes), translation in the map's unit; else null.
-        origin: what was taken from the file's coordinates; zeros unless they are large.
+        reason: reason for the refusal; empty if it is placed.
+        S_map_scan: scan coordinates, less ``origin``, to the component's frame; null if refused.
+        T_map_camera: camera pose of a depth image (OpenCV axes), translation in map units; else null.
+        origin: offset subtracted from the file's coordinates; zeros unless they are large.
         covariance: 7x7 of ``S_map_scan`` over [rot_rad, trans, log_scale] on the scan's side; null where refused.
-        sigma_deg: standard deviation of the rotation about its least known axis.
-        sigma_m: of the place of the scan's middle in its least known direction, metres of the scan.
-        component: of the map; null where refused.
-        scenes: names of those that show the scan at that place.
-        probability: that the place is right; where refused, of the best that was found.
-        coloured: whether the scan has colours; without, less can be told.
-        num_points: points that it was looked for by.
-        supports: what every scene that was asked says.
-        seconds: CPU seconds of it all.
-        notes: what a person should know.
+        sigma_deg: largest standard deviation of the rotation.
+        sigma_m: largest standard deviation of the position of the scan's centre, metres of the scan.
+        component: component of the map; null if refused.
+        scenes: names of the supporting scenes.
+        probability: probability that the pose is right; if refused, that of the best candidate.
+        coloured: true if the scan has colours; without them localization is less certain.
+        num_points: number of points used.
+        supports: registrations with all compared scenes.
+        seconds: CPU time in seconds.
+        notes: remarks.
     """
 
     columns: ClassVar[Mapping[str, str]] = {

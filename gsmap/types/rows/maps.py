@@ -1,4 +1,4 @@
-"""A map as a whole: what is to do, settings, models, upkeep."""
+"""A map as a whole: open tasks, settings, models, maintenance."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from gsmap.types.rows.base import Row
+from gsmap.types.rows.evaluation import EvaluationReport
 from gsmap.types.rows.exports import TileRow
-from gsmap.types.rows.leases import AtWorkRow
+from gsmap.types.rows.leases import LeaseRow
 from gsmap.types.rows.pairs import EdgeRow
 from gsmap.types.rows.scenes import SceneRow
-from gsmap.types.rows.truth import EvaluationReport
 
 TodoKind = Literal[
     "undescribed",
@@ -49,20 +49,18 @@ _FOR_A_PERSON: tuple[TodoKind, ...] = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TodoRow(Row):
-    """Something that is stale or wants a person.
+    """An open task: something is stale or needs a decision.
 
     Args:
-        what: ``undescribed`` scenes; ``stale_graphs``, made by other settings or another version; ``unregistered``
-            scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews, priors or
-            observations are newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes;
-            ``undecided`` edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``;
-            ``world_outliers``, observations of the world that contradict the others; ``untied`` components, whose place
-            in the world is not determined; ``duplicates``, pairs that are one capture twice; ``isolated`` scenes;
-            ``set_aside``, work that twice ended the process it ran in and is left out until it is asked for by name, or
-            a capture that could not be read and is tried again whenever it is given.
-        count: how many; 1 for ``unsolved``, ``stale_poses`` and ``set_aside``.
-        verb: the command that helps.
-        meaning: the same in words.
+        what: ``undescribed`` scenes; ``stale_graphs`` of other settings or versions; ``unregistered`` scenes;
+            ``stale_edges``; ``unsolved`` (inputs newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export;
+            ``tentative`` scenes; ``undecided`` edges; unreviewed ``changes``; ``contradicted_priors``;
+            ``world_outliers`` (contradicting observations of the world); ``untied`` components without a place in the
+            world; ``duplicates`` (pairs of the same capture); ``isolated`` scenes; ``set_aside`` (quarantined jobs,
+            retried by name, and unreadable captures, retried when given again).
+        count: number of items; 1 for ``unsolved``, ``stale_poses`` and ``set_aside``.
+        verb: command that resolves it.
+        meaning: description.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"count": "count", "meaning": "what", "verb": "helps"}
@@ -74,23 +72,22 @@ class TodoRow(Row):
 
     @property
     def wants_person(self) -> bool:
-        """Whether a person has to judge or decide; the rest is work that the command does."""
+        """True if a person has to decide; else the command does the work."""
         return self.what in _FOR_A_PERSON
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MetreRow(Row):
-    """How long a metre is in the frame of a component, how that is known, and how well.
+class MetricScaleRow(Row):
+    """The metric scale of a component.
 
     Args:
-        component: its index.
-        metres_per_unit: metres in a unit of its frame: of its poses and of its tiles.
-        metre_sigma: standard deviation of its logarithm (0.01 is one percent); null where it is unknown.
-        metre_known_by: ``surveyed`` (by control points, positions or scale bars), ``measured`` (by captures
-            that are said to be in metres), ``told`` (a person gave metres per unit of a capture), ``assumed``
-            (nobody said so, but the captures' own unit may well be the metre), ``guessed`` (from how far
-            cameras stand from what they see), ``unknown`` (1 is taken).
-        metre_note: what a person should know of it; empty where nothing.
+        component: component index.
+        metres_per_unit: metres per unit of its frame, which poses and tiles use.
+        metre_sigma: standard deviation of its logarithm (0.01 is one percent); null if unknown.
+        metre_known_by: ``surveyed`` (control points, positions or scale bars), ``measured`` (captures specified to be
+            in metres), ``told`` (metres per unit specified by the user), ``assumed`` (the captures' unit may be the
+            metre), ``guessed`` (from distances between cameras and surfaces), ``unknown`` (1 is used).
+        metre_note: remark, or empty.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -110,18 +107,18 @@ class MetreRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MapStatus(Row):
-    """What is stale or wants a person, most urgent first.
+    """The status of a map with its open tasks, most urgent first.
 
     Args:
-        todo: what is to be done; empty where all is well.
-        scenes: how many scenes the map has.
-        components: connected components of the newest poses.
-        islands: the same number under an older name.
-        tentative: scenes that rest on edges which no cycle confirms.
+        todo: open tasks; empty if there are none.
+        scenes: number of scenes.
+        components: number of connected components of the newest poses.
+        islands: the number of components under an older name.
+        tentative: number of scenes placed by edges without an agreeing cycle.
         revision: number of the newest revision; null before the first.
-        metres_per_unit: metres in a unit of the largest component; null where nothing tells.
-        metres: the same of every component, with how it is known and how well.
-        at_work: what processes are at work on now, this one left out; what one that died was at work on is no more.
+        metres_per_unit: metres per unit of the largest component; null if unknown.
+        metres: metric scale of every component.
+        at_work: work of the other running processes.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -139,20 +136,20 @@ class MapStatus(Row):
     tentative: int
     revision: int | None
     metres_per_unit: float | None
-    metres: tuple[MetreRow, ...] = ()
-    at_work: tuple[AtWorkRow, ...] = ()
+    metres: tuple[MetricScaleRow, ...] = ()
+    at_work: tuple[LeaseRow, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SettingRow(Row):
-    """One setting.
+    """A setting.
 
     Args:
-        name: dotted, as ``--set`` takes it.
-        value: what it is in this map.
-        default: what it is where nobody changes it.
-        unit: of the value; empty where it has none.
-        doc: what it means.
+        name: dotted name for ``--set``.
+        value: value in this map.
+        default: default value.
+        unit: unit of the value, or empty.
+        doc: meaning.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -172,14 +169,14 @@ class SettingRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelRow(Row):
-    """One ONNX model of the map.
+    """An ONNX model of the map.
 
     Args:
         kind: ``sam-encoder``, ``sam-decoder`` or ``clip``.
-        name: what the map calls it.
-        sha256: of the file.
-        preset: how pixels are scaled for it.
-        path: where the file is.
+        name: name in the map.
+        sha256: digest of the file.
+        preset: pixel normalization.
+        path: path of the file.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -199,15 +196,15 @@ class ModelRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CheckReport(Row):
-    """What reading every byte of the map found.
+    """The result of checking every byte of the map.
 
     Args:
-        ok: whether nothing is wrong.
-        problems: one line each.
-        orphans: folders that an interrupted step left; no harm, `gsmap prune` removes them.
-        num_groups: how many groups of arrays were read.
-        num_bytes: how many bytes were read.
-        unverified: what could not be compared with what was written, and why.
+        ok: true if there are no problems.
+        problems: problems, one line each.
+        orphans: harmless folders left by interrupted work, which `gsmap prune` removes.
+        num_groups: number of array groups read.
+        num_bytes: number of bytes read.
+        unverified: data without a stored digest, with the reason.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"num_groups": "groups", "num_bytes": "bytes", "ok": "ok"}
@@ -222,15 +219,15 @@ class CheckReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PruneReport(Row):
-    """What was reclaimed, or would be.
+    """The result of a prune, or its preview.
 
     Args:
-        dry_run: whether nothing was deleted.
-        scene_names: names of removed scenes whose arrays go.
-        revisions: numbers of revisions that can no longer be exported.
-        num_graphs: graphs that go.
-        num_orphans: folders left by interrupted work that go.
-        num_bytes: bytes on disk that this frees; a dry run does not know by how much the catalog would shrink.
+        dry_run: true if nothing was deleted.
+        scene_names: names of removed scenes whose arrays are deleted.
+        revisions: numbers of the revisions that are deleted.
+        num_graphs: number of deleted graphs.
+        num_orphans: number of deleted folders of interrupted work.
+        num_bytes: bytes freed on disk; a dry run does not count the catalog.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -249,10 +246,10 @@ class PruneReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InitReport(Row):
-    """The map that was made.
+    """A new map.
 
     Args:
-        map: its folder.
+        map: folder of the map.
         catalog: URL of the database that holds its catalog, without a password; null where the folder holds it.
     """
 
@@ -264,12 +261,12 @@ class InitReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MigrateReport(Row):
-    """The schema of a map.
+    """The schema of a map before and after a migration.
 
     Args:
-        map: its folder.
-        before: the schema it had; null where it had none.
-        after: the schema it has now.
+        map: folder of the map.
+        before: schema before; null if it had none.
+        after: schema after.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"map": "map", "before": "before", "after": "after"}
@@ -281,14 +278,14 @@ class MigrateReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ConvertReport(Row):
-    """The file that was written.
+    """A converted file.
 
     Args:
-        input: the file read.
-        output: the file written.
-        num_gaussians: how many Gaussians it holds.
-        sh_degree: degree of their spherical harmonics as they were read.
-        offset: (3,) what was taken off the coordinates (``--local``); else zeros.
+        input: input file.
+        output: output file.
+        num_gaussians: number of Gaussians it holds.
+        sh_degree: degree of the spherical harmonics of the input.
+        offset: (3,) offset subtracted from the coordinates (``--local``); else zeros.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"output": "file", "num_gaussians": "Gaussians", "sh_degree": "SH degree"}
@@ -302,14 +299,14 @@ class ConvertReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewReport(Row):
-    """The page that is being served, or that was written.
+    """A page that is served or was written.
 
     Args:
-        url: where it is, on this machine only, with the token that opens it; null where it was written.
-        path: the folder or file that it was written to; null where it is served.
-        num_bytes: of what was written; null as above.
-        num_scenes: that have their levels of detail in it; null as above.
-        notes: what a person should know, such as scenes that could not be read.
+        url: local address with the token that opens the page; null if it was written.
+        path: folder or file of the page; null if it is served.
+        num_bytes: size of the written page; null if it is served.
+        num_scenes: number of scenes with levels of detail in the written page; null if it is served.
+        notes: remarks, such as scenes that could not be read.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"url": "page", "path": "written to"}
@@ -323,15 +320,15 @@ class ViewReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DemoReport(Row):
-    """What the demo made.
+    """The result of the demo.
 
     Args:
-        map: the map's folder.
-        picture: a picture of the map.
+        map: folder of the map.
+        picture: image of the map.
         scenes: the captures.
-        edges: what ties them.
+        edges: the edges.
         tiles: the merged tiles.
-        truth: how close the map comes to the truth.
+        truth: errors against the ground truth.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"map": "map", "picture": "picture"}

@@ -1,4 +1,4 @@
-"""Objects of the map, their sightings and relations."""
+"""Objects of the map, their observations and relations."""
 
 from __future__ import annotations
 
@@ -13,27 +13,26 @@ from gsmap.types.rows.base import Row
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ObjectRow(Row):
-    """One thing of the map, over all captures that show it.
+    """An object of the map, over all captures.
 
     Args:
-        id: what it is called (``o12``), also after objects were made again; 8 hex digits while it has no number, in a
-            map that is open for reading only.
-        name: what people call it; null where they do not.
-        label: what kind of thing they say it is.
-        note: the last one on it.
-        room: id of the room that it stands in; null where that is not known.
-        split_from: id of the object that it was one with until their component came apart; else null.
-        component: of the map, whose frame everything is in.
-        position: mean of its Gaussians, where it was last seen as a thing of its own.
-        size: of the box around it where it was last seen, along the map's axes.
+        id: lasting id (``o12``); 8 hex digits without a number, in a map opened read-only.
+        name: name; null if it has none.
+        label: class label; null if it has none.
+        note: newest note; null if there is none.
+        room: id of its room; null if unknown.
+        split_from: id of the object from which it was split when its component fell apart; else null.
+        component: component of the map, frame of positions.
+        position: mean of its Gaussians where it was last segmented.
+        size: size of its bounding box along the map's axes where it was last seen.
         colour: median colour, CIE L*a*b*.
-        seen: captures that show it.
-        looks: captures that show it, or that looked where it stood and do not.
-        there: whether the newest of these shows it.
-        first_seen: date of the oldest capture that shows it, ISO 8601; null where that has none.
-        last_seen: of the newest.
-        half_life_days: after which half of such objects are gone, by how long this one was watched; null where too few
-            looks have dates.
+        seen: number of captures that show it.
+        looks: number of captures that show it or show that it is absent.
+        there: true if the newest of these shows it.
+        first_seen: date of the oldest capture that shows it, ISO 8601; null if undated.
+        last_seen: date of the newest capture that shows it, ISO 8601; null if undated.
+        half_life_days: estimated time in days after which half of such objects are gone; null if too few observations
+            have dates.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -72,12 +71,12 @@ class ObjectRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RelationRow(Row):
-    """How one object stands to another; both are there still, or neither is.
+    """A relation of two objects that are both present or both gone.
 
     Args:
-        subject: id of an object.
-        relation: ``on``, ``in`` or ``next to``; the last holds both ways and is given once.
-        other: id of the object that it stands to so.
+        subject: id of the first object.
+        relation: ``on``, ``in`` or ``next to``; the last is symmetric and listed once.
+        other: id of the second object.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"subject": "object", "relation": "is", "other": "object"}
@@ -89,17 +88,17 @@ class RelationRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RoomRow(Row):
-    """A room of the map, as its captures show it.
+    """A room of the map.
 
     Args:
-        id: ``r1`` is the largest of the first component; another capture may change it.
-        component: of the map.
-        position: the middle of its floor, map frame and unit.
-        outline: (K, 2, 3) the ends of the straight pieces of line around its floor, map frame and unit, in no order.
-        size_m: of the box around it, metres; the last number is its height.
-        area_m2: of its floor.
-        doors: ids of the rooms that one can walk to from it.
-        objects: ids of the objects in it, those that are gone included.
+        id: ``r1`` is the largest room of the first component; ids may change with new captures.
+        component: component of the map.
+        position: centre of its floor, map frame and unit.
+        outline: (K, 2, 3) end points of the unordered line segments around its floor, map frame and unit.
+        size_m: size of its bounding box in metres; the last number is its height.
+        area_m2: floor area in square metres.
+        doors: ids of the rooms connected by doors.
+        objects: ids of its present and former objects.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -124,13 +123,13 @@ class RoomRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ObjectsReport(Row):
-    """The scene graph of the map.
+    """The objects of the map as a graph.
 
     Args:
-        objects: its nodes; of each component the largest first.
-        relations: its edges.
-        rooms: where its nodes stand.
-        notes: what a person should know, such as captures that tell nothing.
+        objects: objects, the largest of each component first.
+        relations: relations.
+        rooms: rooms.
+        notes: remarks, such as captures without segments.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"objects": "objects", "relations": "relations"}
@@ -142,20 +141,20 @@ class ObjectsReport(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SightingRow(Row):
-    """What one capture says of one object.
+class ObjectObservationRow(Row):
+    """The observation of an object by one capture.
 
     Args:
-        object: id of it.
-        scene: id of the capture; of a photograph that the map keeps, its digest.
-        scene_name: of it; of a photograph, its file.
-        captured_at: when it was captured, ISO 8601; null where nobody knows.
-        state: ``seen``; ``absent`` (the capture looked at or through its place, and it is not there); ``unseen`` (the
-            capture did not look there, which says nothing).
-        box: lowest and highest corner around it, map frame and unit; null where it was not seen.
-        box_m: the same in metres.
-        looked: share of its place that the capture looked at.
-        component: index of the component whose frame the box is in.
+        object: object id.
+        scene: capture id, or the digest of a stored photo.
+        scene_name: capture name, or the file of a stored photo.
+        captured_at: capture date, ISO 8601; null if unknown.
+        state: ``seen``; ``absent`` (the capture observed its place, and it is not there); ``unseen`` (its place was not
+            observed).
+        box: lowest and highest corner, map frame and unit; null if it was not seen.
+        box_m: the box in metres; null if it was not seen.
+        looked: fraction of its place that the capture observed.
+        component: component of the box.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -181,14 +180,14 @@ class SightingRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ObjectFactRow(Row):
-    """One thing that was said of an object.
+    """An annotation of an object.
 
     Args:
-        object: id of it.
-        at: when it was said, ISO 8601.
+        object: object id.
+        at: time of the annotation, ISO 8601.
         fact: ``name``, ``label``, ``note`` or ``same_as``.
-        value: the text; empty where what was said before was taken back.
-        author: who said it; empty where a person did and was not named.
+        value: text; empty if the previous annotation was removed.
+        author: author; empty for an unnamed person.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -208,18 +207,18 @@ class ObjectFactRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HistoryReport(Row):
-    """What stood at a place, and when.
+    """The objects of a place over time.
 
     Args:
-        objects: what was ever seen there.
-        sightings: what each capture says of each of them, oldest first.
-        words: what people said of each of them, oldest first.
-        notes: what a person should know, such as captures that tell nothing.
+        objects: objects ever seen there.
+        sightings: observations of each object, oldest first.
+        words: annotations of each object, oldest first.
+        notes: remarks, such as captures without segments.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"objects": "objects", "sightings": "sightings"}
 
     objects: tuple[ObjectRow, ...]
-    sightings: tuple[SightingRow, ...]
+    sightings: tuple[ObjectObservationRow, ...]
     words: tuple[ObjectFactRow, ...] = ()
     notes: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""Pairs of scenes: edges and what is known of them."""
+"""Pairs of scenes and their edges."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class PairRef(Row):
     """Two scenes by id and name.
 
     Args:
-        target: id of the scene in whose frame the other is placed.
-        target_name: its name.
-        source: id of the other.
-        source_name: its name.
+        target: id of the scene whose frame the pose is in.
+        target_name: name of the target scene.
+        source: id of the other scene.
+        source_name: name of the source scene.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"pair": "pair"}
@@ -38,27 +38,26 @@ class PairRef(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EdgeRow(PairRef):
-    """The current edge of one pair that was tried.
+    """The current edge of a registered pair.
 
     Args:
-        status: ``accepted``, ``rejected`` (a pose was found and contradicted), ``no_match``, or ``never registered``
-            where the pair has no edge; what a person's review says counts before what registration found.
-        reason: why it is not accepted, or why the last optimize did not use it; empty where there is nothing to say.
-        S_target_source: how the source lies in the target; null where no pose was found.
-        scale: of that pose; null as above.
+        status: ``accepted``, ``rejected`` (a contradicted pose), ``no_match``, or ``never registered`` without an edge;
+            a review takes precedence.
+        reason: reason why it is not accepted or not used, or empty.
+        S_target_source: pose of the source in the target; null if none was found.
+        scale: scale of that pose; null if none was found.
         information: (7, 7) over [rotation (3, rad), translation (3), log scale] applied on the source side,
             translation in the source's unit; null where no pose was found.
-        num_inliers: size of the accepted set of correspondences.
-        num_correspondences: candidates it was chosen from.
-        overlap: share of the smaller scene's surface that coincides, in [0, 1].
-        seconds: wall seconds spent in ``match``, ``refine`` and ``verdict``.
-        used: whether the last optimize used it: true, false, or ``"tentative"`` (neither a cycle nor a
-            person confirms it).
-        undecided: whether nothing could tell if it is right: another group of edges contradicts it.
-        review: a person's standing word: ``confirm`` or ``reject``; null where there is none.
-        proposer: what proposed the pose (``graph:landmarks``, ``graph:objects``, ``kiss_matcher``), or ``manual`` where
-            a person measured it; empty where none was found.
-        registered_at: when it was registered, ISO 8601 with zone.
+        num_inliers: number of inliers.
+        num_correspondences: number of candidate correspondences.
+        overlap: fraction of the smaller scene's surface that coincides, in [0, 1].
+        seconds: wall time in seconds of ``match``, ``refine`` and ``verdict``.
+        used: use by the last optimize: true, false, or ``"tentative"`` (neither a cycle nor a review confirms it).
+        undecided: true if another group of edges contradicts it and nothing decides between them.
+        review: standing review: ``confirm`` or ``reject``; null if unreviewed.
+        proposer: source of the pose (``graph:landmarks``, ``graph:objects``, ``kiss_matcher``), ``manual`` for a
+            measured pose; empty if none was found.
+        registered_at: time of the registration, ISO 8601 with zone.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -89,12 +88,12 @@ class EdgeRow(PairRef):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PairEventRow(Row):
-    """Something that happened to a pair.
+    """An event in the history of a pair.
 
     Args:
-        at: when, ISO 8601 with zone.
-        what: the status that registration found, or a person's word: ``confirm``, ``reject`` or ``withdraw``.
-        reason: why.
+        at: time, ISO 8601 with zone.
+        what: status of a registration, or a review: ``confirm``, ``reject`` or ``withdraw``.
+        reason: reason.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"at": "at", "what": "what", "reason": "reason"}
@@ -106,13 +105,13 @@ class PairEventRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PairReport(EdgeRow):
-    """Everything known of one pair.
+    """A pair with its evidence and history.
 
     Args:
-        exact: whether the clique search proved its answer largest.
-        evidence: the figures that the verdict rests on, by name.
+        exact: true if the clique search proved its result largest.
+        evidence: evidence values by name.
         residual_chi2: chi-square of the edge under the newest poses (7 degrees of freedom); null where it has none.
-        notes: what a person should know of how it was registered.
+        notes: remarks on the registration.
         history: every registration and review of the pair, oldest first.
     """
 
@@ -126,14 +125,14 @@ class PairReport(EdgeRow):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WhyStep(Row):
-    """One thing that was asked of a pair on the way from being found to its place in the map.
+class ExplanationStep(Row):
+    """One step of a pair from retrieval to the pose graph.
 
     Args:
-        name: what was asked.
-        value: the answer; null where there is none.
-        bar: what it is held against, in words; empty where it is told for information alone.
-        passed: whether it cleared the bar; null where there is no bar or no answer.
+        name: name of the step.
+        value: result; null if there is none.
+        bar: threshold as text; empty if there is none.
+        passed: true if the threshold is met; null without threshold or result.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"name": "step", "value": "value", "bar": "bar", "passed": "passed"}
@@ -145,19 +144,19 @@ class WhyStep(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WhyReport(PairRef):
-    """Why a pair is an edge of the map, or is not.
+class PairExplanation(PairRef):
+    """The explanation why a pair is, or is not, an edge.
 
     Args:
         status: as in `EdgeRow`.
         reason: as in `EdgeRow`.
-        steps: from retrieval to the place in the map.
-        advice: what would settle it; empty where nothing is open.
-        picture: file with both captures seen from the same cameras, where it was asked for and there is a pose.
+        steps: steps from retrieval to the pose graph.
+        advice: advice for the first open step, or empty.
+        picture: image file with both captures seen from the same cameras; null if not requested or without a pose.
     """
 
     status: str
     reason: str
-    steps: tuple[WhyStep, ...]
+    steps: tuple[ExplanationStep, ...]
     advice: str
     picture: str | None = None

@@ -1,4 +1,4 @@
-"""Reports that were written."""
+"""Written report pages."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from gsmap.types.rows.base import Row
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WrittenReport(Row):
-    """A page about the map that was written.
+    """A written report page.
 
     Args:
-        path: the file.
-        num_bytes: of it.
-        standing: ``good``, ``look`` (something wants a person's judgement), ``act`` (the map is not solved as it is, or
-            work failed) or ``empty``.
-        verdict: the same in a few sentences, as the page says it.
-        sections: ids of the sections that it has, in order.
-        num_pictures: pictures of pairs and changes in it.
-        notes: what could not be shown, and why.
+        path: file of the page.
+        num_bytes: size of the page.
+        standing: ``good``, ``look`` (something needs a review), ``act`` (the map is out of date, or work failed) or
+            ``empty``.
+        verdict: summary in a few sentences, as on the page.
+        sections: ids of its sections, in order.
+        num_pictures: number of images of pairs and changes.
+        notes: omitted content, with the reason.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"path": "page", "num_bytes": "bytes", "standing": "standing"}

@@ -1,4 +1,4 @@
-"""Revisions of the poses, and what an update did."""
+"""Revisions of the poses, and results of an update."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from gsmap.types.rows.scenes import IngestRow, SceneRef, SceneRow
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RevisionRow(Row):
-    """One answer of the optimiser.
+    """A revision of the poses.
 
     Args:
-        number: from 1.
-        created_at: when, ISO 8601 with zone.
-        scenes: how many scenes it has.
-        components: how many connected components they form.
-        edges_used: how many edges it used.
-        edges_tentative: how many of its edges no cycle confirms.
-        edges_refused: how many edges it did not use.
-        undecided: the edges that nothing could decide.
-        solver: ``batch`` (everything solved anew) or ``incremental`` (new scenes placed in the answer before).
-        contradicted_priors: scenes whose prior the edges outweighed.
-        settings: what the optimiser was set to.
-        notes: what a person should know of it.
-        note: why it was made.
-        key: digest of everything that it was made from.
-        dropped_at: when `gsmap prune` let it go; null while it can be exported.
+        number: number, from 1.
+        created_at: time, ISO 8601 with zone.
+        scenes: number of scenes.
+        components: number of connected components.
+        edges_used: number of used edges.
+        edges_tentative: number of edges without an agreeing cycle.
+        edges_refused: number of unused edges.
+        undecided: undecided edges.
+        solver: ``batch`` (all poses solved) or ``incremental`` (new scenes added to the last solution).
+        contradicted_priors: scenes whose prior contradicts the edges.
+        settings: settings of the optimization.
+        notes: remarks on it.
+        note: reason why it was made.
+        key: digest of its recipe and inputs.
+        dropped_at: time when `gsmap prune` deleted it; null while it can be exported.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -63,19 +63,20 @@ class RevisionRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseChangeRow(Row):
-    """How one scene differs between two revisions.
+    """The difference of a scene's pose between two revisions.
 
     Args:
         scene: id.
         scene_name: name.
         change: ``added``, ``removed``, ``moved`` or ``same``.
-        rotation_deg: angle turned; null where the scene is in only one of the two.
-        translation_m: how far the scene's middle went, by the metre of the later revision; null as above.
-        scale_ratio: new scale by old; null as above.
-        component_before: its component in the older revision; null where it is absent.
-        component_after: its component in the newer revision; null where it is absent.
-        status_before: its status in the older revision; null where it is absent.
-        status_after: its status in the newer revision; null where it is absent.
+        rotation_deg: rotation angle; null if the scene is in only one of the two.
+        translation_m: displacement of the scene's centre, by the metric scale of the later revision; null if the scene
+            is in only one of the two.
+        scale_ratio: new scale divided by old; null if the scene is in only one of the two.
+        component_before: component in the older revision; null if absent.
+        component_after: component in the newer revision; null if absent.
+        status_before: status in the older revision; null if absent.
+        status_after: status in the newer revision; null if absent.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -102,13 +103,13 @@ class PoseChangeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UpdateReport(Row):
-    """What an update took in and changed; ``gsmap list MAP scenes`` and ``edges`` have the whole map.
+    """The results of an update; ``gsmap list MAP scenes`` and ``edges`` list the whole map.
 
     Args:
-        ingested: the captures given.
-        scenes: those that came, were described, or whose pose or status changed.
-        edges: the current edge of every pair that was registered, or whose use changed.
-        revision: the newest revision, with how many scenes and edges it has; null where there is none.
+        ingested: the given captures.
+        scenes: scenes that are new, were described, or whose pose or status changed.
+        edges: current edges of the pairs that were registered or whose use changed.
+        revision: the newest revision; null if there is none.
     """
 
     ingested: tuple[IngestRow, ...]

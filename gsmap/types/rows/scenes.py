@@ -1,4 +1,4 @@
-"""Scenes: their rows, graphs, priors and histories."""
+"""Scenes, their graphs, priors and histories."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class SceneRef(Row):
     """A scene by id and name.
 
     Args:
-        scene: id.
-        scene_name: name; that which it last had where it was removed.
+        scene: scene id.
+        scene_name: name; the last one of a removed scene.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"scene_name": "scene"}
@@ -29,30 +29,31 @@ class SceneRef(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SceneRow(Row):
-    """One capture in the map.
+    """A capture in the map.
 
     Args:
         name: unique among the map's scenes.
         id: content digest; the same content has the same id in every map.
-        num_gaussians: how many Gaussians it has.
-        num_nodes: nodes of its scene graph; null before it is described.
+        num_gaussians: number of Gaussians.
+        num_nodes: number of nodes of its scene graph; null before it is described.
         component: index of its connected component by the newest poses, largest first; null before the first optimize.
-        S_map_scene: where it lies in the frame of its component; null before the first optimize.
-        captured_at: when it was captured, ISO 8601 with zone; null where nobody knows.
-        status: ``ingested``, ``described``, or by the newest poses ``placed``, ``tentative`` (it rests on edges that no
-            cycle confirms) or ``isolated``.
-        ingested_at: when it came into the map, ISO 8601 with zone.
+        S_map_scene: pose in the frame of its component; null before the first optimize.
+        captured_at: capture date, ISO 8601 with zone; null if unknown.
+        status: ``ingested``, ``described``, or by the newest poses ``placed``, ``tentative`` (placed by edges without
+            an agreeing cycle) or ``isolated``.
+        ingested_at: time of the ingest, ISO 8601 with zone.
         scale_policy: ``known`` (its unit is the metre), ``unknown`` or ``auto``.
-        tags: labels that people gave it.
-        note: what people noted of it.
-        metres_per_unit: metres in a unit of the frame it is placed in, see ``gsmap status``; null where nothing tells.
-        metric: (3,) where its origin lies, metres east, north, up of the world frame; null where the map is not tied to
-            the world (``gsmap georeference``).
-        world: (3,) the same in the map's CRS; null as above.
-        crs: of that; null as above.
-        heights: the unit and zero of the heights in it, such as metres above the ellipsoid; null as above.
-        offset: (3,) what was taken off the coordinates of its file, where these are too large for single precision, as
-            map coordinates are: a point of the scene's frame plus this is the file's own; else zeros.
+        tags: tags.
+        note: newest note.
+        metres_per_unit: metres per unit of its component's frame, see ``gsmap status``; null if unknown.
+        metric: (3,) position of its origin, metres east, north, up of the world frame; null if the map is not
+            georeferenced (``gsmap georeference``).
+        world: (3,) position of its origin in the map's CRS; null if the map is not georeferenced.
+        crs: CRS of ``world``; null if the map is not georeferenced.
+        heights: unit and zero of heights in the CRS, such as metres above the ellipsoid; null if the map is not
+            georeferenced.
+        offset: (3,) offset subtracted from the coordinates of its file if these exceed single precision, as map
+            coordinates do; else zeros.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -89,19 +90,19 @@ class SceneRow(Row):
 
     @property
     def in_world(self) -> str | None:
-        """World coordinates of its origin, for people."""
+        """World coordinates of its origin as text."""
         return coordinates(self.world)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LayerRow(Row):
-    """One layer of a scene graph.
+    """A node layer of a scene graph.
 
     Args:
         layer: name (``objects``, ``landmarks``, ...).
-        num_nodes: how many nodes it has.
-        descriptor_id: what made its embeddings; layers of different ids are never compared.
-        unit_m: metres per scene unit that it was made under.
+        num_nodes: number of nodes.
+        descriptor_id: digest of the embedder; layers with different digests are never compared.
+        unit_m: metres per scene unit assumed for the layer.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -119,16 +120,16 @@ class LayerRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NodeRow(Row):
-    """One node of a scene graph.
+    """A node of a scene graph.
 
     Args:
-        layer: its layer.
-        index: its place in the layer.
+        layer: name of its layer.
+        index: index in the layer.
         position: (3,) centre, scene frame and unit.
         size: (3,) edges of its axis-aligned box, scene unit.
-        type: nodes match only within a type.
+        type: type; nodes match only within a type.
         weight: confidence or response, larger is better.
-        num_views: how many rendered views saw it; 0 where nothing was rendered.
+        num_views: number of rendered views that show it; 0 without rendering.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -152,11 +153,11 @@ class NodeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SceneEdgeRow(Row):
-    """An edge as one of its scenes sees it.
+    """An edge of a scene.
 
     Args:
         scene: id of the scene at the other end.
-        scene_name: its name.
+        scene_name: name of the scene at the other end.
         status: as in `EdgeRow`.
         used: as in `EdgeRow`.
         overlap: as in `EdgeRow`.
@@ -184,15 +185,15 @@ class SceneEdgeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PriorRow(Row):
-    """What is known of a scene's pose from outside.
+    """The pose prior of a scene.
 
     Args:
         scene: id.
         scene_name: name.
         S_map_scene: the expected pose.
-        sigmas: (7,) standard deviations [rotation (3, rad), translation (3, the scene's unit), log scale]; null where
-            nothing is known.
-        up: (3,) direction against gravity in the scene's frame; null where nobody told.
+        sigmas: (7,) standard deviations [rotation (3, rad), translation (3, the scene's unit), log scale]; null if
+            unconstrained.
+        up: (3,) up direction in the scene's frame; null if not specified.
         up_sigma_rad: standard deviation of that direction.
         outcome: ``used``, ``outweighed by the edges``, or ``not solved yet``.
     """
@@ -210,13 +211,13 @@ class PriorRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FactRow(Row):
-    """Something that was said of a scene, kept in history.
+    """An annotation of a scene.
 
     Args:
-        at: when it was said, ISO 8601 with zone.
+        at: time of the annotation, ISO 8601 with zone.
         fact: ``name``, ``captured_at``, ``note``, ``tag`` or ``untag``.
-        value: what was said; empty where a date was taken back.
-        author: who said it, or what did (such as the EXIF of a frame); empty where a person did and was not named.
+        value: text; empty if a date was removed.
+        author: author or source (such as the EXIF of a frame); empty for an unnamed person.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"at": "said at", "fact": "fact", "value": "value", "author": "by"}
@@ -229,30 +230,30 @@ class FactRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SceneReport(SceneRow):
-    """Everything known of one scene.
+    """A scene with its pose, graph, edges and history.
 
     Args:
-        origin: where it was read from, for people.
+        origin: path it was read from.
         sh_degree: degree of its spherical harmonics.
-        num_cameras: how many cameras it has.
-        cameras_synthesised: whether gsmap invented the cameras because the capture had none.
-        antialiased: whether it was trained with the 2D Mip filter.
+        num_cameras: number of cameras.
+        cameras_synthesised: true if gsmap synthesized the cameras because the capture had none.
+        antialiased: true if it was trained with the 2D Mip filter.
         bounds: (2, 3) lowest and highest corner of the Gaussians' centres, scene frame.
-        notes: what a person should know of how it was read and described.
-        rotation_sigma_deg: largest standard deviation of its rotation; null where it is not known.
-        translation_sigma_m: largest standard deviation of its translation; null where it is not known.
+        notes: remarks on how it was read and described.
+        rotation_sigma_deg: largest standard deviation of its rotation; null if unknown.
+        translation_sigma_m: largest standard deviation of its translation; null if unknown.
         covariance: (7, 7) covariance of its pose over [rotation (3, rad), translation (3), log scale] on the scene
             side; null where it is not known.
-        prior: what is known of its pose from outside; null where nothing is.
-        up: (3,) direction against gravity in its frame; null where it could not be told.
+        prior: pose prior; null if there is none.
+        up: (3,) up direction in its frame; null if unknown.
         unit_m: guess of metres per scene unit, good to a factor of about 2; null before it is described.
-        metre_sigma: standard deviation of the logarithm of ``metres_per_unit``; null where nothing tells.
-        metre_known_by: how it is known, see ``gsmap status``; empty before the first optimize.
-        metre_note: what a person should know of it; empty where nothing.
-        layers: the layers of its graph.
+        metre_sigma: standard deviation of the logarithm of ``metres_per_unit``; null if unknown.
+        metre_known_by: source of the metric scale, see ``gsmap status``; empty before the first optimize.
+        metre_note: remark on the metric scale, or empty.
+        layers: node layers of its graph.
         edges: its current edges.
-        nodes: the nodes of its graph that people browse: its objects, and its landmarks in its own unit.
-        history: what people said of it, oldest first.
+        nodes: object nodes, and landmarks in its own unit.
+        history: annotations, oldest first.
     """
 
     columns: ClassVar[Mapping[str, str]] = SceneRow.columns
@@ -281,16 +282,16 @@ class SceneReport(SceneRow):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IngestRow(Row):
-    """What became of one capture that was given.
+    """The result of ingesting one capture.
 
     Args:
         scene: id.
-        scene_name: name, which may differ from the one asked for where that was taken.
-        new: whether it was added; false where the map had the same content already.
-        num_gaussians: how many Gaussians it has.
-        notes: what a person should know of how it was read.
-        captured_at: when it was captured, ISO 8601 with zone; null where nobody knows. Notes say where it came from.
-        dated: whether the map had it already, and it has another date now.
+        scene_name: name, which differs from the requested one if that was taken.
+        new: true if it was added; false if the map had the same content already.
+        num_gaussians: number of Gaussians.
+        notes: remarks on how it was read.
+        captured_at: capture date, ISO 8601 with zone; null if unknown; the notes name its source.
+        dated: true if the map had it already and its date changed.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -311,7 +312,7 @@ class IngestRow(Row):
 
     @property
     def outcome(self) -> str:
-        """In words."""
+        """Description of the result."""
         if self.new:
             return "added"
         return (
@@ -326,12 +327,12 @@ class GraphRow(Row):
     Args:
         scene: id.
         scene_name: name.
-        num_nodes: of all layers.
-        layers: its layers.
-        up: (3,) direction against gravity in the scene's frame; null where it could not be told.
-        unit_m: guess of metres per scene unit; 1 where the scale is known.
-        key: digest of everything that it was made from.
-        notes: what a person should know of it.
+        num_nodes: number of nodes of all layers.
+        layers: node layers.
+        up: (3,) up direction in the scene's frame; null if unknown.
+        unit_m: estimated metres per scene unit; 1 if the scale is known.
+        key: digest of its recipe and inputs.
+        notes: remarks on it.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -352,28 +353,27 @@ class GraphRow(Row):
 
     @property
     def layers_text(self) -> str:
-        """In words."""
+        """Number of nodes of each layer as text."""
         return ", ".join(f"{layer.num_nodes} {layer.layer}" for layer in self.layers) or "no nodes"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseRow(Row):
-    """Where one scene lies.
+    """The pose of a scene.
 
     Args:
         scene: id.
         scene_name: name.
         component: index of its connected component, largest first; components share no frame.
         status: ``placed``, ``tentative`` or ``isolated``, as in `SceneRow`.
-        S_map_scene: its pose in the frame of its component.
-        S_world_scene: its pose in the world frame (metres east, north, up); null where the map is not tied to the
-            world.
-        world: (3,) where its origin lies in the CRS; null as above.
-        crs: of that; null as above.
-        heights: the unit and zero of the heights in it, such as metres above the ellipsoid; null as above.
-        covariance: (7, 7) over [rotation (3, rad), translation (3), log scale] on the scene side; null where it is not
-            known.
-        offset: (3,) as in `SceneRow`: ``S_map_scene`` maps coordinates of the scene's file less this.
+        S_map_scene: pose in the frame of its component.
+        S_world_scene: pose in the world frame (metres east, north, up); null if the map is not georeferenced.
+        world: (3,) position of its origin in the CRS; null if the map is not georeferenced.
+        crs: CRS of ``world``; null if the map is not georeferenced.
+        heights: unit and zero of heights in the CRS, such as metres above the ellipsoid; null if the map is not
+            georeferenced.
+        covariance: (7, 7) over [rotation (3, rad), translation (3), log scale] on the scene side; null if unknown.
+        offset: (3,) offset of `SceneRow`: ``S_map_scene`` maps the file's coordinates less this.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -399,7 +399,7 @@ class PoseRow(Row):
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) where the scene's origin lies."""
+        """Position (3,) of the scene's origin."""
         return self.S_map_scene.translation
 
     @property
@@ -409,5 +409,5 @@ class PoseRow(Row):
 
     @property
     def in_world(self) -> str | None:
-        """World coordinates of its origin, for people."""
+        """World coordinates of its origin as text."""
         return coordinates(self.world)

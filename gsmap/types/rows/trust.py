@@ -1,4 +1,4 @@
-"""What a map on a server would have a person trust."""
+"""Trust in a map's database server."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from gsmap.types.rows.base import Row
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrustReport(Row):
-    """Where a map would have gsmap connect to, and whether this user trusts that.
+    """The database server of a map, and whether this user trusts it.
 
     Args:
-        map: its folder.
-        server: machine and port, or the folder of a socket.
-        database: on that server.
-        user: whose password would be sent there; empty where the driver chooses.
-        trusted: whether the map may be opened so from now on.
+        map: folder of the map.
+        server: host and port, or the folder of a socket.
+        database: database on that server.
+        user: user whose password would be sent; empty for the driver's default.
+        trusted: true if the map may be opened.
     """
 
     columns: ClassVar[Mapping[str, str]] = {

@@ -1,4 +1,4 @@
-"""The world: where components lie in it, how well the observations fit, and what was measured."""
+"""Georeference of components, residuals of observations, and measurements."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from gsmap.types.sim3 import Sim3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResidualRow(Row):
-    """How one observation of the world fits.
+    """The residual of one observation of the world.
 
     Args:
-        kind: ``point`` (a control point), ``image`` (one in one photo), ``fix`` (a position of a camera or scene) or
-            ``bar`` (a distance).
-        name: of the control point, the point and its photo, the photo, or the bar.
-        scene: id of the scene that it speaks of; empty for a control point, which several may show.
-        scene_name: its name; empty as above.
-        use: ``used``, ``outlier`` (it contradicts the others, and was left out), ``check`` (held out) or ``unused``.
-        error_m: east, north, up in metres, from where the survey has it to where the map has it; of a bar how much
-            longer the map has it; empty where the map cannot tell, and of images.
-        size_m: length of that; null where it is empty.
-        sigma_m: standard deviations of ``error_m`` by what the map knows.
-        error_px: of an image: column, row, from where it was picked to where the map has it.
-        statistic: chi-square of the observation against all others; null where nothing else checks it.
-        dof: degrees of freedom of that.
-        reason: why it is an outlier or unused; empty where it is neither.
+        kind: ``point`` (a control point), ``image`` (its pixel in one photo), ``fix`` (a position of a camera or scene)
+            or ``bar`` (a distance).
+        name: name of the control point, the point and its photo, the photo, or the bar.
+        scene: id of the scene; empty for a control point, which several scenes may show.
+        scene_name: name of the scene; empty for a control point.
+        use: ``used``, ``outlier`` (contradicts the others, left out), ``check`` (held out) or ``unused``.
+        error_m: east, north, up in metres from the surveyed to the estimated position; for a bar the estimated minus
+            the measured length; empty if unknown and for images.
+        size_m: length of ``error_m``; null if it is empty.
+        sigma_m: standard deviations of ``error_m``.
+        error_px: for an image, column and row from the picked to the estimated position.
+        statistic: chi-square against all other observations; null without redundancy.
+        dof: degrees of freedom of ``statistic``.
+        reason: reason why it is an outlier or unused, or empty.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -61,7 +61,7 @@ class ResidualRow(Row):
 
     @property
     def error_mm(self) -> str:
-        """The error for people, in millimetres."""
+        """The error in millimetres, as text."""
         return " ".join(f"{1000 * value:.1f}" for value in self.error_m)
 
 
@@ -71,20 +71,20 @@ class ContradictionRow(Row):
 
     Args:
         group: ``points`` (control points), ``photos`` (of captures), ``scenes`` (surveyed scenes) or ``bars``.
-        against: the group that it contradicts; the same where a group contradicts itself.
+        against: contradicted group; the same group if it contradicts itself.
         cause: the likeliest reason: ``altitude_zero``, ``feet`` (taken for metres), ``above_takeoff`` (heights above
             take-off), ``height_system`` (ellipsoidal against orthometric heights), ``vertical_shift`` or
             ``horizontal_shift`` (no known reason, another datum or flight), ``shape`` (of another flight or place),
             ``scale`` (another unit of length) or ``split`` (the group contradicts itself).
         other_causes: further reasons that explain it as well.
-        kept: the side that is solved from: ``against``, ``group``, or ``none`` where nothing tells which is right.
-        offset_m: east, north, up of the group less where the other group has it; empty of bars.
-        sigma_m: standard deviations of ``offset_m``, common errors included; empty of bars.
-        ratio: of bars, measured length by the length in the map; null of other groups.
-        count: observations of the group that differ so.
-        scenes: ids of the captures that they are of.
-        scene_names: names of these captures.
-        text: all this in a sentence.
+        kept: side that is used: ``against``, ``group``, or ``none`` if nothing decides.
+        offset_m: east, north, up of the group relative to the other group; empty for bars.
+        sigma_m: standard deviations of ``offset_m``, common errors included; empty for bars.
+        ratio: for bars, measured length divided by the length in the map; null for other groups.
+        count: number of contradicting observations of the group.
+        scenes: ids of their captures.
+        scene_names: names of their captures.
+        text: description in one sentence.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -111,33 +111,32 @@ class ContradictionRow(Row):
 
     @property
     def offset(self) -> str:
-        """The offset for people, in metres."""
+        """The offset in metres, as text."""
         return " ".join(f"{value:.2f}" for value in self.offset_m)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TieRow(Row):
-    """Where a component of the map lies in the world.
+class GeoreferenceRow(Row):
+    """The pose of a component in the world.
 
     Args:
-        component: its index, largest first.
-        num_scenes: scenes in it.
-        S_world_map: takes its frame to the world frame (metres east, north, up at ``origin``); null where the
-            observations do not determine it.
-        covariance: (7, 7) of that over [rotation (3, rad), translation (3, map unit), log scale] on the map's side;
-            null as above.
-        metres_per_unit: metres in a unit of its frame; null where nothing tells.
-        scale_sigma: standard deviation of the logarithm of that; null where nothing tells.
-        rms_m: root mean square of the errors of the control points, fixes and bars that were solved from; null where
-            there are none.
-        rms_check_m: the same of check points.
-        num_outliers: observations that were left out.
-        residuals: of all its observations.
-        problem: what is missing for ``S_world_map``; empty where it is there.
+        component: component index, largest first.
+        num_scenes: number of scenes.
+        S_world_map: component to world frame (metres east, north, up at ``origin``); null if the observations do not
+            determine it.
+        covariance: (7, 7) of ``S_world_map`` over [rotation (3, rad), translation (3, map unit), log scale] on the
+            map's side; null if it is not determined.
+        metres_per_unit: metres per unit of its frame; null if unknown.
+        scale_sigma: standard deviation of the logarithm of ``metres_per_unit``; null if unknown.
+        rms_m: root mean square error of the used control points, fixes and bars; null without any.
+        rms_check_m: root mean square error of the check points; null without any.
+        num_outliers: number of outliers.
+        residuals: residuals of all its observations.
+        problem: reason why ``S_world_map`` is missing, or empty.
         problem_code: ``undetermined`` (observations are missing), ``contradiction`` (groups contradict each other and
-            none is to be preferred), ``unsolved`` (no finite solution), or empty where there is no problem.
+            nothing decides), ``unsolved`` (no finite solution), or empty.
         contradictions: groups of observations that contradict each other.
-        notes: what a person should know.
+        notes: remarks.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -168,23 +167,22 @@ class TieRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WorldReport(Row):
-    """How a map is tied to the world.
+    """The georeference of a map.
 
     Args:
-        crs: its coordinate reference system, as it was named; null where none was.
-        crs_name: the system's own name.
-        axes: of a coordinate in it, in order.
-        own_heights: whether its heights are its own (a geoid's); else they are above the ellipsoid.
-        heights: the unit and zero of its heights, such as US survey feet above the ellipsoid; empty where there is no
-            CRS.
-        height_unit_m: metres in that unit; null where there is no CRS.
-        origin: latitude and longitude (deg) and ellipsoidal height (m) of the world frame's origin, on the datum of the
-            CRS; null where there is none.
-        components: those of which anything was observed.
-        unseen: names of control points that no photo of the map shows.
-        revision: number of the poses that this is of; null before the first.
-        stale: whether observations have come or gone since: ``gsmap optimize`` solves again.
-        notes: what a person should know.
+        crs: specified coordinate reference system; null without one.
+        crs_name: official name of the CRS.
+        axes: axes of its coordinates, in order.
+        own_heights: true if the CRS has a vertical axis of its own (a geoid's); else heights are above the ellipsoid.
+        heights: unit and zero of heights, such as US survey feet above the ellipsoid; empty without a CRS.
+        height_unit_m: metres per unit of height; null without a CRS.
+        origin: latitude and longitude (deg) and ellipsoidal height (m) of the world frame's origin, on the CRS's datum;
+            null without a world frame.
+        components: components with observations.
+        unseen: names of control points without a pixel in a photo of the map.
+        revision: number of the revision; null before the first.
+        stale: true if observations have changed since: ``gsmap optimize`` solves again.
+        notes: remarks.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"crs": "CRS", "crs_name": "name"}
@@ -196,7 +194,7 @@ class WorldReport(Row):
     heights: str
     height_unit_m: float | None
     origin: tuple[float, ...] | None
-    components: tuple[TieRow, ...]
+    components: tuple[GeoreferenceRow, ...]
     unseen: tuple[str, ...]
     revision: int | None
     stale: bool
@@ -204,18 +202,18 @@ class WorldReport(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PlaceRow(Row):
-    """A point of the map, in every frame that it has.
+class PointRow(Row):
+    """A point in every frame of the map.
 
     Args:
-        said: how it was given.
-        scene: id of the scene that it was picked in; null where it was given in the map or the world.
-        scene_name: its name; null as above.
-        component: whose frame ``map`` is in; null for a point of the world, unless only one component is tied to it.
-        map: (3,) in that frame; null where the component is not known.
-        metric: (3,) metres east, north, up of the world frame; null where the component is not tied to the world.
-        world: (3,) in the CRS; null as above.
-        sigma_m: (3,) standard deviations of ``metric`` east, north, up; null where they are not known.
+        said: the point as given.
+        scene: id of its scene; null for a point of the map or world.
+        scene_name: name of its scene; null for a point of the map or world.
+        component: component of ``map``; null for a point of the world, unless only one component is georeferenced.
+        map: (3,) coordinates in the map; null if the component is unknown.
+        metric: (3,) metres east, north, up of the world frame; null if the component is not georeferenced.
+        world: (3,) coordinates in the CRS; null if the component is not georeferenced.
+        sigma_m: (3,) standard deviations of ``metric`` east, north, up; null if unknown.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -237,23 +235,23 @@ class PlaceRow(Row):
 
     @property
     def in_world(self) -> str | None:
-        """World coordinates for people."""
+        """World coordinates as text."""
         return coordinates(self.world)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeasureReport(Row):
-    """How far two points are apart.
+    """The distance of two points.
 
     Args:
-        distance_m: in metres.
-        sigma_m: its standard deviation, of all that is known to be uncertain: metre, poses, picking.
-        known_by: how its metre is known: ``world`` (the map is tied to it), or as in ``gsmap status``.
-        a: one point.
-        b: the other.
-        crs: of their world coordinates; null where there is none.
-        heights: the unit and zero of the heights in it, such as metres above the ellipsoid; null as above.
-        notes: what the sigma leaves out, and what else a person should know.
+        distance_m: distance in metres.
+        sigma_m: standard deviation of the distance from metric scale, poses and picking.
+        known_by: source of the metric scale: ``world`` (georeferenced), or as in ``gsmap status``.
+        a: the first point.
+        b: the second point.
+        crs: CRS of their world coordinates; null without one.
+        heights: unit and zero of heights in the CRS, such as metres above the ellipsoid; null without a CRS.
+        notes: remarks, such as errors that ``sigma_m`` leaves out.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"distance_m": "distance, m", "sigma_m": "sigma, m", "known_by": "metre"}
@@ -261,8 +259,8 @@ class MeasureReport(Row):
     distance_m: float
     sigma_m: float
     known_by: str
-    a: PlaceRow
-    b: PlaceRow
+    a: PointRow
+    b: PointRow
     crs: str | None
     heights: str | None
     notes: tuple[str, ...]

@@ -1,0 +1,96 @@
+"""Back up, restore and clone a map, reported as rows."""
+
+from __future__ import annotations
+
+import os
+from datetime import UTC, datetime
+
+from gsmap.errors import ConfigError
+from gsmap.ingest import parse_date
+from gsmap.store import Store, schema
+from gsmap.store import backup as _backup
+from gsmap.store.places import place_of
+from gsmap.types.progress import Progress, silent
+from gsmap.types.rows import BackupReport, CloneReport, RestoreReport, SnapshotRow
+
+
+def save(
+    store: Store, target: str | os.PathLike[str], *, verify: bool, keep: int | None, progress: Progress = silent
+) -> BackupReport:
+    """Back up a map to a target (``gsmap backup MAP DEST``); see `gsmap.store.backup.save`."""
+    made = _backup.save(store, place_of(target), verify=verify, keep=keep, progress=progress)
+    return BackupReport(
+        dest=made.target,
+        snapshot=snapshot_row(made.snapshot),
+        num_files_new=made.num_files_new,
+        deleted=made.deleted,
+        num_bytes_freed=made.num_bytes_freed,
+        num_verified=made.num_verified,
+        problems=made.problems,
+        notes=made.notes,
+    )
+
+
+def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
+    """List the snapshots of a backup, oldest first.
+
+    Raises:
+        NotFoundError, StoreError: see `gsmap.store.backup.Backup.open`.
+    """
+    return [snapshot_row(one) for one in _backup.Backup.open(target).snapshots()]
+
+
+def restore(
+    target: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    *,
+    at: str | None = None,
+    catalog_url: str | None = None,
+    progress: Progress = silent,
+) -> RestoreReport:
+    """Restore a map from a backup (``gsmap restore DEST MAP``); see `gsmap.store.backup.restore`."""
+    made = _backup.restore(place_of(target), path, **_moment(at), catalog_url=catalog_url, progress=progress)
+    return RestoreReport(
+        path=str(path),
+        snapshot=snapshot_row(made.snapshot),
+        catalog_schema=made.schema,
+        needs_migration=made.schema < schema.HEAD,
+    )
+
+
+def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> CloneReport:
+    """Clone a map (``gsmap clone MAP NEW``); see `gsmap.store.backup.clone`."""
+    made = _backup.clone(store, path, progress)
+    return CloneReport(
+        path=str(path),
+        map_id=made.map_id,
+        source_map_id=store.id,
+        num_linked=made.num_linked,
+        num_copied=made.num_copied,
+        num_bytes_copied=made.num_bytes_copied,
+    )
+
+
+def snapshot_row(one: _backup.Snapshot) -> SnapshotRow:
+    return SnapshotRow(
+        snapshot=one.name,
+        created_at=one.created_at,
+        map_id=one.map_id,
+        revision=one.revision,
+        counts=one.counts,
+        num_files=one.num_files,
+        num_bytes=one.num_bytes,
+        num_bytes_new=one.num_bytes_new,
+        catalog_schema=one.schema,
+        gsmap_version=one.gsmap_version,
+    )
+
+
+def _moment(at: str | None) -> dict[str, str | None]:
+    """Return ``at`` as a UTC time if it is a date, else as the name of a snapshot."""
+    if at is None or (len(at) > 16 and "Z-" in at):
+        return {"snapshot": at}
+    try:
+        return {"at": datetime.fromisoformat(str(parse_date(at))).astimezone(UTC).isoformat(timespec="microseconds")}
+    except ConfigError:
+        return {"snapshot": at}

@@ -1,0 +1,67 @@
+"""Report and trust the database server of a map."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.store import Store, homes
+from gsmap.store import trust as trusting
+from gsmap.store.explained import called
+from gsmap.types.rows import TrustReport
+
+
+def catalog_of(path: str | os.PathLike[str]) -> TrustReport:
+    """Report the server that a map names and whether this user trusts it; nothing is connected to.
+
+    Raises:
+        NotFoundError: no such map.
+        ConfigError: its catalog lies in its own folder.
+        CorruptError: it names something else than a PostgreSQL database.
+    """
+    found = _remembered(_folder(path))
+    return TrustReport(
+        map=str(path),
+        server=found.server,
+        database=found.database,
+        user=found.user,
+        trusted=trusting.is_trusted(found),
+    )
+
+
+def trust(path: str | os.PathLike[str]) -> TrustReport:
+    """Trust the server that a map names (``gsmap trust MAP``).
+
+    Raises:
+        NotFoundError, ConfigError, CorruptError: as `catalog_of`.
+        StoreError: what the user trusts cannot be written down.
+    """
+    folder = _folder(path)
+    found = _remembered(folder)
+    map_id = found.map_id
+    if map_id is None:  # an older gsmap made it: the database knows
+        map_id = Store.id_at(path, found.url)
+        trusting.write(folder, found.url, map_id)
+    trusting.trust(map_id, found.url)
+    return catalog_of(path)
+
+
+def _folder(path: str | os.PathLike[str]) -> Path:
+    """Return the folder of a map's ``catalog.url``; for an object store, the local mirror."""
+    if not homes.is_remote(path):
+        return homes.local(path)
+    home = homes.Home(os.fspath(path))
+    home.lay_out()
+    return home.desk
+
+
+def _remembered(folder: Path) -> trusting.Remembered:
+    if not folder.is_dir():
+        raise NotFoundError(f"no map at {called(folder)}", code="map_not_found")
+    if not (folder / trusting.URL_FILE).exists():
+        raise ConfigError(
+            f"{folder} keeps its catalog in its own folder, if it is a map: there is nothing to trust",
+            code="nothing_to_trust",
+        )
+    return trusting.remembered(folder)

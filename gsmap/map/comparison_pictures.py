@@ -1,0 +1,292 @@
+"""Draw images of changes and pairs into a folder, with an index of the shown scenes for purges."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.durable import make_folder, open_file, remove_file, write_output, write_text_whole, write_whole
+from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
+from gsmap.geometry.metric_scale import in_metres
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.map.changes import change_arrays, parse_change_id
+from gsmap.map.metric_scales import metres_of_scenes
+from gsmap.map.settings import Settings
+from gsmap.methods import text_digest
+from gsmap.register.view_cache import ViewCache
+from gsmap.store import Store
+from gsmap.types import Cameras, PosedScene, Registration, Scene, Sim3
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows import ChangeRow
+
+_log = logging.getLogger("gsmap.map")
+FILE_NAME = "changes.json"
+_VERSION = 1
+_PICTURE = re.compile(r"c\d+\.png|why-[0-9a-f]{8}-[0-9a-f]{8}\.png|find-[0-9a-f]{16}\.png")
+_LOOKS = 2  # cameras of each capture that a picture of a pair is drawn from
+_MAX_BYTES = 1 << 26
+
+
+@dataclass
+class PictureFolder:
+    """The index of a folder of images: ids of the shown scenes by file."""
+
+    map_id: str
+    scenes: dict[str, list[str]] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, folder: Path, map_id: str) -> PictureFolder:
+        """Load the index; empty if the folder is empty or missing.
+
+        Raises:
+            ConfigError: it holds something else, or pictures of another map.
+            InputError: what it holds cannot be read.
+        """
+        path = folder / FILE_NAME
+        if not os.path.lexists(path):
+            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+                raise ConfigError(
+                    f"{folder} holds other things: give an empty or a new folder for pictures", code="folder_not_empty"
+                )
+            return cls(map_id)
+        try:
+            with open(open_file(path), "rb") as file:
+                content = json.loads(file.read(_MAX_BYTES))
+            owner, version = str(content["map_id"]), content["version"]
+            scenes = {str(name): [str(scene) for scene in ids] for name, ids in content["pictures"].items()}
+        except (OSError, *MALFORMED) as error:
+            raise InputError(
+                f"{path} was not written by gsmap ({error!r}): give another folder", code="foreign_export"
+            ) from error
+        if owner != map_id or version != _VERSION:
+            raise ConfigError(
+                f"{folder} holds pictures of another map ({owner[:12]}): give another folder", code="foreign_export"
+            )
+        return cls(map_id, {name: ids for name, ids in scenes.items() if _PICTURE.fullmatch(name)})
+
+    def save(self, folder: Path) -> None:
+        content = {"version": _VERSION, "map_id": self.map_id, "pictures": self.scenes}
+        write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
+
+    def forget(self, folder: Path, scene: str) -> int:
+        """Delete the images that show a scene; return their number."""
+        gone = [name for name, ids in self.scenes.items() if scene in ids]
+        for name in gone:
+            remove_file(folder, name)
+            del self.scenes[name]
+        if gone:
+            self.save(folder)
+        return len(gone)
+
+
+def draw(
+    store: Store, folder: Path, rows: Sequence[ChangeRow], settings: Settings, progress: StageProgress
+) -> dict[str, str]:
+    """Draw each change before and after; return the files by change id.
+
+    Args:
+        rows: changes of pairs that have a place in the map.
+
+    Raises:
+        ConfigError, InputError: see `PictureFolder.load`.
+    """
+    known = PictureFolder.load(folder, store.id)
+    rows = [row for row in rows if row.box_m is not None]
+    make_folder(folder)
+    _note(store, folder)
+    known.scenes |= {f"{row.id}.png": [row.older, row.newer] for row in rows}
+    known.save(folder)  # first: what an interrupted run leaves is known to a purge
+    files: dict[str, str] = {}
+    for pair in dict.fromkeys((row.older, row.newer) for row in rows):
+        drawer = PairRenderer(store, *pair, settings)
+        for row in rows:
+            if (row.older, row.newer) == pair:
+                progress("pictures", len(files) / len(rows), row.id)
+                files[row.id] = str(folder / f"{row.id}.png")
+                write_whole(folder / f"{row.id}.png", partial(drawer.draw, row))
+    progress("pictures", 1.0, f"{len(files)} pictures")
+    return files
+
+
+def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
+    """Draw both scenes of a pair from the same cameras under the pose of its edge; None if it has none.
+
+    Raises:
+        ConfigError, InputError: see `PictureFolder.load`.
+    """
+    known, stored = PictureFolder.load(folder, store.id), store.registrations.get(a.id, b.id)
+    picture = picture_of_pair(store, a.id, b.id)
+    if stored is None or picture is None:
+        return None
+    edge = stored.registration
+    name = f"why-{edge.target[:8]}-{edge.source[:8]}.png"
+    make_folder(folder)
+    _note(store, folder)
+    known.scenes[name] = [edge.target, edge.source]
+    known.save(folder)
+    write_whole(folder / name, partial(_save, picture))
+    return str(folder / name)
+
+
+def picture_of_pair(store: Store, a: str, b: str, side_px: int = 320) -> np.ndarray | None:
+    """Render both scenes of a pair (ids) from the same cameras, (H, W, 3) uint8; None if its edge has no pose.
+
+    Args:
+        side_px: longer side of each view.
+
+    Raises:
+        CorruptError, NotFoundError: see `gsmap.store.scenes.Scenes.gaussians`.
+    """
+    stored = store.registrations.get(a, b)
+    if stored is None or stored.registration.S_target_source is None:
+        return None
+    from gsmap.view.pair_picture import draw_pair
+
+    seen = pair_views(store, stored.registration, _LOOKS)
+    return draw_pair(seen.target, seen.source, seen.cameras, unit_m=seen.unit_m, side_px=side_px)
+
+
+@dataclass(frozen=True, eq=False)
+class PairViews:
+    """Two scenes in the target's frame, the cameras that see most of the other scene, and metres per unit."""
+
+    target: PosedScene
+    source: PosedScene
+    cameras: list[Cameras]
+    unit_m: float
+
+
+def pair_views(store: Store, edge: Registration, looks: int) -> PairViews:
+    """Return both scenes of an edge with a pose, and at most ``looks`` cameras of each."""
+    assert edge.S_target_source is not None
+    target, source = _placed(store, edge.target, Sim3.identity()), _placed(store, edge.source, edge.S_target_source)
+    graph = store.graphs.load(edge.target)
+    chosen = []
+    for one, other in ((target, source), (source, target)):
+        if one.cameras is not None and len(one.cameras):
+            rows = ViewCache(one.gaussians, one.cameras, synthesize=False).select_views(other.gaussians.means, looks)
+            chosen += [one.cameras[[row]] for row in rows]
+    return PairViews(target, source, chosen, 1.0 if graph is None else graph.unit_m)
+
+
+def picture_of_change(store: Store, settings: Settings, row: ChangeRow, side_px: int = 320) -> np.ndarray | None:
+    """Render a change before and after, (H, W, 3) uint8; None if it has no place. Errors as `picture_of_pair`."""
+    return None if row.box_m is None else PairRenderer(store, row.older, row.newer, settings).picture(row, side_px)
+
+
+def save_picture(picture: np.ndarray, path: str | os.PathLike[str]) -> None:
+    """Write an image (H, W, 3) uint8; the suffix gives the format.
+
+    Raises:
+        ConfigError: a suffix that no picture has.
+    """
+    from PIL import Image
+
+    try:
+        write_output(Path(path), Image.fromarray(picture).save)
+    except ValueError as error:  # a suffix that Pillow does not know
+        raise ConfigError(
+            f"cannot draw to {path} ({error}): name a file that ends with .png", code="wrong_suffix"
+        ) from error
+
+
+def draw_places(
+    store: Store,
+    folder: Path,
+    scenes: Sequence[str],
+    boxes: Sequence[np.ndarray],
+    settings: Settings,
+    progress: StageProgress,
+) -> list[str]:
+    """Draw the content of boxes, each from one scene; return the files in the order of the boxes.
+
+    Args:
+        scenes: id of the scene of each box.
+        boxes: (2, 3) each, map frame and unit.
+
+    Raises:
+        ConfigError, InputError: see `PictureFolder.load`.
+    """
+    from gsmap.view.change_picture import draw_place
+
+    known, poses = PictureFolder.load(folder, store.id), store.revisions.get()
+    assert poses is not None
+    metres = metres_of_scenes(store, settings, poses)
+    names = [
+        f"find-{text_digest(f'{scene} {box.tolist()}')[:16]}.png" for scene, box in zip(scenes, boxes, strict=True)
+    ]
+    make_folder(folder)
+    _note(store, folder)
+    known.scenes |= {name: [scene] for name, scene in zip(names, scenes, strict=True)}
+    known.save(folder)  # first: what an interrupted run leaves is known to a purge
+    for done, scene in enumerate(dict.fromkeys(scenes)):
+        progress("pictures", done / len(scenes), scene[:12])
+        placed = _placed(store, scene, in_metres(poses.poses[scene].S_map_scene, metres[scene]))
+        for name, one, box in zip(names, scenes, boxes, strict=True):
+            if one == scene:
+                write_whole(folder / name, partial(_save, draw_place(placed, box * metres[scene])))
+    progress("pictures", 1.0, f"{len(names)} pictures")
+    return [str(folder / name) for name in names]
+
+
+def _save(drawn: np.ndarray, path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(drawn).save(path, format="PNG")
+
+
+class PairRenderer:
+    """Renders all changes of a pair of scenes, which are read once."""
+
+    def __init__(self, store: Store, older: str, newer: str, settings: Settings) -> None:
+        graph = store.revisions.get()
+        assert graph is not None
+        self._store = store
+        self._metres = metres = metres_of_scenes(store, settings, graph)[newer]
+        self._older = _placed(store, older, in_metres(graph.poses[older].S_map_scene, metres))
+        self._newer = _placed(store, newer, in_metres(graph.poses[newer].S_map_scene, metres))
+
+    def draw(self, row: ChangeRow, path: Path) -> None:
+        """Draw a change to a PNG file."""
+        _save(self.picture(row), path)
+
+    def picture(self, row: ChangeRow, side_px: int = 320) -> np.ndarray:
+        """Render a change before and after, (H, W, 3) uint8."""
+        from gsmap.view.change_picture import draw_change
+
+        change = change_arrays(self._store, parse_change_id(row.id))
+        box, voxels = change.box * self._metres, change.voxels * self._metres
+        return draw_change(self._older, self._newer, box, voxels, side_px)
+
+
+def _placed(store: Store, scene: str, S: Sim3) -> PosedScene:
+    gaussians, cameras = store.scenes.gaussians(scene), store.scenes.cameras(scene)
+    return PosedScene(transform_gaussians(gaussians, S), transform_cameras(cameras, S), scene)
+
+
+def _note(store: Store, folder: Path) -> None:
+    """Record the folder in the catalog, as exports are."""
+    if (refused := note_target(store, folder, {"pictures": True})) is not None:
+        _log.warning("%s: the map does not know of these pictures, so a purge will not find them", refused)
+
+
+def note_target(store: Store, path: Path, settings: Mapping[str, Any]) -> str | None:
+    """Record a folder or file that shows scenes, so that a purge finds it; return why that failed, or None."""
+    if str(path.resolve()) in {one.target for one in store.exports.list()}:
+        return None
+    if not store.catalog.writable:
+        return f"{store.location} is read-only"
+    try:
+        store.exports.begin(path, revision=None, settings=settings)
+    except (DiskFullError, ReadOnlyError) as error:
+        return str(error)
+    return None

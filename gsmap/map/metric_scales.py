@@ -1,0 +1,86 @@
+"""Compute the metric scale of each component of a map from its catalog."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from gsmap.errors import NotFoundError
+from gsmap.geometry.metric_scale import PLAUSIBLE_M, SceneUnit, estimate_metric_scale
+from gsmap.store import Store
+from gsmap.types import PoseGraph, ScenePose
+from gsmap.types.metric_scale import MetricScale
+from gsmap.types.world import Georeference
+
+if TYPE_CHECKING:
+    from gsmap.map.settings import Settings
+
+
+def metres_at(store: Store, settings: Settings, revision: int | None = None) -> dict[int, MetricScale]:
+    """Return the metric scale of every component of a revision, by default the newest."""
+    graph = (
+        PoseGraph(store.revisions.poses(), world=store.revisions.world())
+        if revision is None
+        else store.revisions.get(revision)
+    )
+    return map_metres(store, settings, graph)
+
+
+def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dict[int, MetricScale]:
+    """Return the metric scale of every component, the largest first; no array is read. Scenes removed since the
+    revision still count.
+
+    What is known of a scene that was removed since still counts, as long as the poses are those it took part in.
+    """
+    told, policies = store.scenes.told_metres(), {scene.id: scene.scale_policy for scene in store.scenes.brief()}
+    guesses = {graph.scene: graph.unit_m for graph in store.graphs.says()}  # oldest first: the newest stays
+    components: dict[int, list[tuple[SceneUnit, ScenePose]]] = {}
+    low, high = PLAUSIBLE_M
+    for pose in graph.poses.values() if graph else ():
+        policy, guess = policies.get(pose.scene), guesses.get(pose.scene)
+        if policy is None:
+            try:
+                policy = store.scenes.get(pose.scene).scale_policy
+            except NotFoundError:
+                continue  # forgotten, and all that was said of it
+        if guess is not None and not (math.isfinite(guess) and guess > 0):
+            guess = None
+        unit = SceneUnit(
+            specified=told.get(pose.scene),
+            in_metres=policy == "known",
+            # As registration takes it (`gsmap.describe.unit.landmark_units`): metres, where that is plausible.
+            may_be_metres=policy == "auto" and guess is not None and low < guess < high,
+            guess_m=None if policy == "known" else guess,
+        )
+        components.setdefault(pose.component, []).append((unit, pose))
+    ties = {tie.component: tie for tie in (graph.world if graph else ()) if tie.metres_per_unit is not None}
+    return {
+        component: estimate_metric_scale(components[component], _surveyed(ties.get(component)))
+        for component in sorted(components)
+    }
+
+
+def _surveyed(tie: Georeference | None) -> tuple[float, float] | None:
+    return None if tie is None or tie.metres_per_unit is None else (tie.metres_per_unit, tie.scale_sigma)
+
+
+def metres_of_scenes(store: Store, settings: Settings, graph: PoseGraph) -> dict[str, float]:
+    """Return metres per unit of the frame of each scene's component, by scene id."""
+    metres = map_metres(store, settings, graph)
+    return {
+        scene: metres[pose.component].metres_per_unit if pose.component in metres else 1.0
+        for scene, pose in graph.poses.items()
+    }
+
+
+def metre_notes(metres: Mapping[int, MetricScale]) -> tuple[str, ...]:
+    """Return remarks on the metric scales of components, each once."""
+    components: dict[str, list[int]] = {}
+    for component, metre in metres.items():
+        if metre.note:
+            components.setdefault(metre.note, []).append(component)
+    return tuple(
+        f"component{'s' * (len(of) > 1)} {', '.join(map(str, of[:5]))}{' and more' * (len(of) > 5)}: {note}"
+        for note, of in components.items()
+    )

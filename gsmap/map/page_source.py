@@ -1,0 +1,418 @@
+"""Serve a map to the page of `gsmap.view`; every request reads one state of the catalog."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geometry.transforms import transform_poses
+from gsmap.map import reports
+from gsmap.map.changes import change_row, changes_report, parse_change_id
+from gsmap.map.comparison_pictures import pair_views, picture_of_change
+from gsmap.map.metric_scales import map_metres
+from gsmap.map.objects import MapObjects, compute_objects, history_report, objects_report
+from gsmap.map.page_pairs import pair_detail
+from gsmap.map.photos import photo_rows
+from gsmap.map.snapshot_read import snapshot_read
+from gsmap.map.stages.change import plan_comparisons
+from gsmap.map.stages.optimize import pose_basis
+from gsmap.methods import text_digest
+from gsmap.report.content import EdgeEntry
+from gsmap.store import Store, cache
+from gsmap.types import GaussianSource, PoseGraph, Prior, Scene
+from gsmap.types.plain import canonical
+from gsmap.types.world import ImagePoint
+from gsmap.view import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
+from gsmap.view.doors import Action, PairPictures
+from gsmap.view.pair_picture import looks_at
+from gsmap.view.trees import VERSION, TreeParams
+
+if TYPE_CHECKING:
+    from gsmap.map.settings import Settings
+
+_CAMERA_M = 0.1  # how long a camera is drawn
+
+
+class MapPageSource:
+    """The map that a page shows.
+
+    Args:
+        store: the store of the map.
+        settings: the settings in force.
+        actions: actions that the page may request.
+        tiles: folder of exported 3D Tiles to show beside the scenes.
+
+    Raises:
+        ConfigError, InputError: that folder holds no 3D Tiles of this map.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        settings: Settings,
+        actions: Mapping[str, Action] | None = None,
+        tiles: Path | None = None,
+    ) -> None:
+        self._store, self._settings = store, settings
+        self.actions: Mapping[str, Action] = actions or {}
+        self._lock = threading.Lock()
+        self._read: tuple[str | None, ViewMap] | None = None
+        self._objects: tuple[str | None, MapObjects] | None = None
+        self._objects_lock = threading.Lock()
+        self._tiles = tiles
+        self._merged = {} if tiles is None else merged_tilesets(store, tiles)
+
+    def state(self) -> str:
+        return self.content().state
+
+    def content(self) -> ViewMap:
+        signature = self._store.catalog.signature()
+        with self._lock:
+            if self._read is None or signature is None or self._read[0] != signature:
+                self._read = signature, view_of(self._store, self._settings, frozenset(self._merged))
+            return self._read[1]
+
+    def source(self, scene: str) -> GaussianSource:
+        if self._store.scenes.removed_at(scene) is not None:
+            raise NotFoundError(f"scene {scene} was removed", code="scene_removed")
+        return self._store.scenes.source(scene)
+
+    def extras(self, scene: str) -> dict[str, Any]:
+        """Return nodes and cameras of a scene in the map frame."""
+        entry = self._entry(scene)
+        S, shown = entry.S_map_scene, self._settings.view
+        graph, cameras = self._store.graphs.load(scene), self._store.scenes.cameras(scene)
+        layers = {}
+        for name, layer in (graph.layers if graph else {}).items():
+            weightiest = np.argsort(-layer.weights, kind="stable")[: shown.nodes]
+            layers[name] = S.apply(layer.positions[weightiest]).tolist()
+        frusta: list[list[list[float]]] = []
+        if not cameras.synthesised:
+            metres = 1.0 if entry.pose is None else self.content().metres_per_unit.get(entry.pose.component, 1.0)
+            some = cameras.evenly(shown.cameras)
+            for pose, (fx, fy, cx, cy), (width, height) in zip(
+                some.T_frame_camera, some.intrinsics_px, some.sizes_px, strict=True
+            ):
+                pixels = ((0, 0), (width, 0), (width, height), (0, height))
+                rays = np.array([[(u - cx) / fx, (v - cy) / fy, 1] for u, v in pixels])
+                local = np.vstack([np.zeros((1, 3)), rays * (_CAMERA_M / (S.scale * metres))])
+                frusta.append(S.apply(local @ pose[:3, :3].T + pose[:3, 3]).tolist())
+        return {"layers": layers, "cameras": frusta}
+
+    def revision(self, number: int) -> dict[str, Any]:
+        graph = self._store.revisions.get(number)
+        if graph is None:
+            raise NotFoundError(f"there is no revision {number}", code="revision_not_found")
+        at = self._places()
+        return {
+            "id": number,
+            "scenes": [
+                {
+                    "scene": at[pose.scene],
+                    "component": pose.component,
+                    "status": pose.status,
+                    "S_map_scene": pose.S_map_scene.matrix().tolist(),
+                }
+                for pose in graph.poses.values()
+                if pose.scene in at
+            ],
+        }
+
+    # --- pairs and changes -------------------------------------------------------------------------------------------
+
+    def edge(self, target: str, source: str) -> dict[str, Any]:
+        a, b = self._entry(target), self._entry(source)
+        at = self._places()
+        ends = {"target": at[target], "source": at[source]}
+        return ends | pair_detail(self._store, self._settings, a.scene, b.scene, a.S_map_scene)
+
+    def pair_cameras(self, target: str, source: str) -> tuple[str, ...]:
+        stored = self._store.registrations.get(target, source)
+        if stored is None or stored.registration.S_target_source is None:
+            return ()
+        ends = [self._entry(scene).scene for scene in (stored.registration.target, stored.registration.source)]
+        if sum(scene.num_gaussians for scene in ends) > self._settings.view.picture_gaussians:
+            return ()
+        looks = self._settings.view.pair_views
+        return tuple(f"{scene.name}, view {k + 1}" for scene in ends for k in range(min(looks, scene.num_cameras)))
+
+    def pair_pictures(self, target: str, source: str) -> PairPictures:
+        stored, names = self._store.registrations.get(target, source), self.pair_cameras(target, source)
+        if stored is None or not names:
+            raise NotFoundError(
+                "this pair has no pose to draw both captures in, or is too large to be drawn here",
+                code="no_pose_of_pair",
+            )
+        seen = pair_views(self._store, stored.registration, self._settings.view.pair_views)
+        side = self._settings.view.picture_px
+        looks = [looks_at(seen.target, seen.source, one.resized(side), seen.unit_m) for one in seen.cameras]
+        a, b, difference = zip(*looks, strict=True) if looks else ((), (), ())
+        return PairPictures(names[: len(looks)], a, b, difference)
+
+    def change_picture(self, change: str) -> np.ndarray:
+        row = change_row(self._store, self._settings, parse_change_id(change))
+        picture = picture_of_change(self._store, self._settings, row, self._settings.view.picture_px)
+        if picture is None:
+            raise NotFoundError(
+                f"{change} has no place now: its newer capture has none (gsmap update)", code="change_unplaced"
+            )
+        return picture
+
+    # --- objects -----------------------------------------------------------------------------------------------------
+
+    def graph(self) -> dict[str, Any]:
+        known = self._known()
+        report = objects_report(known)
+        boxes = {thing.id: thing.box for thing in known.objects}
+        return {
+            "objects": [
+                {
+                    "id": row.id,
+                    "name": row.name or row.label or _called(row.size * known.metres[row.component]),
+                    "component": row.component,
+                    "position": row.position.tolist(),
+                    "box": boxes[row.id].tolist(),
+                    "first_seen": row.first_seen,
+                    "last_seen": row.last_seen,
+                    "present": row.there,
+                    "num_sightings": row.seen,
+                    "room": row.room,
+                }
+                for row in report.objects
+            ],
+            "relations": [{"a": one.subject, "b": one.other, "kind": one.relation} for one in report.relations],
+            "rooms": [
+                {
+                    "id": row.id,
+                    "component": row.component,
+                    "outline": row.outline.tolist(),
+                    "area_m2": row.area_m2,
+                    "doors": row.doors,
+                }
+                for row in report.rooms
+            ],
+        }
+
+    def history(self, at: str, component: int) -> dict[str, Any]:
+        known, places = self._known(), self._places()
+        inside = {thing.id for thing in known.objects if thing.component == component}
+        report = history_report(known, at, None)
+        return {
+            "rows": [
+                {"at": row.captured_at, "scene": places[row.scene], "what": row.state, "object": row.object}
+                for row in report.sightings
+                if row.object in inside and row.scene in places
+            ]
+        }
+
+    def merged(self, component: int) -> Path:
+        if component not in self._merged:
+            raise NotFoundError(f"no merged tiles of component {component} were given", code="no_tiles")
+        return self._merged[component]
+
+    # -----------------------------------------------------------------------------------------------------------------
+
+    def _known(self) -> MapObjects:
+        """Return the annotated objects of the map, cached for one state of the catalog."""
+        with self._objects_lock:
+            signature = self._store.catalog.signature()
+            if self._objects is None or signature is None or self._objects[0] != signature:
+                known = compute_objects(self._store, self._settings, lambda stage, fraction, text: None)
+                self._objects = self._store.catalog.signature(), known
+            return self._objects[1]
+
+    def _places(self) -> dict[str, int]:
+        return {entry.scene.id: place for place, entry in enumerate(self.content().scenes)}
+
+    def _entry(self, scene: str) -> ViewScene:
+        found = next((entry for entry in self.content().scenes if entry.scene.id == scene), None)
+        if found is None:
+            raise NotFoundError(f"there is no scene {scene}", code="scene_not_found")
+        return found
+
+
+@snapshot_read
+def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset()) -> ViewMap:
+    """Return the scenes at their newest poses with edges, changes and photos; no array is read."""
+    placed = store.revisions.get()
+    poses = placed.poses if placed else {}
+    graphs = store.graphs.list()
+    ups = {one.scene: np.array(one.up, np.float64) for one in graphs if one.up is not None}
+    metres = map_metres(store, settings, placed)
+    told = {}
+    for number, prior in store.priors.numbered():
+        pose = poses.get(prior.scene)
+        metre = None if pose is None else metres.get(pose.component)
+        told[prior.scene] = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit), number
+    scenes = [_scene(scene, content_key(scene, settings.view.tree), poses, ups, told) for scene in store.scenes.list()]
+    living = {entry.scene.id for entry in scenes}
+    newest, given = store.revisions.newest(), pose_basis(store, settings)
+    found = ViewMap(
+        Path(store.location).name,
+        scenes,
+        _edges(store, placed),
+        [
+            ViewRevision(row.number, row.created_at, row.scenes, row.edges_used, row.dropped_at is None)
+            for row in reports.revision_rows(store)
+        ],
+        _changes(store, settings, placed, living),
+        _photos(store, placed, living),
+        revision=store.revisions.current(),
+        metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
+        merged=merged,
+        has_objects=placed is not None and bool(graphs),
+        stale=bool(given.scenes) and (newest is None or newest.key != given.key.digest),
+    )
+    return replace(found, state=text_digest(canonical(found))[:24])
+
+
+def prior_words(prior: Prior, metres_per_unit: float) -> str:
+    """Describe a prior with its uncertainty: ``pose, 0.05 m, 2°``."""
+    turn, place = prior.sigmas[:3], prior.sigmas[3:6] * prior.S_map_scene.scale * metres_per_unit
+    known = [
+        f"{place.max():.2g} m" if np.isfinite(place).all() else "",
+        f"{np.degrees(turn.max()):.2g}°" if np.isfinite(turn).all() else "",
+        "" if prior.up is None else f"vertical {np.degrees(prior.up_sigma_rad):.2g}°",
+    ]
+    what = "pose" if known[0] and known[1] else "position" if known[0] else "direction"
+    return ", ".join([what, *filter(None, known)])
+
+
+def _scene(
+    scene: Scene,
+    key: str,
+    poses: Mapping[str, Any],
+    ups: Mapping[str, np.ndarray],
+    told: Mapping[str, tuple[str, int]],
+) -> ViewScene:
+    up = ups.get(scene.id)
+    if up is None and scene.thinning is not None and scene.thinning.up is not None:
+        up = np.array(scene.thinning.up, np.float64)
+    return ViewScene(scene, key, poses.get(scene.id), up, *told.get(scene.id, (None, None)))
+
+
+def content_key(scene: Scene, tree: TreeParams) -> str:
+    """Return the key of a scene's levels of detail. It begins with the scene's id and changes when the scene is
+    thinned or the levels are made otherwise."""
+    thinned = "" if scene.thinning is None else f"-t{text_digest(scene.thinning.thinned_at)[:8]}"
+    return f"{scene.id}{thinned}-v{VERSION}-{text_digest(canonical(tree))[:8]}"
+
+
+def _edges(store: Store, placed: PoseGraph | None) -> list[ViewEdge]:
+    outcomes = placed.outcomes if placed else {}
+    current = {(one.registration.target, one.registration.source): one for one in store.registrations.current()}
+    out = []
+    for row in reports.edge_rows(store):
+        pair = (row.target, row.source)
+        stored, outcome = current.get(pair), outcomes.get(pair)
+        probability = float("nan") if stored is None else stored.registration.evidence.get("probability", float("nan"))
+        known = float(probability) if np.isfinite(probability) else None
+        note = ""
+        if row.review is not None:
+            words = store.registrations.reviews(*pair)
+            note = words[-1].note if words else ""
+        chi2 = None if outcome is None else outcome.residual_chi2
+        out.append(
+            ViewEdge(
+                *pair,
+                status=row.status,
+                reason=row.reason,
+                used=row.used if placed else None,
+                undecided=row.undecided,
+                review=row.review,
+                note=note,
+                probability=known,
+                overlap=row.overlap,
+                num_inliers=row.num_inliers,
+                doubt=EdgeEntry(row, chi2=chi2, probability=known).doubt,
+            )
+        )
+    return out
+
+
+def _changes(store: Store, settings: Settings, placed: PoseGraph | None, living: set[str]) -> list[ViewChange]:
+    """Return the stored changes; nothing is compared."""
+    if placed is None:
+        return []
+    report = changes_report(
+        store, settings, plan_comparisons(store, settings), min_confidence=settings.change.min_confidence
+    )
+    return [
+        ViewChange(
+            row.id,
+            row.kind,
+            row.component,
+            row.box,
+            row.older,
+            row.newer,
+            row.newer_at,
+            row.confidence,
+            row.status,
+            _note_of(store, row.id),
+        )
+        for row in report.changes
+        if row.box is not None and row.component is not None and {row.older, row.newer} <= living
+    ]
+
+
+def _note_of(store: Store, change: str) -> str:
+    words = store.changes.reviews(parse_change_id(change))
+    return words[-1].note if words and words[-1].review != "withdraw" else ""
+
+
+def _photos(store: Store, placed: PoseGraph | None, living: set[str]) -> list[ViewPhoto]:
+    """Return the photos stored in the map and the photos localized for control points."""
+    found: dict[tuple[str, str], ImagePoint] = {}
+    for one in store.world.survey().images:
+        if one.camera_covariance is not None and one.scene in living and placed and one.scene in placed.poses:
+            found.setdefault((one.scene, one.image), one)
+    out = []
+    for one in found.values():
+        assert placed is not None
+        pose = placed.poses[one.scene]
+        T = transform_poses(one.T_scene_camera, pose.S_map_scene)
+        width, height = np.maximum(1, np.round(2 * one.intrinsics_px[2:])).astype(int).tolist()
+        out.append(ViewPhoto(one.image, pose.component, T, one.intrinsics_px, (width, height)))
+    for row in photo_rows(store):
+        if row.component is not None and row.T_map_camera is not None and row.scene in living:
+            out.append(
+                ViewPhoto(row.file, row.component, row.T_map_camera, row.intrinsics_px, row.size_px, row.captured_at)
+            )
+    return out
+
+
+def cache_folder() -> Path:
+    """Return the folder of cached levels of detail, in the user's cache folder (`gsmap.store.cache`)."""
+    return cache.folder() / "view"
+
+
+def merged_tilesets(store: Store, out: Path) -> dict[int, Path]:
+    """Return the folder of each component of an export that has 3D Tiles.
+
+    Raises:
+        ConfigError, InputError: it is no export of this map, or has none.
+    """
+    from gsmap.export.manifest import Manifest
+    from gsmap.export.tileset import FILE_NAME
+
+    if not out.is_dir():
+        raise NotFoundError(f"no folder of exported tiles at {out}", code="folder_not_found")
+    manifest = Manifest.load(out, store.id)
+    folders = {tile.component: out / tile.path.split("/")[0] for tile in manifest.tiles.values() if tile.path}
+    found = {component: folder for component, folder in folders.items() if (folder / FILE_NAME).is_file()}
+    if not found:
+        raise ConfigError(
+            f"{out} holds no 3D Tiles: gsmap export MAP {out} --format 3dtiles makes them", code="no_tiles"
+        )
+    return found
+
+
+def _called(size_m: np.ndarray) -> str:
+    """Describe an unnamed object by its size."""
+    return " × ".join(f"{value:.2g}" for value in sorted(size_m.tolist(), reverse=True)) + " m"

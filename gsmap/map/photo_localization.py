@@ -1,0 +1,278 @@
+"""Localize photos and report the results as rows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from gsmap.errors import ConfigError, ReadOnlyError
+from gsmap.formats.scans import is_scan
+from gsmap.ingest.dates import CaptureDate, given_date, photo_date
+from gsmap.localize import Lens, read_clip, read_photo
+from gsmap.map.metric_scales import metre_notes, metres_at
+from gsmap.map.photo_changes import PhotoReporter, write_picture
+from gsmap.map.photos import PhotoObservation, localized_photo_of, small_jpeg
+from gsmap.map.scan_localization import scan_rows
+from gsmap.map.stages.localize import Localizer, SearchRegion, localize, localize_all, parse_near
+from gsmap.store import Store
+from gsmap.types.localization import LocalizationResult, Photo
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
+
+if TYPE_CHECKING:
+    from gsmap.map.settings import Settings
+
+Numbers = str | Sequence[float] | None
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """Options for photos that were localized.
+
+    Args:
+        changes: report differences between the photo and the map.
+        pictures: folder for images with these differences drawn.
+        add: store the photos in the map as evidence.
+        captured_at: capture date given by the user; default: the EXIF date.
+
+    Raises:
+        ConfigError: pictures, or a date, of what is not asked for; or no date.
+    """
+
+    changes: bool = False
+    pictures: str | os.PathLike[str] | None = None
+    add: bool = False
+    captured_at: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.pictures is not None and not self.changes:
+            raise ConfigError("--pictures are of what differs: ask for it by --changes", code="missing_option")
+        if self.captured_at is not None:
+            if not self.add:
+                raise ConfigError(
+                    "--captured-at dates photographs that are kept: add them by --add", code="missing_option"
+                )
+            given_date(self.captured_at)
+
+
+def localize_files(
+    store: Store,
+    settings: Settings,
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    intrinsics: Numbers,
+    focal: str | float | None,
+    near: str | None,
+    together: bool,
+    video: str | os.PathLike[str] | None,
+    progress: StageProgress,
+    masks: str | os.PathLike[str] | None = None,
+    depth: str | os.PathLike[str] | None = None,
+    depth_scale: float = 1000.0,
+    options: PhotoOptions | None = None,
+) -> LocalizeReport:
+    """Read and localize photos and scans; nothing is localized if a file cannot be read.
+
+    Args:
+        together: the photographs show one place.
+        video: a video, in place of files.
+        masks: folder with a mask for each photo; black pixels are ignored.
+        depth: a depth image of the view of the single photo, which makes a scan of it.
+        depth_scale: depth value of one metre.
+        options: options for photos that were localized.
+    """
+    options = options or PhotoOptions()
+    if options.add and not store.catalog.writable:
+        raise ReadOnlyError(f"{store.location} is open to be read only: photographs can be placed in it, but not kept")
+    check_named(files, video, masks)
+    if depth is not None and masks is not None:
+        raise ConfigError(
+            "--masks are of photographs: of a depth picture, set what does not count to 0", code="option_not_applicable"
+        )
+    lens = parse_lens(intrinsics, focal)
+    if video is not None:
+        return _of_pictures(store, settings, frames_of(video, lens, settings), near, True, progress, options)
+    pictures = photos_of([path for path in files if depth is None and not is_scan(path)], lens, masks)
+    of_scans, notes = scan_rows(store, settings, files, depth, depth_scale, lens, near, progress)
+    report = LocalizeReport(results=())
+    if pictures:
+        report = _of_pictures(store, settings, pictures, near, together, progress, options)
+    observation = iter(report.results)
+    rows = tuple(of_scans[number] if number in of_scans else next(observation) for number in range(len(files)))
+    return LocalizeReport(results=rows, notes=(*notes, *report.notes))
+
+
+def check_named(
+    files: Sequence[str | os.PathLike[str]],
+    video: str | os.PathLike[str] | None,
+    masks: str | os.PathLike[str] | None = None,
+) -> None:
+    """Refuse photos together with a video, neither of them, and masks for a video."""
+    if video is not None and masks is not None:
+        raise ConfigError(
+            "--masks are of photographs, by their names: a clip's frames have none", code="option_not_applicable"
+        )
+    if bool(files) == (video is not None):
+        raise ConfigError("name the photographs to localise, or one clip by --video", code="nothing_requested")
+
+
+def photos_of(
+    files: Sequence[str | os.PathLike[str]], lens: Lens, masks: str | os.PathLike[str] | None = None
+) -> list[tuple[str, Photo]]:
+    """Read photos by name, each with its mask if there is one."""
+    return [(os.fspath(path), read_photo(path, lens, masks)) for path in files]
+
+
+def frames_of(video: str | os.PathLike[str], lens: Lens, settings: Settings) -> list[tuple[str, Photo]]:
+    """Read the frames of a video, each named by its time in seconds."""
+    clip = read_clip(video, lens, settings.localize.clips)
+    return [(f"{os.fspath(video)}#{at:.2f}", photo) for at, photo in clip]
+
+
+def find_all(
+    localizer: Localizer,
+    named: Sequence[tuple[str, Photo]],
+    where: SearchRegion | None,
+    together: bool,
+    progress: StageProgress,
+) -> list[tuple[LocalizationResult, float]]:
+    """Localize photos; return each result with its wall time in seconds."""
+    photos = [photo for _, photo in named]
+    if together:
+        return list(localize_all(localizer, photos, where))
+    return list(localize(localizer, photos, where, progress))
+
+
+def _of_pictures(
+    store: Store,
+    settings: Settings,
+    named: Sequence[tuple[str, Photo]],
+    near: str | None,
+    together: bool,
+    progress: StageProgress,
+    options: PhotoOptions,
+) -> LocalizeReport:
+    """Localize named photos and report the results."""
+    where = None if near is None else parse_near(store, near)
+    localizer = Localizer(store, settings, progress)
+    found = find_all(localizer, named, where, together, progress)
+    names = {scene.id: scene.name for scene in store.scenes.list()}
+    rows = [row_of(names, name, *one) for (name, _), one in zip(named, found, strict=True)]
+    notes: list[str] = []
+    if options.changes or options.add:
+        rows, notes = _with_what_they_tell(localizer, named, [one for one, _ in found], rows, options, progress)
+    metres = metres_at(store, settings)
+    components = {row.component for row in rows if row.component is not None and row.status == "placed"}
+    return LocalizeReport(
+        results=tuple(rows),
+        notes=(*metre_notes({c: metres[c] for c in sorted(components) if c in metres}), *notes),
+    )
+
+
+def _with_what_they_tell(
+    localizer: Localizer,
+    named: Sequence[tuple[str, Photo]],
+    found: Sequence[LocalizationResult],
+    rows: Sequence[LocalizeRow],
+    options: PhotoOptions,
+    progress: StageProgress,
+) -> tuple[list[LocalizeRow], list[str]]:
+    """Add differences from the map to the rows of localized photos, and store the photos if requested. Return the
+    rows and notes."""
+    reporter = PhotoReporter(localizer, progress)
+    out: list[LocalizeRow] = []
+    notes: list[str] = []
+    for (name, photo), where, row in zip(named, found, rows, strict=True):
+        if not where.is_placed:
+            out.append(row)
+            continue
+        observation = reporter.compare(photo, where)
+        picture = (
+            None if options.pictures is None else write_picture(options.pictures, name, photo, observation, localizer)
+        )
+        shown = None if picture is None else os.fspath(picture)
+        if options.changes:
+            row = replace(row, changes=observation.rows, compared=observation.found.judged, picture=shown)
+            notes += observation.notes
+        if options.add:
+            added, more = _add(localizer.store, reporter, photo, row, observation, options.captured_at)
+            row = replace(row, added=added)
+            notes += more
+        out.append(row)
+    return out, notes
+
+
+def _add(
+    store: Store,
+    reporter: PhotoReporter,
+    photo: Photo,
+    row: LocalizeRow,
+    observation: PhotoObservation,
+    captured_at: str | None,
+) -> tuple[bool, list[str]]:
+    """Store a localized photo; return true if it is new, and notes."""
+    if captured_at is not None:
+        date = given_date(captured_at)
+    else:
+        date = photo_date(row.file) if os.path.isfile(row.file) else CaptureDate()
+    sighting = localized_photo_of(store, row, photo, reporter.observed_objects(row, observation), date.when)
+    if sighting is None:
+        return False, [f"{row.file} was not kept: the scene that it was found by is gone"]
+    notes = [date.note] if date.note else []
+    if date.when is None:
+        notes.append(f"{row.file} has no date: what it shows comes last in histories (--captured-at DATE says it)")
+    added = store.photos.add(sighting, small_jpeg(photo))
+    return added, notes if added else [f"{row.file} is kept already"]
+
+
+def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
+    """Parse the lens options of `gsmap localize`.
+
+    Raises:
+        ConfigError: not four numbers, a focal length that is none, or both.
+    """
+    if intrinsics is not None and focal is not None:
+        raise ConfigError(
+            "intrinsics hold the focal length: give one of --intrinsics and --focal", code="conflicting_options"
+        )
+    if intrinsics is not None:
+        parts = intrinsics.split(",") if isinstance(intrinsics, str) else intrinsics
+        try:
+            fx, fy, cx, cy = (float(part) for part in parts)
+        except ValueError:
+            raise ConfigError(
+                f"intrinsics are four numbers fx,fy,cx,cy, got {intrinsics!r}", code="invalid_intrinsics"
+            ) from None
+        return Lens((fx, fy, cx, cy))
+    if focal is None:
+        return Lens()
+    if focal == "auto":
+        return Lens(ask_file=False)
+    try:
+        return Lens(focal_px=float(focal))
+    except ValueError:
+        raise ConfigError(f"a focal length is auto or pixels, got {focal!r}", code="invalid_intrinsics") from None
+
+
+def row_of(names: Mapping[str, str], file: str, found: LocalizationResult, seconds: float) -> LocalizeRow:
+    """Convert a localization result to a row.
+
+    Args:
+        names: scene names by id.
+    """
+    return LocalizeRow(
+        file=file,
+        status="placed" if found.is_placed else "refused",
+        reason=found.reason,
+        T_map_camera=found.T_map_camera,
+        covariance=found.covariance,
+        component=found.component,
+        scenes=tuple(names.get(scene, scene) for scene in found.scenes),
+        intrinsics_px=found.intrinsics_px,
+        probability=found.probability,
+        evidence=found.evidence,
+        num_gaussians=found.num_gaussians,
+        seconds=seconds,
+    )

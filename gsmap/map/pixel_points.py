@@ -1,0 +1,86 @@
+"""Find the surface point that a pixel of a scene's camera shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.errors import InputError, NotFoundError
+from gsmap.geometry.rays import surface_along
+from gsmap.map.photo_names import rows_of_photo
+from gsmap.store import Store
+from gsmap.types import Cameras, Gaussians
+
+
+def camera_of(cameras: Cameras, name: str, scene_name: str) -> Cameras:
+    """Return a camera of a scene by its name or its photo's name, with or without folders and suffix.
+
+    Raises:
+        NotFoundError: none, or several.
+    """
+    found = rows_of_photo(cameras.names, name)
+    if len(found) != 1:
+        what = f"{len(found)} cameras" if found else "no camera"
+        some = ", ".join([cameras.names[row] for row in found[:3]] or cameras.names[:3])
+        raise NotFoundError(
+            f"scene {scene_name} has {what} called {name!r}: {'such as' if found else 'its first ones are'} {some}",
+            code="camera_not_found",
+        )
+    return cameras[found]
+
+
+def surface_at(
+    gaussians: Gaussians, camera: Cameras, pixel: np.ndarray, sigma_share: float
+) -> tuple[float, float] | None:
+    """Return the depth along z of the surface at a pixel and its standard deviation; None if there is none.
+
+    The standard deviation is that of splats around surfaces (a share of the depth), and how thick the surface is.
+
+    Raises:
+        InputError: a pixel outside of the picture.
+    """
+    width, height = camera.sizes_px[0].tolist()
+    if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
+        raise InputError(
+            f"pixel {pixel[0]:g},{pixel[1]:g} lies outside of camera {camera.names[0]} ({width}x{height})",
+            code="pixel_outside",
+        )
+    pose = camera.T_frame_camera[0]
+    ray = pose[:3, :3] @ ray_of(camera.intrinsics_px[0], pixel)
+    found = surface_along(gaussians, pose[:3, 3], ray)
+    if found is None:
+        return None
+    depth, thickness = found
+    return depth, float(np.hypot(sigma_share * depth, thickness))
+
+
+def ray_of(intrinsics_px: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """Return the (3,) direction of a pixel in the camera frame, with z = 1."""
+    fx, fy, cx, cy = intrinsics_px
+    return np.array([(pixel[0] - cx) / fx, (pixel[1] - cy) / fy, 1.0])
+
+
+def picked_point(
+    store: Store, scene: str, camera_name: str, pixel: np.ndarray, sigma_share: float, sigma_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (3,) scene point that a pixel of a camera shows, and its (3, 3) covariance.
+
+    Raises:
+        NotFoundError: no such camera, or nothing is to be seen there.
+        InputError: a pixel outside of the picture.
+    """
+    found = store.scenes.get(scene)
+    camera = camera_of(store.scenes.cameras(found.id), camera_name, found.name)
+    seen = surface_at(store.scenes.gaussians(found.id), camera, pixel, sigma_share)
+    if seen is None:
+        raise NotFoundError(
+            f"pixel {pixel[0]:g},{pixel[1]:g} of camera {camera.names[0]} of scene {found.name} shows no surface: pick "
+            "one that does",
+            code="pixel_without_surface",
+        )
+    depth, sigma = seen
+    fx, fy = camera.intrinsics_px[0, :2]
+    ray = ray_of(camera.intrinsics_px[0], pixel)
+    J = np.stack([np.array([depth / fx, 0, 0]), np.array([0, depth / fy, 0]), ray], axis=1)
+    covariance = J @ np.diag([sigma_px**2, sigma_px**2, sigma**2]) @ J.T
+    turn = camera.T_frame_camera[0]
+    return turn[:3, :3] @ (ray * depth) + turn[:3, 3], turn[:3, :3] @ covariance @ turn[:3, :3].T

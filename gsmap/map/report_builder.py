@@ -1,0 +1,564 @@
+"""Collect the data of a map's report; `gsmap.report` draws it.
+
+Catalog rows are those of one moment. Of arrays a bounded number is read (`gsmap.report.Params`); what is damaged is
+left out and named, so that the page an operator opens each morning comes out whatever the night did.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.durable import is_stream, write_text_output
+from gsmap.errors import ConfigError, CorruptError, NotFoundError
+from gsmap.geometry.boxes import box_corners
+from gsmap.geometry.rotations import angle_between
+from gsmap.geometry.uncertainty import middle_covariance_m2
+from gsmap.map import reports
+from gsmap.map.changes import changes_report, filter_by_date
+from gsmap.map.comparison_pictures import PairRenderer, note_target, picture_of_pair
+from gsmap.map.date_filter import is_after, parse_moment
+from gsmap.map.metric_scales import map_metres
+from gsmap.map.objects import load_objects, objects_report
+from gsmap.map.settings import Settings
+from gsmap.map.snapshot_read import snapshot_read
+from gsmap.map.stages.change import plan_comparisons
+from gsmap.map.status import status
+from gsmap.report import (
+    SECTIONS,
+    ChangePicture,
+    EdgeEntry,
+    Island,
+    Moved,
+    News,
+    PairPicture,
+    Params,
+    Plan,
+    PlanEdge,
+    Report,
+    SceneEntry,
+    Shown,
+    StorageEntry,
+    density_picture,
+    make_plan,
+    owner_of,
+    page,
+    top_picture,
+)
+from gsmap.report.content import CHI2_999
+from gsmap.report.words import verdict
+from gsmap.store import Store
+from gsmap.store.registrations import StoredRegistration
+from gsmap.store.set_aside import CAPTURE
+from gsmap.store.sizes import scene_sizes, sizes
+from gsmap.types import Gaussians, PoseGraph, Scene, ScenePose
+from gsmap.types.metric_scale import MetricScale
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, ObjectsReport, RevisionRow, WrittenReport
+from gsmap.version import __version__
+
+_SUFFIXES = (".html", ".htm")
+_SAMPLE = 4000  # points of a scene that its outline is drawn around
+_SOLID = 0.3  # opacity from which a Gaussian is something
+_KINDS = {
+    "scenes": "captures",
+    "graphs": "scene graphs",
+    "changes": "changes",
+    "indexes": "retrieval index",
+    "models": "networks",
+    "catalog": "catalog",
+}
+
+
+def write_report(
+    store: Store, settings: Settings, path: Path, since: str | None, pictures: bool, progress: StageProgress
+) -> WrittenReport:
+    """Write a map's report to a file, whole or not at all.
+
+    Args:
+        since: report only what is new since this date, ISO 8601; None for everything.
+        pictures: draw doubtful pairs and changes.
+
+    Raises:
+        ConfigError: a file that is no ``.html``, or is there and is no report; or no date.
+        NotFoundError: no such folder.
+    """
+    check_target(path)
+    report = _ReportBuilder(store, settings, since, progress).report(pictures)
+    text = page(report)
+    if not is_stream(path) and (refused := note_target(store, path, {"report": True})) is not None:
+        report = replace(report, notes=(*report.notes, f"{refused}: a purge of a scene will not find this page"))
+        text = page(report)
+    write_text_output(path, text)
+    standing, sentences = verdict(report)
+    return WrittenReport(
+        path=str(path),
+        num_bytes=len(text.encode()),
+        standing=standing,
+        verdict=" ".join(sentences),
+        sections=tuple(name for name in SECTIONS if f'<section id="{name}">' in text),
+        num_pictures=len(report.pair_pictures) + len(report.change_pictures),
+        notes=report.notes,
+    )
+
+
+def check_target(path: Path) -> None:
+    """Refuse a file to which no report may be written; see `write_report` for the errors."""
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ConfigError(
+            f"a report is a page: name a file that ends with .html, not {path.name or path}", code="wrong_suffix"
+        )
+    if path.is_dir():
+        raise ConfigError(
+            f"{path} is a folder: name a file in it, such as {path / 'report.html'}", code="target_is_a_folder"
+        )
+    if not path.parent.is_dir():
+        raise NotFoundError(f"cannot write {path}: {path.parent} does not exist", code="folder_not_found")
+    if path.exists() and not is_stream(path) and owner_of(path) is None:
+        raise ConfigError(
+            f"{path} is there and was not written by gsmap report: choose another name, or delete it",
+            code="foreign_export",
+        )
+
+
+def _load_objects(store: Store, settings: Settings) -> ObjectsReport | None:
+    """Return the stored objects; None if they are out of date."""
+    try:
+        return objects_report(load_objects(store, settings))
+    except NotFoundError:
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class _CatalogState:
+    """The catalog of a map as of one transaction."""
+
+    status: MapStatus
+    scenes: list[Scene]
+    graph: PoseGraph | None
+    metres: dict[int, MetricScale]
+    ups: dict[str, np.ndarray]
+    edges: list[EdgeRow]
+    registrations: dict[tuple[str, str], StoredRegistration]
+    revisions: list[RevisionRow]
+    changes: ChangesReport | None
+    report: Report
+
+
+@dataclass
+class _SceneArrays:
+    """Points, cameras and centre of one scene in its frame, for plans and uncertainties."""
+
+    points: np.ndarray
+    track: np.ndarray
+    eyes: np.ndarray
+    middle: np.ndarray
+    kind: str = "boxes"
+    gaussians: Gaussians | None = None
+
+
+@dataclass
+class _ReportBuilder:
+    """Builds one report."""
+
+    store: Store
+    settings: Settings
+    since: str | None
+    progress: StageProgress
+    notes: list[str] = field(default_factory=list)
+
+    def report(self, pictures: bool) -> Report:
+        self.progress("report", 0.0, "reading the catalog")
+        state = _state(self.store, self.settings, self.since)
+        reads = self._arrays(state)
+        edges = _edges(state, reads)
+        islands = self._islands(state, reads, edges)
+        made = replace(
+            state.report,
+            scenes=tuple(self._scene_entries(state, reads)),
+            edges=tuple(edges),
+            islands=tuple(islands),
+        )
+        if pictures:
+            made = replace(made, pair_pictures=self._pairs(made), change_pictures=self._changes(state))
+        self.progress("report", 1.0, "")
+        return replace(made, notes=tuple(self.notes))
+
+    @property
+    def params(self) -> Params:
+        return self.settings.report
+
+    # --- arrays ------------------------------------------------------------------------------------------------------
+
+    def _arrays(self, state: _CatalogState) -> dict[str, _SceneArrays]:
+        """Read the points and centre of every placed scene, within the limits of a report."""
+        poses = state.graph.poses if state.graph else {}
+        placed = [scene for scene in state.scenes if scene.id in poses]
+        placed.sort(key=lambda scene: poses[scene.id].component)
+        budget = self.params.plan_gaussians
+        whole: set[int] = set()
+        drawn = sorted({poses[scene.id].component for scene in placed})[: self.params.islands]
+        for component in drawn:
+            need = sum(scene.num_gaussians for scene in placed if poses[scene.id].component == component)
+            if need <= budget:
+                whole.add(component)
+                budget -= need
+        found = {}
+        for i, scene in enumerate(placed):
+            self.progress("report", 0.6 * i / len(placed), scene.name)
+            component = poses[scene.id].component
+            is_read = i < self.params.plan_scenes and component in drawn
+            try:
+                found[scene.id] = self._read(scene, whole=component in whole) if is_read else _box_of(scene)
+            except (CorruptError, NotFoundError) as error:
+                self.notes.append(f"scene {scene.name} is drawn as a box: {self._hidden(str(error))}")
+                found[scene.id] = _box_of(scene)
+        return found
+
+    def _read(self, scene: Scene, *, whole: bool) -> _SceneArrays:
+        cameras = self.store.scenes.cameras(scene.id)
+        eyes = np.zeros((0, 3)) if cameras.synthesised else cameras.centers
+        track = eyes if not len(eyes) else cameras.evenly(self.params.track_points).centers
+        gaussians, kind = None, "boxes"
+        points = box_corners(scene.bounds)
+        if whole:
+            every = self.store.scenes.gaussians(scene.id)
+            gaussians, kind = replace(every, sh=every.sh[:, :1]), "rendered"
+            solid = np.flatnonzero((every.opacities > _SOLID) & np.isfinite(every.means).all(1))
+            if len(solid):
+                points = every.means[solid[:: -(-len(solid) // _SAMPLE)]].astype(np.float64)
+        elif (graph := self.store.graphs.load(scene.id)) is not None:
+            layer = graph.layers.get("landmarks") or graph.layers.get("landmarks:1") or graph.layers.get("objects")
+            if layer is not None and len(layer):
+                points, kind = layer.positions[:: -(-len(layer) // _SAMPLE)], "landmarks"
+        middle = np.median(eyes if len(eyes) else points, axis=0)
+        return _SceneArrays(points, track, eyes, middle, kind, gaussians)
+
+    def _scene_entries(self, state: _CatalogState, reads: Mapping[str, _SceneArrays]) -> Iterable[SceneEntry]:
+        poses = state.graph.poses if state.graph else {}
+        for entry in state.report.scenes:
+            pose, read = poses.get(entry.row.id), reads.get(entry.row.id)
+            if pose is None or read is None:
+                yield entry
+                continue
+            metre = state.metres.get(pose.component, MetricScale()).metres_per_unit
+            yield replace(
+                entry,
+                middle=pose.S_map_scene.apply(read.middle[None])[0],
+                covariance_m2=middle_covariance_m2(pose, read.middle, metre),
+                rotation_sigma_deg=_rotation_sigma_deg(pose),
+            )
+
+    # --- plans -------------------------------------------------------------------------------------------------------
+
+    def _islands(
+        self, state: _CatalogState, reads: Mapping[str, _SceneArrays], edges: Sequence[EdgeEntry]
+    ) -> list[Island]:
+        members: dict[int, list[Scene]] = {}
+        poses = state.graph.poses if state.graph else {}
+        for scene in state.scenes:
+            if scene.id in poses:
+                members.setdefault(poses[scene.id].component, []).append(scene)
+        islands = []
+        for place, component in enumerate(sorted(members)):
+            scenes, metre = members[component], state.metres.get(component, MetricScale())
+            island = Island(component, tuple(scene.name for scene in scenes), metre)
+            if place < self.params.islands:
+                self.progress("report", 0.6, f"plan of island {component}")
+                island = self._plan(state, island, scenes, reads, edges)
+            islands.append(island)
+        return islands
+
+    def _plan(
+        self, state: _CatalogState, island: Island, scenes: Sequence[Scene], reads: Mapping[str, _SceneArrays],
+        edges: Sequence[EdgeEntry],
+    ) -> Island:  # fmt: skip
+        assert state.graph is not None
+        poses = [state.graph.poses[scene.id] for scene in scenes]
+        found = [reads[scene.id] for scene in scenes]
+        metre = island.metre.metres_per_unit
+        shown = [
+            Shown(
+                scene.name,
+                pose.status,
+                pose.S_map_scene.apply(read.points),
+                pose.S_map_scene.apply(read.track),
+                pose.S_map_scene.apply(read.middle[None])[0],
+                middle_covariance_m2(pose, read.middle, metre),
+            )
+            for scene, pose, read in zip(scenes, poses, found, strict=True)
+        ]
+        place = {scene.id: i for i, scene in enumerate(scenes)}
+        lines = [
+            PlanEdge(place[edge.row.target], place[edge.row.source], _on_plan(edge), _tip(edge))
+            for edge in edges
+            if edge.row.target in place and edge.row.source in place and edge.use not in ("rejected", "no_match")
+        ]
+        plan = make_plan(shown, lines, _up(state, scenes, poses), metre)
+        if plan is None:
+            return replace(island, note="where its scenes show anything is not known")
+        plan, note = self._picture(plan, poses, found)
+        return replace(island, plan=plan, note=note)
+
+    def _picture(self, plan: Plan, poses: Sequence[ScenePose], found: Sequence[_SceneArrays]) -> tuple[Plan, str]:
+        from gsmap.geometry.transforms import transform_gaussians
+
+        px = self.params.plan_px
+        whole = [(read.gaussians, pose) for read, pose in zip(found, poses, strict=True) if read.gaussians is not None]
+        if whole:
+            parts = [transform_gaussians(gaussians, pose.S_map_scene) for gaussians, pose in whole]
+            eyes = np.concatenate([pose.S_map_scene.apply(r.eyes) for r, pose in zip(found, poses, strict=True)])
+            picture, kind = top_picture(parts, plan, eyes, px), "rendered"
+            note = "Below, the Gaussians from straight above, ceilings off."
+        else:
+            marks = [
+                pose.S_map_scene.apply(read.points)
+                for read, pose in zip(found, poses, strict=True)
+                if read.kind == "landmarks"
+            ]
+            if not marks:
+                return plan, "Outlines are boxes around what the scenes hold."
+            picture, kind = density_picture(np.concatenate(marks), plan, px), "landmarks"
+            note = "Below, where the landmarks of its graphs lie."
+        return (replace(plan, picture=picture, picture_kind=kind), note) if picture else (plan, "")
+
+    # --- pictures ----------------------------------------------------------------------------------------------------
+
+    def _pairs(self, made: Report) -> tuple[PairPicture, ...]:
+        """Draw the most doubtful pairs."""
+        sizes_ = {entry.row.id: entry.row.num_gaussians for entry in made.scenes}
+        doubtful = [edge for edge in made.edges if edge.use in ("undecided", "tentative")]
+        doubtful.sort(key=lambda edge: (-edge.doubt, edge.row.pair))
+        out: list[PairPicture] = []
+        left = self.params.pair_pictures
+        for edge in doubtful:
+            if left == 0:
+                break
+            ends = (edge.row.target, edge.row.source)
+            if sum(sizes_.get(scene, 0) for scene in ends) > self.params.picture_gaussians:
+                continue
+            left -= 1
+            self.progress("report", 0.7, edge.row.pair)
+            try:
+                picture = picture_of_pair(self.store, *ends, side_px=self.params.picture_px)
+            except (CorruptError, NotFoundError) as error:
+                self.notes.append(f"{edge.row.pair} is not drawn: {self._hidden(str(error))}")
+                continue
+            if picture is not None:
+                out.append(PairPicture(edge.row, picture))
+        return tuple(out)
+
+    def _changes(self, state: _CatalogState) -> tuple[ChangePicture, ...]:
+        """Draw the changes of highest confidence."""
+        found = [] if state.changes is None else [row for row in state.changes.changes if row.box_m is not None]
+        sizes_ = {scene.id: scene.num_gaussians for scene in state.scenes}
+        found = [
+            row
+            for row in found
+            if row.status != "rejected" and {row.older, row.newer} <= set(sizes_)
+            and sizes_[row.older] + sizes_[row.newer] <= self.params.picture_gaussians
+        ]  # fmt: skip
+        found.sort(key=lambda row: -row.confidence)
+        found = found[: self.params.change_pictures]
+        out = []
+        for pair in dict.fromkeys((row.older, row.newer) for row in found):
+            try:
+                drawer = PairRenderer(self.store, *pair, self.settings)
+                for row in found:
+                    if (row.older, row.newer) == pair:
+                        self.progress("report", 0.9, row.id)
+                        picture = drawer.picture(row, side_px=self.params.picture_px)
+                        out.append(ChangePicture(row.id, picture))
+            except (CorruptError, NotFoundError) as error:
+                self.notes.append(f"changes of {pair[0][:12]} are not drawn: {self._hidden(str(error))}")
+        return tuple(out)
+
+    def _hidden(self, text: str) -> str:
+        return _without_places(text, _places(self.store))
+
+
+# --- the catalog -----------------------------------------------------------------------------------------------------
+
+
+@snapshot_read
+def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState:
+    """Read the catalog and the parts of the report that need no arrays."""
+    params = settings.report
+    when = None if since is None else parse_moment(since)
+    scenes, graph = store.scenes.list(), store.revisions.get()
+    metres = map_metres(store, settings, graph)
+    stored = {(one.registration.target, one.registration.source): one for one in store.registrations.current()}
+    edges = reports.edge_rows(store)
+    revisions = reports.revision_rows(store)
+    num_bytes = scene_sizes(store)
+    cameras = {scene.id: scene.num_cameras for scene in scenes}
+    found = status(store, settings)
+    places = _places(store)
+    changes = None if graph is None else _known_changes(store, settings, since)
+    shown = Report(
+        title=Path(store.location).name,
+        map_id=store.id,
+        made_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        version=__version__,
+        status=_hide_places(found, places),
+        scenes=tuple(
+            SceneEntry(row, cameras.get(row.id, 0), num_bytes.get(row.id, 0))
+            for row in reports.scene_rows(store, metres=metres)
+        ),
+        revisions=tuple(revisions[-params.revisions :]) if params.revisions else (),
+        num_revisions=len(revisions),
+        moved=tuple(_moved(store, settings, revisions, params.moves)),
+        moved_since=None if when is None else _moved_since(store, settings, revisions, when),
+        changes=changes,
+        objects=None if graph is None else _load_objects(store, settings),
+        storage=tuple(StorageEntry(_KINDS.get(one.kind, one.kind), one.count, one.num_bytes) for one in sizes(store)),
+        seconds=_seconds(stored.values()),
+        news=None if when is None or since is None else _news(since, when, scenes, edges),
+        params=params,
+    )
+    ups = {one.scene: np.array(one.up, np.float64) for one in store.graphs.list() if one.up is not None}
+    ups |= {
+        scene.id: np.array(scene.thinning.up, np.float64)
+        for scene in scenes
+        if scene.thinning is not None and scene.thinning.up is not None and scene.id not in ups
+    }
+    return _CatalogState(found, scenes, graph, metres, ups, edges, stored, revisions, changes, shown)
+
+
+def _known_changes(store: Store, settings: Settings, since: str | None) -> ChangesReport:
+    """Return the stored changes; nothing is compared."""
+    asked = filter_by_date(plan_comparisons(store, settings), since, None, None)
+    return changes_report(store, settings, asked, min_confidence=settings.change.min_confidence)
+
+
+def _news(since: str, when: datetime, scenes: Sequence[Scene], edges: Sequence[EdgeRow]) -> News:
+    tried = [edge for edge in edges if is_after(edge.registered_at, when)]
+    return News(
+        since=since,
+        scenes=tuple(scene.name for scene in scenes if is_after(scene.ingested_at, when)),
+        num_tried=len(tried),
+        num_accepted=sum(edge.status == "accepted" for edge in tried),
+    )
+
+
+def _moved(store: Store, settings: Settings, revisions: Sequence[RevisionRow], most: int) -> Iterable[Moved]:
+    """Return the pose changes between the newest stored revisions, newest first."""
+    kept = [row.number for row in revisions if row.dropped_at is None]
+    for after, before in list(zip(reversed(kept), reversed(kept[:-1]), strict=False))[:most]:
+        yield Moved(before, after, tuple(reports.pose_change_rows(store, before, after, settings)))
+
+
+def _moved_since(store: Store, settings: Settings, revisions: Sequence[RevisionRow], when: datetime) -> Moved | None:
+    kept = [row for row in revisions if row.dropped_at is None]
+    before = [row.number for row in kept if not is_after(row.created_at, when)]
+    if not before or before[-1] == kept[-1].number:
+        return None
+    rows = reports.pose_change_rows(store, before[-1], kept[-1].number, settings)
+    return Moved(before[-1], kept[-1].number, tuple(rows))
+
+
+def _seconds(stored: Iterable[StoredRegistration]) -> dict[str, float]:
+    """Return the wall time per step, summed over all current edges."""
+    total: dict[str, float] = {}
+    for one in stored:
+        for step, value in one.registration.seconds.items():
+            total[step] = total.get(step, 0.0) + float(value)
+    return dict(sorted(total.items(), key=lambda item: -item[1]))
+
+
+def _edges(state: _CatalogState, reads: Mapping[str, _SceneArrays]) -> list[EdgeEntry]:
+    """Return every edge with its residual under the newest poses."""
+    poses = state.graph.poses if state.graph else {}
+    outcomes = state.graph.outcomes if state.graph else {}
+    out = []
+    for row in state.edges:
+        stored = state.registrations.get((row.target, row.source))
+        outcome = outcomes.get((row.target, row.source))
+        probability = float("nan") if stored is None else stored.registration.evidence.get("probability", float("nan"))
+        entry = EdgeEntry(
+            row,
+            chi2=None if outcome is None else outcome.residual_chi2,
+            probability=float(probability) if np.isfinite(probability) else None,
+        )
+        a, b = poses.get(row.target), poses.get(row.source)
+        if a is not None and b is not None and a.component == b.component:
+            entry = replace(entry, component=a.component)
+            if row.S_target_source is not None and row.status == "accepted":
+                middle = reads[row.source].middle[None]
+                alone = a.S_map_scene @ row.S_target_source
+                gap = float(np.linalg.norm(alone.apply(middle) - b.S_map_scene.apply(middle)))
+                turn = angle_between(alone.rotation, b.S_map_scene.rotation)
+                metre = state.metres.get(a.component, MetricScale()).metres_per_unit
+                entry = replace(entry, translation_m=gap * metre, rotation_deg=float(np.degrees(turn)))
+        out.append(entry)
+    return out
+
+
+def _on_plan(edge: EdgeEntry) -> str:
+    return "strained" if edge.use == "used" and (edge.chi2 or 0.0) > CHI2_999 else edge.use
+
+
+def _tip(edge: EdgeEntry) -> str:
+    chi2 = "" if edge.chi2 is None else f", chi2 {edge.chi2:.3g}"
+    off = "" if edge.translation_m is None else f", off by {edge.translation_m:.3g} m"
+    return f"{edge.row.pair}: {_on_plan(edge)}{chi2}{off}"
+
+
+def _box_of(scene: Scene) -> _SceneArrays:
+    none = np.zeros((0, 3))
+    return _SceneArrays(box_corners(scene.bounds), none, none, scene.bounds.mean(0))
+
+
+def _rotation_sigma_deg(pose: ScenePose) -> float | None:
+    if pose.covariance is None:
+        return None
+    return float(np.degrees(np.sqrt(max(0.0, float(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])))))
+
+
+def _up(state: _CatalogState, scenes: Sequence[Scene], poses: Sequence[ScenePose]) -> np.ndarray | None:
+    """Return the median up direction of a component's scenes, in its frame; None if unknown."""
+    told = [
+        pose.S_map_scene.rotation @ state.ups[scene.id]
+        for scene, pose in zip(scenes, poses, strict=True)
+        if scene.id in state.ups
+    ]
+    if not told:
+        return None
+    middle = np.median(np.array(told), axis=0)
+    size = float(np.linalg.norm(middle))
+    return middle / size if size > 1e-3 else None
+
+
+# --- places of files -------------------------------------------------------------------------------------------------
+
+
+def _places(store: Store) -> dict[str, str]:
+    """Return short names for local paths, which a shared page must not show."""
+    targets = [*store.exports.targets(), str(store.folder), str(store.home), store.location]
+    for one in store.set_aside.list():
+        if one.what.startswith(f"{CAPTURE} "):  # and its cameras, which may lie above it
+            targets += [str(folder) for folder in [Path(one.about), *Path(one.about).parents][:4] if folder.name]
+    return {target: Path(target).name for target in targets if "/" in target}
+
+
+def _without_places(text: str, places: Mapping[str, str]) -> str:
+    for place in sorted(places, key=len, reverse=True):
+        text = text.replace(shlex.quote(place), shlex.quote(places[place])).replace(place, places[place])
+    return text
+
+
+def _hide_places(found: MapStatus, places: Mapping[str, str]) -> MapStatus:
+    todo = tuple(
+        replace(row, verb=_without_places(row.verb, places), meaning=_without_places(row.meaning, places))
+        for row in found.todo
+    )
+    at_work = tuple(
+        replace(row, what=_without_places(row.what, places), task=_without_places(row.task, places))
+        for row in found.at_work
+    )
+    return replace(found, todo=todo, at_work=at_work)

@@ -1,0 +1,90 @@
+"""The owner of a lock or lease: a process, its task, and a test whether it still runs."""
+
+from __future__ import annotations
+
+import os
+import socket
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class LockOwner:
+    """A process that holds a lock or lease.
+
+    Args:
+        task: the verb.
+        host: name of its machine.
+        process: process id, start time and machine (kernel and container), as `this_process` gives them; the id alone
+            may be reused.
+        since: start of the task, ISO 8601, UTC.
+    """
+
+    task: str
+    host: str
+    process: str
+    since: str
+
+    @property
+    def pid(self) -> int:
+        """Process id on its machine; 0 if the stored text is invalid."""
+        first = self.process.partition(" ")[0]
+        return int(first) if first.isdecimal() and len(first) < 10 else 0
+
+    @property
+    def who(self) -> str:
+        """Description such as ``gsmap update (process 123 on HOST, since 14:02)``; with the date if not today."""
+        try:
+            since = datetime.fromisoformat(self.since).astimezone()
+            text = f"{since:%H:%M}" if since.date() == datetime.now().astimezone().date() else f"{since:%Y-%m-%d %H:%M}"
+        except (ValueError, OverflowError):
+            text = self.since
+        words = f"gsmap {self.task} (process {self.pid} on {self.host}, since {text})"
+        return "".join(c if c.isprintable() else "?" for c in words)  # it was read from a file that others may write
+
+    @property
+    def is_gone(self) -> bool:
+        """True if the process has ended; known for this machine only, else false."""
+        number, _, rest = self.process.partition(" ")
+        started, _, machine = rest.partition(" ")
+        if not self.pid or machine != _machine():
+            return False
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return True
+        except OSError:
+            pass  # another user's
+        now = _started(number)
+        return now is not None and now != started
+
+
+def this_process(task: str) -> LockOwner:
+    """Return this process as the owner of a task that starts now."""
+    process = f"{os.getpid()} {_started('self') or '-'} {_machine()}"
+    return LockOwner(task, socket.gethostname(), process, datetime.now(UTC).isoformat(timespec="microseconds"))
+
+
+@cache
+def _machine() -> str:
+    """Return an identifier of the running kernel and pid namespace. Processes can judge each other by pid only if both
+    agree; host names may be shared by containers and machines.
+
+    Containers of one machine may share its name, and a machine its name with another; neither shares both of these.
+    """
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{boot}/{os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return socket.gethostname()
+
+
+def _started(number: str) -> str | None:
+    """Return the start time of a process in ticks since boot; ``ended`` for a zombie; None if it cannot be read."""
+    try:
+        fields = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
+        return "ended" if fields[0] in "ZX" else fields[19]
+    except (OSError, IndexError):
+        return None
