@@ -122,6 +122,14 @@ def test_every_page_is_in_the_table_of_contents() -> None:
     assert all(Path(name).name in told for name in design)
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_tools_that_are_named_exist(page: Path) -> None:
+    text = page.read_text()
+    modules = {name.replace(".", "/") + ".py" for name in re.findall(r"python -m (tools\.[a-z_.]+[a-z])", text)}
+    files = set(re.findall(r"(tools/[a-z_/0-9]+\.(?:py|sh|js))", text))
+    assert sorted(name for name in modules | files if not (ROOT / name).exists()) == []
+
+
 def test_documents_stay_short() -> None:
     assert sum(len(page.read_text().split()) for page in PAGES) <= 50_000
     assert (ROOT / "README.md").stat().st_size <= 9_000
