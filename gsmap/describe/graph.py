@@ -95,7 +95,7 @@ def describe(
         scene_id: recorded in the graph.
         gaussians, cameras: the capture, scene frame; cameras may be None or synthesised.
         models: checked ONNX models by kind, for the methods that need them (`gsmap.describe.onnx.check`).
-        scale_policy: ``known`` (the unit is the metre: no layers at guessed units), ``unknown`` (only those),
+        scale_policy: ``known`` (the unit is the metre: no layers at estimated units), ``unknown`` (only those),
             ``auto`` (both, where a metre is plausible).
 
     Returns:

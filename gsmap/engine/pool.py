@@ -65,7 +65,7 @@ class Worker:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             worker_end.close()
-        about = spawn.get_preparation_data("gsmap worker")  # the search path, the folder, and what `__main__` is
+        about = spawn.get_preparation_data("gsmap worker")  # search path, working directory and `__main__`
         about.pop("authkey", None)  # a secret, and of no use here
         self._unsent = [pickle.dumps(about)]
 

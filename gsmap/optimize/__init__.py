@@ -121,8 +121,8 @@ def joint_covariance(
 ) -> np.ndarray | None:
     """Compute the joint covariance (7 + 7 S, 7 + 7 S) of ``S_world_map`` and the poses of S scenes of a component.
 
-    Each over [rotation, translation, log scale] on its source side; zero for the world where the component is not tied.
-    Marginals do not give the uncertainty between two scenes: neighbouring scenes have common errors.
+    Each over [rotation, translation, log scale] on its source side; zero for the world where the component is not
+    georeferenced. Marginals do not give the uncertainty between two scenes: neighbouring scenes have common errors.
 
     Args:
         answer: an answer of `optimize`, with its edges, priors and observations.

@@ -187,7 +187,7 @@ def attaching_joins(offers: list[Join], sizes: np.ndarray, min_large: int) -> li
             continue
         taken.add(start)
         reach(start, rank)
-        # Components that are not small reach out together: what lies between goes to the likelier.
+        # Large components grow together: a small one between two of them joins by the likelier edge.
         if rank + 1 < len(starts) and sizes[starts[rank + 1]] >= min_large:
             continue
         while front:

@@ -13,7 +13,7 @@ from gsmap.optimize.params import Params
 from gsmap.types import PoseGraph, ScenePose, Sim3
 from gsmap.types.world import Georeference
 
-_MIN_AGREEMENT = 0.5  # length of the median of unit up directions below which scenes do not agree on what is up
+_MIN_AGREEMENT = 0.5  # length of the median of unit up directions below which scenes disagree on up
 
 
 def gravity_align(

@@ -56,7 +56,7 @@ def tie_component(
         return None
     system = System(own, terms, poses[whole.scenes])
     try:
-        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # what is not finite is caught below
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # infinite results are handled below
             surveyed = _surveyed(system, whole, poses, survey, index, marginal_scenes)
     except (np.linalg.LinAlgError, RuntimeError, InputError):  # of numpy, a singular factor in scipy, and Sim3
         surveyed = None

@@ -422,7 +422,7 @@ class _GroupSolver:
             used = reference.rows[self._is_active(reference.active, reference.rows)]
             wrong = likely_causes(self.places[rows], shift, self.frame, self._ground(used))
             back = replace(shift, shift_m=-shift.shift_m)
-            # A wrong reference is bent out of shape itself, so that the shape tells nothing of it.
+            # A wrong reference deforms the component, so that its shape is no evidence.
             right = likely_causes(self.places[used], replace(back, shaped=True), self.frame, self._ground(rows))
             together = np.concatenate([used, rows])
             shifted = self.places.moved(rows, -shift.shift_m)[together].misfit_m()

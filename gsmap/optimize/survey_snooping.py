@@ -64,7 +64,7 @@ def _exchange(
     alpha = np.log(1 - GATE_PROBABILITY)
     for kind, (use, log_p) in enumerate(zip(active, tests.log_p, strict=True)):
         for k in np.flatnonzero(use & (log_p < alpha)).tolist():
-            # Of two that say the same the survey of the point is doubted first: it is named first.
+            # Of equivalent observations the survey of the point is excluded first: points come first.
             if log_p[k] < worst - 1e-6 * abs(worst) - 1e-9 and not (kind == 1 and system.lone[k]):
                 worst, place = float(log_p[k]), (kind, k)
     if place is not None:

@@ -1,6 +1,6 @@
 """Blending weights behind gsplat's images: the dominant Gaussian of every pixel, the largest weight of every Gaussian.
 
-gsplat returns neither. Its tile lists say which Gaussians a pixel is blended from, near to far; both are found by
+gsplat returns neither. Its tile lists hold the Gaussians that a pixel is blended from, near to far; both are found by
 blending them once more, by a Triton kernel where Triton is installed, else by torch.
 """
 

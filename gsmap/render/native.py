@@ -47,7 +47,7 @@ def arrays_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
 
 
 _kept = threading.local()
-_KEPT_BYTES = 1 << 27  # at most: what a view of a room needs, and of a street does not
+_KEPT_BYTES = 1 << 27  # largest view memory to keep: enough for a room, not for a street
 
 
 @contextmanager

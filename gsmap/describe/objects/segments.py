@@ -27,7 +27,7 @@ _MAX_EXTENT_M = 10_000.0  # a scene so large, or so far from metric, has no furn
 _BAND_M = 0.25  # the colour of a wall is estimated for squares of this side,
 _AROUND_M = 1.5  # from all of the wall so far to either side at that height: pictures are narrower
 _LAYER_M = 0.02  # points whose distances from a wall differ by more are of different surfaces
-_SOLE_M = 0.14  # what hangs on a wall does not reach so low: trims and the frames of doors do
+_SOLE_M = 0.14  # hanging objects do not reach so low: trims and door frames do
 _LINKED = 8  # of these, those that may be one thing
 
 

@@ -166,7 +166,7 @@ def _wall(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, rows: np.n
     facing = np.abs(normals[:, :2] @ normal) > 0.8
     off = points[:, :2] @ normal - offset
     on = facing & (np.abs(off) < 2 * _FLAT_M)
-    # The wall, not the mean of the wall and what hangs on it.
+    # The mode of the distances: the wall without the objects on it.
     bins, edges = np.histogram(off[on], bins=40, range=(-2 * _FLAT_M, 2 * _FLAT_M), weights=areas[on])
     peak = int(np.argmax(np.convolve(bins, np.ones(5), "same")))
     offset += 0.5 * (edges[peak] + edges[peak + 1])

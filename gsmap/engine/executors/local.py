@@ -68,7 +68,7 @@ class LocalWorkers:
         """Return True if workers would finish the remaining jobs sooner than this process, their start included."""
         if self._pool.num_idle:
             return True
-        # The first job also pays for what it imports.
+        # The first job includes imports.
         saved_s = (count - len(took_s)) * min(took_s, default=0.0) * (1 - 1 / self._pool.size)
         return len(took_s) > 1 and saved_s > _START_S
 
