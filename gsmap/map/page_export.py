@@ -258,7 +258,7 @@ def _remove(folder: Path, files: Sequence[str]) -> None:
 @contextmanager
 def _levels(doors: MapPageSource, settings: Settings) -> Iterator[Levels]:
     cache = TreeCache(cache_folder(), int(settings.view.cache_gib * 2**30))
-    levels = Levels(doors, cache, settings.view)
+    levels = Levels(doors, cache, settings.view.workers)
     try:
         yield levels
     finally:

@@ -16,6 +16,7 @@ from gsmap.types.rows import ExplanationStep
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
 
+_CORRESPONDENCES = 400  # shown of a pair
 _SAME_M = 0.25  # landmarks of one thing lie so near to each other at most
 _LAYERS = ("landmarks", "landmarks:1", "objects")
 
@@ -57,7 +58,7 @@ def correspondences(
     back = cKDTree(other).query(own)[1]
     rows = np.arange(len(other))
     same = rows[(back[row] == rows) & (near * layers[0].unit_m < _SAME_M)]
-    same = same[np.argsort(near[same], kind="stable")][: settings.view.correspondences]
+    same = same[np.argsort(near[same], kind="stable")][:_CORRESPONDENCES]
     pairs = np.stack([S_map_target.apply(own[row[same]]), S_map_target.apply(other[same])], axis=1)
     found: list[list[list[float]]] = pairs.tolist()
     return found

@@ -36,6 +36,10 @@ from gsmap.view.trees import VERSION, TreeParams
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
 
+_NODES = 2_000  # of a layer of a scene graph that are sent, by weight
+_CAMERAS = 300  # of a scene that are sent, evenly along its capture
+_PAIR_VIEWS = 2  # cameras of each of two scenes that they are compared from
+_PICTURE_PX = 640  # longer side of the pictures of a pair or a change
 _CAMERA_M = 0.1  # how long a camera is drawn
 
 
@@ -86,16 +90,16 @@ class MapPageSource:
     def extras(self, scene: str) -> dict[str, Any]:
         """Return nodes and cameras of a scene in the map frame."""
         entry = self._entry(scene)
-        S, shown = entry.S_map_scene, self._settings.view
+        S = entry.S_map_scene
         graph, cameras = self._store.graphs.load(scene), self._store.scenes.cameras(scene)
         layers = {}
         for name, layer in (graph.layers if graph else {}).items():
-            weightiest = np.argsort(-layer.weights, kind="stable")[: shown.nodes]
+            weightiest = np.argsort(-layer.weights, kind="stable")[:_NODES]
             layers[name] = S.apply(layer.positions[weightiest]).tolist()
         frusta: list[list[list[float]]] = []
         if not cameras.synthesised:
             metres = 1.0 if entry.pose is None else self.content().metres_per_unit.get(entry.pose.component, 1.0)
-            some = cameras.evenly(shown.cameras)
+            some = cameras.evenly(_CAMERAS)
             for pose, (fx, fy, cx, cy), (width, height) in zip(
                 some.T_frame_camera, some.intrinsics_px, some.sizes_px, strict=True
             ):
@@ -139,25 +143,24 @@ class MapPageSource:
         ends = [self._entry(scene).scene for scene in (stored.registration.target, stored.registration.source)]
         if sum(scene.num_gaussians for scene in ends) > self._settings.view.picture_gaussians:
             return ()
-        looks = self._settings.view.pair_views
+        looks = _PAIR_VIEWS
         return tuple(f"{scene.name}, view {k + 1}" for scene in ends for k in range(min(looks, scene.num_cameras)))
 
     def pair_pictures(self, target: str, source: str) -> PairPictures:
         stored, names = self._store.registrations.get(target, source), self.pair_cameras(target, source)
         if stored is None or not names:
             raise NotFoundError(
-                "this pair has no pose to draw both captures in, or is too large to be drawn here",
-                code="no_pose_of_pair",
+                "this pair has no pose to draw both scenes in, or is too large to be drawn here", code="no_pose_of_pair"
             )
-        seen = pair_views(self._store, stored.registration, self._settings.view.pair_views)
-        side = self._settings.view.picture_px
+        seen = pair_views(self._store, stored.registration, _PAIR_VIEWS)
+        side = _PICTURE_PX
         looks = [looks_at(seen.target, seen.source, one.resized(side), seen.unit_m) for one in seen.cameras]
         a, b, difference = zip(*looks, strict=True) if looks else ((), (), ())
         return PairPictures(names[: len(looks)], a, b, difference)
 
     def change_picture(self, change: str) -> np.ndarray:
         row = change_row(self._store, self._settings, parse_change_id(change))
-        picture = picture_of_change(self._store, self._settings, row, self._settings.view.picture_px)
+        picture = picture_of_change(self._store, self._settings, row, _PICTURE_PX)
         if picture is None:
             raise NotFoundError(
                 f"{change} has no place now: its newer capture has none (gsmap update)", code="change_unplaced"
@@ -250,7 +253,7 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         pose = poses.get(prior.scene)
         metre = None if pose is None else metres.get(pose.component)
         told[prior.scene] = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit), number
-    scenes = [_scene(scene, content_key(scene, settings.view.tree), poses, ups, told) for scene in store.scenes.list()]
+    scenes = [_scene(scene, content_key(scene, TreeParams()), poses, ups, told) for scene in store.scenes.list()]
     living = {entry.scene.id for entry in scenes}
     newest, given = store.revisions.newest(), pose_basis(store, settings)
     found = ViewMap(

@@ -63,6 +63,14 @@ from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, ObjectsReport, R
 from gsmap.version import __version__
 
 _SUFFIXES = (".html", ".htm")
+_PLAN_GAUSSIANS = 2_000_000  # read for the pictures under floor plans; larger components are drawn by landmarks
+_PLAN_SCENES = 400  # with arrays read for plans; boxes of the others are drawn
+_PLAN_PX = 1200  # longer side of the picture under a floor plan
+_TRACK_CAMERAS = 120  # drawn of one scene, evenly along its capture
+_PICTURE_GAUSSIANS = 3_000_000  # of a pair of scenes that is drawn
+_PICTURE_PX = 320  # longer side of one view in a picture of a pair or a change
+_REVISIONS = 30  # in the history, the newest
+_COMPARED_REVISIONS = 8  # of these, each compared with the one before it
 _SAMPLE = 4000  # points of a scene that its outline is drawn around
 _SOLID = 0.3  # opacity from which a Gaussian is something
 _KINDS = {
@@ -200,7 +208,7 @@ class _ReportBuilder:
         poses = state.graph.poses if state.graph else {}
         placed = [scene for scene in state.scenes if scene.id in poses]
         placed.sort(key=lambda scene: poses[scene.id].component)
-        budget = self.params.plan_gaussians
+        budget = _PLAN_GAUSSIANS
         whole: set[int] = set()
         drawn = sorted({poses[scene.id].component for scene in placed})[: self.params.islands]
         for component in drawn:
@@ -212,7 +220,7 @@ class _ReportBuilder:
         for i, scene in enumerate(placed):
             self.progress("report", 0.6 * i / len(placed), scene.name)
             component = poses[scene.id].component
-            is_read = i < self.params.plan_scenes and component in drawn
+            is_read = i < _PLAN_SCENES and component in drawn
             try:
                 found[scene.id] = self._read(scene, whole=component in whole) if is_read else _box_of(scene)
             except (CorruptError, NotFoundError) as error:
@@ -223,7 +231,7 @@ class _ReportBuilder:
     def _read(self, scene: Scene, *, whole: bool) -> _SceneArrays:
         cameras = self.store.scenes.cameras(scene.id)
         eyes = np.zeros((0, 3)) if cameras.synthesised else cameras.centers
-        track = eyes if not len(eyes) else cameras.evenly(self.params.track_points).centers
+        track = eyes if not len(eyes) else cameras.evenly(_TRACK_CAMERAS).centers
         gaussians, kind = None, "boxes"
         points = box_corners(scene.bounds)
         if whole:
@@ -308,7 +316,7 @@ class _ReportBuilder:
     def _picture(self, plan: Plan, poses: Sequence[ScenePose], found: Sequence[_SceneArrays]) -> tuple[Plan, str]:
         from gsmap.geometry.transforms import transform_gaussians
 
-        px = self.params.plan_px
+        px = _PLAN_PX
         whole = [(read.gaussians, pose) for read, pose in zip(found, poses, strict=True) if read.gaussians is not None]
         if whole:
             parts = [transform_gaussians(gaussians, pose.S_map_scene) for gaussians, pose in whole]
@@ -340,12 +348,12 @@ class _ReportBuilder:
             if left == 0:
                 break
             ends = (edge.row.target, edge.row.source)
-            if sum(sizes_.get(scene, 0) for scene in ends) > self.params.picture_gaussians:
+            if sum(sizes_.get(scene, 0) for scene in ends) > _PICTURE_GAUSSIANS:
                 continue
             left -= 1
             self.progress("report", 0.7, edge.row.pair)
             try:
-                picture = picture_of_pair(self.store, *ends, side_px=self.params.picture_px)
+                picture = picture_of_pair(self.store, *ends, side_px=_PICTURE_PX)
             except (CorruptError, NotFoundError) as error:
                 self.notes.append(f"{edge.row.pair} is not drawn: {self._hidden(str(error))}")
                 continue
@@ -361,7 +369,7 @@ class _ReportBuilder:
             row
             for row in found
             if row.status != "rejected" and {row.older, row.newer} <= set(sizes_)
-            and sizes_[row.older] + sizes_[row.newer] <= self.params.picture_gaussians
+            and sizes_[row.older] + sizes_[row.newer] <= _PICTURE_GAUSSIANS
         ]  # fmt: skip
         found.sort(key=lambda row: -row.confidence)
         found = found[: self.params.change_pictures]
@@ -372,7 +380,7 @@ class _ReportBuilder:
                 for row in found:
                     if (row.older, row.newer) == pair:
                         self.progress("report", 0.9, row.id)
-                        picture = drawer.picture(row, side_px=self.params.picture_px)
+                        picture = drawer.picture(row, side_px=_PICTURE_PX)
                         out.append(ChangePicture(row.id, picture))
             except (CorruptError, NotFoundError) as error:
                 self.notes.append(f"changes of {pair[0][:12]} are not drawn: {self._hidden(str(error))}")
@@ -388,7 +396,6 @@ class _ReportBuilder:
 @snapshot_read
 def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState:
     """Read the catalog and the parts of the report that need no arrays."""
-    params = settings.report
     when = None if since is None else parse_moment(since)
     scenes, graph = store.scenes.list(), store.revisions.get()
     metres = map_metres(store, settings, graph)
@@ -410,16 +417,16 @@ def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState
             SceneEntry(row, cameras.get(row.id, 0), num_bytes.get(row.id, 0))
             for row in reports.scene_rows(store, metres=metres)
         ),
-        revisions=tuple(revisions[-params.revisions :]) if params.revisions else (),
+        revisions=tuple(revisions[-_REVISIONS:]),
         num_revisions=len(revisions),
-        moved=tuple(_moved(store, settings, revisions, params.moves)),
+        moved=tuple(_moved(store, settings, revisions, _COMPARED_REVISIONS)),
         moved_since=None if when is None else _moved_since(store, settings, revisions, when),
         changes=changes,
         objects=None if graph is None else _load_objects(store, settings),
         storage=tuple(StorageEntry(_KINDS.get(one.kind, one.kind), one.count, one.num_bytes) for one in sizes(store)),
         seconds=_seconds(stored.values()),
         news=None if when is None or since is None else _news(since, when, scenes, edges),
-        params=params,
+        params=settings.report,
     )
     ups = {one.scene: np.array(one.up, np.float64) for one in store.graphs.list() if one.up is not None}
     ups |= {

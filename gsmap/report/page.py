@@ -35,6 +35,9 @@ from gsmap.report.words import (
 
 _MARK = re.compile(rb'<meta name="gsmap-map" content="([0-9a-f]{32,64})">')
 _HEAD_BYTES = 4096  # of a report, within which it says whose it is
+_BARS = 24  # in a plot, the largest
+_CHANGES = 200  # rows in the tables of changes and objects
+_MATRIX_SCENES = 300  # in the matrix of registered pairs
 _FEW = 12  # rows of a table that are open; the others fold away
 _STANDING = {
     "good": "In order",
@@ -276,15 +279,14 @@ def _data(picture: np.ndarray) -> str:
 def _edges(report: Report) -> Markup | None:
     if not report.edges:
         return None
-    params = report.params
     solved = [edge for edge in report.edges if edge.chi2 is not None and edge.use in ("used", "tentative", "undecided")]
     checked = [edge for edge in solved if edge.use == "used"]
     plots_: list[Part] = [_figure(_matrix(report), "Who was tried with whom, and what came of it.")]
     if plots.pulled(solved):
         plots_.append(
             _figure(
-                plots.residual_bars(solved, params.bars),
-                f"{_largest(plots.pulled(solved), params.bars)}. Dashed: 95 % and 99.9 % of correct edges lie below. "
+                plots.residual_bars(solved, _BARS),
+                f"{_largest(plots.pulled(solved), _BARS)}. Dashed: 95 % and 99.9 % of correct edges lie below. "
                 "An edge that no loop checks has no residual, whether right or wrong.",
             )
         )
@@ -298,7 +300,7 @@ def _edges(report: Report) -> Markup | None:
         )
     if any(edge.translation_m is not None for edge in plots.pulled(solved)):
         plots_.append(
-            _figure(plots.offset_bars(solved, params.bars), "How far the poses leave what each edge measured, at the "
+            _figure(plots.offset_bars(solved, _BARS), "How far the poses leave what each edge measured, at the "
                     "middle of the second scene.")
         )  # fmt: skip
     parts: list[Part] = [_redundancy(report), tag("div", plots_, class_="plots"), _statistics(checked)]
@@ -360,7 +362,7 @@ def _statistics(edges: Sequence[EdgeEntry]) -> Markup | None:
 def _matrix(report: Report) -> Markup:
     known = [entry.row for entry in report.scenes]
     order = sorted(range(len(known)), key=lambda i: (known[i].component is None, known[i].component or 0, i))
-    order = order[: report.params.cells]
+    order = order[:_MATRIX_SCENES]
     place = {known[i].id: k for k, i in enumerate(order)}
     cells = []
     for edge in report.edges:
@@ -448,7 +450,7 @@ def _scenes(report: Report) -> Markup | None:
     parts: list[Part] = []
     known = [entry for entry in report.scenes if entry.position_sigma_m]
     if known:
-        most = report.params.bars
+        most = _BARS
         first = f"The {most} largest of {len(known):,}" if len(known) > most else "The largest first"
         words = f"{first}. Of each scene's middle, along its worst axis, in the frame of its island."
         drawn = [_figure(plots.sigma_bars(known, most), words)]
@@ -500,7 +502,7 @@ def _changes(report: Report) -> Markup | None:
             parts.append(tag("div", cards, class_="cards"))
         rows = [
             (row.id, row.kind, row.pair, day(row.newer_at), row.at_m, row.size_m, number(row.confidence, 2), row.status)
-            for row in found.changes[: report.params.changes]
+            for row in found.changes[:_CHANGES]
         ]
         if rows:
             head = ("id", "kind", "from:to", "seen", "at, m", "size, m", "confidence", "status")
@@ -523,7 +525,7 @@ def _things(report: Report) -> Markup | None:
             (row.id, f"{row.area_m2:.1f}", ", ".join(row.doors), f"{len(row.objects):,}") for row in known.rooms[:_FEW]
         ]
         parts += [tag("h3", "Rooms"), _table(("room", "m²", "doors to", "objects"), rooms, (1, 3))]
-    ordered = sorted(known.objects, key=lambda row: (row.name is None, row.label is None))[: report.params.changes]
+    ordered = sorted(known.objects, key=lambda row: (row.name is None, row.label is None))[:_CHANGES]
     rows = [
         (
             row.id,

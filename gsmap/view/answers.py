@@ -21,12 +21,12 @@ from gsmap.view.content import Served, ViewMap, ViewScene, summary
 from gsmap.view.doors import Doors, PairPictures
 from gsmap.view.levels import Levels
 from gsmap.view.making import Waiting
-from gsmap.view.params import Params
 from gsmap.view.trees import FILE_NAME
 
 JSON, BYTES, JPEG = "application/json", "application/octet-stream", "image/jpeg"
 _RETRY_S, _EACH_S, _LONGEST_S = 0.5, 0.1, 10.0  # what has many before it is asked for less often
 _JPEG_QUALITY = 88
+_PICTURES_KEPT = 64  # in memory
 _ID = r"[0-9a-f]{32}"
 _MERGED = re.compile(r"(?:[A-Za-z0-9_-][A-Za-z0-9._-]{0,200}/){0,4}[A-Za-z0-9_-][A-Za-z0-9._-]{0,200}\.(?:json|glb)")
 
@@ -62,8 +62,8 @@ class Answers:
         levels: what is drawn of it.
     """
 
-    def __init__(self, doors: Doors, levels: Levels, params: Params) -> None:
-        self._doors, self._levels, self._params = doors, levels, params
+    def __init__(self, doors: Doors, levels: Levels) -> None:
+        self._doors, self._levels = doors, levels
         self._pictures: OrderedDict[str, bytes] = OrderedDict()
         self._drawing, self._reading = threading.Lock(), threading.Lock()
         self._content: tuple[str, ViewMap] | None = None
@@ -215,7 +215,7 @@ class Answers:
             if found is None:
                 for one, picture in draw().items():
                     self._pictures[f"{state} {one}"] = jpeg(picture)
-                while len(self._pictures) > self._params.pictures_kept:
+                while len(self._pictures) > _PICTURES_KEPT:
                     self._pictures.popitem(last=False)
                 found = self._pictures.get(f"{state} {name}")
             else:

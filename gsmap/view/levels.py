@@ -23,11 +23,12 @@ from gsmap.types.progress import Progress
 from gsmap.view.content import ViewMap, ViewOverview, ViewScene, up_of
 from gsmap.view.doors import Doors
 from gsmap.view.making import Maker, Waiting
-from gsmap.view.params import Params
 from gsmap.view.tree_cache import TreeCache
-from gsmap.view.trees import Sketch, sketch, write_tree
+from gsmap.view.trees import Sketch, TreeParams, sketch, write_tree
 
 _SPZ_BYTES = 19  # of a Gaussian of SH degree 0 before it is compressed, and grids that are not quite full
+_OVERVIEW_BYTES = 5e6  # of the first picture of an island, in which every scene has a share
+OVERVIEW_GAUSSIANS = 32_768  # of one scene in it, at most
 _STEP = 8  # between the sizes of sketches, so that few of them are kept of a scene
 _LEAST = 16
 _FIRST = -1.0  # rank of what everybody waits for: before any tree
@@ -39,10 +40,10 @@ _FILES_KEPT = 4  # overviews as bytes
 _T = TypeVar("_T")
 
 
-def sketch_size(num_scenes: int, params: Params) -> int:
+def sketch_size(num_scenes: int) -> int:
     """Gaussians of a scene in the overview of an island of so many."""
-    share = params.overview_mb * 1e6 / _SPZ_BYTES / max(1, num_scenes)
-    size = params.overview_gaussians
+    share = _OVERVIEW_BYTES / _SPZ_BYTES / max(1, num_scenes)
+    size = OVERVIEW_GAUSSIANS
     while size > share and size > _LEAST:
         size = max(_LEAST, size // _STEP)
     return size
@@ -81,12 +82,13 @@ class Levels:
     Args:
         doors: to the map.
         cache: where they are kept.
-        params: how fine they are.
+        workers: threads that make them.
+        tree: sizes of the levels.
     """
 
-    def __init__(self, doors: Doors, cache: TreeCache, params: Params) -> None:
-        self._doors, self._cache, self._params = doors, cache, params
-        self._maker = Maker(params.workers)
+    def __init__(self, doors: Doors, cache: TreeCache, workers: int = 2, tree: TreeParams | None = None) -> None:
+        self._doors, self._cache, self._tree = doors, cache, tree or TreeParams()
+        self._maker = Maker(workers)
         self._lock = threading.RLock()
         self._islands: OrderedDict[int, _Island] = OrderedDict()
         self._files: OrderedDict[str, tuple[tuple[ViewScene, Sketch], ...] | bytes] = OrderedDict()
@@ -148,7 +150,7 @@ class Levels:
         if self._cache.tree(key) is not None:  # another process was faster
             return
         source = self._doors.source(scene)
-        self._cache.make_tree(key, lambda folder: write_tree(folder, source, self._params.tree, progress))
+        self._cache.make_tree(key, lambda folder: write_tree(folder, source, self._tree, progress))
         self._forget_if_gone(scene)
 
     def _forget_if_gone(self, scene: str) -> None:
@@ -223,7 +225,7 @@ class Levels:
         Args:
             size: Gaussians of each at most; by default what fits.
         """
-        size = size or sketch_size(len(inside), self._params)
+        size = size or sketch_size(len(inside))
         parts, places, boxes = [], [], {}
         for place, entry in inside.items():
             try:
@@ -241,7 +243,7 @@ class Levels:
 
     def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
         """What is known of one island; what is not is asked for."""
-        size = sketch_size(len(inside), self._params)
+        size = sketch_size(len(inside))
         island = self._islands.get(component)
         if island is None or island.size != size:
             island = self._islands[component] = _Island(size)

@@ -110,8 +110,8 @@ class ViewServer:
             raise ConfigError(
                 f"cannot serve on port {port}: {error}; try another --port, or 0", code="port_unavailable"
             ) from error
-        self.levels = Levels(doors, TreeCache(cache, int(params.cache_gib * 2**30)), params)
-        handler.answers = Answers(doors, self.levels, params)
+        self.levels = Levels(doors, TreeCache(cache, int(params.cache_gib * 2**30)), params.workers)
+        handler.answers = Answers(doors, self.levels)
         self._thread: threading.Thread | None = None
 
     @cached_property

@@ -26,7 +26,7 @@ from gsmap.types.progress import Progress
 from gsmap.view.answers import Answers, jpeg
 from gsmap.view.content import Served, ViewMap, ViewOverview, summary
 from gsmap.view.doors import Doors
-from gsmap.view.levels import Levels, members
+from gsmap.view.levels import OVERVIEW_GAUSSIANS, Levels, members
 from gsmap.view.params import Params
 from gsmap.view.trees import FILE_NAME
 
@@ -135,7 +135,7 @@ class _Maker:
         yield "map.json", _json(said | {"graph": "graph.json" if has_objects else None})
 
     def _edges(self, view: ViewMap, pictures: bool) -> Iterator[tuple[str, bytes]]:
-        answers = Answers(self.doors, self.levels, self.params)
+        answers = Answers(self.doors, self.levels)
         living = {entry.scene.id for entry in view.scenes}
         edges = [edge for edge in view.edges if {edge.target, edge.source} <= living]
         edges.sort(key=lambda edge: -edge.doubt)
@@ -223,7 +223,7 @@ def write_page(
     view, maker = doors.content(), _Maker(doors, levels, params, progress)
     files: dict[str, bytes] = {}
     # A twentieth for what stands behind everything until the trees are there.
-    size = max(1, min(params.overview_gaussians, max_bytes // (20 * 20 * max(1, len(view.scenes)))))
+    size = max(1, min(OVERVIEW_GAUSSIANS, max_bytes // (20 * 20 * max(1, len(view.scenes)))))
     for address, data in maker.told(view, size=size, pictures=False):
         files[address] = data
     left = max_bytes - sum(len(data) for address, data in files.items() if address.startswith("overviews/"))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.errors import ConfigError, InputError
+from gsmap.errors import InputError
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import CONTENT_FOLDER, TileNode
 from gsmap.geometry.boxes import box_around, robust_box
@@ -39,24 +39,17 @@ _ERROR_QUANTILE = 0.95
 
 @dataclass(frozen=True)
 class TreeParams:
-    """How fine a tree of a scene is.
+    """Sizes of the levels of detail of a scene.
 
     Args:
-        leaf_gaussians: of a scene's own in one tile, at most; about half as many on average.
-        coarsening: how many Gaussians become one from one level to the next.
-        root_gaussians: what the coarsest level has at most.
+        leaf_gaussians: largest number of original Gaussians in one tile; about half as many on average.
+        coarsening: number of Gaussians that become one from one level to the next.
+        root_gaussians: largest number of Gaussians of the coarsest level.
     """
 
     leaf_gaussians: int = 32_768
     coarsening: int = 8
     root_gaussians: int = 512
-
-    def __post_init__(self) -> None:
-        for name, least in (("leaf_gaussians", 64), ("coarsening", 2), ("root_gaussians", 1)):
-            if getattr(self, name) < least:
-                raise ConfigError(
-                    f"view.tree.{name} must be at least {least}, got {getattr(self, name)}", code="out_of_range"
-                )
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,8 @@ from gsmap.view.site import write_page, write_site
 from gsmap.view.tree_cache import TreeCache
 from gsmap.view.trees import TreeParams
 
-PARAMS = Params(tree=TreeParams(leaf_gaussians=200, root_gaussians=32), workers=1)
+PARAMS = Params(workers=1)
+TREE = TreeParams(leaf_gaussians=200, root_gaussians=32)
 
 
 @pytest.fixture
@@ -48,7 +49,7 @@ def doors(tmp_path):
 
 @pytest.fixture
 def levels(doors, tmp_path):
-    found = Levels(doors, TreeCache(tmp_path / "cache", 1 << 30), PARAMS)
+    found = Levels(doors, TreeCache(tmp_path / "cache", 1 << 30), 1, TREE)
     yield found
     found.close()
 

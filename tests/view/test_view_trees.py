@@ -13,7 +13,7 @@ from raising import raises
 from scipy.spatial import cKDTree
 from view_room import A, blob
 
-from gsmap.errors import ConfigError, InputError
+from gsmap.errors import InputError
 from gsmap.formats import tiles3d
 from gsmap.geometry.boxes import robust_box
 from gsmap.geometry.rotations import exp_so3
@@ -144,12 +144,6 @@ def test_a_sketch_is_few_gaussians_that_stop_as_much_light():
     assert 100 < len(made.gaussians) <= 512
     assert made.gaussians.sh.shape[1] == 1
     assert 0.6 < light(made.gaussians) / light(shown(g)) < 1.5
-
-
-@pytest.mark.parametrize("name", ["leaf_gaussians", "coarsening", "root_gaussians"])
-def test_settings_that_make_no_sense_are_named(name):
-    with raises(ConfigError, code="out_of_range", match=f"view.tree.{name}"):
-        TreeParams(**{name: 0})
 
 
 # --- the cache -------------------------------------------------------------------------------------------------------
