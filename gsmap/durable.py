@@ -1,8 +1,8 @@
-"""What must survive a power cut, and what must not happen outside a folder.
+"""Durable and atomic file operations, and safe access below folders that may come from an untrusted source.
 
-Names in a folder that last, files that appear whole or not at all, and deleting, looking and opening below a folder
-without ever following a link that lies in it: such a folder may come from a stranger. A path that a person names as
-output is another matter: `write_output` follows its links and writes to pipes and devices.
+Files appear whole or not at all and survive a power cut; deleting, inspecting and opening below a folder never follows
+a link in it. An output path from the user is different: `write_output` follows its links and writes to pipes and
+devices.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gsmap.errors import BusyError, CorruptError, InputError
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder survive a power cut."""
+    """Make the names in a folder durable (fsync)."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -32,7 +32,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Make a file's bytes survive a power cut."""
+    """Make the bytes of a file durable (fsync)."""
     handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     try:
         os.fsync(handle)
@@ -41,7 +41,7 @@ def sync_file(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, and what it lies in, so that it survives a power cut; nothing where it is there."""
+    """Create a folder and its parents durably; does nothing if it exists."""
     if path.is_dir():
         return
     make_folder(path.parent)
@@ -50,33 +50,33 @@ def make_folder(path: Path) -> None:
 
 
 def write_text_whole(path: Path, text: str) -> None:
-    """Replace a text file (UTF-8) in one step; see `write_whole`."""
+    """Replace a text file (UTF-8) atomically; see `write_whole`."""
     write_whole(path, lambda staged: staged.write_bytes(text.encode("utf-8")))
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a file under a passing name, synchronise it, and put it in its place by one rename.
+    """Let ``write`` fill a staged file, synchronize it, and rename it to ``path``.
 
-    For files of gsmap's own folders: a link at ``path`` is replaced and never followed. See `write_output`.
+    For files in gsmap's own folders: a link at ``path`` is replaced and never followed. See `write_output`.
 
     Raises:
-        OSError: what the system says; the file that was there before stays as it was.
+        OSError: a system call failed; the previous file is unchanged.
     """
     _replace(path, path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}"), write)
 
 
 def write_output(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill the output file that a person named.
+    """Let ``write`` fill an output file that the user named.
 
-    A file is replaced whole or not at all, and of a symbolic link the file that it leads to. A pipe, a character device
-    and an open file of this process (``/dev/stdout``) get the bytes once all are there. Nothing else is replaced.
+    A file, or the target of a symbolic link, is replaced atomically. A pipe, a character device and an open file of
+    this process (``/dev/stdout``) get the bytes once all are written. Nothing else is replaced.
 
     Args:
         write: fills the file at the path it gets, whose name ends with that of ``path``.
 
     Raises:
         InputError: a folder, a socket or a block device.
-        OSError: what the system says; the file that was there before stays as it was.
+        OSError: a system call failed; the previous file is unchanged.
     """
     if is_stream(path):
         with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
@@ -94,17 +94,17 @@ def write_output(path: Path, write: Callable[[Path], object]) -> None:
                 f"cannot write {path}: it is a socket or a block device; name a file, or a pipe", code="not_writable"
             )
     target = Path(os.path.realpath(path))
-    # A name that nobody can have put a link at, with the suffix that was asked for.
+    # A random name, at which no link can exist, with the requested suffix.
     _replace(target, target.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}"), write)
 
 
 def write_text_output(path: Path, text: str) -> None:
-    """Write a text (UTF-8) to the output file that a person named; see `write_output`."""
+    """Write a text (UTF-8) to an output file that the user named; see `write_output`."""
     write_output(path, lambda staged: staged.write_bytes(text.encode("utf-8")))
 
 
 def is_stream(path: Path) -> bool:
-    """Whether bytes written to a path go to a pipe, a character device or an open file of this process."""
+    """Return True if bytes written to a path go to a pipe, a character device or an open file of this process."""
     if _descriptor(path) is not None:
         return True
     try:
@@ -115,12 +115,12 @@ def is_stream(path: Path) -> bool:
 
 
 def _descriptor(path: Path) -> int | None:
-    """The number of this process's open file that a path names (``/dev/stdout``, ``/dev/fd/63``); None where none.
+    """Return the file descriptor of this process that a path names (``/dev/stdout``, ``/dev/fd/63``); otherwise None.
 
-    Opening such a path anew would cut what a shell redirects to, and replacing it would replace another process's file.
+    Opening such a path again would truncate a shell redirection, and replacing it would replace another process's file.
     """
     own = {os.path.realpath(folder) for folder in ("/proc/self/fd", "/dev/fd")}
-    for _ in range(40):  # as many links as the system follows
+    for _ in range(40):  # the system's limit of links
         folder = os.path.realpath(path.parent)
         if folder in own and path.name.isdecimal():
             return int(path.name)
@@ -131,13 +131,13 @@ def _descriptor(path: Path) -> int | None:
 
 
 def _opened_stream(path: Path) -> BinaryIO:
-    """A pipe, a device or an open file of this process, to be written to; never makes or cuts a file."""
+    """Open a pipe, a device or an open file of this process for writing; never creates or truncates a file."""
     number = _descriptor(path)
     return open(os.open(path, os.O_WRONLY | os.O_NOCTTY | os.O_CLOEXEC) if number is None else os.dup(number), "wb")
 
 
 def _replace(path: Path, staged: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill ``staged``, and put it in the place of ``path``."""
+    """Let ``write`` fill ``staged``, and rename it to ``path``."""
     try:
         write(staged)
         sync_file(staged)
@@ -148,10 +148,11 @@ def _replace(path: Path, staged: Path, write: Callable[[Path], object]) -> None:
 
 
 def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
-    """Lock an open file or folder (``how``: `fcntl.LOCK_EX`, `fcntl.LOCK_SH`); the kernel frees it with the process.
+    """Lock an open file or folder (``how``: `fcntl.LOCK_EX`, `fcntl.LOCK_SH`) within a time limit; the kernel frees it
+    with the process.
 
     Raises:
-        BusyError: others kept it for so long; ``busy`` says what they have been doing.
+        BusyError: another process kept the lock for ``patience_s``; ``busy`` begins the message.
     """
     deadline = time.monotonic() + patience_s
     while True:
@@ -164,23 +165,25 @@ def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
             time.sleep(0.01)
 
 
-# --- below a folder that may come from a stranger ---------------------------------------------------------------------
-# ``root`` itself may be a link (the person named it); what lies below it may not. ``names`` are the parts of a path.
+# --- below a folder that may be untrusted -----------------------------------------------------------------------------
+# ``root`` itself may be a link (the user named it); entries below it may not. ``names`` are the parts of a path.
 
 
 def remove_tree(root: Path, *names: str) -> None:
-    """Delete a folder and all in it, or a file; links in it are deleted and what they name is not. Nothing if missing.
+    """Delete a folder with its content, or a file; links are deleted, not their targets. Does nothing if it is missing.
 
     Raises:
-        CorruptError: a folder on the way down is a link, or a name is none.
-        OSError: the system refused.
+        CorruptError: a folder on the path is a link, or a name is invalid.
+        OSError: a system call failed.
     """
     with _parent_of(root, names) as parent:
         if parent is None or (mode := _mode(names[-1], parent)) is None:
             return
         if stat.S_ISDIR(mode):
             try:
-                shutil.rmtree(names[-1], dir_fd=parent)  # by open folders: follows no link, whatever is swapped in
+                shutil.rmtree(
+                    names[-1], dir_fd=parent
+                )  # by folder descriptors: follows no link, even if swapped in meanwhile
             except RecursionError as error:
                 raise OSError(f"{root.joinpath(*names)} is too deep to be deleted: remove it by hand") from error
         else:
@@ -188,11 +191,11 @@ def remove_tree(root: Path, *names: str) -> None:
 
 
 def remove_file(root: Path, *names: str) -> None:
-    """Delete a file, or a link and not what it names. Nothing if missing.
+    """Delete a file, or a link and not its target. Does nothing if it is missing.
 
     Raises:
-        CorruptError: a folder on the way down is a link, or a name is none.
-        OSError: the system refused, or it is a folder.
+        CorruptError: a folder on the path is a link, or a name is invalid.
+        OSError: a system call failed, or it is a folder.
     """
     with _parent_of(root, names) as parent:
         if parent is not None:
@@ -201,17 +204,17 @@ def remove_file(root: Path, *names: str) -> None:
 
 
 def remove_empty_folder(root: Path, *names: str) -> None:
-    """Delete a folder that has nothing in it; any other stays."""
+    """Delete a folder if it is empty."""
     with _parent_of(root, names) as parent, contextlib.suppress(OSError):
         if parent is not None:
             os.rmdir(names[-1], dir_fd=parent)
 
 
 def refuse_links(root: Path, *names: str) -> None:
-    """Refuse a path any part of which is a link; parts that are missing are none.
+    """Raise if any part of a path is a link; missing parts are allowed.
 
     Raises:
-        CorruptError: a part is a link, or a name is none.
+        CorruptError: a part is a link, or a name is invalid.
     """
     at = root
     for name in names:
@@ -225,25 +228,25 @@ def refuse_links(root: Path, *names: str) -> None:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether it is a folder itself, not a link to one."""
+    """Return True for a folder itself, not a link to one."""
     return _is(path, stat.S_ISDIR)
 
 
 def is_file(path: Path) -> bool:
-    """Whether it is a plain file itself: not a link to one, a pipe or a device."""
+    """Return True for a plain file itself: not a link to one, a pipe or a device."""
     return _is(path, stat.S_ISREG)
 
 
 def files_below(folder: Path) -> dict[str, os.stat_result]:
-    """What lies in a folder and the folders in it, by relative path: files, and whatever else is no folder.
+    """Return the status of all entries below a folder that are not folders, by relative path.
 
-    A link is listed as itself; nothing is looked at through one. Empty where the folder is missing or a link.
+    A link is listed as itself and not followed. Empty if the folder is missing or a link.
     """
     out: dict[str, os.stat_result] = {}
     todo = [""] if is_folder(folder) else []
     while todo:
         below = todo.pop()
-        with contextlib.suppress(FileNotFoundError):  # others may be deleting it
+        with contextlib.suppress(FileNotFoundError):  # may be deleted concurrently
             for name in os.listdir(folder / below):
                 path = f"{below}{name}"
                 with contextlib.suppress(FileNotFoundError):
@@ -256,14 +259,14 @@ def files_below(folder: Path) -> dict[str, os.stat_result]:
 
 
 def open_file(path: Path) -> int:
-    """Open a plain file to read it; never a link, and without waiting at a pipe.
+    """Open a plain file for reading, without following a link or waiting at a pipe.
 
     Raises:
-        CorruptError: it is something else.
-        OSError: the system refused.
+        CorruptError: not a plain file.
+        OSError: a system call failed.
     """
     if not is_file(path):
-        path.lstat()  # says so where it is missing
+        path.lstat()  # raises FileNotFoundError if it is missing
         raise CorruptError(
             f"{path} is no plain file (a link, folder, pipe or device): gsmap made none; remove it",
             code="not_a_plain_file",
@@ -280,7 +283,8 @@ def _is(path: Path, kind: Callable[[int], bool]) -> bool:
 
 @contextlib.contextmanager
 def _parent_of(root: Path, names: tuple[str, ...]) -> Iterator[int | None]:
-    """The folder of a path below ``root``, held open, reached without a link; None where it is missing."""
+    """Yield a descriptor of the parent folder of a path below ``root``, reached without following links; None if it
+    is missing."""
     for name in names:
         _checked_name(root, name)
     handle: int | None = None

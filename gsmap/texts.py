@@ -1,4 +1,4 @@
-"""Texts that people read: values as tables show them, and what must never reach a terminal as it is."""
+"""Format values for people, and keep control characters from terminals."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from typing import Any
 
 # Cc, Cs: escape sequences, line breaks, halves of characters. Zl, Zp: line breaks of another kind.
 _CATEGORIES = ("Cc", "Cs", "Zl", "Zp")
-_TURNING = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")  # make a text read as another one
+_TURNING = frozenset(
+    "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+)  # bidirectional overrides, which disguise a text
 
 
 def control_characters(text: str, *, lines: bool = False) -> list[str]:
-    """The characters of a text that steer a terminal instead of showing something, in order.
+    """Return the characters of a text that control a terminal, in order.
 
     Args:
-        lines: a line feed is none of them.
+        lines: allow line feeds.
     """
     if text.isascii() and text.isprintable():
         return []
@@ -23,10 +25,10 @@ def control_characters(text: str, *, lines: bool = False) -> list[str]:
 
 
 def escaped(text: str, *, lines: bool = False) -> str:
-    r"""A text as a terminal may have it: control characters as ``\x1b`` and the like, everything else as it is.
+    r"""Escape control characters as ``\x1b`` and the like; other characters are unchanged.
 
     Args:
-        lines: line feeds stay.
+        lines: keep line feeds.
     """
     if not control_characters(text, lines=lines):
         return text
@@ -35,10 +37,10 @@ def escaped(text: str, *, lines: bool = False) -> str:
 
 
 def shown(value: Any, *, lines: bool = False) -> str:
-    """A value as people read it in a table; control characters are escaped, whoever wrote them.
+    """Format a value for a table; control characters are escaped.
 
     Args:
-        lines: line breaks stay.
+        lines: keep line breaks.
     """
     if value is None:
         return "-"
@@ -60,5 +62,5 @@ def _steers(c: str) -> bool:
 
 
 def few(names: Sequence[str], most: int = 5) -> str:
-    """The first of some names, and how many more there are."""
+    """List the first names, and the number of the others."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -18,7 +18,7 @@ from gsmap.texts import escaped, shown
 
 if TYPE_CHECKING:
     from gsmap.map import Map
-    from gsmap.store.set_aside import StoredSetAside
+    from gsmap.store.quarantine import QuarantinedJob
     from gsmap.types.progress import StageProgress
     from gsmap.types.rows import Row
 
@@ -232,17 +232,17 @@ def opened(
         if values or preset is not None:
             m.with_settings(values, preset)
         yield m
-        _left.extend(m.store.set_aside.met.values())
+        _left.extend(m.store.quarantine.encountered.values())
 
 
-_left: list[StoredSetAside] = []
+_left: list[QuarantinedJob] = []
 
 
 def left() -> str:
     """Name what verbs of this process have set aside or left out, and forget it; empty where that is nothing."""
     if not _left:
         return ""
-    from gsmap.store.set_aside import CAPTURE
+    from gsmap.store.quarantine import CAPTURE
 
     captures = [one for one in _left if one.what.startswith(f"{CAPTURE} ")]
     jobs = len(_left) - len(captures)

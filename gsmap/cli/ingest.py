@@ -102,10 +102,10 @@ def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
     """
     from gsmap.errors import ConfigError, InputError
     from gsmap.ingest import search_captures
-    from gsmap.store.branches import holds_catalog
+    from gsmap.store.branches import has_catalog
 
     given = Path(map)
-    if not given.exists() or given.suffix == ".gsmap" or holds_catalog(given):
+    if not given.exists() or given.suffix == ".gsmap" or has_catalog(given):
         return
     if given.is_dir() and ((given / "arrays").is_dir() or not any(given.iterdir())):
         return  # a damaged map, or the place for one
@@ -113,8 +113,8 @@ def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
         search_captures([given])
     except InputError as error:
         raise ConfigError(f"{map} is not a gsmap map: {error}", code="not_a_map") from error
-    named = [path for path in paths if holds_catalog(Path(path))]
-    near = named or sorted(path.name for path in Path().iterdir() if holds_catalog(path))
+    named = [path for path in paths if has_catalog(Path(path))]
+    near = named or sorted(path.name for path in Path().iterdir() if has_catalog(path))
     guess = near[0] if len(near) == 1 else f"{given.resolve().stem or 'site'}.gsmap" if not near else "MAP"
     meant = ["gsmap", verb, guess, map, *(path for path in paths if path not in named)]
     also = f" (MAP is one of {', '.join(near)})" if len(near) > 1 else ""

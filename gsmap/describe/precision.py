@@ -1,6 +1,7 @@
 """Rounding of scene graphs to their significant digits, so that stored and matched values are equal and small.
 
-All numbers are rounded to multiples of powers of two, which small integers hold without loss (`gsmap.store.narrow`).
+All numbers are rounded to multiples of powers of two, which small integers hold without loss
+(`gsmap.store.array_encoding`).
 Landmarks are localized to centimetres, and embeddings of one place differ by tenths between captures: a millimetre and
 1/256 are far below that.
 """

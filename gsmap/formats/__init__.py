@@ -21,7 +21,7 @@ from gsmap.durable import is_stream, write_output
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats.precision import about_origin, about_zero
 from gsmap.methods import family
-from gsmap.stream import clamped, clamped_column
+from gsmap.stream import clamp_column, clamp_infinities
 from gsmap.types import Cameras, FileInfo, Gaussians, GaussianSource
 from gsmap.types.source import origin_of_source
 
@@ -52,7 +52,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     suffix = _suffix(path, "read")
     # NaN and overflow in a damaged file are for `gsmap.ingest` to name, not for numpy to warn of.
     with _explained(path, "read"), np.errstate(all="ignore"):
-        return about_origin(path, clamped(_load(_layout(path, suffix)).read(path))).load()
+        return about_origin(path, clamp_infinities(_load(_layout(path, suffix)).read(path))).load()
 
 
 def stream(path: str | os.PathLike[str]) -> GaussianSource:
@@ -86,15 +86,15 @@ class _FileSource:
 
     def chunks(self) -> Iterator[Gaussians]:
         for chunk in self._quietly(self.source.chunks()):
-            yield clamped(chunk)
+            yield clamp_infinities(chunk)
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
         for column in self._quietly(self.source.columns(name)):
-            yield clamped_column(name, column)
+            yield clamp_column(name, column)
 
     def load(self) -> Gaussians:
         with _explained(self.path, "read"), np.errstate(all="ignore"):
-            return clamped(self.source.load())
+            return clamp_infinities(self.source.load())
 
     def _quietly(self, parts: Iterator[_Part]) -> Iterator[_Part]:
         while True:

@@ -21,7 +21,7 @@ from gsmap.formats.axes import PLY, change_axes
 from gsmap.formats.inside import file_inside
 from gsmap.formats.quantise import from_smallest_three, logits_of_bytes
 from gsmap.geometry.sh import sh0_of_rgb
-from gsmap.stream import loaded
+from gsmap.stream import load_all
 from gsmap.types import FileInfo, Gaussians
 from gsmap.types.gaussians import CHUNK_ROWS
 
@@ -134,7 +134,7 @@ class LccSource:
             yield getattr(chunk, name)
 
     def load(self) -> Gaussians:
-        return loaded(self)
+        return load_all(self)
 
     def _decoded(self, rows: np.ndarray, more: np.ndarray | None) -> Gaussians:
         low, high = self.bounds["scale"]

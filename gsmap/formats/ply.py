@@ -21,7 +21,7 @@ from numpy.lib import recfunctions as rfn
 from gsmap.errors import InputError, NotGaussiansError
 from gsmap.geometry.origins import centred, neighbour_distance, origin_of
 from gsmap.geometry.sh import sh0_of_rgb
-from gsmap.stream import loaded
+from gsmap.stream import load_all
 from gsmap.types import FileInfo, Gaussians, GaussianSource
 from gsmap.types.gaussians import CHUNK_ROWS, FIELDS
 from gsmap.types.source import origin_of_source
@@ -169,7 +169,7 @@ class PlySource:
             yield self._field(name, part)
 
     def load(self) -> Gaussians:
-        return loaded(self)
+        return load_all(self)
 
     def _field(self, name: str, part: np.ndarray) -> np.ndarray:
         """One field of `Gaussians`, of some rows."""

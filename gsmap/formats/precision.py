@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.origins import float32_step, is_float32, neighbour_distance, origin_of
-from gsmap.stream import about
+from gsmap.stream import shift_origin
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.source import gathered, origin_of_source
 
@@ -37,7 +37,7 @@ def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> Gauss
         origin = origin_of(gathered(source, "means", rows))
         if not origin.any():
             return source
-        source = about(source, origin)
+        source = shift_origin(source, origin)
     step = rounded_to(source)
     apart = neighbour_distance(source) if step else np.inf
     if apart <= 2 * step:

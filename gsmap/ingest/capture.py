@@ -19,7 +19,7 @@ from gsmap.geometry.transforms import transform_cameras
 from gsmap.ingest.capture_search import CaptureFiles, find_captures
 from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.validate import validate_cameras, validate_gaussians
-from gsmap.stream import clamped
+from gsmap.stream import clamp_infinities
 from gsmap.types import Cameras, Gaussians, GaussianSource, Sim3
 from gsmap.types.progress import Progress
 from gsmap.types.scene import SCALE_POLICIES
@@ -154,7 +154,7 @@ def take_capture(
     date = given_date(captured_at)
     where = source or f"capture {name!r}"
     if isinstance(gaussians, Gaussians):
-        gaussians = about_origin(where, clamped(gaussians))
+        gaussians = about_origin(where, clamp_infinities(gaussians))
     notes = list(validate_gaussians(gaussians, where))
     notes += [] if cameras is None else cameras.notes
     origin = origin_of_source(gaussians)

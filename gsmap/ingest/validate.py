@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.projection import in_image, project
-from gsmap.stream import clamped, num_clamped
+from gsmap.stream import clamp_infinities, count_clamped
 from gsmap.types import Cameras, GaussianSource
 from gsmap.types.gaussians import FIELDS
 from gsmap.types.source import gathered
@@ -46,8 +46,8 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
     sampled = []
     start, step = 0, _step(n)
     opacities, scales = 0, 0
-    for chunk in map(clamped, gaussians.chunks()):
-        infinite = num_clamped(chunk)
+    for chunk in map(clamp_infinities, gaussians.chunks()):
+        infinite = count_clamped(chunk)
         opacities, scales = opacities + infinite[0], scales + infinite[1]
         for name in FIELDS:
             rows = getattr(chunk, name).reshape(len(chunk), -1)

@@ -9,7 +9,7 @@ from gsmap.errors import ConfigError
 from gsmap.ingest import parse_date
 from gsmap.store import Store, schema
 from gsmap.store import backup as _backup
-from gsmap.store.places import place_of
+from gsmap.store.storage import open_storage
 from gsmap.types.progress import Progress, silent
 from gsmap.types.rows import BackupReport, CloneReport, RestoreReport, SnapshotRow
 
@@ -18,7 +18,7 @@ def save(
     store: Store, target: str | os.PathLike[str], *, verify: bool, keep: int | None, progress: Progress = silent
 ) -> BackupReport:
     """Back up a map to a target (``gsmap backup MAP DEST``); see `gsmap.store.backup.save`."""
-    made = _backup.save(store, place_of(target), verify=verify, keep=keep, progress=progress)
+    made = _backup.save(store, open_storage(target), verify=verify, keep=keep, progress=progress)
     return BackupReport(
         dest=made.target,
         snapshot=snapshot_row(made.snapshot),
@@ -49,7 +49,7 @@ def restore(
     progress: Progress = silent,
 ) -> RestoreReport:
     """Restore a map from a backup (``gsmap restore DEST MAP``); see `gsmap.store.backup.restore`."""
-    made = _backup.restore(place_of(target), path, **_moment(at), catalog_url=catalog_url, progress=progress)
+    made = _backup.restore(open_storage(target), path, **_moment(at), catalog_url=catalog_url, progress=progress)
     return RestoreReport(
         path=str(path),
         snapshot=snapshot_row(made.snapshot),

@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 from gsmap.errors import ConfigError, NotFoundError
-from gsmap.store import Store, homes
+from gsmap.store import Store, remote_map
 from gsmap.store import trust as trusting
-from gsmap.store.explained import called
+from gsmap.store.error_translation import display_name
 from gsmap.types.rows import TrustReport
 
 
@@ -49,19 +49,19 @@ def trust(path: str | os.PathLike[str]) -> TrustReport:
 
 def _folder(path: str | os.PathLike[str]) -> Path:
     """Return the folder of a map's ``catalog.url``; for an object store, the local mirror."""
-    if not homes.is_remote(path):
-        return homes.local(path)
-    home = homes.Home(os.fspath(path))
-    home.lay_out()
-    return home.desk
+    if not remote_map.is_remote(path):
+        return remote_map.local_folder(path)
+    home = remote_map.RemoteMap(os.fspath(path))
+    home.refresh_mirror()
+    return home.mirror
 
 
-def _remembered(folder: Path) -> trusting.Remembered:
+def _remembered(folder: Path) -> trusting.CatalogAddress:
     if not folder.is_dir():
-        raise NotFoundError(f"no map at {called(folder)}", code="map_not_found")
+        raise NotFoundError(f"no map at {display_name(folder)}", code="map_not_found")
     if not (folder / trusting.URL_FILE).exists():
         raise ConfigError(
             f"{folder} keeps its catalog in its own folder, if it is a map: there is nothing to trust",
             code="nothing_to_trust",
         )
-    return trusting.remembered(folder)
+    return trusting.read_address(folder)

@@ -14,7 +14,7 @@ from gsmap.errors import CorruptError, InputError
 from gsmap.geometry.metric_scale import in_metres, scale_gaussians
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.methods import family
-from gsmap.store import Store, branches, homes, sqlite
+from gsmap.store import Store, branches, remote_map, sqlite
 from gsmap.store.photos import StoredPhoto
 from gsmap.types import (
     Cameras,
@@ -58,9 +58,9 @@ def _opened(location: str, inode: int) -> Store:
 def _catalog_file(path: str) -> tuple[str, int]:
     """Return the absolute location of a map and the inode of its catalog file. The inode tells maps apart that lie
     at one path one after the other; an open file keeps its inode."""
-    location = path if homes.is_remote(path) else os.path.abspath(path)
+    location = path if remote_map.is_remote(path) else os.path.abspath(path)
     try:
-        return location, (branches.find(location).folder / sqlite.FILE).stat().st_ino
+        return location, (branches.locate(location).folder / sqlite.FILE).stat().st_ino
     except FileNotFoundError:  # its catalog is a database elsewhere
         return location, 0
 

@@ -210,7 +210,7 @@ class Map(AbstractContextManager["Map"]):
 
         with self.store.catalog.lock():
             write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
-            self.store.send_settings()
+            self.store.upload_settings()
         self.__dict__.pop("settings", None)
 
     def setting_rows(self) -> Table[SettingRow]:
@@ -231,7 +231,8 @@ class Map(AbstractContextManager["Map"]):
         """Add captures from files and folders, or one from memory. Each is validated before it is written.
 
         Of several, those that cannot be read are set aside: they are named in the logs (``gsmap.map``), by `status` and
-        in ``store.set_aside.met``, and tried again whenever they are given. What is no splat is skipped with a warning.
+        in ``store.quarantine.encountered``, and tried again whenever they are given. Other files are skipped with a
+        warning.
 
         Args:
             captures: files and folders; or `Gaussians`, with `Cameras` or none.
@@ -355,7 +356,7 @@ class Map(AbstractContextManager["Map"]):
         before = reports.history_position(self.store)
         with announce_work(self.store, "update"):
             ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-            describe(self.store, unthinned(self.store.scenes.brief()), self.settings, self._progress)
+            describe(self.store, unthinned(self.store.scenes.summaries()), self.settings, self._progress)
             known = RegisteredPairs()
             register(self.store, "auto", self.settings, self._progress, known)
             # Poses may tell of new neighbours, and their edges of new poses.

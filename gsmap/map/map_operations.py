@@ -124,7 +124,7 @@ def restore_scene(store: Store, ref: str, source: str | os.PathLike[str] | None)
         return store.scenes.restore(ref)
     with Store.open(source, "r") as other:
         scene = other.scenes.find_any(ref).id
-        merging.bring_scene(store, other, scene)
+        merging.import_scene(store, other, scene)
     return store.scenes.get(scene)
 
 

@@ -33,8 +33,11 @@ def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dic
 
     What is known of a scene that was removed since still counts, as long as the poses are those it took part in.
     """
-    told, policies = store.scenes.told_metres(), {scene.id: scene.scale_policy for scene in store.scenes.brief()}
-    guesses = {graph.scene: graph.unit_m for graph in store.graphs.says()}  # oldest first: the newest stays
+    told, policies = (
+        store.scenes.specified_metres(),
+        {scene.id: scene.scale_policy for scene in store.scenes.summaries()},
+    )
+    guesses = {graph.scene: graph.unit_m for graph in store.graphs.frames()}  # oldest first: the newest stays
     components: dict[int, list[tuple[SceneUnit, ScenePose]]] = {}
     low, high = PLAUSIBLE_M
     for pose in graph.poses.values() if graph else ():

@@ -28,7 +28,7 @@ def apply_annotations(
     Returns:
         Also the id that each is told under that was joined to another, and what of the words cannot be told so.
     """
-    words, notes = store.objects.words(), []
+    words, notes = store.objects.annotations(), []
     of = {thing.id: replace(thing, words=words.get(thing.id, ObjectAnnotations())) for thing in objects}
     joined: dict[str, str] = {}
     for thing in list(of.values()):

@@ -23,7 +23,8 @@ from gsmap.map.settings import Settings
 from gsmap.map.stages.objects import ComponentObjects, objects_of_components
 from gsmap.objects import estimate_persistence, graphml, object_graph, relations
 from gsmap.store import Store
-from gsmap.store.objects import Computed, ObjectFact, number_of
+from gsmap.store.facts import Fact
+from gsmap.store.objects import ComputedObjects, number_of
 from gsmap.texts import few
 from gsmap.types import MapObject, Room, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
@@ -67,7 +68,7 @@ class MapObjects:
     metres: dict[int, float]
     photos: Mapping[str, tuple[str, str | None]] = field(default_factory=dict)
     joined: Mapping[str, str] = field(default_factory=dict)
-    facts: Mapping[str, Sequence[ObjectFact]] = field(default_factory=dict)
+    facts: Mapping[str, Sequence[Fact]] = field(default_factory=dict)
     rooms: Mapping[int, tuple[np.ndarray, tuple[Room, ...]]] = field(default_factory=dict)
     parted: Mapping[str, str] = field(default_factory=dict)
 
@@ -161,7 +162,7 @@ def compute_objects(
     placed, scenes, metres, parts, notes = objects_of_components(store, settings, progress, graphs, make=make)
     objects = _numbered(store, parts)
     shown = {number: [s.scene for s in one.sightings] for one in objects if (number := number_of(one.id))}
-    parted = {f"o{number}": f"o{other}" for number, other in store.objects.parted(shown).items()}
+    parted = {f"o{number}": f"o{other}" for number, other in store.objects.split_objects(shown).items()}
     if parted:
         told = few([f"{one} from {other}" for one, other in parted.items()])
         notes = [*notes, f"components came apart, and objects with them: {told} were split"]
@@ -194,11 +195,11 @@ def _numbered(store: Store, parts: Sequence[ComponentObjects]) -> list[MapObject
         part.component: [replace(thing, component=part.component) for thing in part.made.objects] for part in parts
     }
     if store.catalog.writable and all(part.key is not None for part in new):
-        computed = [Computed(part.made, part.places or (), part.key) for part in new if part.key is not None]
+        computed = [ComputedObjects(part.made, part.places or (), part.key) for part in new if part.key is not None]
         saved = store.objects.save(computed) if computed else []
         made |= {part.component: kept.objects for part, kept in zip(new, saved, strict=True)}
     elif new:
-        numbers = iter(store.objects.numbers([one for part in new for one in part.places or ()]))
+        numbers = iter(store.objects.match_numbers([one for part in new for one in part.places or ()]))
         for part in new:
             made[part.component] = [
                 thing if number is None else replace(thing, id=f"o{number}")

@@ -266,7 +266,7 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         ],
         _changes(store, settings, placed, living),
         _photos(store, placed, living),
-        revision=store.revisions.current(),
+        revision=store.revisions.newest_number(),
         metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
         merged=merged,
         has_objects=placed is not None and bool(graphs),

@@ -80,8 +80,8 @@ def _held(store: Store, settings: Settings) -> list[tuple[str, str]]:
     bar = settings.optimize.max_disagreement
     return [
         (one.target, one.source)
-        for one in store.registrations.tried()
-        if one.usable and (one.is_told or not one.disagreement > bar)
+        for one in store.registrations.all_summaries()
+        if one.usable and (one.is_specified or not one.disagreement > bar)
     ]
 
 

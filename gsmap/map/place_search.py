@@ -157,7 +157,7 @@ def _called(
 
     Of several those come first whose name is just what was asked for, then those that are there still.
     """
-    if not store.objects.words():
+    if not store.objects.annotations():
         return None
     known = compute_objects(store, settings, progress)
     asked = str(request.text).casefold().split()

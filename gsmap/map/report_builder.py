@@ -53,8 +53,8 @@ from gsmap.report import (
 from gsmap.report.content import CHI2_999
 from gsmap.report.words import verdict
 from gsmap.store import Store
+from gsmap.store.quarantine import CAPTURE
 from gsmap.store.registrations import StoredRegistration
-from gsmap.store.set_aside import CAPTURE
 from gsmap.store.sizes import scene_sizes, sizes
 from gsmap.types import Gaussians, PoseGraph, Scene, ScenePose
 from gsmap.types.metric_scale import MetricScale
@@ -547,7 +547,7 @@ def _up(state: _CatalogState, scenes: Sequence[Scene], poses: Sequence[ScenePose
 def _places(store: Store) -> dict[str, str]:
     """Return short names for local paths, which a shared page must not show."""
     targets = [*store.exports.targets(), str(store.folder), str(store.home), store.location]
-    for one in store.set_aside.list():
+    for one in store.quarantine.list():
         if one.what.startswith(f"{CAPTURE} "):  # and its cameras, which may lie above it
             targets += [str(folder) for folder in [Path(one.about), *Path(one.about).parents][:4] if folder.name]
     return {target: Path(target).name for target in targets if "/" in target}

@@ -70,7 +70,7 @@ class SceneIndex:
             old = [segments[k] for k in to_merge(sizes, len(new.members))]
             whole = merged([*old, new])
             members = [member for member in whole.members if member is not None]
-            self.store.indexes.put(
+            self.store.indexes.save_segment(
                 self.recipe, members, whole.arrays, [segment.id for segment in old], beside=self.beside
             )
 

@@ -43,7 +43,9 @@ def look_up_scenes(
                 scenes = asking[start : start + _AT_ONCE]
                 voters = [mine[scene] if scene in mine else _voters(store, graphs[scene], params) for scene in scenes]
                 found = retrieve.look_up(voters, segments, params)
-                store.indexes.note([_lookup(one, said, params) for one, said in zip(voters, found, strict=True)])
+                store.indexes.save_lookups(
+                    [_lookup(one, said, params) for one, said in zip(voters, found, strict=True)]
+                )
             return
         except CorruptError:
             if not (left and index.forget_damaged()):

@@ -58,7 +58,7 @@ class SharedJobs:
         again: bool = False,
     ) -> None:
         self._leases, self._stage, self._kind, self._progress = store.leases, stage, kind, progress
-        self._set_aside, self._about = store.set_aside, about
+        self._set_aside, self._about = store.quarantine, about
         self._done = done
         self._keys = list(jobs)
         self._todo = dict(jobs)  # not done as far as is known, and not begun here
@@ -141,7 +141,7 @@ class SharedJobs:
             return
         for key in known:
             one = before[self._lease(key)]
-            self._set_aside.met[one.what] = one
+            self._set_aside.encountered[one.what] = one
             del self._todo[key]
 
     def _put_aside(self, key: str, reason: str) -> None:
@@ -174,7 +174,7 @@ class SharedJobs:
 
         while self._todo:
             worth = int(_WORTH_S * self._came / (time.monotonic() - self._began + 1e-3))
-            taken = self._leases.take(
+            taken = self._leases.acquire(
                 [self._lease(key) for key in self._todo],
                 self._stage,
                 limit=min(max(worth, 1), _AT_MOST),
@@ -232,7 +232,7 @@ class _CountedArguments:
 @contextmanager
 def announce_work(store: Store, task: str) -> Iterator[None]:
     """Register this process as working on the map, and log the other processes at work."""
-    with store.leases.attend(task) as others:
+    with store.leases.announce(task) as others:
         for other in others:
             _log.warning("another %s is at work: what is left is shared", other.who)
         yield

@@ -16,7 +16,7 @@ from gsmap.map.stages.register import num_stale
 from gsmap.register.duplicate import SAME_CAPTURE
 from gsmap.store import Store
 from gsmap.store.leases import Lease
-from gsmap.store.set_aside import CAPTURE
+from gsmap.store.quarantine import CAPTURE
 from gsmap.types import PoseGraph
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import LeaseRow, MapStatus, MetricScaleRow, TodoRow
@@ -28,7 +28,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     """Report the status of a map (``gsmap status MAP``) from the catalog; nothing is computed."""
     at = shlex.quote(store.location)
     update = f"gsmap update {at} --no-create"
-    scenes = store.scenes.brief()
+    scenes = store.scenes.summaries()
     newest, graph = store.revisions.newest(), PoseGraph(store.revisions.poses(), world=store.revisions.world())
     todo: list[TodoRow] = []
 
@@ -47,7 +47,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
         update,
         "graphs made by other settings or another version",
     )
-    pairs = store.registrations.keys()
+    pairs = store.registrations.current_keys()
     registered = {scene for pair, _ in pairs if living.issuperset(ends := pair.split(":")) for scene in ends}
     add(
         "unregistered",
@@ -83,7 +83,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     add("world_outliers", contrary, f"gsmap georeference {at}", "observations of the world that contradict the others")
     untied = sum(bool(tie.problem) for tie in graph.world)
     add("untied", untied, f"gsmap georeference {at}", "components whose place in the world is not determined yet")
-    twice = store.registrations.noted(SAME_CAPTURE)
+    twice = store.registrations.current_with_note(SAME_CAPTURE)
     add("duplicates", len(twice), f"gsmap list {at} edges", "pairs that are the same capture twice: remove one of each")
     isolated = [pose for pose in poses if pose.status == "isolated"]
     add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes that nothing ties to others")
@@ -113,7 +113,7 @@ def _look(store: Store, pairs: Sequence[tuple[str, str]]) -> str:
 
 def quarantined_rows(store: Store) -> list[TodoRow]:
     """Return one row per quarantined job or capture, with the command to retry it."""
-    aside = store.set_aside.list()
+    aside = store.quarantine.list()
     at, names = shlex.quote(store.location), store.scenes.names() if aside else {}
     rows = []
     for one in aside:

@@ -1,10 +1,10 @@
-"""The only door to disk: a catalog in SQL and immutable arrays in zarr."""
+"""Store maps on disk: a relational catalog and immutable array groups (zarr)."""
 
 from gsmap.store.arrays import digest
 from gsmap.store.exports import Export
-from gsmap.store.facts import SceneFact
+from gsmap.store.facts import Fact
 from gsmap.store.graphs import StoredGraph
-from gsmap.store.integrity import Check, Pruned
+from gsmap.store.integrity import CheckResult, PruneResult
 from gsmap.store.models import Model
 from gsmap.store.registrations import MANUAL, Review, StoredRegistration
 from gsmap.store.revisions import Revision
@@ -13,13 +13,13 @@ from gsmap.store.store import Store
 
 __all__ = [
     "MANUAL",
-    "Check",
+    "CheckResult",
     "Export",
     "Model",
-    "Pruned",
+    "PruneResult",
     "Review",
     "Revision",
-    "SceneFact",
+    "Fact",
     "Store",
     "StoredGraph",
     "StoredRegistration",

@@ -1,12 +1,11 @@
 """Immutable groups of arrays on disk (zarr v3), staged beside, synchronised, renamed into place.
 
-A group is a folder ``arrays/KIND/ID`` with one archive in it (`gsmap.store.packed`). It appears by one rename once all
-its bytes are on the disk, and counts only once a committed row of the catalog names it. Every chunk is checksummed
-(zarr's default codecs return wrong data for flipped bits, and zeros for a missing file), and the digest of every file
-goes into the catalog.
+A group is a folder ``arrays/KIND/ID`` with one archive in it (`gsmap.store.array_archive`). It appears by one rename
+once all its bytes are on the disk, and is valid only once a committed row of the catalog names it. Every chunk has a
+checksum (zarr's default codecs return wrong data for flipped bits, and zeros for a missing file), and the digest of
+every file is stored in the catalog.
 
-This class is the seam for arrays elsewhere than in a local folder: nothing else knows where or how they lie. Those of
-`gsmap.store.object_arrays` lie in an object store.
+`Arrays` hides where and how arrays are stored; `gsmap.store.object_arrays` keeps them in an object store.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ from gsmap.durable import (
     sync_folder,
 )
 from gsmap.errors import CorruptError
-from gsmap.store import layout, packed
-from gsmap.store.columns import KINDS, is_digest
-from gsmap.store.explained import explained
+from gsmap.store import array_archive, layout
+from gsmap.store.column_types import KINDS, is_digest
+from gsmap.store.error_translation import translate_errors
 from gsmap.store.layout import CHUNK_ROWS
 
 _PIECE_BYTES = 1 << 20
@@ -48,7 +47,7 @@ _NOT_ITS_BYTES = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFI
 
 @dataclass(frozen=True)
 class StoredFile:
-    """One file of a group: path relative to it, size and digest."""
+    """A file of a group: its path relative to the group, size and digest."""
 
     path: str
     size_bytes: int
@@ -56,17 +55,17 @@ class StoredFile:
 
 
 @dataclass(frozen=True)
-class Staged:
-    """A group that is complete on disk but not yet in its place."""
+class StagedGroup:
+    """A group that is complete on disk but not yet at its final path."""
 
     folder: Path
     files: tuple[StoredFile, ...]
 
 
 class Arrays:
-    """The groups below one folder.
+    """The array groups below one folder.
 
-    Nothing in it is read, written or deleted through a link: it may come from a stranger.
+    Never reads, writes or deletes through a link in the folder, because a map may come from an untrusted source.
 
     Args:
         root: ``MAP/arrays``.
@@ -79,25 +78,28 @@ class Arrays:
         self._held = threading.local()
 
     @contextlib.contextmanager
-    def stage(self, arrays: Mapping[str, np.ndarray | packed.Column], kind: str, name: str) -> Iterator[Staged]:
-        """Write arrays beside their place and synchronise them; dropped at the end unless `publish` took them.
+    def stage(
+        self, arrays: Mapping[str, np.ndarray | array_archive.StreamedArray], kind: str, name: str
+    ) -> Iterator[StagedGroup]:
+        """Write arrays to the staging folder and synchronize them; they are deleted at the end unless `publish` moved
+        them.
 
         Args:
-            kind, name: of the group that they are to be.
+            kind, name: kind and id of the group.
         """
         with self._lock_staging(fcntl.LOCK_SH):
             folder = self.staging / uuid.uuid4().hex
             try:
                 folder.mkdir()
-                packed.write(folder / packed.FILE, arrays, chunk_rows=CHUNK_ROWS)
-                yield Staged(folder, _synchronise(folder))
+                array_archive.write(folder / array_archive.FILE, arrays, chunk_rows=CHUNK_ROWS)
+                yield StagedGroup(folder, _synchronise(folder))
             finally:
-                with contextlib.suppress(OSError):  # there is nothing where it was published
+                with contextlib.suppress(OSError):  # a published folder is no longer here
                     self._remove_staged(folder.name)
 
     @contextlib.contextmanager
     def scratch(self) -> Iterator[Path]:
-        """A folder for files that are needed for a moment, on the disk of the arrays; it is not made yet."""
+        """Yield the path of a temporary folder on the disk of the arrays; it does not exist yet."""
         with self._lock_staging(fcntl.LOCK_SH):
             folder = self.staging / uuid.uuid4().hex
             try:
@@ -109,23 +111,24 @@ class Arrays:
     @contextlib.contextmanager
     def stage_copies(
         self, source: Arrays, groups: Mapping[tuple[str, str], Sequence[StoredFile]]
-    ) -> Iterator[dict[tuple[str, str], Staged]]:
-        """Bring groups of another map beside their places; dropped at the end unless `publish` took them.
+    ) -> Iterator[dict[tuple[str, str], StagedGroup]]:
+        """Copy groups of another map to the staging folder; they are deleted at the end unless `publish` moved them.
 
-        Files are linked where the disk allows, since no map ever writes to one again, and else copied.
+        Files are hard links where the disk supports it, since no map writes to a stored file again; otherwise they are
+        copies.
 
         Args:
             groups: manifest by (kind, name).
 
         Raises:
-            CorruptError: a file is missing, or differs from what was written.
+            CorruptError: a file is missing, or differs from its digest.
         """
         with self._lock_staging(fcntl.LOCK_SH):
             folder = self.staging / uuid.uuid4().hex
             try:
                 folder.mkdir()
                 yield {
-                    group: Staged(source.copied(*group, files, folder / "-".join(group)), tuple(files))
+                    group: StagedGroup(source.copy_group(*group, files, folder / "-".join(group)), tuple(files))
                     for group, files in groups.items()
                 }
             finally:
@@ -134,13 +137,15 @@ class Arrays:
 
     @contextlib.contextmanager
     def lock(self, patience_s: float = 120.0) -> Iterator[None]:
-        """Held by the one who puts groups into their places, until a committed row names them, or who reclaims them.
+        """Hold the lock for publishing and reclaiming groups.
 
-        Several catalogs may name these arrays (`gsmap.store.branches`), so that the writer lock of one does not do. Who
-        holds it waits for no lock of a catalog that others know. Again in the same thread: nothing.
+        Held from publishing a group until the row that names it is committed, and while groups are reclaimed. The
+        writer lock of one catalog does not suffice, because several catalogs may name these arrays
+        (`gsmap.store.branches`). While holding it, wait for no lock of a catalog that other processes use. Reentrant
+        within a thread.
 
         Raises:
-            BusyError: another process kept it for ``patience_s``.
+            BusyError: another process kept the lock for ``patience_s``.
         """
         if getattr(self._held, "depth", 0):
             yield
@@ -154,49 +159,49 @@ class Arrays:
             self._held.depth = 0
             os.close(handle)
 
-    def copied(self, kind: str, name: str, files: Sequence[StoredFile], target: Path) -> Path:
-        """Another copy of a group in a folder that is made for it, every byte compared; returns ``target``.
+    def copy_group(self, kind: str, name: str, files: Sequence[StoredFile], target: Path) -> Path:
+        """Copy a group to a new folder, verify every byte, and return ``target``.
 
         Raises:
-            CorruptError: a file is missing, or differs from what was written.
+            CorruptError: a file is missing, or differs from its digest.
         """
-        return _take(self._place(kind, name), target, files)
+        return _copy_group(self._group_folder(kind, name), target, files)
 
-    def chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
-        """The bytes of a file, in order.
+    def file_chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
+        """Yield the bytes of a file in order.
 
         Raises:
-            FileNotFoundError: there is none.
+            FileNotFoundError: the file is missing.
         """
-        with open(open_file(self._place(kind, name) / file.path), "rb") as opened:
+        with open(open_file(self._group_folder(kind, name) / file.path), "rb") as opened:
             while chunk := opened.read(_PIECE_BYTES):
                 yield chunk
 
     def exists(self, kind: str, name: str) -> bool:
-        """Whether anything lies where a group should."""
-        return self._place(kind, name).exists()
+        """Return True if anything exists at the path of a group."""
+        return self._group_folder(kind, name).exists()
 
-    def send_model(self, path: str) -> None:
-        """Let the map's home have the copy of a model in its folder, by its path below the map; in a folder it has."""
+    def upload_model(self, path: str) -> None:
+        """Upload a model from the local mirror by its path below the map; does nothing for a local map."""
 
-    def bring_model(self, path: str) -> None:
-        """Have that copy in the map's folder; there it is, unless the home is elsewhere.
+    def fetch_model(self, path: str) -> None:
+        """Download a model to the local mirror; does nothing for a local map.
 
         Raises:
-            NotFoundError: the home has none.
+            NotFoundError: the remote map has no such model.
         """
 
-    def drop_models(self, named: Collection[str]) -> None:
-        """Delete the copies of models at the map's home, if that is elsewhere, but those that are named."""
+    def delete_models(self, named: Collection[str]) -> None:
+        """Delete all models of a remote map except the named ones; does nothing for a local map."""
 
-    def publish(self, staged: Staged, kind: str, name: str) -> None:
-        """Move a staged group into its place; only under `lock`, and only where no row names that place."""
-        place = self._place(kind, name)
+    def publish(self, staged: StagedGroup, kind: str, name: str) -> None:
+        """Move a staged group to its final path; requires `lock`, and that no row names the group."""
+        place = self._group_folder(kind, name)
         fresh = not place.parent.exists()
         place.parent.mkdir(parents=True, exist_ok=True)
         if fresh:
             sync_folder(self.root)
-        self.drop(kind, name)  # an orphan of a crash between rename and commit
+        self.drop(kind, name)  # an orphan left by a crash between rename and commit
         os.rename(staged.folder, place)
         sync_folder(place.parent)
 
@@ -213,15 +218,15 @@ class Arrays:
         """Read arrays of a group.
 
         Args:
-            files: its manifest; what is missing or short is found before anything is read.
+            files: manifest of the group; missing or short files are detected before anything is read.
             only: names of the arrays to read.
-            rows: ranges ``[start, stop)`` of rows, in order; all where None.
-            shapes: what the catalog says of the arrays; None for a length that it does not know.
+            rows: ranges ``[start, stop)`` of rows, in order; default: all rows.
+            shapes: expected shape of each array; None for an unknown length.
 
         Raises:
-            CorruptError: a file is missing, short, or fails its checksum, or gsmap does not write arrays so.
+            CorruptError: a file is missing, short, or fails its checksum, or has a layout that gsmap does not write.
         """
-        place = self._place(kind, name)
+        place = self._group_folder(kind, name)
         present = files_below(place)
         for file in files:
             path, found = place / file.path, present.get(file.path)
@@ -231,22 +236,22 @@ class Arrays:
                     code="not_a_plain_file",
                 )
             if found is None or found.st_size != file.size_bytes:
-                raise CorruptError(f"{path} is missing or cut off: {layout.mend(kind)}", code="arrays_missing")
+                raise CorruptError(f"{path} is missing or cut off: {layout.repair_advice(kind)}", code="arrays_missing")
         try:
-            with _opened(place, kind, files) as body:
+            with _open_body(place, kind, files) as body:
                 names = body.array_names() if only is None else only
-                return body.read(body.laid_out(names, shapes), rows)
+                return body.read(body.check_arrays(names, shapes), rows)
         except OSError as error:
             if error.errno in _NOT_ITS_BYTES:
-                with explained(place):
+                with translate_errors(place):
                     raise
             raise CorruptError(
-                f"{place} cannot be read ({error}): {layout.mend(kind)}", code="arrays_corrupt"
+                f"{place} cannot be read ({error}): {layout.repair_advice(kind)}", code="arrays_corrupt"
             ) from error
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
-        """What differs from the manifest, after reading every byte."""
-        place = self._place(kind, name)
+        """Read every byte of a group and return a message for each difference from the manifest."""
+        place = self._group_folder(kind, name)
         out = []
         present = files_below(place)
         for file in files:
@@ -261,19 +266,19 @@ class Arrays:
                 out.append(problem)
         if not out:
             try:
-                with _opened(place, kind, files) as body:
-                    body.laid_out(body.array_names(), heads=True)
+                with _open_body(place, kind, files) as body:
+                    body.check_arrays(body.array_names(), heads=True)
             except CorruptError as error:
                 out.append(str(error))
         extra = sorted(set(present) - {file.path for file in files})
         return out + [f"{place / name} does not belong there" for name in extra]
 
     def size_bytes(self, kind: str, name: str) -> int:
-        return sum(found.st_size for found in files_below(self._place(kind, name)).values())
+        return sum(found.st_size for found in files_below(self._group_folder(kind, name)).values())
 
     def drop(self, kind: str, name: str) -> None:
-        """Delete a group, in one rename as far as readers can see."""
-        place = self._place(kind, name)
+        """Delete a group; for readers it disappears in one rename."""
+        place = self._group_folder(kind, name)
         if os.path.lexists(place):
             self._make_staging()
             grave = self.staging / uuid.uuid4().hex
@@ -282,7 +287,7 @@ class Arrays:
                 self._remove_staged(grave.name)
 
     def groups(self) -> list[tuple[str, str]]:
-        """(kind, name) of every group on disk, named by a row or not."""
+        """Return (kind, name) of every group on disk, whether or not a row names it."""
         return [
             (kind, name)
             for kind in KINDS
@@ -290,15 +295,15 @@ class Arrays:
             if is_digest(name) and is_folder(self.root / kind / name)
         ]
 
-    def strangers(self) -> list[str]:
-        """What lies among the groups and is none; gsmap did not make it and does not touch it."""
+    def unknown_entries(self) -> list[str]:
+        """Return the paths of entries that are not groups; gsmap leaves them alone."""
         groups = {f"{kind}/{name}" for kind, name in self.groups()}
         kinds = [kind for kind in _names(self.root) if not (kind in KINDS and is_folder(self.root / kind))]
         out = [kind for kind in kinds if kind != self.staging.name or not is_folder(self.staging)]
         return out + [f"{k}/{name}" for k in KINDS for name in _names(self.root / k) if f"{k}/{name}" not in groups]
 
-    def _place(self, kind: str, name: str) -> Path:
-        """Where a group lies; its name has been a row's, and that row a stranger's."""
+    def _group_folder(self, kind: str, name: str) -> Path:
+        """Return the folder of a group; validates the name, which may come from an untrusted catalog."""
         if kind not in KINDS or not is_digest(name):
             raise CorruptError(
                 f"{kind}/{name} is not the name of a group of arrays: nothing is done with it",
@@ -320,10 +325,11 @@ class Arrays:
         remove_tree(self.root.parent, self.root.name, self.staging.name, name)
 
     def drop_leftovers(self, *, dry_run: bool = False) -> int:
-        """Delete what dead writers left while staging; returns the bytes freed. Nothing while another is staging.
+        """Delete what killed writers left in the staging folder and return the bytes freed; skipped while a writer is
+        staging.
 
         Args:
-            dry_run: only count.
+            dry_run: only count the bytes.
         """
         freed = 0
         if not is_folder(self.staging):
@@ -341,7 +347,8 @@ class Arrays:
 
     @contextlib.contextmanager
     def _lock_staging(self, how: int) -> Iterator[None]:
-        """Shared by those who stage, exclusive to clean up; the kernel frees it with the process."""
+        """Lock the staging folder: shared while staging, exclusive for cleaning up; the kernel frees the lock with the
+        process."""
         self._make_staging()
         handle = os.open(self.staging, os.O_RDONLY | os.O_CLOEXEC | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
@@ -352,12 +359,12 @@ class Arrays:
 
 
 @dataclass(frozen=True)
-class Parts:
-    """An array that is read part after part.
+class ChunkedArray:
+    """An array that is read in parts.
 
     Args:
-        shape, dtype: of the whole.
-        parts: reads it from its first row on.
+        shape, dtype: of the whole array.
+        parts: iterates over the parts from the first row on.
     """
 
     shape: tuple[int, ...]
@@ -365,18 +372,18 @@ class Parts:
     parts: Callable[[], Iterator[np.ndarray]]
 
 
-def digest(*arrays: np.ndarray | Parts, text: str = "") -> str:
-    """32 hex digits over the bytes, shapes and types of arrays, and a text."""
+def digest(*arrays: np.ndarray | ChunkedArray, text: str = "") -> str:
+    """Return 32 hex digits of SHA-256 over the bytes, shapes and types of arrays, and a text."""
     out = hashlib.sha256(text.encode())
     for array in arrays:
         out.update(f"|{array.dtype.str}{array.shape}|".encode())
-        for part in array.parts() if isinstance(array, Parts) else (array,):
+        for part in array.parts() if isinstance(array, ChunkedArray) else (array,):
             out.update(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
     return out.hexdigest()[:32]
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Another name for a file that is never written again, or a copy where the disk has no such thing."""
+    """Hard-link a file that is never written again, or copy it where the disk does not support links."""
     try:
         os.link(source, target)
     except OSError:
@@ -384,8 +391,8 @@ def link_or_copy(source: Path, target: Path) -> None:
         sync_file(target)
 
 
-def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
-    """Another map's group as one of our own, every byte compared; returns ``target``."""
+def _copy_group(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
+    """Link or copy a group of another map, verify every byte, and return ``target``."""
     target.mkdir()
     present = files_below(place)
     for file in files:
@@ -406,21 +413,21 @@ def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
     return target
 
 
-class _Files:
-    """The files of a group that is a folder; the one that was read last stays open until the end."""
+class _FolderReader:
+    """Read files of a group that is a folder; the file read last stays open."""
 
     def __init__(self, place: Path) -> None:
-        self._place = place
+        self._folder = place
         self._open: tuple[str, int] | None = None
 
     def read(self, file: str, start: int, stop: int) -> bytes:
         if self._open is None or self._open[0] != file:
             self.close()
-            self._open = file, open_file(self._place / file)
+            self._open = file, open_file(self._folder / file)
         return os.pread(self._open[1], stop - start, start)
 
     def expect(self, file: str, ranges: Sequence[layout.Range]) -> None:
-        """Nothing: the disk is near."""
+        """Do nothing: local reads need no prefetching."""
 
     def close(self) -> None:
         if self._open is not None:
@@ -429,16 +436,16 @@ class _Files:
 
 
 @contextlib.contextmanager
-def _opened(place: Path, kind: str, files: Sequence[StoredFile]) -> Iterator[layout.Body]:
-    reader = _Files(place)
+def _open_body(place: Path, kind: str, files: Sequence[StoredFile]) -> Iterator[layout.GroupReader]:
+    reader = _FolderReader(place)
     try:
-        yield layout.Body(str(place), kind, {file.path: file.size_bytes for file in files}, reader)
+        yield layout.GroupReader(str(place), kind, {file.path: file.size_bytes for file in files}, reader)
     finally:
         reader.close()
 
 
 def _synchronise(folder: Path) -> tuple[StoredFile, ...]:
-    """Force every file and folder to the disk; the manifest of what was written."""
+    """Synchronize every file and folder to the disk and return the manifest."""
     out = []
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         with open(path, "rb") as file:
@@ -450,13 +457,13 @@ def _synchronise(folder: Path) -> tuple[StoredFile, ...]:
 
 
 def stored_file(folder: Path, path: str) -> StoredFile:
-    """A file below a folder as a manifest has it."""
+    """Return the manifest entry of a file below a folder."""
     with open(folder / path, "rb") as file:
         return StoredFile(path, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
 
 
 def _names(folder: Path) -> list[str]:
-    """What lies in a folder; nothing where it is missing or a link."""
+    """List the entries of a folder; empty if it is missing or a link."""
     return sorted(os.listdir(folder)) if is_folder(folder) else []
 
 
@@ -468,6 +475,6 @@ def _sha256(path: Path) -> str:
 def _content_problem(path: Path, sha256: str) -> str | None:
     try:
         same = _sha256(path) == sha256
-    except OSError as error:  # a disk that fails is what `check` is there to find
+    except OSError as error:  # report a failing disk as a problem, so that `check` can go on
         return f"{path} cannot be read: {error.strerror or error}"
     return None if same else f"{path} differs from what was written"

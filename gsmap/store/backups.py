@@ -1,4 +1,4 @@
-"""Where a map was backed up to."""
+"""Record of the backups and clones of a map."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from gsmap.store.schema import backups
 
 @dataclass(frozen=True)
 class StoredBackup:
-    """A snapshot that was taken, or a clone that was made.
+    """A snapshot or a clone that was made of the map.
 
     Args:
-        target: the folder or URL it went to, without secrets.
-        snapshot: its name there; of a clone the word and its map id.
-        created_at: when it was done.
-        num_bytes: how many were sent.
+        target: folder or URL of the backup, without secrets.
+        snapshot: name of the snapshot; for a clone the word ``clone`` and its map id.
+        created_at: when it was made.
+        num_bytes: bytes that were sent.
     """
 
     number: int
@@ -29,7 +29,7 @@ class StoredBackup:
 
 
 class Backups:
-    """The backups that a map knows of; copies of a backup, and snapshots that were deleted there, it does not."""
+    """Backups recorded in the map; does not include copies of backups, and may list snapshots deleted since."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
@@ -40,7 +40,7 @@ class Backups:
             connection.execute(insert(backups), row)
 
     def list(self) -> list[StoredBackup]:
-        """All, oldest first."""
+        """Return all backups, oldest first."""
         with self._catalog.read() as connection:
             return [
                 StoredBackup(**row) for row in connection.execute(select(backups).order_by(backups.c.number)).mappings()

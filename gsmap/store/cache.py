@@ -1,7 +1,7 @@
-"""Files of immutable groups that were read from an object store, kept on this machine for a while.
+"""Local cache for files of immutable groups that were read from an object store.
 
-They are named by their digest and compared with it when they come, so that two maps share what they have in common. The
-ones that were used longest ago go first. Anything here may be deleted at any time.
+Files are named by their digest and verified against it when they are stored, so that maps share common files. The least
+recently used ones are evicted first. All of it may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _DEFAULT_MB = 10_000
 
 
 def folder() -> Path:
-    """Where everything is kept: ``GSMAP_CACHE``, else in the user's folder of caches."""
+    """Return the cache folder: ``GSMAP_CACHE``, default: ``gsmap`` in the user's cache folder."""
     named = os.environ.get(FOLDER_VARIABLE)
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(named).expanduser() if named else Path(base).expanduser() / "gsmap"
 
 
 def max_bytes() -> int:
-    """How much is kept at most: ``GSMAP_CACHE_MB``."""
+    """Return the maximum size of the cache, from ``GSMAP_CACHE_MB``."""
     named = os.environ.get(SIZE_VARIABLE) or str(_DEFAULT_MB)
     if not named.isdecimal():
         raise ConfigError(f"{SIZE_VARIABLE} must be a number of megabytes, got {named!r}", code="invalid_environment")
@@ -37,7 +37,7 @@ def max_bytes() -> int:
 
 
 def find(sha256: str) -> Path | None:
-    """The file of a digest, if it is kept."""
+    """Return the cached file with this digest; None if it is not cached."""
     path = folder() / "files" / sha256
     with contextlib.suppress(OSError):
         os.utime(path)
@@ -46,13 +46,13 @@ def find(sha256: str) -> Path | None:
 
 
 def keep(sha256: str, chunks: Iterable[bytes], what: str) -> Path:
-    """Keep a file.
+    """Store a file in the cache.
 
     Args:
-        what: it is, for messages.
+        what: name of the file for messages.
 
     Raises:
-        CorruptError: its bytes are not those of the digest; nothing is kept.
+        CorruptError: the bytes do not match the digest; nothing is stored.
     """
     root = folder() / "files"
     root.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -72,19 +72,19 @@ def keep(sha256: str, chunks: Iterable[bytes], what: str) -> Path:
 
 
 def drop(sha256: str) -> None:
-    """Forget a file, by its digest or the beginning of it."""
+    """Delete cached files by digest or digest prefix."""
     for path in (folder() / "files").glob(f"{glob.escape(sha256)}*"):
         path.unlink(missing_ok=True)
 
 
 def _make_room(root: Path, size_bytes: int) -> None:
-    """Delete what was used longest ago until so many bytes more are within bounds."""
+    """Delete the least recently used files until ``size_bytes`` more fit."""
     kept = []
     for entry in os.scandir(root):
         with contextlib.suppress(FileNotFoundError):
             about = entry.stat(follow_symlinks=False)
             kept.append((about.st_mtime, about.st_size, entry.name))
-    over = sum(size for _, size, _ in kept) - max_bytes()  # what is coming is among them
+    over = sum(size for _, size, _ in kept) - max_bytes()  # the incoming file is already staged in this folder
     for _, size, name in sorted(kept):
         if over <= 0:
             break

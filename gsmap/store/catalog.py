@@ -1,4 +1,4 @@
-"""The catalog's transactions: one writer at a time, errors in our words."""
+"""Transactions of the catalog: one writer at a time, with readable errors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from gsmap.durable import lock_within
 from gsmap.errors import BusyError, ConfigError, CorruptError, MissingDependencyError, StoreError
-from gsmap.store import advisory, digests, sqlite, trust
-from gsmap.store.explained import NOT_KEPT, called, explained, is_full, summary
-from gsmap.store.wal import log_of, read_log
+from gsmap.store import advisory_locks, page_digests, sqlite, trust
+from gsmap.store.error_translation import NOT_KEPT, display_name, is_full, summary, translate_errors
+from gsmap.store.wal import read_log, wal_path
 
 LOCK_FILE = "lock"
-_LOOKS = 3  # at pages that others are writing, before they are asked to wait
+_MAX_COMPARISONS = 3  # attempts before writers are paused
 _log = logging.getLogger("gsmap.store")
 
 
@@ -32,152 +32,157 @@ class Catalog:
     """A database with the tables of `gsmap.store.schema`, and the map's writer lock.
 
     Args:
-        folder: the map.
-        engine: on its database.
-        writable: whether `write` may be called.
-        patience_s: how long a writer waits for the others before `BusyError`.
-        refusal: what to tell who would write where that may not be; by default, that it was opened for reading.
+        folder: folder of the map or branch.
+        engine: engine of its database.
+        writable: allow `write`.
+        patience_s: seconds that a writer waits for other writers before `BusyError`.
+        read_only_message: message for attempts to write to a read-only catalog; default: that it was opened for
+            reading.
     """
 
     def __init__(
-        self, folder: Path, engine: Engine, *, writable: bool, patience_s: float = 120.0, refusal: str = ""
+        self, folder: Path, engine: Engine, *, writable: bool, patience_s: float = 120.0, read_only_message: str = ""
     ) -> None:
         self.folder = folder
-        self._refusal = refusal or f"{called(folder)} was opened for reading: open it with mode 'w' to change it"
+        self._read_only_message = (
+            read_only_message or f"{display_name(folder)} was opened for reading: open it with mode 'w' to change it"
+        )
         self.engine = engine
         self.writable = writable
         self.patience_s = patience_s
-        self._held = threading.local()
+        self._thread = threading.local()
 
     @property
     def is_sqlite(self) -> bool:
         return self.engine.dialect.name == "sqlite"
 
     def signature(self) -> str | None:
-        """Another text whenever anything may have been written, by whomever; None where that cannot be told quickly."""
+        """Return a text that changes whenever the catalog may have been written; None for a catalog on a server."""
         if not self.is_sqlite:
             return None
-        said = []
+        parts = []
         for name in (sqlite.FILE, f"{sqlite.FILE}-wal"):
             with contextlib.suppress(FileNotFoundError):
                 about = (self.folder / name).stat()
-                said.append(f"{name} {about.st_ino} {about.st_size} {about.st_mtime_ns}")
-        return " ".join(said)
+                parts.append(f"{name} {about.st_ino} {about.st_size} {about.st_mtime_ns}")
+        return " ".join(parts)
 
     @property
-    def _depth(self) -> int:
-        """Whether this thread holds the writer lock."""
-        return int(getattr(self._held, "depth", 0))
+    def _has_lock(self) -> int:
+        """Return 1 while this thread holds the writer lock, otherwise 0."""
+        return int(getattr(self._thread, "depth", 0))
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
-        self._held.depth = 1
+        self._thread.depth = 1
         try:
             yield
         finally:
-            self._held.depth = 0
+            self._thread.depth = 0
 
     @property
-    def _busy(self) -> str:
-        return f"{called(self.folder)}: others have been writing"
+    def _busy_message(self) -> str:
+        return f"{display_name(self.folder)}: others have been writing"
 
     @property
     def _writing(self) -> Connection | None:
-        return getattr(self._held, "connection", None)
+        return getattr(self._thread, "connection", None)
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Connection]:
-        """A transaction that sees one state of the map, whatever others write.
+        """Open a snapshot read: a transaction that sees one state of the map, whatever other processes write.
 
-        Inside another one of the same thread, or inside `write`, it is that one.
+        Inside another transaction of the same thread it joins that one.
         """
-        within = self._writing or getattr(self._held, "reading", None)
+        within = self._writing or getattr(self._thread, "reading", None)
         if within is not None:
             yield within
             return
-        with explained(self.folder), self._reading() as connection, connection.begin():
-            self._held.reading = connection
+        with translate_errors(self.folder), self._reading() as connection, connection.begin():
+            self._thread.reading = connection
             try:
                 yield connection
             finally:
-                self._held.reading = None
+                self._thread.reading = None
 
     @contextlib.contextmanager
     def _reading(self) -> Iterator[Connection]:
-        """A connection; on a full disk one that needs no room there, for which writers wait meanwhile."""
+        """Open a connection; on a full disk open a frozen copy that needs no space, while writers wait."""
         try:
             connection = self.engine.connect()
         except (SQLAlchemyError, sqlite3.Error) as error:
             if not self.is_sqlite or not sqlite.needs_room(error) or not is_full(self.folder):
                 raise
-            with self.still():
-                engine = sqlite.still_engine(self.folder / sqlite.FILE)
-                with engine.connect() as still:
-                    yield still
+            with self.pause_writers():
+                engine = sqlite.frozen_engine(self.folder / sqlite.FILE)
+                with engine.connect() as frozen:
+                    yield frozen
             return
         with connection:
-            if not self.is_sqlite:  # else each statement would see what is newest
+            if not self.is_sqlite:  # otherwise each statement would see the newest state
                 connection = connection.execution_options(isolation_level="REPEATABLE READ")
             yield connection
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Connection]:
-        """A transaction that commits at the end of the block, or leaves nothing; durable once the block is left.
+        """Open a transaction that commits durably at the end of the block, or leaves nothing.
 
-        Inside another one of the same thread it is part of that one.
+        Inside another transaction of the same thread it joins that one.
         """
         if self._writing is not None:
             yield self._writing
             return
         if not self.writable:
-            raise StoreError(self._refusal, code="catalog_refused")
+            raise StoreError(self._read_only_message, code="catalog_refused")
         with self.lock() if self.is_sqlite else contextlib.nullcontext():
-            with explained(self.folder, NOT_KEPT), self.engine.connect() as connection:
+            with translate_errors(self.folder, NOT_KEPT), self.engine.connect() as connection:
                 try:
                     with (
                         contextlib.ExitStack() as until_end,
                         connection.execution_options(gsmap_write=True).begin() as transaction,
                     ):
-                        if not self._depth:  # on a server, where the lock is the transaction's own
-                            advisory.take(connection, advisory.WRITER, self.patience_s, self._busy)
+                        if not self._has_lock:  # on a server the lock belongs to the transaction
+                            advisory_locks.acquire(
+                                connection, advisory_locks.WRITER, self.patience_s, self._busy_message
+                            )
                             until_end.enter_context(self._locked())
-                        self._held.connection, self._held.until_end = connection, until_end
+                        self._thread.connection, self._thread.until_end = connection, until_end
                         yield connection
-                        with explained(self.folder, NOT_KEPT, committing=True):
+                        with translate_errors(self.folder, NOT_KEPT, committing=True):
                             commit(connection, transaction)
                 finally:
-                    self._held.connection = None
+                    self._thread.connection = None
             self._fold(at_bytes=sqlite.CHECKPOINT_BYTES)
 
-    def hold(self, context: contextlib.AbstractContextManager[Any]) -> None:
-        """Inside `write`: hold a lock from now until the transaction has been committed or undone."""
-        self._held.until_end.enter_context(context)
+    def hold_until_commit(self, context: contextlib.AbstractContextManager[Any]) -> None:
+        """Hold a lock from now until the surrounding `write` transaction is committed or rolled back."""
+        self._thread.until_end.enter_context(context)
 
     @contextlib.contextmanager
     def lock(self, patience_s: float | None = None) -> Iterator[None]:
-        """Hold the map's writer lock (again in the same thread: nothing). The kernel frees it when a process dies.
+        """Hold the map's writer lock; reentrant within a thread. The kernel frees it when a process dies.
 
         Raises:
             StoreError: the map was opened for reading.
-            BusyError: another process kept it for ``patience_s``.
+            BusyError: another process kept the lock for ``patience_s``.
         """
         if not self.writable:
-            raise StoreError(self._refusal, code="catalog_refused")
-        if self._depth:
+            raise StoreError(self._read_only_message, code="catalog_refused")
+        if self._has_lock:
             yield
             return
         patience_s = self.patience_s if patience_s is None else patience_s
         if not self.is_sqlite:
-            with self._advised(advisory.WRITER, patience_s), self._locked():
+            with self._server_lock(advisory_locks.WRITER, patience_s), self._locked():
                 yield
             return
         try:
             handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         except OSError as error:
-            with explained(self.folder, NOT_KEPT):
+            with translate_errors(self.folder, NOT_KEPT):
                 raise error
         try:
-            lock_within(handle, fcntl.LOCK_EX, patience_s, self._busy)
+            lock_within(handle, fcntl.LOCK_EX, patience_s, self._busy_message)
             with self._locked():
                 yield
         finally:
@@ -185,87 +190,89 @@ class Catalog:
 
     @contextlib.contextmanager
     def arrays_lock(self, patience_s: float = 120.0) -> Iterator[None]:
-        """As `gsmap.store.arrays.Arrays.lock`, of arrays that lie in no folder; the catalog is on a server."""
-        with self._advised(advisory.ARRAYS, patience_s):
+        """Hold the lock of `gsmap.store.arrays.Arrays.lock` for arrays in an object store, on the catalog's server."""
+        with self._server_lock(advisory_locks.ARRAYS, patience_s):
             yield
 
     @contextlib.contextmanager
-    def _advised(self, lock: int, patience_s: float, *, shared: bool = False) -> Iterator[None]:
-        """Hold a lock of the server's by a transaction of its own, which ends with this process."""
-        with explained(self.folder, NOT_KEPT), self.engine.connect() as connection, connection.begin():
-            advisory.take(connection, lock, patience_s, self._busy, shared=shared)
+    def _server_lock(self, lock: int, patience_s: float, *, shared: bool = False) -> Iterator[None]:
+        """Hold a lock of the server by a transaction of its own, which ends with this process."""
+        with translate_errors(self.folder, NOT_KEPT), self.engine.connect() as connection, connection.begin():
+            advisory_locks.acquire(connection, lock, patience_s, self._busy_message, shared=shared)
             yield
 
     @contextlib.contextmanager
-    def still(self) -> Iterator[None]:
-        """Keep everybody from writing for a moment, without the right to write.
+    def pause_writers(self) -> Iterator[None]:
+        """Keep all processes from writing for a moment; needs no permission to write.
 
-        Not to be begun by who holds the lock of the arrays: a writer waits for that one while we wait for this one.
+        Must not be started while holding the lock of the arrays: a writer that holds the writer lock may wait for that
+        lock.
         """
-        if self._depth:
+        if self._has_lock:
             yield
         elif self.is_sqlite:
-            with still(self.folder, self.patience_s):
+            with pause_writers(self.folder, self.patience_s):
                 yield
         else:
-            with self._advised(advisory.WRITER, self.patience_s, shared=True):
+            with self._server_lock(advisory_locks.WRITER, self.patience_s, shared=True):
                 yield
 
     def verify(self, *, whole: bool = False) -> None:
-        """Compare the catalog's pages with what was written, unless there are very many; `check` does it always.
+        """Compare the catalog's pages with their digests; only `check` does so for a large catalog.
 
         Args:
-            whole: compare all of them, however many there are.
+            whole: compare all pages, however many there are.
 
         Raises:
-            CorruptError: they differ, or the file is not in WAL mode: what is written would go past its digests.
+            CorruptError: pages differ, or the file is not in WAL mode, so that writes would bypass the digests.
         """
         if self.is_sqlite:
             file = self.folder / sqlite.FILE
             if self.writable and not sqlite.has_log(file):
                 raise CorruptError(
-                    digests.damaged(file, ["another program changed its journal mode"]), code="catalog_damaged"
+                    page_digests.damage_message(file, ["another program changed its journal mode"]),
+                    code="catalog_damaged",
                 )
-            found = self.page_problems(at_most_bytes=None if whole else digests.WHOLE_BYTES)
+            found = self.page_problems(at_most_bytes=None if whole else page_digests.WHOLE_BYTES)
             if found:
-                backup = digests.is_backup(file, sqlite.handle(self.engine))
-                if backup is None or read_log(log_of(file)).frames:
-                    raise CorruptError(digests.damaged(file, found), code="catalog_damaged")
-                if self.writable:  # somebody put it back
+                backup = page_digests.find_backup_digests(file, sqlite.handle(self.engine))
+                if backup is None or read_log(wal_path(file)).frames:
+                    raise CorruptError(page_digests.damage_message(file, found), code="catalog_damaged")
+                if self.writable:  # the backup was restored by hand
                     with self.lock():
-                        digests.save(file, backup)
+                        page_digests.save(file, backup)
 
     def page_problems(self, *, at_most_bytes: int | None = None) -> list[str]:
-        """What in the catalog's file and its log differs from what was written.
+        """Return a message for each difference of the catalog's file and log from the page digests.
 
         Args:
-            at_most_bytes: of a longer file look at the log alone.
+            at_most_bytes: check only the log of a longer file.
         """
         file = self.folder / sqlite.FILE
-        with explained(self.folder):
-            for _ in range(_LOOKS):
-                found = self._look(file, at_most_bytes)
+        with translate_errors(self.folder):
+            for _ in range(_MAX_COMPARISONS):
+                found = self._compare_pages(file, at_most_bytes)
                 if not found:
                     return []
-            with self.still():  # others were writing while we looked, or it is damage
-                return self._look(file, at_most_bytes)
+            with self.pause_writers():  # either concurrent writes or damage
+                return self._compare_pages(file, at_most_bytes)
 
-    def _look(self, file: Path, at_most_bytes: int | None) -> list[str]:
+    def _compare_pages(self, file: Path, at_most_bytes: int | None) -> list[str]:
         handle = sqlite.handle(self.engine)
         try:
-            noted = digests.load(file)
+            stored = page_digests.load(file)
         except CorruptError as error:
             return [str(error)]
-        log = read_log(log_of(file), handle.index)
+        log = read_log(wal_path(file), handle.index)
         if at_most_bytes is not None and (size := os.fstat(handle.number).st_size) > at_most_bytes:
             _log.info("%s has %.0f MB: only gsmap check compares its pages with their digests", file, size / 1e6)
             return [f"in its log {log.problem}"] if log.problem else []
-        return digests.problems(file, handle, noted, log)
+        return page_digests.problems(file, handle, stored, log)
 
     def unverified(self) -> list[str]:
-        """Why the catalog's bytes cannot be compared with what was written; empty where they can."""
+        """Return reasons why the catalog's bytes cannot be verified; empty if they can."""
         if self.is_sqlite:
-            if digests.digests_of(self.folder / sqlite.FILE).exists():
+            if page_digests.digests_path(self.folder / sqlite.FILE).exists():
                 return []
             return [
                 "the catalog was written by an older gsmap, which kept no digests of its pages: the next write does"
@@ -278,17 +285,17 @@ class Catalog:
         return [f"the catalog lies in a PostgreSQL server, whose own page checksums are {says}"]
 
     def accept(self) -> list[str]:
-        """Take the catalog's pages for what was written, whatever they are; what differed, in words.
+        """Accept the catalog's pages as they are, write new digests, and return the differences found.
 
         Raises:
-            CorruptError: SQLite cannot make sense of them.
+            CorruptError: SQLite finds the file damaged.
         """
         if not self.is_sqlite:
             raise ConfigError(
                 f"{self.folder}: its catalog is no file of the map, so that there is nothing to accept",
                 code="nothing_to_accept",
             )
-        with self.lock(), explained(self.folder):
+        with self.lock(), translate_errors(self.folder):
             found = self.page_problems()
             with self.read() as connection:
                 wrong = sqlite.integrity_problems(connection)
@@ -302,10 +309,10 @@ class Catalog:
         return found
 
     def close(self, *, fold: bool = True) -> None:
-        """Leave one file at rest, unless others are still at it.
+        """Close the catalog, leaving a single file unless other processes use it.
 
         Args:
-            fold: whether to touch anything; off where the map turned out to be damaged.
+            fold: checkpoint the log; False if the map turned out to be damaged.
         """
         if not self.is_sqlite:
             self.engine.dispose()
@@ -320,11 +327,11 @@ class Catalog:
             sqlite.dispose(self.engine, file, tidy=False)
 
     def _fold(self, at_bytes: int) -> None:
-        """Fold the log in, under the lock. What was committed is in the log, so that a failure costs nothing."""
+        """Checkpoint the log under the lock. Committed data is in the log, so that a failure loses nothing."""
         if not self.is_sqlite:
             return
         try:
-            with explained(self.folder):
+            with translate_errors(self.folder):
                 sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
         except CorruptError as error:
             raise CorruptError(f"{error}; what was written since is kept in its log", code="catalog_damaged") from error
@@ -333,11 +340,11 @@ class Catalog:
 
 
 @contextlib.contextmanager
-def still(folder: Path, patience_s: float) -> Iterator[None]:
-    """See `Catalog.still`; of the catalog in a folder."""
+def pause_writers(folder: Path, patience_s: float) -> Iterator[None]:
+    """Pause the writers of the catalog in a folder; see `Catalog.pause_writers`."""
     try:
         handle = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
-    except OSError:  # then nobody has ever written here, or nobody can
+    except OSError:  # no lock file: never written, or not writable
         yield
         return
     try:
@@ -348,7 +355,7 @@ def still(folder: Path, patience_s: float) -> Iterator[None]:
 
 
 def commit(connection: Connection, transaction: RootTransaction) -> None:
-    """Commit, or leave nothing open: a connection that could not commit is not used again."""
+    """Commit, or invalidate the connection if that fails."""
     try:
         transaction.commit()
     except BaseException:
@@ -357,14 +364,14 @@ def commit(connection: Connection, transaction: RootTransaction) -> None:
 
 
 def open_engine(folder: Path, *, writable: bool) -> Engine:
-    """The engine of a map: its own ``map.sqlite``, or what ``catalog.url`` names if the user trusts that."""
+    """Open the engine of a map: its ``map.sqlite``, or the database in ``catalog.url`` if the user trusts it."""
     if (folder / sqlite.FILE).is_file():
         return sqlite.engine(folder / sqlite.FILE, writable=writable)
-    return url_engine(trust.named_url(folder))
+    return url_engine(trust.catalog_url(folder))
 
 
 def url_engine(url: str) -> Engine:
-    """The engine of a catalog on a server that the user named or trusts; nothing is connected to yet."""
+    """Create the engine for a database URL; does not connect yet."""
     try:
         if make_url(url).get_backend_name() != "postgresql":
             raise ConfigError(
@@ -381,34 +388,34 @@ def url_engine(url: str) -> Engine:
 
 
 def url_without_password(url: str) -> str:
-    """What may lie in a file: the password comes from the driver's own places (``PGPASSWORD``, ``~/.pgpass``)."""
+    """Return a database URL without its password; the driver takes it from ``PGPASSWORD`` or ``~/.pgpass``."""
     known = make_url(url).difference_update_query(["password"])._replace(password=None)
     return known.render_as_string(hide_password=False)
 
 
 def now() -> str:
-    """The current time, ISO 8601, UTC."""
+    """Return the current time, ISO 8601, UTC."""
     return datetime.now(UTC).isoformat(timespec="microseconds")
 
 
-def after(moment: datetime) -> str:
-    """The first time after a moment that `now` may return."""
+def timestamp_after(moment: datetime) -> str:
+    """Return the first time after a moment that `now` may return."""
     return (moment + timedelta(microseconds=1)).astimezone(UTC).isoformat(timespec="microseconds")
 
 
-def later(connection: Connection, created_at: Column[str], *among: ColumnElement[bool]) -> str:
-    """The current time, or the first after the newest row where that has a later one: the clock was ahead once.
+def next_timestamp(connection: Connection, created_at: Column[str], *among: ColumnElement[bool]) -> str:
+    """Return the current time, or the first time after the newest row if that is later because a clock was ahead.
 
-    Rows that are read in order of time are then in the order in which they were written.
+    Ordering rows by time then gives the order in which they were written.
 
     Args:
-        created_at: the column with the time.
-        among: conditions on the rows that the new one is ordered among.
+        created_at: column with the time.
+        among: conditions on the rows among which the new one is ordered.
     """
     when, newest = now(), connection.execute(select(func.max(created_at)).where(*among)).scalar()
     if newest is None or newest < when:
         return when
     try:
-        return after(datetime.fromisoformat(newest))
-    except (ValueError, OverflowError, TypeError):  # gsmap did not write that
+        return timestamp_after(datetime.fromisoformat(newest))
+    except (ValueError, OverflowError, TypeError):  # not written by gsmap
         return when

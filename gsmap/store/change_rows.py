@@ -1,4 +1,4 @@
-"""Rows of comparisons and changes as they are read, and which changes of two comparisons are one."""
+"""Rows of comparisons and changes, and matching of changes between comparisons."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ KIND = "changes"
 OPEN = "open"
 _STATUS = {None: OPEN, "confirm": "confirmed", "reject": "rejected"}
 
-# Boxes of one change by two comparisons overlap: by this share of what they cover together, each made larger by half a
-# voxel of 10 cm first, since that of a picture on a wall has no thickness to speak of.
-_SAME_SHARE = 0.1
+# Minimum intersection over union of the boxes of one change in two comparisons, each padded by half a voxel of 10 cm
+# because the box of a picture on a wall has almost no thickness.
+_MIN_OVERLAP = 0.1
 _PAD_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class StoredChange:
-    """A change, as its newest comparison has it.
+    """A change, as found by the newest comparison of its pair.
 
     Args:
-        number: of the change; it keeps it when its pair is compared again.
+        number: of the change; kept when its pair is compared again.
         older, newer: scene ids.
-        kind, box, S_after_before, symmetry, confidence, evidence: as in `gsmap.types.change.Change`, lengths and frames
-            are those of the comparison.
-        num_voxels, num_before, num_after: how long its arrays are.
-        status: what people say of it: ``open``, ``confirmed`` or ``rejected``.
+        kind, box, S_after_before, symmetry, confidence, evidence: as in `gsmap.types.change.Change`, with lengths and
+            frames of the comparison.
+        num_voxels, num_before, num_after: lengths of its arrays.
+        status: review status: ``open``, ``confirmed`` or ``rejected``.
         comparison: number of the comparison, and ``place`` in it.
         found_at: when it was compared.
     """
@@ -60,18 +60,18 @@ class StoredChange:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two captures that were compared, without the arrays (`Changes.load`).
+    """A comparison of two scenes, without its arrays (`Changes.load`).
 
     Args:
         number: unique in the map, growing.
         older, newer: scene ids.
         key: `RecipeKey.digest`; the two scenes are its inputs.
         recipe: digest of its recipe.
-        S_newer_older: the relative pose that it was made with.
-        S_frame_newer: takes the newer scene to the frame of its boxes; metres where the map has them.
+        S_newer_older: the relative pose used for it.
+        S_frame_newer: transforms the newer scene to the frame of the boxes; in metres if the map is metric.
         seen_share, gains, notes: as in `gsmap.types.change.ChangeReport`.
-        changes: what changed, surest first.
-        whole: its arrays were not pruned.
+        changes: the changes, most confident first.
+        whole: its arrays are still stored.
     """
 
     number: int
@@ -91,7 +91,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ChangeReview:
-    """A person's word on a change: ``confirm``, ``reject`` or ``withdraw``."""
+    """A person's review of a change: ``confirm``, ``reject`` or ``withdraw``."""
 
     review: str
     note: str
@@ -99,18 +99,18 @@ class ChangeReview:
 
 
 def pair_of(older: str, newer: str) -> str:
-    """The two ids, lower first."""
+    """Return both ids with a colon between them, the lower first."""
     return ":".join(sorted((older, newer)))
 
 
 def newest(connection: Connection, pair: str) -> Row[Any] | None:
-    """The comparison of a pair that counts."""
+    """Return the current comparison of a pair; None if there is none."""
     query = select(comparisons).where(comparisons.c.pair == pair)
     return connection.execute(query.order_by(comparisons.c.created_at.desc(), comparisons.c.number.desc())).first()
 
 
 def newest_of_all(connection: Connection) -> list[Row[Any]]:
-    """The comparison of every pair that counts, in the order they were made; scenes may be gone."""
+    """Return the current comparison of every pair, in the order they were made; scenes may be removed."""
     query = select(comparisons).order_by(comparisons.c.created_at, comparisons.c.number)
     return list({row.pair: row for row in connection.execute(query)}.values())
 
@@ -118,11 +118,11 @@ def newest_of_all(connection: Connection) -> list[Row[Any]]:
 def named_groups(
     ours: Connection, theirs: Connection, only: Collection[str] | None
 ) -> Iterator[tuple[str, str, str | None]]:
-    """(kind, scene, group) of the arrays that go from one map into another: those of the newest comparisons of scenes
-    that are there or come along.
+    """Yield (kind, scene, group) of the change arrays to copy between maps: those of current comparisons of scenes that
+    are present or copied along.
 
     Args:
-        only: ids of the scenes that come; None for all.
+        only: ids of the scenes to copy; None for all.
     """
     here = set(ours.execute(select(scenes.c.id)).scalars())
     for row in newest_of_all(theirs):
@@ -131,21 +131,21 @@ def named_groups(
             yield from ((KIND, end, row.group_id) for end in ends)
 
 
-def same_changes(
+def match_changes(
     connection: Connection, older: str, newer: str, S_frame_newer: Sim3, found: Sequence[tuple[str, np.ndarray]]
 ) -> dict[int, int]:
-    """Which changes of a comparison are changes that its pair has already: their numbers, by place.
+    """Match changes of a new comparison to earlier changes of the pair; returns change numbers by place.
 
     Args:
-        found: kind and box of each, in the frame that ``S_frame_newer`` takes the newer scene to.
+        found: kind and box of each change, in the frame that ``S_frame_newer`` transforms the newer scene to.
     """
     boxes: list[tuple[float, int, int]] = []
     for number, old, pose in latest_changes(connection, pair_of(older, newer)):
         if old.older != older:
-            continue  # their dates were corrected: what appeared has disappeared
+            continue  # the dates were corrected, so that appeared and disappeared are swapped
         moved = moved_box(old.box, S_frame_newer @ pose.inverse())
         for i, (kind, box) in enumerate(found):
-            if kind == old.kind and (share := _overlap(moved, box)) >= _SAME_SHARE:
+            if kind == old.kind and (share := _overlap(moved, box)) >= _MIN_OVERLAP:
                 boxes.append((-share, number, i))
     same: dict[int, int] = {}
     for _, number, i in sorted(boxes):
@@ -155,14 +155,14 @@ def same_changes(
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Share of what two boxes cover together that both cover."""
+    """Return the intersection over union of two padded boxes."""
     a, b = (np.array([box[0] - _PAD_M, box[1] + _PAD_M]) for box in (a, b))
     both = float(np.prod(np.maximum(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0.0)))
     return both / (float(np.prod(a[1] - a[0])) + float(np.prod(b[1] - b[0])) - both)
 
 
 def latest_changes(connection: Connection, pair: str) -> list[tuple[int, StoredChange, Sim3]]:
-    """Every change that a pair ever had, as it was found last: its number, and the S_frame_newer of its box."""
+    """Return every change a pair ever had with its number and the S_frame_newer of its box, as last found."""
     query = select(comparisons).where(comparisons.c.pair == pair)
     rows = connection.execute(query.order_by(comparisons.c.created_at, comparisons.c.number)).all()
     latest: dict[int, tuple[int, StoredChange, Sim3]] = {}
@@ -171,8 +171,8 @@ def latest_changes(connection: Connection, pair: str) -> list[tuple[int, StoredC
     return list(latest.values())
 
 
-def carried_words(connection: Connection, pair: str, same: Mapping[int, int]) -> list[str]:
-    """What becomes of the words on a pair's changes when it is compared again."""
+def review_notes(connection: Connection, pair: str, same: Mapping[int, int]) -> list[str]:
+    """Return notes on what happens to the reviews of a pair's changes when it is compared again."""
     notes = []
     for number, change, _ in latest_changes(connection, pair):
         if change.status == OPEN:
@@ -189,19 +189,19 @@ def read_comparison(connection: Connection, row: Row[Any]) -> Comparison:
 
 
 def read_comparisons(connection: Connection, rows: Sequence[Row[Any]]) -> list[Comparison]:
-    """Comparisons with their changes and what people say of these."""
+    """Return comparisons with their changes and the status of these."""
     wanted = {row.number: row for row in rows}
     query = select(changes).order_by(changes.c.comparison, changes.c.place)
     if len(wanted) == 1:
         query = query.where(changes.c.comparison == next(iter(wanted)))
-    said: dict[int, str | None] = {}
-    words = select(change_reviews).order_by(change_reviews.c.created_at, change_reviews.c.number)
-    for word in connection.execute(words):
-        said[word.change] = None if word.review == "withdraw" else word.review
+    in_force: dict[int, str | None] = {}
+    ordered = select(change_reviews).order_by(change_reviews.c.created_at, change_reviews.c.number)
+    for review in connection.execute(ordered):
+        in_force[review.change] = None if review.review == "withdraw" else review.review
     of: dict[int, list[StoredChange]] = {number: [] for number in wanted}
     for line in connection.execute(query):
         if line.comparison in wanted:
-            of[line.comparison].append(_stored(line, wanted[line.comparison], said))
+            of[line.comparison].append(_stored(line, wanted[line.comparison], in_force))
     return [
         Comparison(
             number=row.number,
@@ -222,7 +222,7 @@ def read_comparisons(connection: Connection, rows: Sequence[Row[Any]]) -> list[C
     ]
 
 
-def _stored(line: Row[Any], row: Row[Any], said: Mapping[int, str | None]) -> StoredChange:
+def _stored(line: Row[Any], row: Row[Any], in_force: Mapping[int, str | None]) -> StoredChange:
     number = line.number if line.same_as is None else line.same_as
     return StoredChange(
         number=number,
@@ -237,7 +237,7 @@ def _stored(line: Row[Any], row: Row[Any], said: Mapping[int, str | None]) -> St
         num_voxels=line.num_voxels,
         num_before=line.num_before,
         num_after=line.num_after,
-        status=_STATUS[said.get(number)],
+        status=_STATUS[in_force.get(number)],
         comparison=row.number,
         place=line.place,
         found_at=row.created_at,

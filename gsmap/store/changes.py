@@ -1,4 +1,4 @@
-"""What changed between captures, and what people said of it. Nothing is overwritten."""
+"""Comparisons of scenes, the changes found, and their reviews; rows are never overwritten."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from sqlalchemy import insert, select
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
+from gsmap.store.array_groups import manifest, publish, unless_pruned
 from gsmap.store.arrays import Arrays, digest
-from gsmap.store.catalog import Catalog, later
+from gsmap.store.catalog import Catalog, next_timestamp
 from gsmap.store.change_rows import (
     KIND,
     OPEN,
     ChangeReview,
     Comparison,
     StoredChange,
-    carried_words,
+    match_changes,
     newest,
     newest_of_all,
     pair_of,
     read_comparison,
     read_comparisons,
-    same_changes,
+    review_notes,
 )
-from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import manifest, publish, unless_pruned
+from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.layout import Shape
 from gsmap.store.matrices import from_array, from_pose
-from gsmap.store.row_maps import RowMaps
+from gsmap.store.row_index_maps import RowIndexMaps
 from gsmap.store.scene_refs import living_ids, resolve, scene_name
 from gsmap.store.schema import change_reviews, changes, comparisons, scenes
 from gsmap.types import Sim3
@@ -43,16 +43,16 @@ REVIEWS = ("confirm", "reject", "withdraw")
 
 
 class Changes:
-    """The changes of a map. Of a pair its newest comparison counts, whichever of the two was called the older then.
+    """The changes of a map. The newest comparison of a pair is current, whichever scene was the older one then.
 
-    A change keeps its number, and with it what was said of it, when its pair is compared again: the change of the same
-    kind whose box overlaps that of the earlier one most is the same change.
+    A change keeps its number and reviews when its pair is compared again: it is matched to the earlier change of the
+    same kind whose box overlaps most.
     """
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
-        self._rows = RowMaps(catalog, arrays)
+        self._rows = RowIndexMaps(catalog, arrays)
 
     def save(
         self,
@@ -63,28 +63,28 @@ class Changes:
         newer: str,
         S_newer_older: Sim3,
         S_frame_newer: Sim3,
-        counted: tuple[int, int] | None = None,
+        num_at_comparison: tuple[int, int] | None = None,
     ) -> Comparison:
-        """Keep what a comparison found; the same again mends damaged bytes.
+        """Store a comparison; saving the same one again repairs damaged arrays.
 
         Args:
             key: its recipe; its inputs begin with the two scenes, the older one first.
             older, newer: scene ids.
             S_newer_older, S_frame_newer: see `Comparison`.
-            counted: how many Gaussians the older and the newer scene had when they were compared, which the rows of
-                the report count; default: as many as they have now.
+            num_at_comparison: numbers of Gaussians of the older and newer scene when they were compared, to which the
+                rows of the report refer; default: the current numbers.
 
         Raises:
-            InputError: the key is of other scenes, or a scene with itself; or a scene was thinned, or ingested again,
-                since they were compared.
-            NotFoundError: a scene that is not in the map.
+            InputError: the key has other scenes, both scenes are the same, or a scene was thinned or ingested again
+                since the comparison.
+            NotFoundError: a scene is not in the map.
         """
         if key.inputs[:2] != (older, newer) or older == newer:
             raise InputError(
                 f"the key of a comparison must have its two scenes {older} and {newer} as its first inputs",
                 code="key_input_mismatch",
             )
-        whole = self._whole(report.changes, older, newer, counted)
+        whole = self._whole(report.changes, older, newer, num_at_comparison)
         arrays = _to_arrays(whole)
         text = f"{key.digest}{from_pose(S_newer_older)}{from_pose(S_frame_newer)}"
         group_id = digest(*arrays.values(), text=text) if report.changes else None
@@ -100,7 +100,7 @@ class Changes:
             "group_id": group_id,
         }
         staging = self._arrays.stage(arrays, KIND, group_id) if group_id is not None else contextlib.nullcontext()
-        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+        with translate_errors(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             for scene in (older, newer):
                 resolve(connection, scene)
             known = manifest(connection, group_id or "")
@@ -111,18 +111,20 @@ class Changes:
             if before is not None and all(getattr(before, name) == row[name] for name in same):
                 return read_comparison(connection, before)
             boxes = [(change.kind, np.asarray(change.box)) for change in report.changes]
-            told = same_changes(connection, older, newer, S_frame_newer, boxes)
+            known_numbers = match_changes(connection, older, newer, S_frame_newer, boxes)
             made = {
-                "recipe": recipes.keep(connection, key),
-                "notes": [*report.notes, *carried_words(connection, pair_of(older, newer), told)],
-                "created_at": later(connection, comparisons.c.created_at, comparisons.c.pair == pair_of(older, newer)),
+                "recipe": recipes.save_recipe(connection, key),
+                "notes": [*report.notes, *review_notes(connection, pair_of(older, newer), known_numbers)],
+                "created_at": next_timestamp(
+                    connection, comparisons.c.created_at, comparisons.c.pair == pair_of(older, newer)
+                ),
             }
             number = connection.execute(insert(comparisons).returning(comparisons.c.number), row | made).scalar_one()
             lines = [
                 {
                     "comparison": number,
                     "place": i,
-                    "same_as": told.get(i),
+                    "same_as": known_numbers.get(i),
                     "kind": change.kind,
                     "box": from_array(change.box),
                     "S_after_before": from_pose(change.S_after_before),
@@ -139,17 +141,17 @@ class Changes:
             return read_comparison(connection, stored)
 
     def current(self) -> list[Comparison]:
-        """The newest comparison of every pair of living scenes, in the order they were made."""
+        """Return the current comparison of every pair of living scenes, in the order they were made."""
         with self._catalog.read() as connection:
             living = living_ids(connection)
             rows = [row for row in newest_of_all(connection) if {row.older, row.newer} <= living]
             return read_comparisons(connection, rows)
 
     def comparison(self, number: int) -> Comparison:
-        """A comparison by its number.
+        """Return a comparison by its number.
 
         Raises:
-            NotFoundError: there is none.
+            NotFoundError: no such comparison.
         """
         with self._catalog.read() as connection:
             row = connection.execute(select(comparisons).where(comparisons.c.number == number)).first()
@@ -158,18 +160,18 @@ class Changes:
             return read_comparison(connection, row)
 
     def load(self, comparison: int) -> ChangeReport:
-        """A comparison with its arrays; rows are those of the scenes' Gaussians as they are kept now.
+        """Load a comparison with its arrays; row numbers refer to the scenes' Gaussians as stored now.
 
         Raises:
             NotFoundError: no such comparison, or its arrays were pruned.
-            CorruptError: bytes on disk are missing or differ, or are not what a comparison can have found.
+            CorruptError: bytes on disk are missing or differ, or are not valid results of a comparison.
         """
         with self._catalog.read() as connection:
             found = self.comparison(comparison)
             group = select(comparisons.c.group_id).where(comparisons.c.number == comparison)
             group_id = connection.execute(group).scalar_one() or ""
             files = manifest(connection, group_id)
-            # Kept rows count the whole capture (`gsmap.store.row_maps`).
+            # Stored rows refer to the whole capture (`gsmap.store.row_index_maps`).
             sizes = {
                 row.id: row.num_gaussians if row.thinned is None else row.thinned["num_gaussians"]
                 for row in connection.execute(select(scenes))
@@ -194,19 +196,21 @@ class Changes:
         of_type = (_change(stored, part) for stored, part in zip(found.changes, parts, strict=True))
         return ChangeReport(tuple(of_type), found.seen_share, found.gains, found.notes)
 
-    def _whole(self, found: Sequence[Change], older: str, newer: str, counted: tuple[int, int] | None) -> list[Change]:
-        """Changes with rows of the whole captures; see `gsmap.store.row_maps`."""
+    def _whole(
+        self, found: Sequence[Change], older: str, newer: str, num_at_comparison: tuple[int, int] | None
+    ) -> list[Change]:
+        """Convert changes to rows of the whole captures; see `gsmap.store.row_index_maps`."""
         if not found:
             return []
         before, after = self._rows.of(older), self._rows.of(newer)
-        of_older, of_newer = (None, None) if counted is None else counted
+        of_older, of_newer = (None, None) if num_at_comparison is None else num_at_comparison
         return [
             replace(one, before=before.whole(one.before, of_older), after=after.whole(one.after, of_newer))
             for one in found
         ]
 
     def damaged(self, numbers: Iterable[int]) -> set[int]:
-        """Those of the comparisons whose arrays differ from what was written; every byte of them is read."""
+        """Return the numbers of the comparisons whose arrays differ from their digests; reads every byte."""
         with self._catalog.read() as connection:
             query = select(comparisons.c.number, comparisons.c.group_id).where(comparisons.c.group_id.is_not(None))
             groups = {row.number: row.group_id for row in connection.execute(query)}
@@ -218,10 +222,11 @@ class Changes:
             }
 
     def get(self, number: int) -> StoredChange:
-        """A change by its number, as its newest comparison has it.
+        """Return a change by its number, as found by the newest comparison.
 
         Raises:
-            NotFoundError: there is none, its scenes are gone, or its pair was compared again and it is no longer found.
+            NotFoundError: no such change, its scenes were removed, or the newest comparison of its pair did not find
+                it.
         """
         with self._catalog.read() as connection:
             row = connection.execute(
@@ -245,12 +250,12 @@ class Changes:
         )
 
     def review(self, number: int, review: str, note: str = "") -> StoredChange:
-        """Write down a person's word on a change: ``confirm`` it, ``reject`` it, or ``withdraw`` the last word.
+        """Store a person's review of a change: ``confirm``, ``reject``, or ``withdraw`` the last review.
 
         Raises:
             NotFoundError: see `get`.
-            InputError: nothing to withdraw.
-            ConfigError: another word.
+            InputError: there is no review to withdraw.
+            ConfigError: an unknown review.
         """
         if review not in REVIEWS:
             raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
@@ -260,13 +265,13 @@ class Changes:
                     f"nobody has reviewed c{number}: there is nothing to withdraw", code="nothing_to_withdraw"
                 )
             self.get(number)
-            when = later(connection, change_reviews.c.created_at, change_reviews.c.change == number)
+            when = next_timestamp(connection, change_reviews.c.created_at, change_reviews.c.change == number)
             row = {"change": number, "review": review, "note": note, "created_at": when}
             connection.execute(insert(change_reviews), row)
             return self.get(number)
 
     def reviews(self, number: int) -> list[ChangeReview]:
-        """Everything people said of a change, oldest first."""
+        """Return all reviews of a change, oldest first."""
         query = select(change_reviews).where(change_reviews.c.change == number)
         with self._catalog.read() as connection:
             rows = connection.execute(query.order_by(change_reviews.c.created_at, change_reviews.c.number))
@@ -289,7 +294,7 @@ _PARTS = {"voxels": ((0, 3), np.float32), "before": ((0,), np.int32), "after": (
 
 
 def _to_arrays(found: Sequence[Change]) -> dict[str, np.ndarray]:
-    """The arrays of changes, one after another."""
+    """Concatenate the arrays of changes."""
     return {
         name: np.concatenate([np.zeros(shape, kind), *(np.asarray(getattr(one, name), dtype=kind) for one in found)])
         for name, (shape, kind) in _PARTS.items()
@@ -299,11 +304,11 @@ def _to_arrays(found: Sequence[Change]) -> dict[str, np.ndarray]:
 def _parts(
     arrays: Mapping[str, np.ndarray], found: Sequence[StoredChange], older: int, newer: int, where: str
 ) -> list[dict[str, np.ndarray]]:
-    """`_to_arrays` undone.
+    """Split concatenated arrays by change: the inverse of `_to_arrays`.
 
     Args:
-        older, newer: how many Gaussians each scene has.
-        where: what messages call it.
+        older, newer: number of Gaussians of each scene.
+        where: name of the group for messages.
     """
     most = {"before": older, "after": newer}
     fits = all(((arrays[name] >= 0) & (arrays[name] < count)).all() for name, count in most.items())

@@ -1,8 +1,8 @@
-"""Gaussians in a fifth of their bytes: what is kept of a capture that newer ones supersede.
+"""Compact storage of superseded captures: Gaussians in a fifth of their bytes.
 
-Each value is rounded to 8 bits (positions to 16 within their chunk, rotations to the three smallest of their
-components at 10), which pictures of the capture do not show: `gsmap.thin` measures it. Rows stay rows, so that pieces
-of a scene are read as before.
+Each value is quantized to 8 bits (positions to 16 within their chunk, rotations to the three smallest components at
+10), which is not visible in renders; `gsmap.thin` measures that. Row order is kept, so that parts of a scene are read
+as before.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from gsmap.types import Gaussians
 
 _SQRT2 = np.sqrt(2.0)
 _LEVELS_16, _LEVELS_10, _LEVELS_8 = 65535.0, 1023.0, 255.0
-# Finer than these nothing shows in a picture (over 50 dB), and coarser values pack better.
-_SIZE_STEP = 0.06  # of the logarithm: 6 percent
+# Quantization steps below these are not visible (over 50 dB PSNR), and coarser values compress better.
+_SIZE_STEP = 0.06  # of the natural logarithm: 6 percent
 _COLOUR_STEP = 0.02  # 0.006 of a colour in [0, 1]
-_GLOSS_STEP = 0.06  # of what depends on the direction
+_GLOSS_STEP = 0.06  # of the view-dependent coefficients
 _NOT_FINITE = "a compact scene holds numbers that are not finite: ingest its capture again"
 _VALUES = ("log_scales", "sh0", "sh_rest")
 
 
 def pack(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """The arrays of compact Gaussians, in the same order; chunks are `CHUNK_ROWS` rows.
+    """Return the arrays of compact Gaussians, in the same order, in chunks of `CHUNK_ROWS` rows.
 
     Args:
         gaussians: finite (`gsmap.ingest.validate`), sorted so that a chunk is small (Morton order).
@@ -46,7 +46,7 @@ def pack(gaussians: Gaussians) -> dict[str, np.ndarray]:
     q = np.round((three / _SQRT2 + 0.5) * _LEVELS_10).astype(np.uint32)
     out = {
         "compact.boxes": boxes,
-        "compact.means": _bytes_apart(means.astype(np.uint16)),
+        "compact.means": _split_bytes(means.astype(np.uint16)),
         "compact.quats": (largest.astype(np.uint32) << 30) | (q[:, 0] << 20) | (q[:, 1] << 10) | q[:, 2],
         "compact.opacities": opacity_bytes(gaussians.logit_opacities),
     }
@@ -64,14 +64,14 @@ def pack(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
-    """The Gaussians again.
+    """Return the Gaussians of compact arrays.
 
     Args:
-        arrays: those of `pack`; of boxes and ranges all, of the others the rows that were read.
-        rows: (N,) which rows these are, of all.
+        arrays: arrays of `pack`: boxes and ranges whole, of the others the rows that were read.
+        rows: (N,) numbers of the rows that were read.
 
     Raises:
-        CorruptError: numbers that `pack` does not write.
+        CorruptError: values that `pack` does not write.
     """
     boxes = arrays["compact.boxes"]
     ranges = {name: arrays[f"compact.{name}_range"] for name in _VALUES}
@@ -80,7 +80,7 @@ def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
     chunk = rows // CHUNK_ROWS
     with np.errstate(over="ignore", invalid="ignore"):
         size = boxes[:, 1] - boxes[:, 0]
-        means = boxes[chunk, 0] + _bytes_together(arrays["compact.means"]) / _LEVELS_16 * size[chunk]
+        means = boxes[chunk, 0] + _join_bytes(arrays["compact.means"]) / _LEVELS_16 * size[chunk]
         value = {name: low + arrays[f"compact.{name}"] * step for name, (low, step) in ranges.items()}
         found = [array.astype(np.float32) for array in (means, *value.values())]
     if not all(np.isfinite(array).all() for array in found):
@@ -92,18 +92,18 @@ def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
     return Gaussians(means, quats, value["log_scales"], logits_of_bytes(arrays["compact.opacities"]), sh)
 
 
-def rounded(gaussians: Gaussians) -> Gaussians:
-    """What would be read of Gaussians that are kept compact."""
+def round_trip(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians as they are read after compact storage."""
     return unpack(pack(gaussians), np.arange(len(gaussians)))
 
 
 def num_bytes(gaussians: Gaussians) -> int:
-    """About what Gaussians take on the disk where they are kept compact: their arrays, packed as in a map."""
+    """Estimate the bytes of Gaussians in compact storage."""
     return sum(len(zlib.compress(array.tobytes(), 1)) for array in pack(gaussians).values())
 
 
 def shapes(n: int, sh_degree: int) -> dict[str, Shape]:
-    """The shapes of the arrays of `pack`."""
+    """Return the shapes of the arrays of `pack`."""
     k = 3 * (sh_degree + 1) ** 2 - 3
     return {
         "compact.boxes": (-(-n // CHUNK_ROWS), 2, 3),
@@ -124,7 +124,7 @@ KEPT = "compact.kept"
 
 
 def pack_kept(kept: np.ndarray) -> dict[str, np.ndarray]:
-    """The array that tells which Gaussians of the whole capture are kept.
+    """Return the array that marks the Gaussians of the whole capture that are kept.
 
     Args:
         kept: (N,) bool.
@@ -133,24 +133,24 @@ def pack_kept(kept: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def kept_shape(num_whole: int) -> Shape:
-    """The shape of the array of `pack_kept`."""
+    """Return the shape of the array of `pack_kept`."""
     return (-(-num_whole // 8),)
 
 
 def unpack_kept(bits: np.ndarray, num_whole: int) -> np.ndarray:
-    """(n,) int64 rows of the whole capture that are kept, rising."""
+    """Return (n,) int64 rows of the whole capture that are kept, ascending."""
     return np.flatnonzero(np.unpackbits(bits, count=num_whole))
 
 
 WHOLE: Sequence[str] = ("compact.boxes", *(f"compact.{name}_range" for name in _VALUES))
-"""Arrays that are read whole, whichever rows are wanted."""
+"""Arrays that are always read whole."""
 
 
-def _bytes_apart(values: np.ndarray) -> np.ndarray:
-    """(N, 3) uint16 as (N, 6) uint8, high bytes first: they hardly change from row to row, and pack well."""
+def _split_bytes(values: np.ndarray) -> np.ndarray:
+    """Convert (N, 3) uint16 to (N, 6) uint8, high bytes first: they change slowly and compress well."""
     return np.concatenate([values >> 8, values & 255], axis=1).astype(np.uint8)
 
 
-def _bytes_together(values: np.ndarray) -> np.ndarray:
+def _join_bytes(values: np.ndarray) -> np.ndarray:
     out: np.ndarray = (values[:, :3].astype(np.uint16) << 8) | values[:, 3:]
     return out

@@ -1,4 +1,4 @@
-"""What was exported where, and with which poses, so that only what changed is made again."""
+"""Record of exports and their tiles, so that only changed tiles are made again."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Export:
     Args:
         number: unique in the map, growing.
         target: absolute path of the folder or file.
-        revision: the poses it was made with.
+        revision: number of the revision whose poses were used.
         settings: tile size, merger, format and the like, as given to `Exports.begin`.
-        num_tiles: tiles it made (clean ones are not made again).
+        num_tiles: number of tiles made; unchanged tiles are not made again.
     """
 
     number: int
@@ -41,7 +41,7 @@ class Export:
 
 
 class Exports:
-    """The exports of a map. A tile belongs to a target; the newest one of a path is the one on disk."""
+    """The exports of a map. A tile belongs to a target; the newest tile of a path is the one on disk."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
@@ -49,17 +49,17 @@ class Exports:
     def begin(
         self, target: str | os.PathLike[str], *, revision: int | None, settings: Mapping[str, Any] | None = None
     ) -> int:
-        """Note that an export begins; returns its number."""
+        """Record the start of an export and return its number."""
         row = {"target": _target(target), "revision": revision, "settings": plain(dict(settings or {}))}
         with self._catalog.write() as connection:
             query = insert(exports).returning(exports.c.number)
             return int(connection.execute(query, row | {"created_at": now()}).scalar_one())
 
     def add_tile(self, export: int, tile: Tile) -> None:
-        """Note a tile that was just written (so that an interrupted export goes on where it stopped).
+        """Record a tile that was just written, so that an interrupted export can continue.
 
         Raises:
-            InputError: its recipe is neither empty nor a `RecipeKey.to_json`.
+            InputError: the recipe is neither empty nor a `RecipeKey.to_json`.
         """
         row = {
             "export": export,
@@ -77,17 +77,17 @@ class Exports:
         with self._catalog.write() as connection:
             if connection.execute(select(exports.c.number).where(exports.c.number == export)).first() is None:
                 raise NotFoundError(f"no export {export}: begin one first", code="export_not_found")
-            connection.execute(insert(tiles), row | {"recipe": recipes.keep(connection, tile.recipe)})
+            connection.execute(insert(tiles), row | {"recipe": recipes.save_recipe(connection, tile.recipe)})
 
     def forget(self, target: str | os.PathLike[str], paths: Iterable[str]) -> None:
-        """Note that tiles (by path) are no longer part of a target; their rows stay as history."""
+        """Mark tiles (by path) as removed from a target; their rows stay as history."""
         ours = select(exports.c.number).where(exports.c.target == _target(target))
         gone = tiles.c.export.in_(ours) & tiles.c.path.in_(list(paths)) & tiles.c.removed_at.is_(None)
         with self._catalog.write() as connection:
             connection.execute(update(tiles).where(gone).values(removed_at=now()))
 
     def tiles(self, target: str | os.PathLike[str]) -> list[Tile]:
-        """The tiles that a target should hold now, by path."""
+        """Return the current tiles of a target, by path."""
         query = (
             select(tiles, *(column for column in recipe_rows.c if column.name in recipes.PARTS))
             .join(exports, exports.c.number == tiles.c.export)
@@ -100,13 +100,13 @@ class Exports:
         return [_tile(newest[path]) for path in sorted(newest)]
 
     def targets(self) -> list[str]:
-        """Every target that holds tiles."""
+        """Return every target with current tiles."""
         query = select(exports.c.target).join(tiles).where(tiles.c.removed_at.is_(None)).distinct()
         with self._catalog.read() as connection:
             return sorted(connection.execute(query).scalars())
 
     def list(self) -> list[Export]:
-        """All exports, oldest first."""
+        """Return all exports, oldest first."""
         count = func.count(tiles.c.number).label("num_tiles")
         query = select(exports, count).outerjoin(tiles).group_by(exports.c.number).order_by(exports.c.number)
         with self._catalog.read() as connection:

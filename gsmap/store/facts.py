@@ -1,4 +1,5 @@
-"""What people said of scenes, such as names, dates and tags, with when and by whom. Nothing is overwritten."""
+"""Facts that people give about scenes and objects: names, dates, notes, tags and scales, with time and author; never
+overwritten."""
 
 from __future__ import annotations
 
@@ -17,14 +18,15 @@ from gsmap.texts import control_characters
 
 
 @dataclass(frozen=True)
-class SceneFact:
-    """One thing that was said of a scene.
+class Fact:
+    """A fact that was given about a scene or an object.
 
     Args:
-        kind: ``name``, ``captured_at``, ``note``, ``tag``, ``untag`` or ``metres_per_unit``.
-        value: the text; empty for a ``captured_at`` or ``metres_per_unit`` that was taken back.
-        author: who said it, or what did (such as the EXIF of a frame); empty where a person did and was not named.
-        created_at: when it was said.
+        kind: of a scene ``name``, ``captured_at``, ``note``, ``tag``, ``untag`` or ``metres_per_unit``; of an object
+            one of `gsmap.types.map_object.OBJECT_FACTS`.
+        value: the text; empty if the previous value was withdrawn.
+        author: person or source, such as the EXIF data of a frame; empty for an unnamed person.
+        created_at: when it was given.
     """
 
     kind: str
@@ -33,8 +35,8 @@ class SceneFact:
     created_at: str
 
 
-def say(connection: Connection, scene: str, facts: Iterable[tuple[str, str]], author: str = "") -> None:
-    """Write (kind, value) facts of a scene down."""
+def add_facts(connection: Connection, scene: str, facts: Iterable[tuple[str, str]], author: str = "") -> None:
+    """Insert (kind, value) facts of a scene."""
     when = now()
     rows = [
         {"scene": scene, "kind": kind, "value": value, "author": author, "created_at": when} for kind, value in facts
@@ -43,50 +45,51 @@ def say(connection: Connection, scene: str, facts: Iterable[tuple[str, str]], au
         connection.execute(insert(scene_facts), rows)
 
 
-def said(connection: Connection, scene: str) -> list[SceneFact]:
-    """All facts of a scene, oldest first."""
+def list_facts(connection: Connection, scene: str) -> list[Fact]:
+    """Return all facts of a scene, oldest first."""
     query = select(scene_facts).where(scene_facts.c.scene == scene).order_by(scene_facts.c.number)
-    return [SceneFact(row.kind, row.value, row.author, row.created_at) for row in connection.execute(query)]
+    return [Fact(row.kind, row.value, row.author, row.created_at) for row in connection.execute(query)]
 
 
-def tags(connection: Connection, scene: str | None = None) -> dict[str, tuple[str, ...]]:
-    """The tags that stand, sorted, by scene id; of one scene or of all that have any."""
+def current_tags(connection: Connection, scene: str | None = None) -> dict[str, tuple[str, ...]]:
+    """Return the current tags by scene id, sorted; of one scene or of all scenes with tags."""
     query = select(scene_facts).where(scene_facts.c.kind.in_(("tag", "untag"))).order_by(scene_facts.c.number)
     rows: Iterable[Row[Any]] = connection.execute(query if scene is None else query.where(scene_facts.c.scene == scene))
-    standing: dict[str, set[str]] = {}
+    current: dict[str, set[str]] = {}
     for row in rows:
-        mine = standing.setdefault(row.scene, set())
+        mine = current.setdefault(row.scene, set())
         (mine.add if row.kind == "tag" else mine.discard)(row.value)
-    return {known: tuple(sorted(mine)) for known, mine in standing.items() if mine}
+    return {known: tuple(sorted(mine)) for known, mine in current.items() if mine}
 
 
 def latest_notes(connection: Connection) -> dict[str, str]:
-    """The last note of each scene that has any, by scene id."""
+    """Return the newest note of each scene that has one, by scene id."""
     query = select(scene_facts).where(scene_facts.c.kind == "note").order_by(scene_facts.c.number)
     return {row.scene: row.value for row in connection.execute(query)}
 
 
-def told_metres(connection: Connection) -> dict[str, str]:
-    """Metres per unit that people gave of scenes and did not take back, as `checked_metres` has them, by scene id.
+def specified_metres(connection: Connection) -> dict[str, str]:
+    """Return the specified metres per unit by scene id, as `validated_metres` formats them; withdrawn values are left
+    out.
 
     Raises:
-        CorruptError: something else was written there.
+        CorruptError: a value is not a scale.
     """
     query = select(scene_facts).where(scene_facts.c.kind == "metres_per_unit").order_by(scene_facts.c.number)
-    said = {row.scene: row.value for row in connection.execute(query)}
+    values = {row.scene: row.value for row in connection.execute(query)}
     try:
-        return {scene: checked_metres(value) for scene, value in said.items() if value}
+        return {scene: validated_metres(value) for scene, value in values.items() if value}
     except InputError as error:
         raise CorruptError(
             f"the catalog holds a fact that gsmap did not write: {error}", code="catalog_invalid"
         ) from error
 
 
-def checked_metres(value: float | str) -> str:
-    """Metres per unit of a scene as a fact holds them: a positive number.
+def validated_metres(value: float | str) -> str:
+    """Format metres per unit of a scene as stored in a fact.
 
     Raises:
-        InputError: something else.
+        InputError: not a positive number.
     """
     try:
         metres = float(value)
@@ -99,33 +102,33 @@ def checked_metres(value: float | str) -> str:
     return repr(metres)
 
 
-def checked(
+def validated_facts(
     name: str | None, captured_at: str | None, note: str | None, metres_per_unit: float | None
 ) -> list[tuple[str, str]]:
-    """What is said of a scene, as (kind, value); an empty date, or 0 metres, takes back what was said before.
+    """Return facts about a scene as (kind, value); an empty date, or 0 metres, withdraws the previous value.
 
     Raises:
-        InputError: an empty text, one with control characters, no date, no length.
+        InputError: an empty text, control characters, an invalid date or scale.
     """
-    new = [] if name is None else [("name", checked_text("the name of a scene", name))]
+    new = [] if name is None else [("name", validated_text("the name of a scene", name))]
     if captured_at is not None:
-        new.append(("captured_at", captured_at and checked_date(captured_at)))
+        new.append(("captured_at", captured_at and validated_date(captured_at)))
     if note is not None:
-        new.append(("note", checked_text("a note", note, lines=True)))
+        new.append(("note", validated_text("a note", note, lines=True)))
     if metres_per_unit is not None:
-        new.append(("metres_per_unit", checked_metres(metres_per_unit) if metres_per_unit else ""))
+        new.append(("metres_per_unit", validated_metres(metres_per_unit) if metres_per_unit else ""))
     return new
 
 
-def checked_text(what: str, text: str, *, lines: bool = False) -> str:
-    """A text that may be shown on a terminal: not empty, without control characters.
+def validated_text(what: str, text: str, *, lines: bool = False) -> str:
+    """Return a text that is safe to print: not empty and without control characters.
 
     Args:
-        what: how messages call it.
-        lines: it may have several lines.
+        what: name of the text in messages.
+        lines: allow line breaks.
 
     Raises:
-        InputError: otherwise.
+        InputError: the text is empty or has control characters.
     """
     if not text.strip():
         raise InputError(f"{what} must not be empty", code="invalid_name")
@@ -135,8 +138,8 @@ def checked_text(what: str, text: str, *, lines: bool = False) -> str:
     return text
 
 
-def checked_date(when: str) -> str:
-    """A capture date as the catalog keeps it: ISO 8601 with its zone, UTC where it has none.
+def validated_date(when: str) -> str:
+    """Format a capture date as stored: ISO 8601 with its time zone, default UTC.
 
     Raises:
         InputError: not a date.

@@ -1,7 +1,7 @@
-"""A scene graph as arrays and as what the catalog says of them.
+"""Conversion of scene graphs to arrays and catalog metadata.
 
-Arrays of one name and width of all layers lie one after another in one array: a graph then has a dozen arrays, not
-seven for each layer. Landmarks of one capture share positions between layers, which pack to nothing so.
+Arrays of the same name and width of all layers are concatenated: a graph then has a dozen arrays instead of seven per
+layer, and the positions that landmarks of one capture share between layers compress to almost nothing.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from gsmap.errors import CorruptError
+from gsmap.store.array_encoding import decode_array, encode_array, encoded_shape
 from gsmap.store.layout import Shape
 from gsmap.store.matrices import from_array, to_array
-from gsmap.store.narrow import narrow, shape_of, widen
 from gsmap.types import NodeLayer, SceneGraph, Segments
 from gsmap.types.plain import plain
 
@@ -24,7 +24,7 @@ _NODES = tuple(field.name for field in fields(NodeLayer) if field.type == "np.nd
 
 
 def to_arrays(graph: SceneGraph) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """What is written of a graph, by the names of its arrays, and what its row says beside that."""
+    """Return the arrays of a graph by name, and the metadata for its row."""
     parts: dict[str, list[np.ndarray]] = {}
     layers: dict[str, dict[str, Any]] = {}
     around = all(_is_around(nodes) for nodes in graph.layers.values())
@@ -52,38 +52,38 @@ def to_arrays(graph: SceneGraph) -> tuple[dict[str, np.ndarray], dict[str, Any]]
     if graph.things is not None:
         whole |= {f"things.{name}": getattr(graph.things, name) for name in _THINGS}
         about["things"] = {"count": len(graph.things), "unit_m": float(graph.things.unit_m)}
-    kept = {key: narrow(array) for key, array in whole.items()}
+    kept = {key: encode_array(array) for key, array in whole.items()}
     about["arrays"] = {key: how for key, (_, how) in kept.items()}
     return {key: array for key, (array, _) in kept.items()}, about
 
 
 def shapes_of(about: Mapping[str, Any]) -> dict[str, Shape] | None:
-    """What a graph's row says of its arrays; None in rows of schema 0006 and older, which do not.
+    """Return the shapes of a graph's arrays from its metadata; None for rows of schema 0006 and older, which lack them.
 
     Raises:
-        CorruptError: what no graph says.
+        CorruptError: invalid metadata.
     """
     if "arrays" not in about:
         return None
-    return {key: shape_of(how) for key, how in about["arrays"].items()}
+    return {key: encoded_shape(how) for key, how in about["arrays"].items()}
 
 
 def from_arrays(scene_id: str, about: Mapping[str, Any], stored: Mapping[str, np.ndarray]) -> SceneGraph:
-    """The graph again.
+    """Rebuild a graph from its metadata and arrays.
 
     Raises:
-        CorruptError: arrays and row do not fit together.
+        CorruptError: arrays and metadata do not match.
     """
     up, unit_m, known = to_array(about["up"]), about["unit_m"], about.get("arrays")
-    # Graphs of older releases: the metre wherever it was plausible.
+    # Older releases: use metres if plausible.
     working_m = about.get("working_m", 1.0 if "landmarks" in about["layers"] else unit_m)
     try:
-        whole = stored if known is None else {key: widen(array, known[key]) for key, array in stored.items()}
+        whole = stored if known is None else {key: decode_array(array, known[key]) for key, array in stored.items()}
         layers = _older_layers(about, whole) if known is None else _layers(about, whole)
         things = None
-        if (told := about.get("things")) is not None:
+        if (segments := about.get("things")) is not None:
             own: dict[str, Any] = {name: whole[f"things.{name}"] for name in _THINGS}
-            things = Segments(**own, unit_m=told["unit_m"])
+            things = Segments(**own, unit_m=segments["unit_m"])
     except (KeyError, ValueError, TypeError) as error:
         raise CorruptError(
             f"the graph of scene {scene_id[:12]} does not fit its row ({error!r})", code="catalog_invalid"
@@ -109,7 +109,7 @@ def _layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[s
 
 
 def _older_layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[str, NodeLayer]:
-    """Of graphs of schema 0006 and older: arrays of their own for every layer, called by its number."""
+    """Rebuild layers of schema 0006 and older, with separate arrays for every layer, named by its number."""
     out = {}
     for i, (name, layer) in enumerate(about["layers"].items()):
         own: dict[str, Any] = {key.split(".", 1)[1]: array for key, array in whole.items() if key.startswith(f"{i}.")}
@@ -118,7 +118,8 @@ def _older_layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> 
 
 
 def _keys(layer: Mapping[str, Any]) -> dict[str, str]:
-    """The array that each part of a layer lies in; an object's embedding is its feature, and is not kept twice."""
+    """Return the array name of each part of a layer; the embedding of an object node is its feature and not stored
+    twice."""
     embeddings, features = layer["widths"]
     own = {part: f"nodes.{part}" for part in _NODES}
     own |= {"embeddings": f"nodes.embeddings.{embeddings}", "features": f"nodes.features.{features}"}
@@ -132,11 +133,11 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _around(nodes: NodeLayer) -> np.ndarray:
-    """Extents relative to positions: a landmark's is the same to all sides."""
+    """Return extents relative to positions; those of a landmark are equal on all sides."""
     out: np.ndarray = nodes.extents - nodes.positions[:, None]
     return out
 
 
 def _is_around(nodes: NodeLayer) -> bool:
-    """Whether extents relative to positions lose nothing, as where both are rounded (`gsmap.describe.precision`)."""
+    """Return True if extents relative to positions are exact, as when both are rounded (`gsmap.describe.precision`)."""
     return bool((_around(nodes) + nodes.positions[:, None]).tobytes() == nodes.extents.tobytes())

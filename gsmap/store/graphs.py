@@ -1,4 +1,4 @@
-"""Scene graphs, kept under what they were made from and how (`RecipeKey`)."""
+"""Scene graphs, stored under their recipe and inputs (`RecipeKey`)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sqlalchemy import Connection, Row, Text, delete, insert, select, true, type
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
+from gsmap.store.array_groups import manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.arrays import Arrays, digest
-from gsmap.store.catalog import Catalog, later
-from gsmap.store.columns import a_direction, corrupt
-from gsmap.store.explained import NOT_KEPT, explained
+from gsmap.store.catalog import Catalog, next_timestamp
+from gsmap.store.column_types import corrupt_value, is_direction
+from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
-from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
-from gsmap.store.row_maps import RowMaps
+from gsmap.store.row_index_maps import RowIndexMaps
 from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import graphs, scenes
 from gsmap.types import SceneGraph
@@ -29,14 +29,14 @@ KIND = "graphs"
 
 @dataclass(frozen=True)
 class StoredGraph:
-    """What the catalog knows of a graph without reading it.
+    """A scene graph as recorded in the catalog, without its arrays.
 
     Args:
-        key: `RecipeKey.digest`; the keys of registrations name it.
+        key: `RecipeKey.digest`; keys of registrations include it.
         scene: scene id.
         layers: number of nodes by layer.
-        unit_m: metres per scene unit that were guessed.
-        up: (3,) against gravity in the scene's frame, or None.
+        unit_m: estimated metres per scene unit.
+        up: (3,) direction against gravity in the scene frame, or None.
         recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in maps that schema 0001 wrote.
     """
 
@@ -54,8 +54,8 @@ class StoredGraph:
 
 
 @dataclass(frozen=True)
-class GraphSays:
-    """What a graph says of its scene's frame; as in `StoredGraph`."""
+class GraphFrame:
+    """Scale and up direction of a scene frame as estimated by its graph; fields as in `StoredGraph`."""
 
     key: str
     scene: str
@@ -64,33 +64,33 @@ class GraphSays:
 
 
 class Graphs:
-    """The scene graphs of a map, of each scene one for every key that it was described under."""
+    """The scene graphs of a map, one per scene and recipe."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
-        self._rows = RowMaps(catalog, arrays)
-        self._said: dict[tuple[str, str], GraphSays] = {}  # by key and arrays, which do not change
+        self._rows = RowIndexMaps(catalog, arrays)
+        self._frames: dict[tuple[str, str], GraphFrame] = {}  # by key and array group; cached, since neither changes
 
     def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
-        """Keep a graph; another one under the same key takes its place, the same again mends damaged bytes.
+        """Store a graph, replacing one with the same key; saving the same one again repairs damaged arrays.
 
         Args:
-            key: its recipe; among its inputs is the scene.
+            key: its recipe; the scene must be among its inputs.
 
         Raises:
-            InputError: the key does not name the scene, so another scene's graph would have the same.
+            InputError: the scene is not among the inputs of the key.
         """
         if graph.scene_id not in key.inputs:
             raise InputError(
                 f"the key of a graph must name its scene {graph.scene_id} among its inputs", code="key_input_mismatch"
             )
-        arrays, about = to_arrays(self._whole(graph))
+        arrays, about = to_arrays(self._with_whole_members(graph))
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
         mine = graphs.c.key == key.digest
         staging = self._arrays.stage(arrays, KIND, group_id)
-        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+        with translate_errors(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             old = connection.execute(select(graphs).where(mine)).first()
             known = manifest(connection, group_id)
             if not known or self._arrays.problems(KIND, group_id, known):
@@ -101,26 +101,26 @@ class Graphs:
             connection.execute(delete(graphs).where(mine))
             if old is not None and self._is_damaged(connection, old.group_id):
                 unname(connection, old.group_id)
-            when = later(connection, graphs.c.created_at, graphs.c.scene == graph.scene_id)
-            made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": when}
+            when = next_timestamp(connection, graphs.c.created_at, graphs.c.scene == graph.scene_id)
+            made = {"recipe": recipes.save_recipe(connection, key), "group_id": group_id, "created_at": when}
             connection.execute(insert(graphs), row | made)
             return _stored(connection.execute(select(graphs).where(mine)).one())
 
     def find(self, key: RecipeKey | str) -> StoredGraph | None:
-        """The graph that is kept under a key (or its digest), without reading it; None where there is none."""
+        """Return the record of the graph with this key (or digest); None if there is none."""
         with self._catalog.read() as connection:
             row = connection.execute(select(graphs).where(graphs.c.key == recipes.digest_of(key))).first()
         return None if row is None else _stored(row)
 
     def load(self, ref: str, key: RecipeKey | str | None = None) -> SceneGraph | None:
-        """Read the graph of a scene under a key (or its digest), or the newest one; None where there is none.
+        """Load the graph of a scene with this key (or digest), or the newest one; None if there is none.
 
-        Its things have members among the scene's Gaussians as they are kept now. It has no things where these are of
-        Gaussians that cannot be told any more (`gsmap.store.row_maps`).
+        Segment members refer to the scene's Gaussians as stored now. Segments are left out if the row map of a thinned
+        scene is unknown (`gsmap.store.row_index_maps`).
 
         Raises:
             CorruptError: bytes on disk are missing or differ.
-            NotFoundError: no such scene, or others dropped and pruned the graph meanwhile.
+            NotFoundError: no such scene, or another process pruned the graph meanwhile.
         """
         with self._catalog.read() as connection:
             query = select(graphs).where(graphs.c.scene == resolve(connection, ref))
@@ -134,42 +134,42 @@ class Graphs:
         only = None if shapes is None else list(shapes)
         with unless_pruned(self._catalog, row.group_id, f"the graph of scene {row.scene[:12]} was dropped or replaced"):
             arrays = self._arrays.read(KIND, row.group_id, files, only=only, shapes=shapes)
-        return self._of_kept(from_arrays(row.scene, row.about, arrays))
+        return self._with_kept_members(from_arrays(row.scene, row.about, arrays))
 
-    def _whole(self, graph: SceneGraph) -> SceneGraph:
-        """A graph with things of the whole capture; see `gsmap.store.row_maps`."""
+    def _with_whole_members(self, graph: SceneGraph) -> SceneGraph:
+        """Convert segment members to rows of the whole capture; see `gsmap.store.row_index_maps`."""
         if graph.things is None:
             return graph
         members = self._rows.of(graph.scene_id).values_of_whole(graph.things.members, -1)
         return replace(graph, things=replace(graph.things, members=members))
 
-    def _of_kept(self, graph: SceneGraph) -> SceneGraph:
-        """`_whole` undone."""
+    def _with_kept_members(self, graph: SceneGraph) -> SceneGraph:
+        """Convert segment members to rows of the stored Gaussians: the inverse of `_with_whole_members`."""
         if graph.things is None:
             return graph
         members = self._rows.of(graph.scene_id).values_of_kept(graph.things.members)
         return replace(graph, things=None if members is None else replace(graph.things, members=members))
 
     def num_bytes(self, ref: str) -> int:
-        """Of the arrays of all graphs of a scene, as they were written."""
+        """Return the size of the arrays of all graphs of a scene, as written."""
         with self._catalog.read() as connection:
             made = select(graphs.c.group_id).where(graphs.c.scene == resolve(connection, ref)).distinct()
             return sum(num_bytes(connection, group) for group in connection.execute(made).scalars())
 
-    def kept(self, keys: Iterable[RecipeKey | str]) -> set[str]:
-        """Those of the keys (as digests) that a graph is kept under."""
+    def stored_keys(self, keys: Iterable[RecipeKey | str]) -> set[str]:
+        """Return those of the keys (as digests) that have a graph."""
         with self._catalog.read() as connection:
-            return recipes.kept(connection, graphs.c.key, keys)
+            return recipes.stored_keys(connection, graphs.c.key, keys)
 
     def damaged(self, keys: Iterable[RecipeKey | str]) -> set[str]:
-        """Those of the keys (as digests) whose graph differs from what was written; every byte of them is read."""
+        """Return those of the keys (as digests) whose graph differs from its digest; reads every byte."""
         wanted = {recipes.digest_of(key) for key in keys}
         with self._catalog.read() as connection:
             rows = connection.execute(select(graphs.c.key, graphs.c.group_id)).all()
             return {row.key for row in rows if row.key in wanted and self._is_damaged(connection, row.group_id)}
 
     def forget(self, keys: Iterable[RecipeKey | str]) -> None:
-        """Drop graphs; their arrays go with the next prune."""
+        """Delete graphs; the next prune reclaims their arrays."""
         mine = graphs.c.key.in_({recipes.digest_of(key) for key in keys})
         with self._catalog.write() as connection:
             group_ids = connection.execute(select(graphs.c.group_id).where(mine)).scalars().all()
@@ -181,59 +181,59 @@ class Graphs:
         return bool(self._arrays.problems(KIND, group_id, manifest(connection, group_id)))
 
     def groups(self) -> dict[str, str]:
-        """Scene by the group of each graph: names every graph as it is now."""
+        """Return the scene of every graph by the graph's array group."""
         query = select(graphs.c.group_id, graphs.c.scene)
         with self._catalog.read() as connection:
             return {row.group_id: row.scene for row in connection.execute(query)}
 
     def node_counts(self) -> dict[str, int]:
-        """How many nodes the newest graph of each living scene has, by scene id."""
+        """Return the number of nodes of the newest graph of each living scene, by scene id."""
         query = select(graphs.c.scene, graphs.c.num_nodes).join(scenes, scenes.c.id == graphs.c.scene)
         with self._catalog.read() as connection:
             rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at))
             return {row.scene: row.num_nodes for row in rows}
 
-    def says(self) -> list[GraphSays]:
-        """What the graphs of all living scenes say of their frames, oldest first.
+    def frames(self) -> list[GraphFrame]:
+        """Return the frame estimates of the graphs of all living scenes, oldest first.
 
-        An update asks this several times, so what was read once is remembered.
+        Results are cached, because an update needs them several times.
         """
         names = (type_coerce(graphs.c.key, Text), type_coerce(graphs.c.group_id, Text))  # to be compared with
-        alive = select(*names).join(scenes, scenes.c.id == graphs.c.scene)
-        query = alive.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at)
+        living = select(*names).join(scenes, scenes.c.id == graphs.c.scene)
+        query = living.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at)
         with self._catalog.read() as connection:
             wanted = [(key, group_id) for key, group_id in connection.execute(query).all()]
-            new = sorted(key for key, group_id in wanted if (key, group_id) not in self._said)
+            new = sorted(key for key, group_id in wanted if (key, group_id) not in self._frames)
             if new:
-                some = graphs.c.key.in_(new) if len(new) <= recipes.MOST_ASKED else true()
-                unread = select(graphs.c.key, graphs.c.scene, graphs.c.group_id, _TEXT).where(some)
+                some = graphs.c.key.in_(new) if len(new) <= recipes.MAX_NAMED_KEYS else true()
+                unread = select(graphs.c.key, graphs.c.scene, graphs.c.group_id, _ABOUT_TEXT).where(some)
                 for row in connection.execute(unread).all():
-                    if (row.key, row.group_id) not in self._said:
-                        self._said[row.key, row.group_id] = _says(row)
-        return [self._said[one] for one in wanted]
+                    if (row.key, row.group_id) not in self._frames:
+                        self._frames[row.key, row.group_id] = _parse_frame(row)
+        return [self._frames[one] for one in wanted]
 
     def list(self) -> list[StoredGraph]:
-        """The graphs of all living scenes, oldest first."""
+        """Return the graphs of all living scenes, oldest first."""
         query = select(graphs).join(scenes, scenes.c.id == graphs.c.scene).where(scenes.c.removed_at.is_(None))
         with self._catalog.read() as connection:
             return [_stored(row) for row in connection.execute(query.order_by(graphs.c.created_at))]
 
 
-_TEXT = type_coerce(graphs.c.about, Text).label("about")
-_BEGINS = re.compile(r'(\{"up":(?:null|\[[^][{}"]*\]),"unit_m":[^][{}",]+),')
+_ABOUT_TEXT = type_coerce(graphs.c.about, Text).label("about")
+_FRAME_JSON = re.compile(r'(\{"up":(?:null|\[[^][{}"]*\]),"unit_m":[^][{}",]+),')
 
 
-def _says(row: Row[Any]) -> GraphSays:
-    """From its text: what a graph is beside its arrays is a hundred numbers, of which the first four are asked for."""
+def _parse_frame(row: Row[Any]) -> GraphFrame:
+    """Parse the first two values of the metadata, without decoding the rest."""
     try:
-        begins = _BEGINS.match(row.about)
+        begins = _FRAME_JSON.match(row.about)
         about = json.loads(row.about if begins is None else f"{begins[1]}}}")
         up, unit_m = about["up"], about["unit_m"]
-        if isinstance(unit_m, (int, float)) and (up is None or a_direction(up)):
-            return GraphSays(row.key, row.scene, float(unit_m), None if up is None else tuple(up))
+        if isinstance(unit_m, (int, float)) and (up is None or is_direction(up)):
+            return GraphFrame(row.key, row.scene, float(unit_m), None if up is None else tuple(up))
     except (ValueError, TypeError, KeyError, RecursionError):
         pass
-    raise corrupt("graphs.about", row.about, "JSON of a graph")
+    raise corrupt_value("graphs.about", row.about, "JSON of a graph")
 
 
 def _stored(row: Row[Any]) -> StoredGraph:

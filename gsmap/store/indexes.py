@@ -1,4 +1,4 @@
-"""Segments of the indexes of graphs and of views, and what the first said of scenes. Losing it costs time only."""
+"""Segments of the indexes of graphs and of views, and the candidates found for scenes; all of it can be recomputed."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from sqlalchemy import Connection, Row, Text, delete, insert, select, type_coerce, update
 
 from gsmap.errors import CorruptError
+from gsmap.store.array_groups import manifest, publish, unless_pruned, unname
 from gsmap.store.arrays import Arrays, StoredFile, digest
-from gsmap.store.branches import Others
+from gsmap.store.branches import OtherCatalogs
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import manifest, publish, unless_pruned, unname
+from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.scene_refs import living_ids
 from gsmap.store.schema import index_segments, lookups
 from gsmap.types.retrieval import Candidate, IndexArrays, IndexedScene
@@ -24,12 +24,12 @@ KIND = "indexes"
 
 @dataclass(frozen=True, eq=False)
 class StoredSegment:
-    """A segment of an index, whose arrays are read when they are asked for.
+    """A segment of an inverted index, whose arrays are read on demand.
 
     Args:
         id: digest of its content.
-        members: its scenes; None in the place of one that does not count.
-        num_nodes: of all of them.
+        members: its scenes; None for an outdated member.
+        num_nodes: total number of nodes.
     """
 
     id: str
@@ -40,17 +40,17 @@ class StoredSegment:
     _catalog: Catalog
 
     def lists(self) -> tuple[np.ndarray, np.ndarray]:
-        """(W,) int64 keys of its lists, and (W + 1,) where each begins in the rows.
+        """Return (W,) int64 keys of the inverted lists, and (W + 1,) the row where each begins.
 
         Raises:
             CorruptError: bytes on disk are missing or differ.
-            NotFoundError: another process made it one with others meanwhile.
+            NotFoundError: another process merged the segment meanwhile.
         """
         found = self._read(("keys", "starts"), None)
         return found["keys"], found["starts"]
 
     def rows(self, start: int, stop: int) -> np.ndarray:
-        """(stop - start, B) uint8 nodes; see `lists` for the errors."""
+        """Return (stop - start, B) uint8 nodes; raises as `lists` does."""
         return self._read(("nodes",), [(start, stop)])["nodes"]
 
     def _read(self, names: Sequence[str], rows: Sequence[tuple[int, int]] | None) -> dict[str, np.ndarray]:
@@ -61,13 +61,13 @@ class StoredSegment:
 
 @dataclass(frozen=True)
 class Lookup:
-    """What an index said of a scene.
+    """Candidates that the index found for a scene.
 
     Args:
-        scene: its id.
-        key: `RecipeKey.digest` of how it was asked, and of the scene's graph.
+        scene: id of the query scene.
+        key: `RecipeKey.digest` of the query recipe and the scene's graph.
         candidates: best first.
-        num_left: how many of them were not tried when last there was enough; None until the list was gone down.
+        num_left: number of candidates left when the last registration run had enough edges; None before the first run.
     """
 
     scene: str
@@ -77,20 +77,20 @@ class Lookup:
 
 
 class Indexes:
-    """The indexes of a map, by their recipes, and the lookups in that of its graphs."""
+    """The indexes of a map by recipe, and the lookups in the index of graphs."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
 
     def segments(self, key: str) -> list[StoredSegment]:
-        """The segments that a recipe made, oldest first; nothing of their arrays is read."""
+        """Return the segments with this recipe, oldest first, without reading arrays."""
         query = select(index_segments).where(index_segments.c.key == key).order_by(index_segments.c.number)
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()
             return [self._segment(row, manifest(connection, row.group_id)) for row in rows]
 
-    def put(
+    def save_segment(
         self,
         key: str,
         members: Sequence[IndexedScene],
@@ -98,22 +98,22 @@ class Indexes:
         instead_of: Collection[str],
         beside: Collection[str] = (),
     ) -> bool:
-        """Keep a segment in place of others, whose arrays go; segments of recipes that are no longer used go as well.
+        """Store a segment in place of others, whose arrays are deleted, as are segments of unused recipes.
 
         Args:
             key: of the recipe.
-            instead_of: ids of the segments that it holds what counts of.
+            instead_of: ids of the segments whose valid members it contains.
             beside: recipes of the map's other indexes.
 
         Returns:
-            Whether it was kept: not where another process has replaced one of those meanwhile.
+            True if it was stored; False if another process replaced one of those segments meanwhile.
         """
-        told = [[m.scene, m.graph, m.upright, m.metric, float(m.coarseness)] for m in members]
-        group_id = digest(arrays.keys, arrays.starts, arrays.nodes, text=f"{key}{told}")
-        row = {"key": key, "members": told, "num_nodes": len(arrays.nodes), "group_id": group_id}
+        member_rows = [[m.scene, m.graph, m.upright, m.metric, float(m.coarseness)] for m in members]
+        group_id = digest(arrays.keys, arrays.starts, arrays.nodes, text=f"{key}{member_rows}")
+        row = {"key": key, "members": member_rows, "num_nodes": len(arrays.nodes), "group_id": group_id}
         content = {"keys": arrays.keys, "starts": arrays.starts, "nodes": arrays.nodes}
         staging = self._arrays.stage(content, KIND, group_id)
-        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+        with translate_errors(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             there = connection.execute(select(index_segments.c.group_id, index_segments.c.key)).all()
             if not set(instead_of) <= {old.group_id for old in there}:
                 return False
@@ -122,31 +122,31 @@ class Indexes:
             known = manifest(connection, group_id)
             if not known or self._arrays.problems(KIND, group_id, known):
                 publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
-            if group_id not in {old.group_id for old in there} - gone:  # another process has kept the same
+            if group_id not in {old.group_id for old in there} - gone:  # another process stored the same segment
                 connection.execute(insert(index_segments), row | {"created_at": now()})
         self._drop(dropped - {group_id})
         return True
 
     def forget(self, ids: Collection[str]) -> None:
-        """Drop segments: their scenes are put into the index anew when it is asked next."""
+        """Delete segments; their scenes are indexed again by the next query."""
         with self._catalog.write() as connection:
             dropped = self._unname(connection, ids)
         self._drop(dropped)
 
-    def asked(self) -> dict[str, tuple[str, int | None]]:
-        """By scene, the key of its lookup and how many of its candidates were not tried (`Lookup.num_left`)."""
+    def lookup_states(self) -> dict[str, tuple[str, int | None]]:
+        """Return by scene the key of its lookup and the number of candidates left (`Lookup.num_left`)."""
         columns = (type_coerce(lookups.c.scene, Text), type_coerce(lookups.c.key, Text), lookups.c.num_left)
-        with self._catalog.read() as connection:  # scenes and keys are only compared with
+        with self._catalog.read() as connection:  # scenes and keys are only compared
             return {scene: (key, left) for scene, key, left in connection.execute(select(*columns)).all()}
 
     def lookups(self, scenes: Collection[str]) -> list[Lookup]:
-        """What the index said of these scenes (ids), of those that have asked."""
+        """Return the stored lookups of these scenes (ids)."""
         query = select(lookups).where(lookups.c.scene.in_(sorted(scenes))).order_by(lookups.c.scene)
         with self._catalog.read() as connection:
             return [_lookup(row) for row in connection.execute(query)]
 
-    def note(self, found: Sequence[Lookup]) -> None:
-        """Keep what the index said, each in place of what it said of that scene before; removed scenes' go."""
+    def save_lookups(self, found: Sequence[Lookup]) -> None:
+        """Store lookups, replacing earlier ones of the same scenes; deletes lookups of removed scenes."""
         rows = [
             {
                 "scene": one.scene,
@@ -158,16 +158,16 @@ class Indexes:
             for one in found
         ]
         with self._catalog.write() as connection:
-            alive = living_ids(connection)
+            living = living_ids(connection)
             known = set(connection.execute(select(type_coerce(lookups.c.scene, Text))).scalars().all())
-            gone = sorted((known - set(alive)) | {one.scene for one in found} & known)
+            gone = sorted((known - set(living)) | {one.scene for one in found} & known)
             if gone:
                 connection.execute(delete(lookups).where(lookups.c.scene.in_(gone)))
-            if rows := [row for row in rows if row["scene"] in alive]:
+            if rows := [row for row in rows if row["scene"] in living]:
                 connection.execute(insert(lookups), rows)
 
-    def leave(self, num_left: Mapping[str, int]) -> None:
-        """Note how many of a scene's candidates were not tried, where that is not what is noted."""
+    def set_num_left(self, num_left: Mapping[str, int]) -> None:
+        """Update the numbers of candidates left where they changed."""
         with self._catalog.write() as connection:
             query = select(lookups.c.scene, lookups.c.num_left).where(lookups.c.scene.in_(sorted(num_left)))
             for row in connection.execute(query).all():
@@ -185,18 +185,18 @@ class Indexes:
 
     @staticmethod
     def _unname(connection: Connection, ids: Collection[str]) -> set[str]:
-        """Delete segments, and name their arrays no longer."""
+        """Delete segments and the rows of their groups."""
         connection.execute(delete(index_segments).where(index_segments.c.group_id.in_(sorted(ids))))
         for group_id in ids:
             unname(connection, group_id)
         return set(ids)
 
     def _drop(self, group_ids: Collection[str]) -> None:
-        """Delete arrays that no row names any more, unless a branch does. A crash before leaves them to `prune`."""
+        """Delete arrays that no row of any branch names; after a crash `prune` does so."""
         if not group_ids:
             return
-        others = Others(self._arrays.root.parent, self._catalog.folder)
-        with explained(self._catalog.folder), self._arrays.lock():
+        others = OtherCatalogs(self._arrays.root.parent, self._catalog.folder)
+        with translate_errors(self._catalog.folder), self._arrays.lock():
             with self._catalog.read() as connection:
                 free = [group for group in sorted(group_ids) if not manifest(connection, group)]
             for group in free:

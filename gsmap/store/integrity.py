@@ -1,4 +1,4 @@
-"""`check` reads every byte; `prune` reclaims what nothing names."""
+"""Verify every byte of a map (`check`) and reclaim what no row names (`prune`)."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from sqlalchemy import Connection, delete, not_, select, text, update
 from gsmap.durable import is_file, is_folder, remove_file
 from gsmap.errors import ConfigError, DiskFullError, GsmapError, StoreError
 from gsmap.store import sqlite, staging
+from gsmap.store.array_groups import manifest
 from gsmap.store.arrays import Arrays, StoredFile
-from gsmap.store.branches import Others, bury_leftovers, strangers
+from gsmap.store.branches import OtherCatalogs, remove_leftovers, unknown_entries
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.change_rows import KIND as CHANGES
 from gsmap.store.change_rows import newest_of_all
-from gsmap.store.explained import PRUNE_MAY, explained
-from gsmap.store.groups import manifest
+from gsmap.store.error_translation import PRUNE_MAY, translate_errors
 from gsmap.store.indexes import KIND as INDEXES
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.objects import forget_sets
 from gsmap.store.photos import KIND as PHOTOS
 from gsmap.store.photos import claimed_groups
-from gsmap.store.revisions import forget_dropped, named_by_kept
+from gsmap.store.revisions import forget_dropped, scenes_in_kept_revisions
 from gsmap.store.schema import (
     CHUNK_BOXES,
     comparisons,
@@ -47,20 +47,20 @@ from gsmap.store.view_features import KIND as VIEWS
 from gsmap.types.progress import Progress
 
 _WORTH_BYTES = 64 << 10
-_WORTH_SHARE = 0.05  # of the file: less stays for rows to come
+_WORTH_SHARE = 0.05  # of the file: smaller free space is kept for new rows
 _log = logging.getLogger("gsmap.store")
-_AGAIN = "what was to be reclaimed and is still there goes with the next prune"
+_RECLAIM_LATER = "what was to be reclaimed and is still there goes with the next prune"
 
 
 @dataclass(frozen=True)
-class Check:
-    """What `check` found.
+class CheckResult:
+    """Result of `check`.
 
     Args:
         problems: one line each; empty for a sound map.
-        orphans: folders that no row names (a crash left them; `prune` removes them); no harm.
-        num_groups, num_bytes: what was read.
-        unverified: what cannot be compared with what was written, and why.
+        orphans: harmless groups without a row, left by a crash; `prune` removes them.
+        num_groups, num_bytes: amount read.
+        unverified: parts that cannot be verified, with the reason.
     """
 
     problems: tuple[str, ...]
@@ -75,15 +75,15 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Pruned:
-    """What `prune` reclaimed (or would).
+class PruneResult:
+    """Amount that `prune` reclaimed, or would reclaim.
 
     Args:
-        scenes: names of removed scenes whose arrays were dropped.
-        revisions: numbers that can no longer be exported in full.
-        num_graphs, num_orphans, num_models: graphs, folders without a row, and copies of models that were forgotten.
-        num_bytes: on disk, of all of these, of replaced graphs, and of what dead writers left; and by how much the
-            catalog's file shrank, which no dry run knows.
+        scenes: names of removed scenes whose arrays were deleted.
+        revisions: numbers of revisions that can no longer be exported.
+        num_graphs, num_orphans, num_models: numbers of deleted graphs, groups without a row, and model copies.
+        num_bytes: bytes on disk of all of these, of replaced graphs, of leftovers of killed writers, and by which the
+            catalog file shrank (not in a dry run).
         dry_run: nothing was changed.
     """
 
@@ -103,12 +103,12 @@ def check(
     *,
     read: set[tuple[str, tuple[StoredFile, ...]]] | None = None,
     location: str | None = None,
-) -> Check:
-    """Read every byte of the map and compare it with what was written; see `Check`.
+) -> CheckResult:
+    """Read every byte of the map and compare it with its digests.
 
     Args:
-        read: groups that are known to be as this manifest says, and need not be read again; those that are, are added.
-        location: what opens the map for writing, to name in advice; None for one that cannot be written.
+        read: groups with manifests already verified, which are not read again; verified groups are added.
+        location: string that opens the map for writing, for advice; None for a read-only map.
     """
     read = set() if read is None else read
     home = arrays.root.parent
@@ -117,14 +117,15 @@ def check(
         manifests = {group: manifest(connection, group) for group in named}
         unread = {group: kind for group, kind in named.items() if (group, manifests[group]) not in read}
         problems = _row_problems(connection, arrays)
-        spare = {group for _, group in _waste(connection, None).doomed}
+        spare = {group for _, group in _find_garbage(connection, None).groups}
         if catalog.is_sqlite:
             problems += sqlite.integrity_problems(connection)
-    problems += [f"{arrays.url}/{name} does not belong there: remove it" for name in arrays.strangers()]
+    problems += [f"{arrays.url}/{name} does not belong there: remove it" for name in arrays.unknown_entries()]
     problems += [
-        f"{home / name} is no branch: put back what it lacks, or move it out of the map" for name in strangers(home)
+        f"{home / name} is no branch: put back what it lacks, or move it out of the map"
+        for name in unknown_entries(home)
     ]
-    problems += _odd_models(home)
+    problems += _model_entry_problems(home)
     if catalog.is_sqlite:
         problems += catalog.page_problems()
     unverified = tuple(catalog.unverified())
@@ -132,41 +133,41 @@ def check(
         if progress:
             progress(i / len(unread), f"{kind}/{group[:12]}")
         if group in spare and not arrays.exists(kind, group):
-            continue  # a prune on a full disk was interrupted: nothing claims it
+            continue  # an interrupted prune on a full disk deleted it
         found = arrays.problems(kind, group, manifests[group])
         if not found:
             read.add((group, manifests[group]))
-        if found:  # unless it was pruned or mended meanwhile
+        if found:  # re-read the manifest: it may have been pruned or repaired meanwhile
             with catalog.read() as connection:
                 if manifest(connection, group) == manifests[group]:
                     helps = _advice(connection, kind, group, location)
                     problems += [problem + helps for problem in found]
     try:
-        named_by_any = named.items() | {(group, kind) for kind, group in Others(home, catalog.folder).groups()}
+        named_by_any = named.items() | {(group, kind) for kind, group in OtherCatalogs(home, catalog.folder).groups()}
         orphans = tuple(f"{kind}/{name}" for kind, name in arrays.groups() if (name, kind) not in named_by_any)
-    except StoreError:  # a branch that cannot be read may need any of them; who checks the map is told of it
+    except StoreError:  # an unreadable branch may need any of them; reported as a problem of that branch
         orphans = ()
-    if strangers(home):
+    if unknown_entries(home):
         orphans = ()
     num_bytes = sum(f.size_bytes for group in unread for f in manifests[group])
     if progress:
         progress(1.0, "checked")
-    return Check(tuple(problems), orphans, len(unread), num_bytes, unverified)
+    return CheckResult(tuple(problems), orphans, len(unread), num_bytes, unverified)
 
 
-def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
-    """Reclaim the arrays of removed scenes that no kept revision names, their graphs, and what crashes left.
+def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> PruneResult:
+    """Reclaim the arrays of removed scenes that no kept revision uses, their graphs, and leftovers of crashes.
 
-    What another branch or tag of the map names stays, whichever of them is pruned.
+    What another branch or tag of the map names stays.
 
     Args:
-        keep_revisions: keep only this many of the newest; of older ones only their line in the list is left. None:
-            all. The newest poses stay in any case.
-        dry_run: only say what would go (also of a map that was opened for reading).
+        keep_revisions: number of newest revisions to keep; of older ones only the entry in the list stays. Default:
+            all. The newest poses always stay.
+        dry_run: only compute the result; also for a read-only map.
 
     Raises:
         ConfigError: a negative number of revisions.
-        DiskFullError: even what could be reclaimed first did not make the room that rows need.
+        DiskFullError: deleting unnamed groups did not free the space that row changes need.
     """
     if keep_revisions is not None and keep_revisions < 0:
         raise ConfigError(
@@ -174,36 +175,36 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
         )
     try:
         return _prune(catalog, arrays, keep_revisions, dry_run)
-    except DiskFullError as error:  # no advice to do what is being done
+    except DiskFullError as error:  # the advice to prune makes no sense here
         raise DiskFullError(str(error).replace(PRUNE_MAY, "")) from error
 
 
-def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run: bool) -> Pruned:
-    others = verified(catalog, arrays)  # before anything is changed
+def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run: bool) -> PruneResult:
+    others = verify_catalogs(catalog, arrays)  # before any change
     with contextlib.nullcontext() if dry_run else catalog.lock():
         with catalog.read() as connection:
-            waste = _waste(connection, keep_revisions)
-            spare = _waste(connection, None).doomed
-        # What no row names goes first: on a full disk that makes the room that rows need.
-        orphans = _reclaim(catalog, arrays, others, dry_run=dry_run, besides=waste.doomed if dry_run else ())
+            garbage = _find_garbage(connection, keep_revisions)
+            spare = _find_garbage(connection, None).groups
+        # Delete unnamed groups first: on a full disk that frees the space that row changes need.
+        orphans = _reclaim(catalog, arrays, others, dry_run=dry_run, besides=garbage.groups if dry_run else ())
         num_bytes = orphans.num_bytes
         if not dry_run:
             try:
-                _drop_rows(catalog, waste)
-            except DiskFullError:  # then what nothing claims whatever is kept, which `check` does not miss
-                with explained(catalog.folder, _AGAIN), arrays.lock():
+                _drop_rows(catalog, garbage)
+            except DiskFullError:  # delete groups that are garbage whatever is kept; `check` does not report them
+                with translate_errors(catalog.folder, _RECLAIM_LATER), arrays.lock():
                     for group in set(spare) - others.groups():
                         num_bytes += arrays.size_bytes(*group)
                         arrays.drop(*group)
-                _drop_rows(catalog, waste)
-            # The rows are gone for good: a crash from here on leaves orphans for the next prune of any branch.
+                _drop_rows(catalog, garbage)
+            # The rows are deleted: a crash from here on leaves orphans for the next prune of any branch.
             num_bytes += _reclaim(catalog, arrays, others).num_bytes
             num_bytes += _give_back(catalog)
-    return Pruned(
-        scenes=tuple(name for name, _ in waste.scenes),
-        revisions=tuple(waste.revisions),
-        num_graphs=len(waste.graphs),
-        num_orphans=len(set(orphans.groups) - set(waste.doomed)),
+    return PruneResult(
+        scenes=tuple(name for name, _ in garbage.scenes),
+        revisions=tuple(garbage.revisions),
+        num_graphs=len(garbage.graphs),
+        num_orphans=len(set(orphans.groups) - set(garbage.groups)),
         num_models=orphans.num_models,
         num_bytes=num_bytes,
         dry_run=dry_run,
@@ -211,75 +212,75 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
 
 
 def _give_back(catalog: Catalog) -> int:
-    """Give the room of rows that are gone back to the disk, where it is worth it. (A server does so by itself.)
+    """Shrink the catalog file if enough of it is unused; a server does so by itself.
 
     Returns:
-        By how many bytes the catalog's file is smaller.
+        By how many bytes the file shrank.
     """
     if not catalog.is_sqlite:
         return 0
     file = catalog.folder / sqlite.FILE
     try:
-        with explained(catalog.folder):
+        with translate_errors(catalog.folder):
             before = file.stat().st_size
             if sqlite.num_free_bytes(catalog.engine) > max(_WORTH_BYTES, _WORTH_SHARE * before):
                 sqlite.vacuum(catalog.engine, file)
             return max(0, before - file.stat().st_size)
-    except StoreError as error:  # a full disk, or a reader: what is gone is gone, and its room is used again
+    except StoreError as error:  # a full disk, or a reader: the free space inside the file is reused
         _log.warning("%s keeps the room of what was dropped: %s", sqlite.FILE, error)
         return 0
 
 
 @dataclass(frozen=True)
-class Reclaimed:
-    """What no row of any catalog named: (kind, id) of groups, copies of models, and the bytes of all of it."""
+class ReclaimResult:
+    """Groups (kind, id) that no row of any catalog named, number of model copies, and bytes of all of these."""
 
     groups: tuple[tuple[str, str], ...]
     num_models: int
     num_bytes: int
 
 
-def verified(catalog: Catalog, arrays: Arrays) -> Others:
-    """The other catalogs over the same arrays, every page of them and of this one compared with what was written.
+def verify_catalogs(catalog: Catalog, arrays: Arrays) -> OtherCatalogs:
+    """Verify every page of this and the other catalogs over the same arrays, and return the others.
 
     Raises:
-        CorruptError: one of them is damaged, and may need arrays that it does not seem to name.
-        StoreError: one cannot be read, or something among the branches is none.
+        CorruptError: a catalog is damaged, and may need arrays that it does not seem to name.
+        StoreError: a catalog cannot be read, or an entry of the branches folder is not a branch.
     """
-    others = Others(arrays.root.parent, catalog.folder)
+    others = OtherCatalogs(arrays.root.parent, catalog.folder)
     catalog.verify(whole=True)
     others.verify()
     others.groups()
     return others
 
 
-def reclaim(catalog: Catalog, arrays: Arrays) -> Reclaimed:
-    """Delete the arrays and models that no row of the map or of any of its branches names, and what crashes left.
+def reclaim(catalog: Catalog, arrays: Arrays) -> ReclaimResult:
+    """Delete arrays and models that no row of the map or its branches names, and leftovers of crashes.
 
     Raises:
-        CorruptError, StoreError: as `verified`; nothing was deleted.
+        CorruptError, StoreError: as `verify_catalogs`; nothing was deleted.
     """
-    return _reclaim(catalog, arrays, verified(catalog, arrays))
+    return _reclaim(catalog, arrays, verify_catalogs(catalog, arrays))
 
 
 def _reclaim(
     catalog: Catalog,
     arrays: Arrays,
-    others: Others,
+    others: OtherCatalogs,
     *,
     dry_run: bool = False,
     besides: Collection[tuple[str, str]] = (),
-) -> Reclaimed:
-    """See `reclaim`.
+) -> ReclaimResult:
+    """Reclaim as `reclaim` does, with verified catalogs.
 
     Args:
-        dry_run: only say what would go.
-        besides: groups that rows name and that go all the same.
+        dry_run: only compute the result.
+        besides: groups to delete although rows name them.
     """
     home = arrays.root.parent
-    with explained(catalog.folder, _AGAIN), contextlib.nullcontext() if dry_run else arrays.lock():
+    with translate_errors(catalog.folder, _RECLAIM_LATER), contextlib.nullcontext() if dry_run else arrays.lock():
         forgotten = _forgotten_models(catalog, others, home)
-        # Asked under the lock of the arrays: nobody comes to name any of them from here on.
+        # Read under the lock of the arrays: no process can name a group from here on.
         with catalog.read() as connection:
             known = {(g.kind, g.id) for g in connection.execute(select(groups))}
         named = known - set(besides) | others.groups()
@@ -290,45 +291,45 @@ def _reclaim(
         if not dry_run:
             for group in bodies:
                 arrays.drop(*group)
-            arrays.drop_models(_standing_models(catalog, others))
+            arrays.delete_models(_current_models(catalog, others))
             for path in forgotten:
                 remove_file(home, FOLDER, path.name)
             for name in abandoned:
                 remove_file(catalog.folder, name)
-            bury_leftovers(home)
+            remove_leftovers(home)
         num_bytes += arrays.drop_leftovers(dry_run=dry_run)
-    return Reclaimed(tuple(bodies), len(forgotten), num_bytes)
+    return ReclaimResult(tuple(bodies), len(forgotten), num_bytes)
 
 
 @dataclass(frozen=True)
-class _Waste:
-    """What may go.
+class _Garbage:
+    """Rows and groups that may be deleted.
 
     Args:
-        revisions: numbers of those that are not kept.
-        scenes: names and numbers of removed scenes that no kept revision names.
+        revisions: numbers of the revisions that are not kept.
+        scenes: names and numbers of removed scenes with arrays that no kept revision uses.
         graphs: keys of their graphs.
-        lost: ids of all scenes that are removed and that no kept revision names.
-        doomed: kinds and names of the groups that nothing claims then.
+        lost: ids of all removed scenes that no kept revision uses.
+        groups: kinds and names of the groups without a referrer afterwards.
     """
 
     revisions: list[int]
     scenes: list[tuple[str, int]]
     graphs: list[str]
     lost: set[str]
-    doomed: list[tuple[str, str]]
+    groups: list[tuple[str, str]]
 
 
-def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
+def _find_garbage(connection: Connection, keep_revisions: int | None) -> _Garbage:
     dropped = _revisions_to_drop(connection, keep_revisions)
-    named = named_by_kept(after=max(dropped, default=0))
+    named = scenes_in_kept_revisions(after=max(dropped, default=0))
     gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
     of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
     dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None)))
     keys = connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars()
     claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
     claimed |= set(connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars())
-    # Of a pair the newest comparison counts, as long as both of its scenes can be read.
+    # The newest comparison of a pair is current while both of its scenes have arrays.
     lost = set(connection.execute(select(scenes.c.id).where(gone)).scalars())
     claimed |= {row.group_id for row in newest_of_all(connection) if not {row.older, row.newer} & lost}
     claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
@@ -336,7 +337,7 @@ def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
     claimed |= set(connection.execute(views).scalars())
     claimed |= claimed_groups(connection, lost)
     known = {(g.kind, g.id) for g in connection.execute(select(groups))}
-    return _Waste(
+    return _Garbage(
         dropped,
         [(row.name, row.number) for row in dead],
         list(keys),
@@ -345,17 +346,17 @@ def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
     )
 
 
-def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
-    ids = [group for _, group in waste.doomed]
+def _drop_rows(catalog: Catalog, garbage: _Garbage) -> None:
+    ids = [group for _, group in garbage.groups]
     with catalog.write() as connection:
-        connection.execute(update(revisions).where(revisions.c.number.in_(waste.revisions)).values(dropped_at=now()))
+        connection.execute(update(revisions).where(revisions.c.number.in_(garbage.revisions)).values(dropped_at=now()))
         forget_dropped(connection)
-        connection.execute(delete(graphs).where(graphs.c.key.in_(waste.graphs)))
-        forget_sets(connection, waste.lost)
+        connection.execute(delete(graphs).where(graphs.c.key.in_(garbage.graphs)))
+        forget_sets(connection, garbage.lost)
         connection.execute(delete(view_features).where(view_features.c.group_id.in_(ids)))
         for table in (scenes, comparisons, photo_sightings):
             connection.execute(update(table).where(table.c.group_id.in_(ids)).values(group_id=None))
-        for _, number in waste.scenes:
+        for _, number in garbage.scenes:
             boxes = text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
             connection.execute(boxes, {"s": number})
         connection.execute(delete(files).where(files.c.group_id.in_(ids)))
@@ -363,7 +364,7 @@ def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
 
 
 def _advice(connection: Connection, kind: str, group: str, location: str | None) -> str:
-    """What a damaged group is of, and what makes it whole; empty where the message says so already."""
+    """Return advice for a damaged group: its purpose and how to recompute it; empty if the message has it already."""
     if kind == CHANGES:
         return _comparison_advice(connection, group, location)
     if kind == INDEXES:
@@ -411,7 +412,7 @@ def _row_problems(connection: Connection, arrays: Arrays) -> list[str]:
         try:
             path = model_path(home, row)
             if row.copied:
-                arrays.bring_model(row.path)
+                arrays.fetch_model(row.path)
             opened = open_model(home, row)
         except FileNotFoundError as error:
             out.append(f"model {row.name} is missing: {error.filename}")
@@ -426,32 +427,32 @@ def _row_problems(connection: Connection, arrays: Arrays) -> list[str]:
 
 
 def _revisions_to_drop(connection: Connection, keep: int | None) -> list[int]:
-    """Numbers to drop now: the oldest of those that are kept."""
+    """Return the numbers of the oldest kept revisions that exceed the limit."""
     query = select(revisions.c.number).where(revisions.c.dropped_at.is_(None)).order_by(revisions.c.number)
     numbers = list(connection.execute(query).scalars())
     return [] if keep is None else numbers[: max(0, len(numbers) - max(keep, 0))]
 
 
-def _standing_models(catalog: Catalog, others: Others) -> set[str]:
-    """Paths of the models that any catalog names."""
+def _current_models(catalog: Catalog, others: OtherCatalogs) -> set[str]:
+    """Return the paths of the models that any catalog names."""
     with catalog.read() as connection:
-        standing = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
-    return standing | others.models()
+        current = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
+    return current | others.models()
 
 
-def _forgotten_models(catalog: Catalog, others: Others, home: Path) -> list[Path]:
-    """Copies of models that no row of any catalog names any more. What is no plain file is no copy of ours."""
-    standing = _standing_models(catalog, others)
-    return [path for path in _in_models(home) if is_file(path) and f"{FOLDER}/{path.name}" not in standing]
+def _forgotten_models(catalog: Catalog, others: OtherCatalogs, home: Path) -> list[Path]:
+    """Return model copies that no row of any catalog names; other entries are not gsmap's."""
+    current = _current_models(catalog, others)
+    return [path for path in _model_entries(home) if is_file(path) and f"{FOLDER}/{path.name}" not in current]
 
 
-def _odd_models(home: Path) -> list[str]:
+def _model_entry_problems(home: Path) -> list[str]:
     place = home / FOLDER
     if os.path.lexists(place) and not is_folder(place):
         return [f"{place} is no folder (a link, perhaps): put a folder in its place"]
-    return [f"{path} does not belong there: remove it" for path in _in_models(home) if not is_file(path)]
+    return [f"{path} does not belong there: remove it" for path in _model_entries(home) if not is_file(path)]
 
 
-def _in_models(home: Path) -> list[Path]:
+def _model_entries(home: Path) -> list[Path]:
     place = home / FOLDER
     return sorted(place.iterdir()) if is_folder(place) else []

@@ -1,12 +1,12 @@
-"""The one way in which gsmap lays arrays out as zarr, checked before anything is unpacked.
+"""The zarr layout of gsmap's arrays, validated before anything is decompressed.
 
-zarr would run whatever codec a file names, make an array of whatever shape it claims, and unpack whatever lies in a
-chunk. A map may come from a stranger, so what differs from what `gsmap.store.arrays` writes is refused first: other
-codecs, chunks that are missing or would not unpack to their size, shapes that the catalog contradicts, arrays far
-larger than anything real packs to. What is left to do then is to unpack zstd frames, which zarr is not needed for (it
-would take a millisecond an array).
+zarr would run any codec that a file names, allocate any shape it claims, and decompress any chunk. A map may come from
+an untrusted source, so everything that differs from what `gsmap.store.arrays` writes is rejected first: other codecs,
+missing chunks, chunks of other sizes, shapes that contradict the catalog, and arrays far larger than real data compress
+to. What is left is decompressing zstd frames, which needs no zarr (zarr would take a millisecond per array).
 
-A group is one archive (`gsmap.store.packed`); in maps of schema 0006 and older it is a folder of a file for every key.
+A group is one archive (`gsmap.store.array_archive`); in maps of schema 0006 and older it is a folder with one file per
+key.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from gsmap.errors import CorruptError
-from gsmap.store import packed
-from gsmap.store.packed import Span
+from gsmap.store import array_archive
+from gsmap.store.array_archive import ByteRange
 
 CHUNK_ROWS = 16_384
 _SHARD_ROWS = 16 * CHUNK_ROWS  # in groups that are folders
@@ -38,50 +38,50 @@ _MAY_HAVE = _KEYS | {"attributes", "storage_transformers", "dimension_names"}
 _CHUNK_KEYS = {"name": "default", "configuration": {"separator": "/"}}
 _MAX_METADATA_BYTES = 1 << 16
 _MAX_DIMENSIONS = 4
-# Real Gaussians pack to a tenth; these say from where on it is an attack on memory, not a scene.
+# Real Gaussians compress to a tenth; beyond these limits a file is taken for a decompression bomb.
 _MAX_PACKED = 1_000
 _ALWAYS_ALLOWED_BYTES = 256 << 20
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _MAX_FRAME_HEADER = 18
 
 
-class Reader(Protocol):
-    """Bytes of the files of one group, wherever it lies."""
+class FileReader(Protocol):
+    """Access to the bytes of the files of one group, on disk or in an object store."""
 
     def read(self, file: str, start: int, stop: int) -> bytes:
-        """The bytes ``[start, stop)`` of a file; fewer where it is shorter."""
+        """Read the bytes ``[start, stop)`` of a file; fewer if it is shorter."""
 
     def expect(self, file: str, ranges: Sequence[Range]) -> None:
-        """These ranges of a file are read next: where every read is a request, a few larger ones do."""
+        """Announce ranges that are read next, so that they can be fetched in few requests."""
 
 
-class Body:
-    """The keys of a group and where their bytes are.
+class GroupReader:
+    """The keys of a group and the ranges of their bytes.
 
     Args:
-        at: the group, for messages.
-        kind: of it, for advice.
-        sizes: bytes of every file of the group; each is a plain file of that size.
+        at: name of the group for messages.
+        kind: of the group, for advice.
+        sizes: size of every file of the group; each is a plain file of that size.
 
     Raises:
         CorruptError: the group is an archive that gsmap did not write.
     """
 
-    def __init__(self, at: str, kind: str, sizes: Mapping[str, int], reader: Reader) -> None:
+    def __init__(self, at: str, kind: str, sizes: Mapping[str, int], reader: FileReader) -> None:
         self.at = at
         self.kind = kind
         self.num_bytes = sum(sizes.values())
         self._reader = reader
-        self.keys: Mapping[str, Span] = {path: Span(path, 0, size) for path, size in sizes.items()}
-        if set(sizes) == {packed.FILE}:
-            size = sizes[packed.FILE]
-            reader.expect(packed.FILE, [(max(0, size - packed.TAIL_BYTES), size)])
-            with self._explained(at):
-                self.keys = packed.members(
-                    size, lambda start, stop: self._bytes(Span(packed.FILE, start, stop - start))
+        self.keys: Mapping[str, ByteRange] = {path: ByteRange(path, 0, size) for path, size in sizes.items()}
+        if set(sizes) == {array_archive.FILE}:
+            size = sizes[array_archive.FILE]
+            reader.expect(array_archive.FILE, [(max(0, size - array_archive.TAIL_BYTES), size)])
+            with self._translate_errors(at):
+                self.keys = array_archive.read_members(
+                    size, lambda start, stop: self._bytes(ByteRange(array_archive.FILE, start, stop - start))
                 )
 
-    def _bytes(self, span: Span) -> bytes:
+    def _bytes(self, span: ByteRange) -> bytes:
         found = self._reader.read(span.file, span.start, span.start + span.size)
         if len(found) != span.size:
             raise ValueError(f"{span.file} is shorter than it was")
@@ -104,46 +104,46 @@ class Body:
         return sorted(above for above, _, name in found if name == "zarr.json" and above)
 
     @contextmanager
-    def _explained(self, at: str) -> Iterator[None]:
+    def _translate_errors(self, at: str) -> Iterator[None]:
         try:
             yield
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, struct.error) as error:
-            said = str(error) if type(error) is ValueError else f"its zarr metadata makes no sense ({error!r})"
+            problem = str(error) if type(error) is ValueError else f"its zarr metadata makes no sense ({error!r})"
             raise CorruptError(
-                f"{at}: {said}; gsmap did not write that: {mend(self.kind)}", code="arrays_corrupt"
+                f"{at}: {problem}; gsmap did not write that: {repair_advice(self.kind)}", code="arrays_corrupt"
             ) from error
 
-    def laid_out(
+    def check_arrays(
         self, names: Collection[str], shapes: Mapping[str, Shape] | None = None, *, heads: bool = False
-    ) -> dict[str, Array]:
-        """How arrays are laid out; refused where gsmap did not write them so. Almost nothing is read.
+    ) -> dict[str, ArrayLayout]:
+        """Validate the layout of arrays and return it; reads hardly any data.
 
         Args:
-            names: of the arrays to be read.
-            shapes: what is known of the shapes of some; None for a length that is not.
-            heads: also look at what each chunk says it unpacks to, as `Array.read` does.
+            names: of the arrays.
+            shapes: known shapes of some arrays; None for an unknown length.
+            heads: also validate the decompressed size in the header of each chunk, as `ArrayLayout.read` does.
 
         Raises:
-            CorruptError: with the array, and what is wrong.
+            CorruptError: an array has a layout that gsmap does not write.
         """
         out = {}
-        with self._explained(self.at):
+        with self._translate_errors(self.at):
             group = self.metadata("zarr.json")
             if group.get("node_type") != "group" or group.get("zarr_format") != 3 or group.get("consolidated_metadata"):
                 raise ValueError("it is not a plain zarr v3 group")
         for name in names:
-            with self._explained(f"{self.at}/{name}"):
+            with self._translate_errors(f"{self.at}/{name}"):
                 array = out[name] = self._array(name, (shapes or {}).get(name))
                 if heads:
                     for frame in array.frames:
                         array.check_head(self._bytes(replace(frame, size=min(frame.size, _MAX_FRAME_HEADER))))
         total = sum(array.num_bytes for array in out.values())
-        with self._explained(self.at):
+        with self._translate_errors(self.at):
             if total > _ALWAYS_ALLOWED_BYTES + _MAX_PACKED * self.num_bytes:
                 raise ValueError(f"its arrays would take {total:.3g} bytes, far more than such files can hold")
         return out
 
-    def _array(self, name: str, known: Shape | None) -> Array:
+    def _array(self, name: str, known: Shape | None) -> ArrayLayout:
         about = self.metadata(f"{name}/zarr.json")
         if not _KEYS <= set(about) <= _MAY_HAVE or about["node_type"] != "array" or about["zarr_format"] != 3:
             raise ValueError("it is not a plain zarr v3 array")
@@ -152,20 +152,20 @@ class Body:
         shape, kind = about["shape"], about["data_type"]
         if not isinstance(kind, str) or kind not in _ITEM_BYTES:
             raise ValueError(f"its values are {kind!r}, not plain numbers")
-        if not _lengths(shape, least=0) or not 1 <= len(shape) <= _MAX_DIMENSIONS:
+        if not _are_lengths(shape, least=0) or not 1 <= len(shape) <= _MAX_DIMENSIONS:
             raise ValueError(f"its shape is {shape!r}")
-        if known is not None and not _same(shape, known):
+        if known is not None and not _matches(shape, known):
             wanted = ", ".join("any" if length is None else str(length) for length in known)
             raise ValueError(f"its shape is {shape}, but the catalog says ({wanted})")
         grid = about["chunk_grid"]
         outer = grid["configuration"]["chunk_shape"]
-        inner, sharded = _chunks_in(about["codecs"], outer)
+        inner, sharded = _inner_chunks(about["codecs"], outer)
         rows = [max(1, length) for length in shape[1:]]
-        if grid["name"] != "regular" or not all(_lengths(c, least=1) and c[1:] == rows for c in (outer, inner)):
+        if grid["name"] != "regular" or not all(_are_lengths(c, least=1) and c[1:] == rows for c in (outer, inner)):
             raise ValueError(f"its chunks {outer!r} are not rows")
         if inner[0] > CHUNK_ROWS or outer[0] > _SHARD_ROWS or outer[0] % inner[0]:
             raise ValueError(f"its chunks {inner} in {outer} are not of gsmap's sizes")
-        out = Array(tuple(shape), np.dtype(kind), inner[0], [])
+        out = ArrayLayout(tuple(shape), np.dtype(kind), inner[0], [])
         if not out.num_bytes:
             return out
         files = -(-shape[0] // outer[0])
@@ -184,20 +184,20 @@ class Body:
             out.frames.extend(self._in_shard(span, used, outer[0] // inner[0]))
         return out
 
-    def _in_shard(self, span: Span, used: int, count: int) -> list[Span]:
-        """The frames of the first ``used`` of a shard's ``count`` chunks."""
+    def _in_shard(self, span: ByteRange, used: int, count: int) -> list[ByteRange]:
+        """Return the frames of the first ``used`` of a shard's ``count`` chunks."""
         end = span.size - 16 * count - 4
-        index = self._bytes(Span(span.file, span.start + end, 16 * count)) if end > 0 else b""
+        index = self._bytes(ByteRange(span.file, span.start + end, 16 * count)) if end > 0 else b""
         places = list(struct.iter_unpack("<QQ", index))[:used]
         if len(places) < used or any(start + length > end for start, length in places):
             raise ValueError(f"{span.file.rpartition('/')[2]} of its shards lacks chunks")
-        return [Span(span.file, span.start + start, length) for start, length in places]
+        return [ByteRange(span.file, span.start + start, length) for start, length in places]
 
-    def read(self, arrays: Mapping[str, Array], rows: Sequence[Range] | None = None) -> dict[str, np.ndarray]:
-        """Rows of arrays that `laid_out` found sound: ranges ``[start, stop)`` in order, all where None.
+    def read(self, arrays: Mapping[str, ArrayLayout], rows: Sequence[Range] | None = None) -> dict[str, np.ndarray]:
+        """Read rows of arrays that `check_arrays` validated: ranges ``[start, stop)`` in order, default: all.
 
         Raises:
-            CorruptError: a chunk fails its checksum, or unpacks to other than its size.
+            CorruptError: a chunk fails its checksum, or has another decompressed size.
         """
         wanted: dict[str, list[Range]] = {}
         for array in arrays.values():
@@ -207,23 +207,23 @@ class Body:
             self._reader.expect(file, ranges)
         out = {}
         for name, array in arrays.items():
-            with self._explained(f"{self.at}/{name}"):
+            with self._translate_errors(f"{self.at}/{name}"):
                 out[name] = array.read(self._bytes, rows)
         return out
 
 
 @dataclass(frozen=True)
-class Array:
-    """How one array is laid out: a zstd frame for every ``chunk_rows`` rows."""
+class ArrayLayout:
+    """The validated layout of an array: a zstd frame for every ``chunk_rows`` rows."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
     chunk_rows: int
-    frames: list[Span]
+    frames: list[ByteRange]
 
     @property
     def num_bytes(self) -> int:
-        """In memory."""
+        """Return the size in memory."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     @property
@@ -231,7 +231,7 @@ class Array:
         return self.chunk_rows * math.prod(self.shape[1:]) * self.dtype.itemsize
 
     def chunks_of(self, rows: Sequence[Range] | None) -> list[int]:
-        """The chunks that hold rows."""
+        """Return the numbers of the chunks that hold rows."""
         if rows is None or not self.frames:
             return list(range(len(self.frames)))
         last = self.shape[0] - 1
@@ -242,8 +242,8 @@ class Array:
         if _unpacked_bytes(frame) != self.chunk_bytes:
             raise ValueError("a chunk of it would not unpack to its size")
 
-    def read(self, bytes_of: Callable[[Span], bytes], rows: Sequence[Range] | None) -> np.ndarray:
-        """Ranges ``[start, stop)`` of rows, in order; all where None."""
+    def read(self, bytes_of: Callable[[ByteRange], bytes], rows: Sequence[Range] | None) -> np.ndarray:
+        """Read ranges ``[start, stop)`` of rows, in order; default: all."""
         count = self.shape[0]
         ranges = [(0, count)] if rows is None else [(start, min(stop, count)) for start, stop in rows]
         out = np.zeros((sum(max(0, stop - start) for start, stop in ranges), *self.shape[1:]), self.dtype)
@@ -271,8 +271,8 @@ class Array:
         return np.frombuffer(content, self.dtype).reshape(self.chunk_rows, *self.shape[1:])
 
 
-def mend(kind: str) -> str:
-    """What to do about a damaged group of this kind."""
+def repair_advice(kind: str) -> str:
+    """Return advice for a damaged group of this kind."""
     again = {
         "graphs": "make the graph again (gsmap describe MAP SCENE)",
         "changes": "compare its two scenes again (gsmap changes MAP A:B)",
@@ -283,33 +283,33 @@ def mend(kind: str) -> str:
     return f"run gsmap check, and {again.get(kind, 'ingest the scene again')}"
 
 
-def _chunks_in(codecs: Any, outer: list[int]) -> tuple[list[int], bool]:
-    """The shape of what is packed by itself, and whether several such lie in one key; other codecs are refused."""
-    names = _names_of(codecs)
-    if names == ["bytes", "zstd"] and _little(codecs[0]):
+def _inner_chunks(codecs: Any, outer: list[int]) -> tuple[list[int], bool]:
+    """Return the shape of separately compressed chunks and whether they are sharded; raises for other codecs."""
+    names = _codec_names(codecs)
+    if names == ["bytes", "zstd"] and _is_little_endian(codecs[0]):
         return outer, False
     if names == ["sharding_indexed"]:
         shard = codecs[0]["configuration"]
-        index = _names_of(shard["index_codecs"])
+        index = _codec_names(shard["index_codecs"])
         at_end = shard.get("index_location", "end") == "end"
         inner = shard["codecs"]
-        plain = _names_of(inner) == ["bytes", "zstd"] and index == ["bytes", "crc32c"]
-        if plain and at_end and _little(inner[0]) and _little(shard["index_codecs"][0]):
+        plain = _codec_names(inner) == ["bytes", "zstd"] and index == ["bytes", "crc32c"]
+        if plain and at_end and _is_little_endian(inner[0]) and _is_little_endian(shard["index_codecs"][0]):
             return shard["chunk_shape"], True
-        names += [*_names_of(inner), *index]
+        names += [*_codec_names(inner), *index]
     raise ValueError(f"its codecs are {', '.join(names)[:100]}, which are not gsmap's")
 
 
-def _names_of(codecs: Any) -> list[str]:
+def _codec_names(codecs: Any) -> list[str]:
     return [str(codec["name"]) for codec in codecs]
 
 
-def _little(codec: Any) -> bool:
+def _is_little_endian(codec: Any) -> bool:
     return bool(codec.get("configuration", {}).get("endian", "little") == "little")
 
 
 def _unpacked_bytes(head: bytes) -> int:
-    """What a zstd frame says it unpacks to (RFC 8878, 3.1.1.1); -1 where it does not say."""
+    """Return the decompressed size in the header of a zstd frame (RFC 8878, 3.1.1.1); -1 if it has none."""
     if head[:4] != _ZSTD_MAGIC or len(head) < 5:
         return -1
     flags = head[4]
@@ -321,9 +321,9 @@ def _unpacked_bytes(head: bytes) -> int:
     return int.from_bytes(head[at : at + length], "little") + (256 if kind == 1 else 0)
 
 
-def _lengths(value: Any, least: int) -> bool:
+def _are_lengths(value: Any, least: int) -> bool:
     return isinstance(value, list) and all(type(length) is int and least <= length < 1 << 40 for length in value)
 
 
-def _same(shape: list[int], known: Shape) -> bool:
+def _matches(shape: list[int], known: Shape) -> bool:
     return len(shape) == len(known) and all(b is None or a == b for a, b in zip(shape, known, strict=True))

@@ -1,8 +1,8 @@
-"""Who is at work on a map, on one of its jobs, or on a folder it is exported to, and until when that can be relied on.
+"""Time-limited leases of processes on a map, its jobs, or export folders.
 
-A lease says who does something, so that others do something else meanwhile. It guards no data: every write is a
-transaction that is right whoever makes it. So a lease that is lost (a machine that slept) costs work done twice and
-nothing else, and nothing here has to be certain where that would be slow.
+A lease keeps two processes from doing the same work. It guards no data: every write is a transaction that is valid
+whichever process makes it. So a lost lease (a machine that was suspended) costs duplicate work and nothing else, and
+leases favour speed over certainty.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from sqlalchemy.dialects import sqlite as sqlite_dialect
 
 from gsmap.errors import BusyError, GsmapError, StoreError
 from gsmap.store.catalog import Catalog
-from gsmap.store.explained import called
+from gsmap.store.error_translation import display_name
 from gsmap.store.schema import leases
 from gsmap.types.lock_owner import LockOwner, this_process
 
 _log = logging.getLogger("gsmap.leases")
 
 LEASE_S = 60.0
-"""How long a lease holds unless it is renewed: how long the work of a machine that died stays undone. Processes of this
-machine are seen to end at once."""
+"""Seconds until a lease expires unless it is renewed: the delay after which the work of a dead machine is taken over.
+Processes of this machine are seen to end at once."""
 
 HEARTBEAT_S = 15.0
-"""How often a process renews what it holds, in one small transaction: three may fail (a writer that keeps the lock, a
-server that restarts) before anything is lost."""
+"""Seconds between renewals of all leases of a process, in one small transaction: three may fail (a long writer, a
+server restart) before a lease expires."""
 
-_AT_ONCE = 1000  # rows in one statement: a database takes some ten thousand values
-_PATIENCE_S = 1.0  # for the writer lock, to give leases back: who ends must not wait, and what stays runs out
+_AT_ONCE = 1000  # rows in one statement, within the limits on bound values
+_PATIENCE_S = 1.0  # wait for the writer lock to release leases; unreleased ones expire
 
 
 @dataclass(frozen=True)
 class Lease(LockOwner):
-    """What a process is at work on.
+    """A lease of a process on a piece of work.
 
     Args:
         what: ``map``, ``poses``, ``graph KEY``, ``edge KEY`` or ``export FOLDER``.
-        token: of its holder, an open `gsmap.store.Store`.
-        expires_at: until when it holds unless it is renewed, ISO 8601, UTC.
+        token: of its owner, an open `gsmap.store.Store`.
+        expires_at: when it expires unless it is renewed, ISO 8601, UTC.
     """
 
     what: str
@@ -56,12 +56,12 @@ class Lease(LockOwner):
 
 
 @dataclass(frozen=True)
-class Taken:
-    """What `Leases.take` found.
+class AcquiredLeases:
+    """Result of `Leases.acquire`.
 
     Args:
-        ours: leased to this process now.
-        done: needs no doing any more.
+        ours: work leased to this process.
+        done: work that is done already.
     """
 
     ours: tuple[str, ...]
@@ -69,10 +69,10 @@ class Taken:
 
 
 class Leases:
-    """The leases of a map. All that one open store holds are renewed by one thread, for as long as it holds any.
+    """The leases of a map. One thread renews all leases of an open store.
 
-    Times are by one clock: that of the catalog's server, or of the machine where the catalog is a file (SQLite's write
-    log needs its users on one machine). So clocks that differ between machines make no difference.
+    Times are by one clock: that of the catalog's server, or of the machine for a catalog file (SQLite's write-ahead log
+    requires that its users are on one machine). So clock differences between machines do not matter.
     """
 
     def __init__(self, catalog: Catalog, *, lease_s: float = LEASE_S, heartbeat_s: float = HEARTBEAT_S) -> None:
@@ -83,18 +83,18 @@ class Leases:
         self._lock = threading.Lock()
         self._held: set[str] = set()
         self._present: dict[str, int] = {}
-        self._verb = ""  # what this process said it is at work on: its jobs are part of that
-        self._beat: _Beat | None = None
+        self._verb = ""  # announced task, of which the jobs of this process are part
+        self._heartbeat: _Heartbeat | None = None
 
     def others(self) -> list[Lease]:
-        """As `list`, without what this store holds itself."""
+        """Return the leases of other processes."""
         return [lease for lease in self.list() if lease.token != self._token]
 
     @contextmanager
-    def attend(self, task: str, what: str = "map") -> Iterator[list[Lease]]:
-        """Say that this process is at work on something, which others may be, too; yields who else is.
+    def announce(self, task: str, what: str = "map") -> Iterator[list[Lease]]:
+        """Announce work of this process that others may do, too; yields their leases on the same work.
 
-        A map that was opened for reading is not told.
+        Announces nothing for a map that was opened for reading.
         """
         if not self._catalog.writable:
             yield self.others()
@@ -107,8 +107,8 @@ class Leases:
         try:
             if is_first:
                 try:
-                    self.take([mine], task)
-                except StoreError as error:  # a full disk: what is to be done may need nothing written here
+                    self.acquire([mine], task)
+                except StoreError as error:  # a full disk: the work itself may not need to write here
                     _log.info("others are not told that this process is at work: %s", error)
             yield [lease for lease in self.others() if lease.what == what]
         finally:
@@ -122,16 +122,16 @@ class Leases:
 
     @contextmanager
     def hold(self, what: str, task: str) -> Iterator[None]:
-        """Be the only one at work on something.
+        """Hold an exclusive lease on some work.
 
         Raises:
-            BusyError: somebody else is; the message says who and since when.
+            BusyError: another process holds it; the message has its name and start time.
         """
         if not self.try_hold(what, task):
             holder = next((lease for lease in self.list() if lease.what == what), None)
-            who = "another process" if holder is None else holder.who
+            owner = "another process" if holder is None else holder.who
             raise BusyError(
-                f"{called(self._catalog.folder)}: {who} is at work on {what}; try again when it has ended",
+                f"{display_name(self._catalog.folder)}: {owner} is at work on {what}; try again when it has ended",
                 code="lease_held",
             )
         try:
@@ -140,37 +140,37 @@ class Leases:
             self.release([what])
 
     def try_hold(self, what: str, task: str) -> bool:
-        """Whether this process is the only one at work on something from now on, until `release`."""
-        return bool(self.take([what], task).ours)
+        """Try to get an exclusive lease, to be given back by `release`; returns False if another process holds it."""
+        return bool(self.acquire([what], task).ours)
 
-    def take(
+    def acquire(
         self,
-        whats: Iterable[str],
+        work: Iterable[str],
         task: str,
         *,
         limit: int | None = None,
         done: Callable[[Collection[str]], Collection[str]] | None = None,
         give_back: Collection[str] = (),
-    ) -> Taken:
-        """Lease what nobody is at work on, in one transaction.
+    ) -> AcquiredLeases:
+        """Lease free work in one transaction.
 
         Args:
-            whats: what to lease, the most wanted first.
-            limit: at most so many; all by default.
-            done: tells which of those that nobody is at work on need no doing; called within the transaction, so that
-                nobody can have done and given back one in between.
-            give_back: what is held and no longer needed.
+            whats: work to lease, most wanted first.
+            limit: maximum number of leases; default: all.
+            done: returns those of some free work that are done already; called within the transaction, so that no other
+                process can do and release work in between.
+            give_back: leases to release.
         """
         with self._catalog.write() as connection:
             now = self._now(connection)
             if give_back:
                 connection.execute(delete(leases).where(self._mine(give_back)))
-            living, gone = self._judged(connection, now)
-            for lease in gone:  # as it was when it was judged: its holder may have come back
+            living, gone = self._split_by_validity(connection, now)
+            for lease in gone:  # only if unchanged: its owner may have renewed it
                 same = (leases.c.what == lease.what) & (leases.c.token == lease.token)
                 connection.execute(delete(leases).where(same, leases.c.expires_at == lease.expires_at))
             held = {lease.what for lease in living}
-            free = (what for what in whats if what not in held)
+            free = (what for what in work if what not in held)
             ours: list[str] = []
             finished: set[str] = set()
             while batch := list(islice(free, None if limit is None else limit - len(ours))):
@@ -180,16 +180,16 @@ class Leases:
             ours = self._insert(connection, ours, task, now)
         with self._lock:
             self._held = (self._held - set(give_back)) | set(ours)
-            if self._held and self._beat is None:
-                self._beat = _Beat(self._renew, self._heartbeat_s)
-        return Taken(tuple(ours), frozenset(finished))
+            if self._held and self._heartbeat is None:
+                self._heartbeat = _Heartbeat(self._renew, self._heartbeat_s)
+        return AcquiredLeases(tuple(ours), frozenset(finished))
 
-    def release(self, whats: Collection[str]) -> None:
-        """Give back what this store holds of these; what cannot be given back now (a full disk) runs out by itself."""
+    def release(self, work: Collection[str]) -> None:
+        """Release leases of this store; a lease that cannot be released now (a full disk) expires by itself."""
         with self._lock:
-            mine = self._held & set(whats)
+            mine = self._held & set(work)
             self._held -= mine
-            idle, self._beat = (None, self._beat) if self._held else (self._beat, None)
+            idle, self._heartbeat = (None, self._heartbeat) if self._held else (self._heartbeat, None)
         if idle is not None:
             idle.end()
         if mine:
@@ -197,7 +197,7 @@ class Leases:
                 connection.execute(delete(leases).where(self._mine(mine)))
 
     def close(self) -> None:
-        """Give back everything."""
+        """Release all leases."""
         self.release(tuple(self._held))
 
     def _renew(self) -> None:
@@ -209,8 +209,8 @@ class Leases:
         if renewed.rowcount < len(held):
             _log.info("%d leases had run out: others may do the same work", len(held) - renewed.rowcount)
 
-    def _insert(self, connection: Connection, whats: list[str], task: str, now: datetime) -> list[str]:
-        """Those of them that nobody on another machine leased in this moment."""
+    def _insert(self, connection: Connection, work: list[str], task: str, now: datetime) -> list[str]:
+        """Insert leases and return those that no process on another machine inserted at the same moment."""
         me = this_process(self._verb or task)
         row = {
             "token": self._token,
@@ -221,43 +221,43 @@ class Leases:
             "expires_at": _text(now + timedelta(seconds=self._lease_s)),
         }
         insert = sqlite_dialect.insert if self._catalog.is_sqlite else postgresql.insert
-        # In one order for all, or two servers' connections wait for each other.
-        ordered, ours = [{"what": what, **row} for what in sorted(whats)], set[str]()
+        # Sorted, so that concurrent inserts on a server cannot deadlock.
+        ordered, ours = [{"what": what, **row} for what in sorted(work)], set[str]()
         for start in range(0, len(ordered), _AT_ONCE):
             some = insert(leases).values(ordered[start : start + _AT_ONCE])
             ours |= set(connection.execute(some.on_conflict_do_nothing().returning(leases.c.what)).scalars())
-        return [what for what in whats if what in ours]
+        return [what for what in work if what in ours]
 
-    def _judged(self, connection: Connection, now: datetime) -> tuple[list[Lease], list[Lease]]:
-        """The leases that hold, and those that do not."""
+    def _split_by_validity(self, connection: Connection, now: datetime) -> tuple[list[Lease], list[Lease]]:
+        """Return the valid leases and the expired ones."""
         columns = ("task", "host", "process", "since", "what", "token", "expires_at")
         rows = connection.execute(select(leases).order_by(leases.c.since, leases.c.what))
         found = [Lease(*(str(getattr(row, column)) for column in columns)) for row in rows]
-        # Longer than one can be leased for: the clock was set back, or somebody else wrote it.
+        # A later expiry is invalid: the clock was set back, or gsmap did not write it.
         latest = _text(now + timedelta(seconds=2 * self._lease_s))
         holds = [_text(now) < lease.expires_at <= latest and not lease.is_gone for lease in found]
         living = [lease for lease, yes in zip(found, holds, strict=True) if yes]
         return living, [lease for lease, yes in zip(found, holds, strict=True) if not yes]
 
-    def _mine(self, whats: Collection[str]) -> ColumnElement[bool]:
-        return (leases.c.token == self._token) & leases.c.what.in_(sorted(whats))
+    def _mine(self, work: Collection[str]) -> ColumnElement[bool]:
+        return (leases.c.token == self._token) & leases.c.what.in_(sorted(work))
 
     def _now(self, connection: Connection) -> datetime:
-        """By the one clock."""
+        """Return the time of the shared clock."""
         if self._catalog.is_sqlite:
             return datetime.now(UTC)
         found: datetime = connection.execute(select(func.clock_timestamp())).scalar_one()
         return found.astimezone(UTC)
 
     def list(self) -> list[Lease]:
-        """Everything that somebody is at work on, this process included, oldest first. Nothing is written."""
+        """Return all leases, including those of this process, oldest first; writes nothing."""
         with self._catalog.read() as connection:
-            living, _ = self._judged(connection, self._now(connection))
-        return [replace(lease, what=_named(lease.what)) for lease in living]
+            living, _ = self._split_by_validity(connection, self._now(connection))
+        return [replace(lease, what=_without_token(lease.what)) for lease in living]
 
 
-class _Beat:
-    """A thread that does something every so many seconds, and goes on whatever that says."""
+class _Heartbeat:
+    """A thread that calls a function at a fixed interval and ignores its errors."""
 
     def __init__(self, do: Callable[[], None], every_s: float) -> None:
         self._do, self._every_s = do, every_s
@@ -273,7 +273,7 @@ class _Beat:
         while not self._ended.wait(self._every_s):
             try:
                 self._do()
-            except Exception as error:  # a full disk, a server that restarts, a store that is being closed
+            except Exception as error:  # a full disk, a server restart, a store being closed
                 _log.info("leases were not renewed, which is tried again in %g s: %s", self._every_s, error)
 
 
@@ -281,6 +281,6 @@ def _text(time: datetime) -> str:
     return time.isoformat(timespec="microseconds")
 
 
-def _named(what: str) -> str:
-    """Without what tells several that attend the same from each other."""
+def _without_token(what: str) -> str:
+    """Strip the token that tells apart announcements of the same work."""
     return what.partition(" #")[0]

@@ -1,4 +1,4 @@
-"""Poses and matrices as bytes or JSON, and back, to the last bit."""
+"""Exact conversion of poses and matrices to bytes or JSON and back."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ from gsmap.types import Sim3
 _FLOAT = np.dtype("<f8")
 _POSE = 13  # rotation row by row, translation, scale
 _LOWER = np.tril_indices(7)
-_SKEWED = 1e-6  # of the largest entry: what the solver takes for symmetric
+_SKEWED = 1e-6  # relative to the largest entry: the solver's tolerance for symmetry
 
 
 # --- bytes -----------------------------------------------------------------------------------------------------------
 
 
 def pose_bytes(pose: Sim3) -> bytes:
-    """13 float64, little-endian: the rotation row by row, the translation, the scale."""
+    """Convert a pose to 13 float64, little-endian: the rotation row by row, the translation, the scale."""
     values = np.empty(_POSE, _FLOAT)
     values[:9], values[9:12], values[12] = pose.rotation.ravel(), pose.translation, pose.scale
     return values.tobytes()
 
 
 def pose_of_bytes(value: bytes) -> Sim3:
-    """Raises `InputError` where they are no pose."""
+    """Convert bytes to a pose; raises `InputError` for invalid bytes."""
     return poses_of_bytes([value])[0]
 
 
 def poses_of_bytes(values: Sequence[bytes]) -> list[Sim3]:
-    """Many at once, which takes a tenth of the time."""
+    """Convert many poses at once, in a tenth of the time."""
     found = _floats(values, _POSE)
     return Sim3.many(found[:, :9].reshape(-1, 3, 3), found[:, 9:12], found[:, 12])
 
 
 def matrix_bytes(matrix: np.ndarray) -> bytes:
-    """A (7, 7) matrix as 49 float64, little-endian, row by row."""
+    """Convert a (7, 7) matrix to 49 float64, little-endian, row by row."""
     return np.ascontiguousarray(np.asarray(matrix, _FLOAT).reshape(7, 7)).tobytes()
 
 
 def matrix_of_bytes(value: bytes) -> np.ndarray:
-    """Raises `InputError` where they are no symmetric matrix of finite numbers."""
+    """Convert bytes to a matrix; raises `InputError` unless it is symmetric and finite."""
     found: np.ndarray = matrices_of_bytes([value])[0]
     return found
 
 
 def matrices_of_bytes(values: Sequence[bytes]) -> np.ndarray:
-    """(K, 7, 7) float64 of many; see `matrix_of_bytes`."""
+    """Convert many matrices to (K, 7, 7) float64; see `matrix_of_bytes`."""
     found = _floats(values, 49).reshape(-1, 7, 7).astype(np.float64)
     size = np.abs(found).max((1, 2), initial=0)
     if (np.abs(found - found.transpose(0, 2, 1)).max((1, 2), initial=0) > _SKEWED * size).any():
@@ -58,18 +58,18 @@ def matrices_of_bytes(values: Sequence[bytes]) -> np.ndarray:
 
 
 def covariance_bytes(covariance: np.ndarray) -> bytes:
-    """The lower triangle of a symmetric (7, 7) matrix as 28 float64, little-endian, row by row."""
+    """Convert a symmetric (7, 7) matrix to its lower triangle as 28 float64, little-endian, row by row."""
     return np.asarray(covariance, _FLOAT).reshape(7, 7)[_LOWER].tobytes()
 
 
 def covariance_of_bytes(value: bytes) -> np.ndarray:
-    """Raises `InputError` where they are no numbers of a covariance."""
+    """Convert bytes to a covariance; raises `InputError` for invalid bytes."""
     found: np.ndarray = covariances_of_bytes([value])[0]
     return found
 
 
 def covariances_of_bytes(values: Sequence[bytes]) -> np.ndarray:
-    """(K, 7, 7) float64 of many."""
+    """Convert many covariances to (K, 7, 7) float64."""
     lower = _floats(values, len(_LOWER[0]))
     out = np.zeros((len(values), 7, 7))
     out[:, _LOWER[0], _LOWER[1]] = lower
@@ -78,7 +78,7 @@ def covariances_of_bytes(values: Sequence[bytes]) -> np.ndarray:
 
 
 def _floats(values: Sequence[bytes], count: int) -> np.ndarray:
-    """(K, count) finite numbers."""
+    """Convert bytes to (K, count) finite numbers."""
     if any(len(value) != count * _FLOAT.itemsize for value in values):
         raise InputError(f"not {count} numbers", code="invalid_record")
     found = np.frombuffer(b"".join(values), _FLOAT).reshape(-1, count)

@@ -1,4 +1,4 @@
-"""Maps as values: one merged into another, part of one as a map of its own, a scene brought back."""
+"""Merge maps, split maps, and import scenes from other maps."""
 
 from __future__ import annotations
 
@@ -11,31 +11,32 @@ from sqlalchemy import Connection, Row, func, select
 
 from gsmap.errors import CorruptError, NotFoundError
 from gsmap.settings import FILE_NAME, load
-from gsmap.store.groups import manifest
-from gsmap.store.joint import joined, restricted
-from gsmap.store.revisions import newest_poses, put, stored_lines
+from gsmap.store.array_groups import manifest
+from gsmap.store.pose_graph_join import join_pose_graphs, restrict_pose_graph
+from gsmap.store.revisions import insert_revision, newest_poses, stored_rows
 from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import about, revisions, scenes
 from gsmap.store.store import Store
-from gsmap.store.transfer import Transfer, between
-from gsmap.store.transfer_changes import comparisons_of
-from gsmap.store.transfer_objects import objects_of
+from gsmap.store.transfer import Transfer, open_transfer
+from gsmap.store.transfer_changes import transfer_comparisons
+from gsmap.store.transfer_objects import transfer_objects
 
 Identity = tuple[str, int, str | None]
 
 
 @dataclass(frozen=True)
-class Merged:
-    """What a merge brought.
+class MergeResult:
+    """Result of a merge.
 
     Args:
-        scenes, removed, known: scenes that are new here and live, that are new or now removed, and that both maps had.
+        scenes, removed, known: numbers of new living scenes, of scenes new or now removed, and of scenes that both maps
+            had.
         graphs, registrations, reviews, facts, priors, observations, photos, models, recipes, revisions, comparisons,
-            change_reviews, objects, object_facts: rows that are new here.
-        renamed: (old, new) names of scenes whose name was taken.
-        revision: number of the joint revision; None where none was needed.
-        num_bytes: of the arrays that are new here, linked or copied.
-        notes: what a person should know.
+            change_reviews, objects, object_facts: numbers of new rows.
+        renamed: (old, new) names of scenes whose name was in use.
+        revision: number of the joint revision; None if none was needed.
+        num_bytes: size of the new arrays, linked or copied.
+        notes: remarks for the user.
     """
 
     scenes: int = 0
@@ -61,46 +62,47 @@ class Merged:
     notes: tuple[str, ...] = field(default=())
 
 
-def merge(into: Store, source: Store) -> Merged:
-    """Take all that another map knows; that map stays as it is, and nothing is computed. Again it adds nothing.
+def merge(into: Store, source: Store) -> MergeResult:
+    """Merge another map into this one; the other map stays unchanged, nothing is computed, and repeating it adds
+    nothing.
 
-    Scenes are the same where their content is. Revisions travel as history (`revisions.origin` says which map solved
-    them), followed by one revision of the newest poses of both, as `gsmap.store.joint` puts them together; where this
-    map's newest poses are part of the other's history, the other's newest count as they are.
+    Scenes with equal content are the same scene. Revisions are copied as history (`revisions.origin` names the map that
+    solved them), followed by one revision that joins the newest poses of both maps (`gsmap.store.pose_graph_join`).
+    Where this map's newest poses are part of the other map's history, the other map's newest are used as they are.
 
     Raises:
         ConfigError: a map into itself.
         CorruptError: arrays of the other map are missing or damaged; nothing was changed.
     """
-    with between(into, source) as transfer:
+    with open_transfer(into, source) as transfer:
         transfer.scenes()
         transfer.graphs()
         transfer.pairs()
-        comparisons_of(transfer)
-        objects_of(transfer)
+        transfer_comparisons(transfer)
+        transfer_objects(transfer)
         transfer.priors()
         transfer.observations()
         transfer.photos()
         transfer.models()
         number = _revisions(transfer)
-        transfer.notes += _other_settings(into, source)
+        transfer.notes += _compare_settings(into, source)
         return _merged(transfer, number)
 
 
-def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
-    """Bring some scenes of a map, with all that is known of and among them, into a map that is new and empty.
+def split(source: Store, out: Store, chosen: Collection[str]) -> MergeResult:
+    """Copy some scenes of a map, with all data of and among them, into a new and empty map.
 
-    Of the history the newest poses come along, restricted to these scenes, as revision 1.
+    The newest poses are copied, restricted to these scenes, as revision 1.
 
     Raises:
         CorruptError: arrays of the map are missing or damaged; nothing was changed.
     """
-    with between(out, source, only=chosen) as transfer:
+    with open_transfer(out, source, only=chosen) as transfer:
         transfer.scenes()
         transfer.graphs()
         transfer.pairs()
-        comparisons_of(transfer)
-        objects_of(transfer)
+        transfer_comparisons(transfer)
+        transfer_objects(transfer)
         transfer.priors()
         transfer.observations()
         transfer.photos()
@@ -108,7 +110,7 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
         number = None
         newest = newest_poses(transfer.theirs)
         if newest is not None and set(newest.poses) & set(chosen):
-            number = out.revisions.save(restricted(newest, chosen), note=f"part of {source.location}")
+            number = out.revisions.save(restrict_pose_graph(newest, chosen), note=f"part of {source.location}")
             row = transfer.theirs.execute(select(revisions).order_by(revisions.c.number.desc()).limit(1)).one()
             map_id, its_number, part = _identity(row, _id(transfer.theirs))
             origin = {"map": map_id, "number": its_number, "part": part or _id(transfer.ours)}
@@ -116,16 +118,16 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
         return _merged(transfer, number)
 
 
-def bring_scene(into: Store, source: Store, scene: str) -> Merged:
-    """Bring one scene of another map (by id), its graphs, and its edges to scenes that are here.
+def import_scene(into: Store, source: Store, scene: str) -> MergeResult:
+    """Import one scene of another map (by id), its graphs, and its edges to scenes in this map.
 
-    Where it is here already, arrays of it that are damaged are mended.
+    Repairs damaged arrays of a scene that is already in this map.
 
     Raises:
-        NotFoundError: it was forgotten here on demand.
+        NotFoundError: the scene was purged from this map.
         CorruptError: its arrays are missing or damaged there; nothing was changed.
     """
-    with between(into, source, only={scene}, mend=True) as transfer:
+    with open_transfer(into, source, only={scene}, mend=True) as transfer:
         if scene not in transfer.wanted:
             raise NotFoundError(
                 f"scene {scene} was forgotten in {into.location} on demand: ingest its capture if it is to come back",
@@ -134,12 +136,12 @@ def bring_scene(into: Store, source: Store, scene: str) -> Merged:
         transfer.scenes()
         if into.home.samefile(source.home):
             _check_shared(transfer, scene)
-        if into.scenes.removed_at(scene) is not None:  # whatever was said before: it is asked for now
+        if into.scenes.removed_at(scene) is not None:  # an explicit request overrules the tombstone
             into.scenes.restore(scene)
         transfer.graphs()
         transfer.pairs()
-        comparisons_of(transfer)
-        objects_of(transfer)
+        transfer_comparisons(transfer)
+        transfer_objects(transfer)
         transfer.priors()
         transfer.observations()
         transfer.photos()
@@ -147,7 +149,7 @@ def bring_scene(into: Store, source: Store, scene: str) -> Merged:
 
 
 def _check_shared(transfer: Transfer, scene: str) -> None:
-    """Refuse a scene whose arrays are damaged, where both catalogs are of one map and there are no others."""
+    """Raise for a scene with damaged arrays if both catalogs share the same arrays."""
     group = transfer.ours.execute(select(scenes.c.group_id).where(scenes.c.id == scene)).scalar_one()
     if group is None:
         return
@@ -160,9 +162,9 @@ def _check_shared(transfer: Transfer, scene: str) -> None:
         )
 
 
-def _merged(transfer: Transfer, revision: int | None) -> Merged:
-    counted = {field.name for field in fields(Merged) if field.type == "int"} - {"num_bytes"}
-    return Merged(
+def _merged(transfer: Transfer, revision: int | None) -> MergeResult:
+    counted = {field.name for field in fields(MergeResult) if field.type == "int"} - {"num_bytes"}
+    return MergeResult(
         **{noun: transfer.counts[noun] for noun in counted},
         renamed=tuple(transfer.renamed),
         revision=revision,
@@ -175,7 +177,8 @@ def _merged(transfer: Transfer, revision: int | None) -> Merged:
 
 
 def _revisions(transfer: Transfer) -> int | None:
-    """Their revisions as history, and then one of the newest poses of both; its number, None where none is needed."""
+    """Copy their revisions as history, then join the newest poses of both; returns the joint revision's number, or
+    None."""
     ours, theirs = transfer.ours, transfer.theirs
     my_id, their_id = _id(ours), _id(theirs)
     mine, newest = newest_poses(ours), newest_poses(theirs)
@@ -191,9 +194,9 @@ def _revisions(transfer: Transfer) -> int | None:
         return None
     history = {_identity(row, their_id) for row in their_rows}
     if their_rows[-1].number == lacking[-1].number and _is_known(_identity(rows[-1], my_id), history):
-        return None  # ours is part of their history: theirs is what comes after it
+        return None  # our newest revision is part of their history, so theirs continues it
     living = {row.id: np.array(row.bounds) for row in ours.execute(select(scenes).where(scenes.c.removed_at.is_(None)))}
-    joint = joined(mine, newest, living, living)
+    joint = join_pose_graphs(mine, newest, living, living)
     transfer.notes += joint.notes
     return transfer.into.revisions.save(joint, note=f"joined with {transfer.source.location}")
 
@@ -202,22 +205,23 @@ def _append(transfer: Transfer, row: Row[Any], identity: Identity) -> None:
     number = 1 + (transfer.ours.execute(select(func.max(revisions.c.number))).scalar() or 0)
     map_id, its_number, part = identity
     origin = {"map": map_id, "number": its_number, **({"part": part} if part else {})}
-    here = set(transfer.ours.execute(select(scenes.c.id)).scalars())  # all but those that were forgotten
-    lines = stored_lines(transfer.theirs, row)
+    here = set(transfer.ours.execute(select(scenes.c.id)).scalars())  # without purged scenes
+    lines = stored_rows(transfer.theirs, row)
     if lines is not None:
         lines = {name: {k: v for k, v in of_table.items() if here.issuperset(k)} for name, of_table in lines.items()}
-    put(transfer.ours, dict(row._mapping) | {"number": number, "origin": origin}, lines)
+    insert_revision(transfer.ours, dict(row._mapping) | {"number": number, "origin": origin}, lines)
 
 
 def _identity(row: Row[Any], map_id: str) -> Identity:
-    """What a revision is called in whichever map it lies: the map that solved it, its number there, and which part."""
+    """Return a map-independent identity of a revision: the map that solved it, its number there, and which part of
+    it."""
     if row.origin is None:
         return map_id, row.number, None
     return str(row.origin["map"]), int(row.origin["number"]), row.origin.get("part")
 
 
 def _is_known(identity: Identity, known: Collection[Identity]) -> bool:
-    """Whether a revision, or the whole of which it is a part, is among those that are known."""
+    """Return True if a revision, or the whole of which it is a part, is among the known ones."""
     return identity in known or (*identity[:2], None) in known
 
 
@@ -228,15 +232,16 @@ def _id(connection: Connection) -> str:
 # --- settings --------------------------------------------------------------------------------------------------------
 
 
-def _other_settings(into: Store, source: Store) -> list[str]:
-    """A note on each setting that differs; those of the map that is merged into hold."""
+def _compare_settings(into: Store, source: Store) -> list[str]:
+    """Return a note for each setting that differs; the settings of the target map are kept."""
     mine, theirs = load(into.folder / FILE_NAME), load(source.folder / FILE_NAME)
     return [
-        f"setting {name} stays {_shown(mine, name)} (there: {_shown(theirs, name)}): what that made is out of date here"
+        f"setting {name} stays {_format_setting(mine, name)} (there: {_format_setting(theirs, name)}): what it made "
+        "there is out of date here"
         for name in sorted({*mine, *theirs})
         if mine.get(name) != theirs.get(name)
     ]
 
 
-def _shown(values: Mapping[str, Any], name: str) -> str:
+def _format_setting(values: Mapping[str, Any], name: str) -> str:
     return str(values[name]) if name in values else "its default"

@@ -1,4 +1,4 @@
-"""Running the migrations of ``migrations/`` (in the wheel ``gsmap/migrations``)."""
+"""Run the schema migrations of ``migrations/`` (in the wheel ``gsmap/migrations``)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Engine, inspect, text
 from gsmap.errors import CorruptError, SchemaVersionError, StoreError
 from gsmap.store import schema, sqlite
 from gsmap.store.catalog import Catalog, commit
-from gsmap.store.explained import NOT_KEPT, explained
+from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.version import __version__
 
 if TYPE_CHECKING:
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 def version(engine: Engine, folder: Path) -> str | None:
-    """The migration a database is at; None where it has never seen one."""
-    with explained(folder), engine.connect() as connection:
+    """Return the schema version of a database; None for an empty one."""
+    with translate_errors(folder), engine.connect() as connection:
         return _version(connection)
 
 
@@ -30,11 +30,11 @@ def _version(connection: Connection) -> str | None:
 
 
 def require_current(catalog: Catalog) -> None:
-    """Refuse a database of another schema.
+    """Raise unless a database has the current schema.
 
     Raises:
-        SchemaVersionError: newer (get a newer gsmap) or older (``gsmap migrate``).
-        CorruptError: no schema at all, or tables that gsmap did not make.
+        SchemaVersionError: the schema is newer (get a newer gsmap) or older (``gsmap migrate``).
+        CorruptError: there is no schema, or tables that gsmap did not make.
     """
     folder = catalog.folder
     with catalog.read() as connection:
@@ -54,14 +54,16 @@ def require_current(catalog: Catalog) -> None:
             f"{folder} was written by an older gsmap (schema {found}, now {schema.HEAD}): run gsmap migrate {folder}",
             code="map_too_old",
         )
-    if catalog.is_sqlite:  # a server's tables are the user's own
+    if catalog.is_sqlite:  # a server belongs to the user and is trusted
         with catalog.read() as connection:
             _require_tables(connection, folder)
 
 
 def _require_tables(connection: Connection, folder: Path) -> None:
-    """Refuse a file whose tables are not those of the schema: their types are what rows are trusted for, and a trigger
-    or a view would have gsmap's own statements do something else."""
+    """Raise if the tables of a file differ from the schema.
+
+    Rows are trusted for their column types, and a trigger or a view would change what gsmap's statements do.
+    """
     extra = connection.execute(text("SELECT type, name FROM sqlite_master WHERE type IN ('trigger', 'view')")).first()
     if extra is not None:
         raise _not_ours(folder, f"has a {extra.type} ({extra.name!r})")
@@ -88,7 +90,7 @@ def _not_ours(folder: Path, what: str) -> CorruptError:
 
 
 def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str | None]:
-    """Bring the tables to a revision in one transaction; returns the version before and after.
+    """Migrate the tables to a schema version in one transaction; returns the version before and after.
 
     An existing SQLite catalog is first copied to ``map.sqlite.VERSION.bak``.
 
@@ -102,9 +104,9 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
         return before, before
     with catalog.lock():
         if before is not None and catalog.is_sqlite:
-            with explained(catalog.folder, NOT_KEPT):
+            with translate_errors(catalog.folder, NOT_KEPT):
                 sqlite.backup(catalog.engine, catalog.folder / f"{sqlite.FILE}.{before}.bak")
-        with explained(catalog.folder, NOT_KEPT), catalog.engine.connect() as connection:
+        with translate_errors(catalog.folder, NOT_KEPT), catalog.engine.connect() as connection:
             if catalog.is_sqlite:
                 # Batch migrations rebuild tables, which foreign keys would forbid; checked before the commit.
                 _driver(connection).execute("PRAGMA foreign_keys = OFF")
@@ -116,7 +118,7 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
                             f"{catalog.folder}: the migration would break references: it was not kept",
                             code="migration_breaks_references",
                         )
-                    with explained(catalog.folder, NOT_KEPT, committing=True):
+                    with translate_errors(catalog.folder, NOT_KEPT, committing=True):
                         commit(connection, transaction)
             finally:
                 if catalog.is_sqlite and not connection.invalidated:
@@ -125,7 +127,7 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
 
 
 def config() -> Config:
-    """Alembic's configuration, without a file."""
+    """Return Alembic's configuration, without a file."""
     from alembic.config import Config
 
     out = Config()
@@ -134,7 +136,7 @@ def config() -> Config:
 
 
 def folder() -> Path:
-    """Where the migrations lie: inside the installed package, or beside it in a checkout."""
+    """Return the folder of the migrations: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for place in (package / "migrations", package.parent / "migrations"):
         if (place / "env.py").is_file():

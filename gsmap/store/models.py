@@ -1,4 +1,4 @@
-"""ONNX models that the user gave, by name."""
+"""ONNX models that the user added, by name."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from gsmap.durable import open_file, refuse_links, write_whole
 from gsmap.errors import CorruptError, NotFoundError
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.columns import is_relative
-from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.facts import checked_text
+from gsmap.store.column_types import is_relative
+from gsmap.store.error_translation import NOT_KEPT, translate_errors
+from gsmap.store.facts import validated_text
 from gsmap.store.schema import models
 from gsmap.types.plain import plain
 
@@ -32,12 +32,12 @@ class Model:
     """A model file.
 
     Args:
-        name: how it is called in this map.
-        kind: what it is for (``sam_encoder``, ``clip``, ...).
-        path: where it lies now.
-        copied: whether the map has its own copy.
+        name: name in this map.
+        kind: purpose (``sam_encoder``, ``clip``, ...).
+        path: current path.
+        copied: the map has its own copy.
         sha256: of the file when it was added.
-        options: input size, normalisation and what else its user needs.
+        options: input size, normalization and other options of its use.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Models:
     """The models of a map.
 
     Args:
-        arrays: of the same map; the copies lie beside them, for all its branches.
+        arrays: of the same map; model copies are stored beside them, for all branches.
     """
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
@@ -71,10 +71,10 @@ class Models:
         options: Mapping[str, Any] | None = None,
         copy: bool = True,
     ) -> Model:
-        """Add a model, in place of the one of that name.
+        """Add a model, replacing the one with the same name.
 
         Args:
-            copy: keep a copy in the map, so that it can move; else remember the path.
+            copy: keep a copy in the map, so that it can be moved; otherwise store the path.
 
         Raises:
             NotFoundError: no such file.
@@ -82,7 +82,7 @@ class Models:
         source = Path(path).absolute()
         if not source.is_file():
             raise NotFoundError(f"no model file at {path}", code="file_not_found")
-        checked_text("the name of a model", name)
+        validated_text("the name of a model", name)
         with open(source, "rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         relative = f"{FOLDER}/{sha256[:32]}{source.suffix}"
@@ -90,19 +90,19 @@ class Models:
         row |= {"sha256": sha256, "size_bytes": source.stat().st_size, "options": plain(dict(options or {}))}
         with self._catalog.write() as connection:
             if copy:
-                self._catalog.hold(self._arrays.lock())
+                self._catalog.hold_until_commit(self._arrays.lock())
                 _copy(source, self._home / relative)
-                self._arrays.send_model(relative)
-            standing = (models.c.name == name) & models.c.removed_at.is_(None)
-            connection.execute(update(models).where(standing).values(removed_at=now()))
+                self._arrays.upload_model(relative)
+            current = (models.c.name == name) & models.c.removed_at.is_(None)
+            connection.execute(update(models).where(current).values(removed_at=now()))
             connection.execute(insert(models), row | {"created_at": now()})
         return self.get(name)
 
     def get(self, name: str) -> Model:
-        """One model by name.
+        """Return a model by name.
 
         Raises:
-            NotFoundError: none is called so.
+            NotFoundError: no model has this name.
         """
         for model in self.list():
             if model.name == name:
@@ -112,36 +112,36 @@ class Models:
         )
 
     def list(self) -> list[Model]:
-        """All models, oldest first."""
+        """Return all models, oldest first."""
         query = select(models).where(models.c.removed_at.is_(None)).order_by(models.c.number)
         with self._catalog.read() as connection:
             return [self._model(row) for row in connection.execute(query)]
 
     def remove(self, name: str) -> None:
-        """Forget a model; its copy is reclaimed by `prune`."""
+        """Remove a model; `prune` reclaims its copy."""
         self.get(name)
-        standing = (models.c.name == name) & models.c.removed_at.is_(None)
+        current = (models.c.name == name) & models.c.removed_at.is_(None)
         with self._catalog.write() as connection:
-            connection.execute(update(models).where(standing).values(removed_at=now()))
+            connection.execute(update(models).where(current).values(removed_at=now()))
 
     def _model(self, row: Row[Any]) -> Model:
         path = model_path(self._home, row)
         if row.copied:
-            with contextlib.suppress(NotFoundError):  # who uses it is told
-                self._arrays.bring_model(row.path)
+            with contextlib.suppress(NotFoundError):  # raised again when the model is used
+                self._arrays.fetch_model(row.path)
         return Model(
             row.name, row.kind, path, bool(row.copied), row.sha256, row.size_bytes, row.created_at, row.options
         )
 
 
 def model_path(folder: Path, row: Row[Any]) -> Path:
-    """Where a row's model lies: its copy in the map, else where it was when it was added.
+    """Return the path of a row's model: its copy in the map, or the path where it was added.
 
-    A file outside the map is only ever read, and only as the model that it was added as (`gsmap.describe.onnx` compares
-    its digest): a map cannot say anything of it but whether it is that.
+    A file outside the map is only read, and only if its digest matches (`gsmap.describe.onnx`): a map can learn nothing
+    else about it.
 
     Raises:
-        CorruptError: the copy would not lie in the map's own folder of models.
+        CorruptError: the copy would lie outside the map's folder of models.
     """
     if not row.copied:
         return Path(row.path)
@@ -158,7 +158,7 @@ def model_path(folder: Path, row: Row[Any]) -> Path:
 
 
 def open_model(folder: Path, row: Row[Any]) -> int:
-    """Open a row's model to read it; a person may have put a link where one lies outside the map."""
+    """Open a row's model for reading; follows a link outside the map, which the user may have made."""
     path = model_path(folder, row)
     return open_file(path if row.copied else path.resolve())
 
@@ -167,7 +167,7 @@ def _copy(source: Path, target: Path) -> None:
     """Copy a file durably; it appears whole or not at all."""
     refuse_links(target.parent.parent, FOLDER)
     target.parent.mkdir(exist_ok=True)
-    with explained(target.parent, NOT_KEPT):
+    with translate_errors(target.parent, NOT_KEPT):
         write_whole(target, partial(_fill, source))
 
 

@@ -1,13 +1,13 @@
-"""Groups of arrays in an object store: the objects ``arrays/KIND/ID/DIGEST-FILE`` of a map's home.
+"""Array groups in an object store: objects ``arrays/KIND/ID/DIGEST-FILE`` of a remote map.
 
-An object store has no rename, and needs none: a group counts only once a committed row of the catalog names it, so its
-files go to their final names before. A name holds the digest of the bytes, so an object that is there already is the
-one that was to be written: a request whose answer was lost, or another writer of the same content, is no conflict.
-Whoever names a group looks under the lock whether it is still there, and whoever deletes what no row names holds the
-same lock.
+An object store has no rename and needs none: a group is valid only once a committed row of the catalog names it, so its
+files are written under their final names before that. A name holds the digest of the bytes, so that an existing object
+equals the one to be written: a request with a lost response, or a second writer of the same content, is no conflict. A
+writer checks under the lock that the objects of a group still exist before naming it, and deleting unnamed objects
+requires the same lock.
 
-Parts are read by few requests: ranges that lie near each other are one. What is read whole, or nearly, is kept on this
-machine (`gsmap.store.cache`).
+Partial reads need few requests: nearby ranges are merged. Files read whole, or nearly, are cached on this machine
+(`gsmap.store.cache`).
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import CorruptError, NotFoundError, StoreError
-from gsmap.store import cache, layout, packed
-from gsmap.store.arrays import Arrays, Staged, StoredFile, stored_file
-from gsmap.store.columns import KINDS, is_digest
-from gsmap.store.homes import Home
+from gsmap.store import array_archive, cache, layout
+from gsmap.store.arrays import Arrays, StagedGroup, StoredFile, stored_file
+from gsmap.store.column_types import KINDS, is_digest
 from gsmap.store.layout import CHUNK_ROWS
-from gsmap.store.places import SINGLE_PUT_BYTES, chunks_of
+from gsmap.store.remote_map import RemoteMap
+from gsmap.store.storage import SINGLE_PUT_BYTES, chunks_of
 
 _ROOT = "arrays"
-MAX_REQUESTS = 5  # for the parts of a group that are read, beside the one for its table of contents
-_WHOLE = 0.5  # of a file: who reads so much of it gets all of it
+MAX_REQUESTS = 5  # per partial read of a group, besides the one for its table of contents
+_WHOLE = 0.5  # of a file: larger reads fetch the whole file
 
 
 class ObjectArrays(Arrays):
-    """The groups of a map whose home is an object store.
+    """The array groups of a remote map.
 
     Args:
-        home: the map's.
+        home: the remote map.
         lock: see `Arrays.lock`.
     """
 
-    def __init__(self, home: Home, lock: Callable[[float], contextlib.AbstractContextManager[None]]) -> None:
-        super().__init__(home.desk / _ROOT)
+    def __init__(self, home: RemoteMap, lock: Callable[[float], contextlib.AbstractContextManager[None]]) -> None:
+        super().__init__(home.mirror / _ROOT)
         self.url = f"{home.url}/{_ROOT}"
         self._remote = home
-        self._home = home.place
+        self._storage = home.storage
         self._lock = lock
-        self._sent: set[str] = set()  # by us, and not yet named
+        self._sent: set[str] = set()  # objects sent by this process and not yet named by a row
 
     @contextlib.contextmanager
     def scratch(self) -> Iterator[Path]:
@@ -55,20 +55,22 @@ class ObjectArrays(Arrays):
             yield Path(folder) / "scratch"
 
     @contextlib.contextmanager
-    def stage(self, arrays: Mapping[str, np.ndarray | packed.Column], kind: str, name: str) -> Iterator[Staged]:
+    def stage(
+        self, arrays: Mapping[str, np.ndarray | array_archive.StreamedArray], kind: str, name: str
+    ) -> Iterator[StagedGroup]:
         with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
-            packed.write(Path(folder) / packed.FILE, arrays, chunk_rows=CHUNK_ROWS)
-            staged = Staged(Path(folder), (stored_file(Path(folder), packed.FILE),))
+            array_archive.write(Path(folder) / array_archive.FILE, arrays, chunk_rows=CHUNK_ROWS)
+            staged = StagedGroup(Path(folder), (stored_file(Path(folder), array_archive.FILE),))
             self._send(staged, kind, name)
             yield staged
 
     @contextlib.contextmanager
     def stage_copies(
         self, source: Arrays, groups: Mapping[tuple[str, str], Sequence[StoredFile]]
-    ) -> Iterator[dict[tuple[str, str], Staged]]:
+    ) -> Iterator[dict[tuple[str, str], StagedGroup]]:
         with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
             staged = {
-                group: Staged(source.copied(*group, files, Path(folder) / "-".join(group)), tuple(files))
+                group: StagedGroup(source.copy_group(*group, files, Path(folder) / "-".join(group)), tuple(files))
                 for group, files in groups.items()
             }
             for group, one in staged.items():
@@ -87,28 +89,28 @@ class ObjectArrays(Arrays):
             finally:
                 self._held.depth = 0
 
-    def _send(self, staged: Staged, kind: str, name: str) -> None:
+    def _send(self, staged: StagedGroup, kind: str, name: str) -> None:
         for file in staged.files:
             key, path = self._key(kind, name, file), staged.folder / file.path
             if file.size_bytes <= SINGLE_PUT_BYTES:
                 try:
-                    if self._home.put_new(key, path.read_bytes()):
+                    if self._storage.put_if_absent(key, path.read_bytes()):
                         self._sent.add(key)
                 except StoreError:
-                    if self._home.size_bytes(key) != file.size_bytes:  # else only the answer was lost
+                    if self._storage.size_bytes(key) != file.size_bytes:  # otherwise only the response was lost
                         raise
-            elif self._home.size_bytes(key) != file.size_bytes:  # S3 has no condition for objects of several parts
-                self._home.put(key, chunks_of(path), file.size_bytes)
+            elif self._storage.size_bytes(key) != file.size_bytes:  # S3 has no condition for objects of several parts
+                self._storage.put(key, chunks_of(path), file.size_bytes)
                 self._sent.add(key)
 
-    def publish(self, staged: Staged, kind: str, name: str) -> None:
+    def publish(self, staged: StagedGroup, kind: str, name: str) -> None:
         for file in staged.files:
             key = self._key(kind, name, file)
-            whole = self._home.size_bytes(key) == file.size_bytes  # else a prune took it for an orphan
-            if key not in self._sent:  # another one sent it, some time
+            whole = self._storage.size_bytes(key) == file.size_bytes  # otherwise a prune took it for an orphan
+            if key not in self._sent:  # sent by another process
                 whole = whole and self._sha256(key) == file.sha256
             if not whole:
-                self._home.put(key, chunks_of(staged.folder / file.path), file.size_bytes)
+                self._storage.put(key, chunks_of(staged.folder / file.path), file.size_bytes)
             self._sent.discard(key)
 
     def read(
@@ -121,17 +123,17 @@ class ObjectArrays(Arrays):
         rows: Sequence[tuple[int, int]] | None = None,
         shapes: Mapping[str, layout.Shape] | None = None,
     ) -> dict[str, np.ndarray]:
-        reader = _Objects(self, kind, name, files)
+        reader = _ObjectReader(self, kind, name, files)
         try:
             return self._read(reader, kind, name, files, only, rows, shapes)
         except CorruptError:
             if not reader.dropped():
                 raise
-        return self._read(_Objects(self, kind, name, files), kind, name, files, only, rows, shapes)
+        return self._read(_ObjectReader(self, kind, name, files), kind, name, files, only, rows, shapes)
 
     def _read(
         self,
-        reader: _Objects,
+        reader: _ObjectReader,
         kind: str,
         name: str,
         files: Sequence[StoredFile],
@@ -142,9 +144,11 @@ class ObjectArrays(Arrays):
         try:
             body = self._body(reader, kind, name, files)
             names = body.array_names() if only is None else only
-            return body.read(body.laid_out(names, shapes), rows)
+            return body.read(body.check_arrays(names, shapes), rows)
         except NotFoundError as error:
-            raise CorruptError(f"{error}, or not all of it: {layout.mend(kind)}", code="arrays_corrupt") from error
+            raise CorruptError(
+                f"{error}, or not all of it: {layout.repair_advice(kind)}", code="arrays_corrupt"
+            ) from error
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
         out = []
@@ -152,80 +156,81 @@ class ObjectArrays(Arrays):
         for key, file in expected.items():
             found = self._sha256(key)
             if found is None:
-                out.append(f"{self._home.url}/{key} is missing")
+                out.append(f"{self._storage.url}/{key} is missing")
             elif found != file.sha256:
-                out.append(f"{self._home.url}/{key} differs from what was written")
+                out.append(f"{self._storage.url}/{key} differs from what was written")
         if not out and files:
             try:
-                body = self._body(_Objects(self, kind, name, files), kind, name, files)
-                body.laid_out(body.array_names())
+                body = self._body(_ObjectReader(self, kind, name, files), kind, name, files)
+                body.check_arrays(body.array_names())
             except (CorruptError, NotFoundError) as error:
                 out.append(str(error))
         return out
 
-    def send_model(self, path: str) -> None:
-        self._remote.send(path, self._remote.desk / path)
+    def upload_model(self, path: str) -> None:
+        self._remote.upload(path, self._remote.mirror / path)
 
-    def bring_model(self, path: str) -> None:
-        self._remote.bring(path)
+    def fetch_model(self, path: str) -> None:
+        self._remote.fetch(path)
 
-    def drop_models(self, named: Collection[str]) -> None:
-        for key in self._home.list("models/"):
+    def delete_models(self, named: Collection[str]) -> None:
+        for key in self._storage.list("models/"):
             if key not in named:
-                self._home.delete(key)
+                self._storage.delete(key)
 
-    def copied(self, kind: str, name: str, files: Sequence[StoredFile], target: Path) -> Path:
+    def copy_group(self, kind: str, name: str, files: Sequence[StoredFile], target: Path) -> Path:
         target.mkdir(parents=True)
         for file in files:
             with open(target / file.path, "xb") as copy:
-                for chunk in self.chunks(kind, name, file):
+                for chunk in self.file_chunks(kind, name, file):
                     copy.write(chunk)
             if stored_file(target, file.path) != file:
                 raise CorruptError(
-                    f"{self._home.url}/{self._key(kind, name, file)} differs from what was written", code="bytes_differ"
+                    f"{self._storage.url}/{self._key(kind, name, file)} differs from what was written",
+                    code="bytes_differ",
                 )
         return target
 
-    def chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
-        return self._home.get(self._key(kind, name, file))
+    def file_chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
+        return self._storage.get(self._key(kind, name, file))
 
     def _sha256(self, key: str) -> str | None:
-        """Of an object's bytes; None where there is none."""
+        """Return the digest of an object's bytes; None if there is no such object."""
         digest = hashlib.sha256()
         try:
-            for chunk in self._home.get(key):
+            for chunk in self._storage.get(key):
                 digest.update(chunk)
         except NotFoundError:
             return None
         return digest.hexdigest()
 
     def size_bytes(self, kind: str, name: str) -> int:
-        return sum(found.size_bytes for found in self._home.list(self._prefix(kind, name)).values())
+        return sum(found.size_bytes for found in self._storage.list(self._prefix(kind, name)).values())
 
     def drop(self, kind: str, name: str) -> None:
-        for key in self._home.list(self._prefix(kind, name)):
-            self._home.delete(key)
+        for key in self._storage.list(self._prefix(kind, name)):
+            self._storage.delete(key)
             cache.drop(key.rpartition("/")[2][:32])
 
     def groups(self) -> list[tuple[str, str]]:
-        found = {tuple(key.split("/")[1:3]) for key in self._home.list(f"{_ROOT}/")}
+        found = {tuple(key.split("/")[1:3]) for key in self._storage.list(f"{_ROOT}/")}
         return sorted((kind, name) for kind, name in found if kind in KINDS and is_digest(name))
 
     def exists(self, kind: str, name: str) -> bool:
-        return bool(self._home.list(self._prefix(kind, name)))
+        return bool(self._storage.list(self._prefix(kind, name)))
 
-    def strangers(self) -> list[str]:
+    def unknown_entries(self) -> list[str]:
         ours = {f"{_ROOT}/{kind}/{name}" for kind, name in self.groups()}
         return sorted(
-            key[len(_ROOT) + 1 :] for key in self._home.list(f"{_ROOT}/") if key.rpartition("/")[0] not in ours
+            key[len(_ROOT) + 1 :] for key in self._storage.list(f"{_ROOT}/") if key.rpartition("/")[0] not in ours
         )
 
     def drop_leftovers(self, *, dry_run: bool = False) -> int:
-        return 0  # what was sent and not named is an orphan
+        return 0  # sent but unnamed objects are orphans, deleted by `prune`
 
-    def _body(self, reader: _Objects, kind: str, name: str, files: Sequence[StoredFile]) -> layout.Body:
-        at = f"{self._home.url}/{self._prefix(kind, name)}".rstrip("/")
-        return layout.Body(at, kind, {file.path: file.size_bytes for file in files}, reader)
+    def _body(self, reader: _ObjectReader, kind: str, name: str, files: Sequence[StoredFile]) -> layout.GroupReader:
+        at = f"{self._storage.url}/{self._prefix(kind, name)}".rstrip("/")
+        return layout.GroupReader(at, kind, {file.path: file.size_bytes for file in files}, reader)
 
     def _key(self, kind: str, name: str, file: StoredFile) -> str:
         if "/" in file.path:
@@ -244,11 +249,11 @@ class ObjectArrays(Arrays):
         return f"{_ROOT}/{kind}/{name}/"
 
 
-class _Objects:
-    """The files of a group in an object store."""
+class _ObjectReader:
+    """Read files of a group in an object store."""
 
     def __init__(self, arrays: ObjectArrays, kind: str, name: str, files: Sequence[StoredFile]) -> None:
-        self._home = arrays._home
+        self._storage = arrays._storage
         self._files = {file.path: file for file in files}
         self._keys = {file.path: arrays._key(kind, name, file) for file in files}
         self._whole = {path: cache.find(file.sha256) for path, file in self._files.items()}
@@ -259,11 +264,11 @@ class _Objects:
             with contextlib.suppress(FileNotFoundError), open(whole, "rb") as opened:
                 opened.seek(start)
                 return opened.read(stop - start)
-            self._whole[file] = None  # the cache let it go
+            self._whole[file] = None  # evicted from the cache
         for at, held in self._held[file]:
             if at <= start and stop <= at + len(held):
                 return held[start - at : stop - at]
-        (found,) = self._home.ranges(self._keys[file], [(start, stop)])
+        (found,) = self._storage.get_ranges(self._keys[file], [(start, stop)])
         return found
 
     def expect(self, file: str, ranges: Sequence[layout.Range]) -> None:
@@ -271,24 +276,24 @@ class _Objects:
         missing = [r for r in ranges if not any(at <= r[0] and r[1] <= at + len(b) for at, b in self._held[file])]
         if self._whole[file] is not None or not missing:
             return
-        few = joined(missing, MAX_REQUESTS)
+        few = merge_ranges(missing, MAX_REQUESTS)
         if sum(stop - start for start, stop in few) > _WHOLE * size:
             one = self._files[file]
-            self._whole[file] = cache.keep(one.sha256, self._home.get(self._keys[file]), self._keys[file])
+            self._whole[file] = cache.keep(one.sha256, self._storage.get(self._keys[file]), self._keys[file])
             return
-        found = self._home.ranges(self._keys[file], few)
+        found = self._storage.get_ranges(self._keys[file], few)
         self._held[file] += [(start, content) for (start, _), content in zip(few, found, strict=True)]
 
     def dropped(self) -> bool:
-        """Forget what this machine had kept of the group; whether there was anything."""
+        """Delete this group's files from the cache; returns True if there were any."""
         kept = [self._files[path].sha256 for path, whole in self._whole.items() if whole is not None]
         for sha256 in kept:
             cache.drop(sha256)
         return bool(kept)
 
 
-def joined(ranges: Sequence[layout.Range], at_most: int) -> list[layout.Range]:
-    """Ranges that cover those that are given, at most so many: those with the least between them become one."""
+def merge_ranges(ranges: Sequence[layout.Range], at_most: int) -> list[layout.Range]:
+    """Merge ranges until at most ``at_most`` are left, closing the smallest gaps first."""
     out: list[layout.Range] = []
     for start, stop in sorted(ranges):
         if out and start <= out[-1][1]:

@@ -1,8 +1,7 @@
-"""Objects of the map: their numbers, what people said of them, and what was computed of each component last.
+"""Objects of the map: their numbers, facts about them, and the object sets computed for each component.
 
-An object keeps its number, and with it what was said of it, when objects are made again: it is found by where captures
-show it, in their own frames, so that neither poses nor the order of captures matter. What was computed is a result that
-the next one replaces.
+An object keeps its number and facts when objects are computed again: it is recognized by its boxes in the captures' own
+frames, so that neither poses nor the order of captures matter. A new result replaces the previous one.
 """
 
 from __future__ import annotations
@@ -22,55 +21,39 @@ from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import facts, recipes
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.facts import Fact
 from gsmap.store.matrices import from_array, from_pose, to_pose
 from gsmap.store.schema import object_facts, object_places, object_sets, objects
 from gsmap.types import MapObject, ObjectAnnotations, ObjectObservation, Room, Sim3
 from gsmap.types.map_object import OBSERVATION_STATES
 from gsmap.types.plain import plain
 
-Places = Mapping[str, np.ndarray]
-"""Where captures show an object: (2, 3) box around it in the capture's own frame, by scene id."""
+ObjectBoxes = Mapping[str, np.ndarray]
+"""Boxes of an object: (2, 3) bounds in the scene frame, by scene id."""
 
-# Boxes of one object by two computations overlap by this share of what they cover together, each made larger first by
-# a share of the larger one's diagonal: that of a picture on a wall has no thickness to speak of.
-_SAME_SHARE = 0.1
+# Minimum intersection over union of the boxes of one object in two computations, each padded by a fraction of the
+# larger one's diagonal because the box of a picture on a wall has almost no thickness.
+_MIN_OVERLAP = 0.1
 _PAD = 0.03
 
-_MAX_CELLS = 1 << 24  # of a room: hundreds of metres wide
+_MAX_CELLS = 1 << 24  # cells of a room, hundreds of metres wide
 
 _NUMBER = re.compile(r"o([1-9][0-9]{0,8})")
-_NO_NAME = re.compile(r"o[0-9]+|[0-9a-f]{8}|[-+0-9.eE,\s]+")  # these are ids and points
-
-
-@dataclass(frozen=True)
-class ObjectFact:
-    """One thing that was said of an object.
-
-    Args:
-        kind: of `gsmap.types.map_object.OBJECT_FACTS`.
-        value: the text; empty where what was said before was taken back.
-        author: who said it; empty where a person did and was not named.
-        created_at: when.
-    """
-
-    kind: str
-    value: str
-    author: str
-    created_at: str
+_RESERVED_NAME = re.compile(r"o[0-9]+|[0-9a-f]{8}|[-+0-9.eE,\s]+")  # reserved for ids and points
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectSet:
-    """What was computed of one component.
+    """The objects computed for one component.
 
     Args:
-        key: `RecipeKey.digest`, of the recipe and of what it was made from.
+        key: `RecipeKey.digest` of the recipe and inputs.
         recipe: `RecipeKey.recipe`.
         metres: per unit of the map.
-        poses: ``S_map_scene`` of its captures by scene id, as it was made with.
-        things: digest of what each of them shows, by scene id.
-        objects: with numbers for ids; without photographs and without what people say. The frame is that of ``poses``.
-        up: (3,) against gravity in that frame.
+        poses: ``S_map_scene`` of its captures by scene id, as used for it.
+        things: digest of the segments of each capture, by scene id.
+        objects: with numbers as ids, without photographs and facts, in the frame of ``poses``.
+        up: (3,) direction against gravity in that frame.
         rooms: in the level frame of ``up`` (`gsmap.geometry.directions.level_frame`), the largest first.
     """
 
@@ -85,22 +68,22 @@ class ObjectSet:
 
 
 @dataclass(frozen=True, eq=False)
-class Computed:
-    """What was computed of one component, to be kept.
+class ComputedObjects:
+    """The objects computed for one component, to be stored.
 
     Args:
-        made: its objects, the ids of which are replaced by numbers.
-        places: where captures show each of them.
-        key: what it is kept under.
+        made: the objects, whose ids are replaced by numbers.
+        places: boxes of each object by scene.
+        key: recipe and inputs.
     """
 
     made: ObjectSet
-    places: Sequence[Places]
+    places: Sequence[ObjectBoxes]
     key: RecipeKey
 
 
 def number_of(text: str) -> int | None:
-    """The number of an object by what it is called (``o12``); None for anything else."""
+    """Parse the number of an object from its id (``o12``); None for other texts."""
     found = _NUMBER.fullmatch(text)
     return None if found is None else int(found[1])
 
@@ -111,32 +94,32 @@ class Objects:
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
 
-    # --- what was computed -------------------------------------------------------------------------------------------
+    # --- object sets -------------------------------------------------------------------------------------------------
 
     def sets(self) -> list[ObjectSet]:
-        """What was computed last of every component.
+        """Return the newest object set of every component.
 
         Raises:
-            CorruptError: what the catalog holds makes no sense.
+            CorruptError: the catalog holds an invalid object set.
         """
         with self._catalog.read() as connection:
             rows = connection.execute(select(object_sets).order_by(object_sets.c.number)).all()
         return [_read(row) for row in rows]
 
-    def save(self, parts: Sequence[Computed]) -> list[ObjectSet]:
-        """Keep what was computed of components, in the place of what knew any of their captures before.
+    def save(self, parts: Sequence[ComputedObjects]) -> list[ObjectSet]:
+        """Store object sets, replacing those that share a capture with them.
 
-        No number is given twice in the map. Where a component came apart, the part of which more captures show an
-        object keeps its number; the other part has a new object, see `parted`.
+        No number is assigned twice in the map. If a component was split, an object keeps its number in the part where
+        more captures show it; the other part gets a new object, see `split_objects`.
 
         Returns:
-            The same with the numbers that objects have, or have now, instead of ids.
+            The object sets with numbers as ids.
         """
         with self._catalog.write() as connection:
             forget_sets(connection, [scene for part in parts for scene in part.made.poses])
             found = [places for part in parts for places in part.places]
-            given = _given(connection)
-            numbers = matched(connection, found, given)
+            given = _numbers_in_use(connection)
+            numbers = match_objects(connection, found, given)
             when = now()
             made: list[int] = []
             for number in numbers:
@@ -151,20 +134,20 @@ class Objects:
             ]
 
     def _save(
-        self, connection: Connection, part: Computed, numbers: Sequence[int], given: Collection[int], when: str
+        self, connection: Connection, part: ComputedObjects, numbers: Sequence[int], given: Collection[int], when: str
     ) -> ObjectSet:
-        """Keep one component.
+        """Store one object set.
 
         Args:
             numbers: of its objects.
-            given: of all objects of the map.
+            given: numbers of all objects of the map.
         """
         made = part.made
         kept = replace(
             made,
             objects=tuple(replace(thing, id=f"o{number}") for thing, number in zip(made.objects, numbers, strict=True)),
         )
-        self._follow(connection, part, set(given) - set(numbers))
+        self._update_split_objects(connection, part, set(given) - set(numbers))
         mine = object_places.c.object.in_(numbers)
         connection.execute(delete(object_places).where(mine, object_places.c.scene.in_(list(made.poses))))
         rows = [
@@ -176,7 +159,7 @@ class Objects:
             connection.execute(insert(object_places), rows)
         value = {
             "key": part.key.digest,
-            "recipe": recipes.keep(connection, part.key),
+            "recipe": recipes.save_recipe(connection, part.key),
             "poses": {scene: from_pose(pose) for scene, pose in made.poses.items()},
             "value": _value(kept),
             "created_at": when,
@@ -184,32 +167,33 @@ class Objects:
         connection.execute(insert(object_sets), value)
         return kept
 
-    def _follow(self, connection: Connection, part: Computed, others: Collection[int]) -> None:
-        """Let an object of another component that was one with an object here until they came apart know its place.
+    def _update_split_objects(self, connection: Connection, part: ComputedObjects, others: Collection[int]) -> None:
+        """Update the boxes of objects of other components that were one with an object here until their component was
+        split.
 
-        The two are found at equal places then, so that each keeps its number, and they are one when the components are.
+        Their boxes then stay equal, so that each keeps its number, and they merge again when the components do.
         """
         in_scenes = object_places.c.scene.in_(list(part.made.poses))
         for row in connection.execute(select(object_places).where(in_scenes)).all():
             if row.object in others:
                 here = np.array([places[row.scene] for places in part.places if row.scene in places])
                 share = _overlaps(here, np.array([row.box], np.float64)).ravel() if len(here) else np.zeros(1)
-                if share.max() >= _SAME_SHARE:
+                if share.max() >= _MIN_OVERLAP:
                     same = (object_places.c.object == row.object) & (object_places.c.scene == row.scene)
                     box = from_array(here[share.argmax()])
                     connection.execute(update(object_places).where(same).values(box=box))
 
-    def numbers(self, places: Sequence[Places]) -> list[int | None]:
-        """The numbers of objects, by where captures show them; None for those that have none. Nothing is kept."""
+    def match_numbers(self, places: Sequence[ObjectBoxes]) -> list[int | None]:
+        """Return the numbers of objects by their boxes; None for unknown objects. Nothing is stored."""
         captures = {scene for one in places for scene in one}
         with self._catalog.read() as connection:
-            return matched(connection, places, _given(connection, besides=captures))
+            return match_objects(connection, places, _numbers_in_use(connection, besides=captures))
 
-    def parted(self, shown: Mapping[int, Iterable[str]]) -> dict[int, int]:
-        """Objects that were one with another until their component came apart: the other's number, by number.
+    def split_objects(self, shown: Mapping[int, Iterable[str]]) -> dict[int, int]:
+        """Return pairs of objects that were one until their component was split: the other's number, by number.
 
         Args:
-            shown: captures of its component, by the number of each object of the map.
+            shown: captures of the object's component, by object number.
         """
         components = {number: set(captures) for number, captures in shown.items()}
         with self._catalog.read() as connection:
@@ -224,11 +208,11 @@ class Objects:
             elsewhere = [one for one in places if scene not in components[one[0]]]
             if here and elsewhere:
                 share = _overlaps(np.array([box for _, box in here]), np.array([box for _, box in elsewhere]))
-                for i, j in np.argwhere(share >= _SAME_SHARE):
+                for i, j in np.argwhere(share >= _MIN_OVERLAP):
                     out.setdefault(here[i][0], elsewhere[j][0])
         return out
 
-    # --- what people say ---------------------------------------------------------------------------------------------
+    # --- facts -------------------------------------------------------------------------------------------------------
 
     def edit(
         self,
@@ -240,85 +224,88 @@ class Objects:
         same_as: int | None = None,
         author: str = "",
     ) -> None:
-        """Say something of an object; what was said before stays in `facts`.
+        """Add facts about an object; earlier ones stay in `facts`.
 
         Args:
-            name: no other object's; empty to take it back.
-            label: what kind of thing it is; empty to take it back.
-            note: added to those that there are.
-            same_as: number of the object that it is one with; 0 to take that back.
-            author: who says so.
+            name: unique among objects; empty to withdraw it.
+            label: category of the object; empty to withdraw it.
+            note: added to the existing notes.
+            same_as: number of the object that it is identical with; 0 to withdraw that.
+            author: of the facts.
 
         Raises:
             NotFoundError: no such object.
-            InputError: an empty text, one with control characters, a name that is taken or that looks like a number or
-                a point, or objects that would be one with each other in a circle.
+            InputError: an empty text, control characters, a name that is in use or looks like an id or a point, or a
+                cycle of identical objects.
         """
-        said: list[tuple[str, str]] = []
+        new: list[tuple[str, str]] = []
         if name is not None:
-            said.append(("name", _checked_name(name) if name else ""))
+            new.append(("name", _validated_name(name) if name else ""))
         if label is not None:
-            said.append(("label", facts.checked_text("a label", label).strip() if label else ""))
+            new.append(("label", facts.validated_text("a label", label).strip() if label else ""))
         if note is not None:
-            said.append(("note", facts.checked_text("a note", note, lines=True)))
+            new.append(("note", facts.validated_text("a note", note, lines=True)))
         if same_as is not None:
-            said.append(("same_as", f"o{same_as}" if same_as else ""))
+            new.append(("same_as", f"o{same_as}" if same_as else ""))
         if author:
-            facts.checked_text("an author", author)
+            facts.validated_text("an author", author)
         with self._catalog.write() as connection:
             for one in (number, same_as or number):
                 if connection.execute(select(objects.c.number).where(objects.c.number == one)).first() is None:
                     raise NotFoundError(
                         f"this map has no object o{one}: gsmap graph MAP lists them", code="object_not_found"
                     )
-            words = standing(connection)
-            mine = words.get(number, ObjectAnnotations())
-            said = [(kind, value) for kind, value in said if kind == "note" or getattr(mine, kind) != value]
-            for kind, value in said:
+            annotations = current_annotations(connection)
+            mine = annotations.get(number, ObjectAnnotations())
+            new = [(kind, value) for kind, value in new if kind == "note" or getattr(mine, kind) != value]
+            for kind, value in new:
                 if kind == "name" and value:
-                    _check_free(words, number, value)
+                    _check_free(annotations, number, value)
                 if kind == "same_as" and value:
-                    _check_no_circle(words, number, value)
+                    _check_acyclic(annotations, number, value)
             rows = [
                 {"object": number, "kind": kind, "value": value, "author": author, "created_at": now()}
-                for kind, value in said
+                for kind, value in new
             ]
             if rows:
                 connection.execute(insert(object_facts), rows)
 
-    def words(self) -> dict[str, ObjectAnnotations]:
-        """What people say of objects now, by id (``o12``); those of which nobody said anything are left out."""
+    def annotations(self) -> dict[str, ObjectAnnotations]:
+        """Return the current name, label, note and identity of objects by id (``o12``); objects without any are left
+        out."""
         with self._catalog.read() as connection:
-            return {f"o{number}": words for number, words in standing(connection).items()}
+            return {f"o{number}": words for number, words in current_annotations(connection).items()}
 
-    def facts(self) -> dict[str, list[ObjectFact]]:
-        """Everything people ever said of objects, by id (``o12``), oldest first."""
-        out: dict[str, list[ObjectFact]] = {}
+    def facts(self) -> dict[str, list[Fact]]:
+        """Return all facts about objects by id (``o12``), oldest first."""
+        out: dict[str, list[Fact]] = {}
         query = select(object_facts).order_by(object_facts.c.number)
         with self._catalog.read() as connection:
             for row in connection.execute(query):
-                fact = ObjectFact(row.kind, row.value, row.author, row.created_at)
+                fact = Fact(row.kind, row.value, row.author, row.created_at)
                 out.setdefault(f"o{row.object}", []).append(fact)
         return out
 
     def places(self, number: int) -> dict[str, np.ndarray]:
-        """Where captures show, or showed when they were asked last, an object: its `Places`."""
+        """Return the boxes of an object by scene, as last computed."""
         query = select(object_places).where(object_places.c.object == number)
         with self._catalog.read() as connection:
             return {row.scene: np.array(row.box, np.float64) for row in connection.execute(query)}
 
 
-# --- which object is which -------------------------------------------------------------------------------------------
+# --- matching --------------------------------------------------------------------------------------------------------
 
 
-def matched(connection: Connection, found: Sequence[Places], given: Collection[int] = ()) -> list[int | None]:
-    """The number of each object that is found, None for a new one; each number is given once.
+def match_objects(
+    connection: Connection, found: Sequence[ObjectBoxes], given: Collection[int] = ()
+) -> list[int | None]:
+    """Assign the number of a stored object to each given object, None for new ones; each number is assigned once.
 
-    The more captures show two at one place, the surer they are one; of two that are as sure, the one whose places all
-    take part, then the older one.
+    Pairs are matched by the number of captures with overlapping boxes; ties prefer the object all of whose boxes match,
+    then the older one.
 
     Args:
-        given: numbers of other objects, which are not given again.
+        given: numbers of other objects, which are not assigned.
     """
     known: dict[str, list[tuple[int, np.ndarray]]] = {}
     counts: dict[int, int] = {}
@@ -335,7 +322,7 @@ def matched(connection: Connection, found: Sequence[Places], given: Collection[i
         if not theirs:
             continue
         share = _overlaps(np.array([box for _, box in mine]), np.array([box for _, box in theirs]))
-        for a, b in np.argwhere(share >= _SAME_SHARE):
+        for a, b in np.argwhere(share >= _MIN_OVERLAP):
             pair = mine[a][0], theirs[b][0]
             score[pair] = score.get(pair, 0.0) + float(share[a, b])
     numbers: list[int | None] = [None] * len(found)
@@ -348,8 +335,8 @@ def matched(connection: Connection, found: Sequence[Places], given: Collection[i
     return numbers
 
 
-def _given(connection: Connection, besides: Iterable[str] = ()) -> set[int]:
-    """Numbers of the objects that are kept as computed; of sets with any of the captures ``besides`` none."""
+def _numbers_in_use(connection: Connection, besides: Iterable[str] = ()) -> set[int]:
+    """Return the numbers of objects in stored sets, without sets with any of the captures ``besides``."""
     out, others = set(), set(besides)
     for row in connection.execute(select(object_sets)):
         if not others & set(row.poses):
@@ -358,7 +345,7 @@ def _given(connection: Connection, besides: Iterable[str] = ()) -> set[int]:
 
 
 def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N, M) share of what two boxes cover together that both cover, of boxes (N, 2, 3) and (M, 2, 3)."""
+    """Compute (N, M) intersection over union of padded boxes (N, 2, 3) and (M, 2, 3)."""
     size = np.maximum(
         np.linalg.norm(a[:, 1] - a[:, 0], axis=1)[:, None], np.linalg.norm(b[:, 1] - b[:, 0], axis=1)[None]
     )
@@ -372,35 +359,35 @@ def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return found
 
 
-# --- words -----------------------------------------------------------------------------------------------------------
+# --- facts -----------------------------------------------------------------------------------------------------------
 
 
-def standing(connection: Connection) -> dict[int, ObjectAnnotations]:
-    """What people say of objects now, by number."""
-    said: dict[int, dict[str, str]] = {}
+def current_annotations(connection: Connection) -> dict[int, ObjectAnnotations]:
+    """Return the current annotations of objects by number."""
+    by_object: dict[int, dict[str, str]] = {}
     for row in connection.execute(select(object_facts).order_by(object_facts.c.number)):
-        said.setdefault(row.object, {})[row.kind] = row.value
-    return {number: ObjectAnnotations(**values) for number, values in said.items() if any(values.values())}
+        by_object.setdefault(row.object, {})[row.kind] = row.value
+    return {number: ObjectAnnotations(**values) for number, values in by_object.items() if any(values.values())}
 
 
-def _checked_name(name: str) -> str:
-    name = facts.checked_text("the name of an object", name).strip()
-    if _NO_NAME.fullmatch(name):
+def _validated_name(name: str) -> str:
+    name = facts.validated_text("the name of an object", name).strip()
+    if _RESERVED_NAME.fullmatch(name):
         raise InputError(f"an object cannot be called {name!r}: ids and points look so", code="invalid_name")
     return name
 
 
-def _check_free(words: Mapping[int, ObjectAnnotations], number: int, name: str) -> None:
-    for other, said in words.items():
-        if other != number and said.name.casefold() == name.casefold():
+def _check_free(annotations: Mapping[int, ObjectAnnotations], number: int, name: str) -> None:
+    for other, annotation in annotations.items():
+        if other != number and annotation.name.casefold() == name.casefold():
             raise InputError(
-                f"o{other} is called {said.name!r} already: choose another name, rename that one, or say that the two "
-                f"are one (--same-as o{other})",
+                f"o{other} is called {annotation.name!r} already: choose another name, rename that one, or mark "
+                f"both as the same object (--same-as o{other})",
                 code="name_taken",
             )
 
 
-def _check_no_circle(words: Mapping[int, ObjectAnnotations], number: int, same_as: str) -> None:
+def _check_acyclic(annotations: Mapping[int, ObjectAnnotations], number: int, same_as: str) -> None:
     seen = {f"o{number}"}
     at: str | None = same_as
     while at:
@@ -409,14 +396,14 @@ def _check_no_circle(words: Mapping[int, ObjectAnnotations], number: int, same_a
                 f"o{number} and {same_as} are said to be one already, or are the same object", code="already_same"
             )
         seen.add(at)
-        at = words.get(number_of(at) or 0, ObjectAnnotations()).same_as
+        at = annotations.get(number_of(at) or 0, ObjectAnnotations()).same_as
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
 
 
 def forget_sets(connection: Connection, scenes: Iterable[str]) -> int:
-    """Drop what was computed with any of these captures; how many results went."""
+    """Delete the object sets with any of these captures; returns how many."""
     gone = set(scenes)
     rows = connection.execute(select(object_sets.c.number, object_sets.c.poses)).all()
     numbers = [row.number for row in rows if gone & set(row.poses)]
@@ -425,7 +412,7 @@ def forget_sets(connection: Connection, scenes: Iterable[str]) -> int:
 
 
 def forget_scene(connection: Connection, scene: str) -> dict[str, int]:
-    """Drop all that is known of objects by a capture, and what was said of those that no other shows; rows by noun."""
+    """Delete the boxes of a capture, and facts of objects that no other capture shows; returns row counts by noun."""
     dropped = {"object_sets": forget_sets(connection, [scene])}
     mine = object_places.c.scene == scene
     of_it = list(connection.execute(select(object_places.c.object).where(mine)).scalars())
@@ -437,7 +424,7 @@ def forget_scene(connection: Connection, scene: str) -> dict[str, int]:
 
 
 def inherit(connection: Connection, old: str, new: str) -> None:
-    """Let the objects that a capture shows be shown by another, in whose frame it is."""
+    """Move the object boxes of a capture to another one in the same frame."""
     has = set(connection.execute(select(object_places.c.object).where(object_places.c.scene == new)).scalars())
     moving = (object_places.c.scene == old) & object_places.c.object.not_in(has)
     connection.execute(update(object_places).where(moving).values(scene=new))
@@ -470,7 +457,7 @@ def _value(made: ObjectSet) -> dict[str, Any]:
                 "box": plain(thing.box),
                 "position": plain(thing.position),
                 "colour": plain(thing.colour),
-                # Of captures that cannot have looked nothing is kept.
+                # Observations of captures that cannot see the object are not stored.
                 "sightings": [
                     [at[s.scene], s.state, s.thing, plain(s.box), s.looked, at.get(s.asked, -1)]
                     for s in thing.sightings
@@ -508,18 +495,18 @@ def _read(row: Row[Any]) -> ObjectSet:
 
 
 def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, str]) -> MapObject:
-    said: dict[int, ObjectObservation] = {}
+    observations: dict[int, ObjectObservation] = {}
     for at, state, thing, box, looked, asked in one["sightings"]:
         if state not in OBSERVATION_STATES or not 0 <= at < len(scenes) or not -1 <= asked < len(scenes):
             raise InputError(f"a sighting of {state!r}", code="invalid_record")
         corners = None if box is None else _numbers(box, (2, 3))
         by = "" if asked < 0 else scenes[asked]
-        said[at] = ObjectObservation(scenes[at], state, int(thing), corners, float(looked), by)
+        observations[at] = ObjectObservation(scenes[at], state, int(thing), corners, float(looked), by)
     if number_of(str(one["id"])) is None:
         raise InputError(f"an object called {one['id']!r}", code="invalid_record")
-    # Captures whose things nobody knows tell nothing of any.
+    # Captures with unknown segments have no observations.
     every = tuple(
-        said.get(i, ObjectObservation(scene, "unseen", -1, None, 0.0))
+        observations.get(i, ObjectObservation(scene, "unseen", -1, None, 0.0))
         for i, scene in enumerate(scenes)
         if things[scene]
     )

@@ -1,7 +1,7 @@
-"""Photographs that a map keeps as evidence (`LocalizedPhoto`), each with a small JPEG to show it.
+"""Photos that a map keeps as evidence (`LocalizedPhoto`), each with a small JPEG.
 
-A row is never overwritten: one that is taken back stays, and says when. A photo's pose is relative to the scene that
-supports it, whose newest pose takes it to the map.
+Rows are never overwritten: a removed photo keeps its row with the time of removal. A photo's pose is relative to the
+scene that supports it, whose newest pose transforms it to the map.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from sqlalchemy import Connection, Row, insert, select, update
 
 from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.store import facts
+from gsmap.store.array_groups import manifest, publish, unless_pruned
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import manifest, publish, unless_pruned
+from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.scene_refs import living_ids, resolve
 from gsmap.store.schema import photo_sightings
 from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 
 KIND = "photos"
-MAX_BYTES = 1 << 19  # of a photo's JPEG: the merged map is to look like it, and no sharper
+MAX_BYTES = 1 << 19  # of a photo's JPEG: enough to refine merged tiles
 
 
 @dataclass(frozen=True, eq=False)
 class StoredPhoto:
-    """A photo that is kept.
+    """A photo kept in the map.
 
     Args:
         number: of its row.
-        sighting: what it says.
+        sighting: its pose and observations.
         created_at: when it was added.
-        picture: digest of what is kept of its picture.
+        picture: digest of its small JPEG.
     """
 
     number: int
@@ -44,22 +44,22 @@ class StoredPhoto:
 
 
 class Photos:
-    """The photographs that a map keeps."""
+    """The photos kept in a map."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
 
     def add(self, sighting: LocalizedPhoto, jpeg: bytes) -> bool:
-        """Keep a photo; False, and nothing is changed, where the same one is kept already.
+        """Add a photo; returns False, and changes nothing, if the same one is in the map already.
 
         Raises:
-            InputError: the JPEG is none, or larger than `MAX_BYTES`; or the date is none.
+            InputError: not a JPEG, a JPEG larger than `MAX_BYTES`, or an invalid date.
             NotFoundError: no such scene.
         """
         if not jpeg.startswith(b"\xff\xd8\xff") or len(jpeg) > MAX_BYTES:
             raise InputError(f"a photo is kept as a JPEG of at most {MAX_BYTES} bytes", code="photo_not_jpeg")
-        when = None if sighting.captured_at is None else facts.checked_date(sighting.captured_at)
+        when = None if sighting.captured_at is None else facts.validated_date(sighting.captured_at)
         pixels = np.frombuffer(jpeg, np.uint8)
         group_id = digest(pixels, text=KIND)
         row = {
@@ -71,10 +71,10 @@ class Photos:
             "group_id": group_id,
         }
         staging = self._arrays.stage({"jpeg": pixels}, KIND, group_id)
-        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+        with translate_errors(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             resolve(connection, sighting.scene)
             same = photo_sightings.c.digest == sighting.digest
-            if connection.execute(select(photo_sightings.c.number).where(same, _standing())).first() is not None:
+            if connection.execute(select(photo_sightings.c.number).where(same, _is_current())).first() is not None:
                 return False
             known = manifest(connection, group_id)
             if not known or self._arrays.problems(KIND, group_id, known):
@@ -83,23 +83,23 @@ class Photos:
         return True
 
     def list(self) -> list[StoredPhoto]:
-        """All that are kept, of living scenes, oldest first; those without a date last, as they came.
+        """Return the current photos of living scenes, oldest first, then those without a date in order of addition.
 
         Raises:
-            CorruptError: what the catalog holds makes no sense.
+            CorruptError: the catalog holds an invalid photo.
         """
         with self._catalog.read() as connection:
-            alive = living_ids(connection)
-            rows = connection.execute(select(photo_sightings).where(_standing()).order_by(photo_sightings.c.number))
-            kept = [_stored(row) for row in rows if row.scene in alive]
+            living = living_ids(connection)
+            rows = connection.execute(select(photo_sightings).where(_is_current()).order_by(photo_sightings.c.number))
+            kept = [_stored(row) for row in rows if row.scene in living]
         return sorted(kept, key=lambda one: (one.sighting.captured_at is None, one.sighting.captured_at or ""))
 
     def jpeg(self, number: int) -> bytes:
-        """The small picture of a photo.
+        """Return the small JPEG of a photo.
 
         Raises:
             NotFoundError: no such photo.
-            CorruptError: bytes on disk are missing or differ, or are no JPEG.
+            CorruptError: bytes on disk are missing or differ, or are not a JPEG.
         """
         with self._catalog.read() as connection:
             mine = photo_sightings.c.number == number
@@ -118,47 +118,47 @@ class Photos:
             )
         return content
 
-    def find(self, which: str) -> StoredPhoto:
-        """The photo of a name, of a number (``p3``), or whose digest begins so.
+    def find(self, reference: str) -> StoredPhoto:
+        """Return the photo with a name, number (``p3``) or digest prefix.
 
         Raises:
-            NotFoundError: none, or several.
+            NotFoundError: no photo matches, or several do.
         """
         kept = self.list()
-        found = [one for one in kept if which in (one.sighting.name, f"p{one.number}")]
-        if not found and len(which) >= _SHORTEST:
-            found = [one for one in kept if one.sighting.digest.startswith(which)]
+        found = [one for one in kept if reference in (one.sighting.name, f"p{one.number}")]
+        if not found and len(reference) >= _MIN_DIGEST_LENGTH:
+            found = [one for one in kept if one.sighting.digest.startswith(reference)]
         if len(found) != 1:
             why = "keeps several photos of that name" if found else "keeps no photo"
             raise NotFoundError(
-                f"{which}: the map {why}; gsmap list MAP photos shows them with numbers such as p3",
+                f"{reference}: the map {why}; gsmap list MAP photos shows them with numbers such as p3",
                 code="photo_not_found",
             )
         return found[0]
 
     def remove(self, number: int) -> None:
-        """Take a photo back; its row stays and says when, and prune reclaims its picture."""
+        """Remove a photo; its row stays with the time of removal, and prune reclaims its JPEG."""
         mine = photo_sightings.c.number == number
         with self._catalog.write() as connection:
-            connection.execute(update(photo_sightings).where(mine, _standing()).values(removed_at=now()))
+            connection.execute(update(photo_sightings).where(mine, _is_current()).values(removed_at=now()))
 
 
-_SHORTEST = 6  # of a digest that is not whole
+_MIN_DIGEST_LENGTH = 6  # of a digest prefix
 
 
 def claimed_groups(connection: Connection, lost: set[str] | None = None) -> set[str]:
-    """The groups of photos that are kept, but those of scenes that are lost."""
-    rows = connection.execute(select(photo_sightings.c.group_id, photo_sightings.c.scene).where(_standing()))
+    """Return the groups of current photos, without those of ``lost`` scenes."""
+    rows = connection.execute(select(photo_sightings.c.group_id, photo_sightings.c.scene).where(_is_current()))
     return {row.group_id for row in rows if row.group_id is not None and row.scene not in (lost or ())}
 
 
 def inherit(connection: Connection, old: str, new: str) -> None:
-    """Let a scene have the photos of another, in whose frame it is."""
+    """Move the photos of a scene to another one in the same frame."""
     mine = photo_sightings.c.scene == old
-    connection.execute(update(photo_sightings).where(mine, _standing()).values(scene=new))
+    connection.execute(update(photo_sightings).where(mine, _is_current()).values(scene=new))
 
 
-def _standing() -> Any:
+def _is_current() -> Any:
     return photo_sightings.c.removed_at.is_(None)
 
 
@@ -179,7 +179,7 @@ def _value(sighting: LocalizedPhoto) -> dict[str, Any]:
 def _stored(row: Row[Any]) -> StoredPhoto:
     try:
         value = row.value
-        when = None if row.captured_at is None else facts.checked_date(row.captured_at)
+        when = None if row.captured_at is None else facts.validated_date(row.captured_at)
         things = tuple(
             PhotoObjectObservation(np.array(one["position"], np.float64), one["state"], float(one["share"]))
             for one in value["things"]

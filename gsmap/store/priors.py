@@ -1,4 +1,4 @@
-"""Outside knowledge of scene poses: at most one standing prior for each scene, the earlier ones kept."""
+"""Pose priors: at most one current prior per scene; earlier ones are kept as history."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from gsmap.types import Prior
 
 
 class Priors:
-    """The priors of a map."""
+    """The pose priors of a map."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
 
     def set(self, prior: Prior) -> None:
-        """Give a scene a prior, in place of the one it had."""
+        """Set the pose prior of a scene, replacing the previous one."""
         sigmas = np.asarray(prior.sigmas, np.float64)
         if sigmas.shape != (7,) or not (sigmas > 0).all():
             raise InputError(
@@ -42,29 +42,29 @@ class Priors:
             connection.execute(insert(priors), row | {"created_at": now()})
 
     def list(self) -> list[Prior]:
-        """The standing priors of living scenes, oldest first."""
+        """Return the current priors of living scenes, oldest first."""
         return [prior for _, prior in self.numbered()]
 
     def numbered(self) -> tuple[tuple[int, Prior], ...]:
-        """The same, each with which of all that was ever told it is."""
+        """Return the current priors of living scenes with their row numbers, oldest first."""
         query = select(priors).where(priors.c.removed_at.is_(None)).order_by(priors.c.number)
         with self._catalog.read() as connection:
-            alive = living_ids(connection)
-            rows = [row for row in connection.execute(query) if row.scene in alive]
+            living = living_ids(connection)
+            rows = [row for row in connection.execute(query) if row.scene in living]
         return tuple((row.number, _prior(row)) for row in rows)
 
     def of(self, scene: str) -> Prior | None:
-        """The standing prior of a scene (id); None where it has none."""
+        """Return the current prior of a scene (id); None if it has none."""
         query = select(priors).where(priors.c.scene == scene, priors.c.removed_at.is_(None)).order_by(priors.c.number)
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()
         return _prior(rows[-1]) if rows else None
 
     def earlier(self, ref: str, number: int) -> Prior:
-        """What was told of a scene once, by its number.
+        """Return an earlier prior of a scene by its number.
 
         Raises:
-            NotFoundError: no such prior of that scene.
+            NotFoundError: the scene has no prior with this number.
         """
         with self._catalog.read() as connection:
             scene = resolve(connection, ref)
@@ -75,7 +75,7 @@ class Priors:
         return _prior(row)
 
     def remove(self, ref: str) -> None:
-        """Take a scene's prior back.
+        """Remove the prior of a scene.
 
         Raises:
             NotFoundError: it has none.
@@ -85,8 +85,8 @@ class Priors:
                 raise NotFoundError(f"scene {ref!r} has no prior", code="prior_not_found")
 
     def _retire(self, connection: Connection, scene: str) -> int:
-        standing = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
-        return int(connection.execute(update(priors).where(standing).values(removed_at=now())).rowcount)
+        current = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
+        return int(connection.execute(update(priors).where(current).values(removed_at=now())).rowcount)
 
 
 def _prior(row: Row[Any]) -> Prior:

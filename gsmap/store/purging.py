@@ -1,8 +1,8 @@
-"""Forgetting a scene for good: its rows, its arrays, and every byte of the catalog that told of it.
+"""Purge a scene: delete its rows, its arrays, and every byte of the catalog about it.
 
-In three steps, so that a crash leaves a purge that the next one finishes: `begin` takes the rows out in one transaction
-and writes down what is still to be done; who knows the exports deletes tiles there; `finish` reclaims arrays, older
-copies of the catalog and what deleted rows left in its file, and completes the receipt.
+A purge has three steps, so that one interrupted by a crash can be finished later: `begin` deletes the rows in one
+transaction and records what is left to do; the caller deletes tiles in the export folders; `finish` reclaims arrays,
+older copies of the catalog and deleted rows in its file, and completes the receipt.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from sqlalchemy import Connection, Row, Table, delete, exists, func, insert, sel
 from gsmap.durable import files_below, is_file, is_folder, remove_file, sync_folder
 from gsmap.errors import BusyError
 from gsmap.store import integrity, objects, sqlite
-from gsmap.store.branches import Place
+from gsmap.store.branches import MapLocation
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.columns import KINDS
-from gsmap.store.explained import explained
+from gsmap.store.column_types import KINDS
+from gsmap.store.error_translation import translate_errors
 from gsmap.store.revisions import holds_in_revision
 from gsmap.store.schema import (
     CHUNK_BOXES,
@@ -54,10 +54,10 @@ from gsmap.store.schema import (
 )
 from gsmap.store.store import Store
 
-_GONE = "a scene that was purged"
-# Texts that gsmap wrote itself: where one names the scene it says instead that it was purged. What people wrote of
-# other scenes is theirs, and is only told of.
-_REMARKS: tuple[tuple[Table, tuple[str, ...]], ...] = (
+_PURGED = "a scene that was purged"
+# Texts that gsmap generated: the name of the scene is replaced. Texts that people wrote about other scenes are kept
+# and only listed in the receipt.
+_GENERATED_TEXTS: tuple[tuple[Table, tuple[str, ...]], ...] = (
     (scenes, ("notes",)),
     (registrations, ("reason", "notes")),
     (revisions, ("notes", "provenance", "world")),
@@ -65,7 +65,7 @@ _REMARKS: tuple[tuple[Table, tuple[str, ...]], ...] = (
     (comparisons, ("notes",)),
     (tiles, ("notes",)),
 )
-_WORDS: tuple[tuple[Table, str, str], ...] = (
+_USER_TEXTS: tuple[tuple[Table, str, str], ...] = (
     (scene_facts, "value", "scene"),
     (reviews, "note", "pair"),
     (change_reviews, "note", "change"),
@@ -76,14 +76,15 @@ _WORDS: tuple[tuple[Table, str, str], ...] = (
 
 @dataclass(frozen=True)
 class Purge:
-    """A purge of a scene and how far it is.
+    """A purge of a scene and its progress.
 
     Args:
         number: of its row.
         scene: id.
-        receipt: counts of what went, what is still to be done (``pending``: the folders to look into, how many files go
-            in those that were, and the arrays and copies of the catalog to delete), and where else the scene may live.
-        created_at: when its rows went.
+        receipt: counts of what was deleted; what is left to do (``pending``: folders to search, numbers of files to
+            delete in those already searched, arrays and catalog copies to delete); and other places where the scene may
+            exist.
+        created_at: when its rows were deleted.
     """
 
     number: int
@@ -97,13 +98,13 @@ class Purge:
 
 
 def begin(store: Store, scene: str) -> Purge:
-    """Take everything out of the catalog that tells of a scene, in one transaction; `finish` does the rest.
+    """Delete all rows about a scene in one transaction; `finish` does the rest.
 
     Args:
-        scene: id of a scene that the catalog has, living or removed.
+        scene: id of a living or removed scene in the catalog.
     """
-    # These stay, and another purge takes them.
-    shared = {group for _, group in integrity.verified(store.catalog, store.arrays).groups()}
+    # Groups of other catalogs stay until the scene is purged there.
+    shared = {group for _, group in integrity.verify_catalogs(store.catalog, store.arrays).groups()}
     of_map = _backups_of_map(store)
     with store.catalog.write() as connection:
         row = connection.execute(select(scenes).where(scenes.c.id == scene)).one()
@@ -132,51 +133,52 @@ def begin(store: Store, scene: str) -> Purge:
     return Purge(number, scene, receipt, when)
 
 
-def listed(store: Store) -> list[Purge]:
-    """All purges, oldest first."""
+def list_purges(store: Store) -> list[Purge]:
+    """Return all purges, oldest first."""
     with store.catalog.read() as connection:
         rows = connection.execute(select(purges).order_by(purges.c.number)).all()
     return [Purge(row.number, row.scene, dict(row.receipt), row.created_at) for row in rows]
 
 
-def note(store: Store, purge: Purge, target: str, num_files: int) -> Purge:
-    """Write down how many files of tiles go in a folder, before they do: a crash may leave nothing to count."""
+def record_tile_files(store: Store, purge: Purge, target: str, num_files: int) -> Purge:
+    """Record the number of tile files to delete in a folder before they are deleted, since a crash may leave none to
+    count."""
     pending = purge.receipt["pending"]
-    known = pending.get("tiles", {})  # an older gsmap began purges without
+    known = pending.get("tiles", {})  # missing in purges begun by an older gsmap
     noted = {**known, target: max(num_files, known.get(target, 0))}
     return _save(store, purge, {**purge.receipt, "pending": {**pending, "tiles": noted}})
 
 
 def finish(store: Store, purge: Purge, unreachable: Sequence[str]) -> Purge:
-    """Reclaim arrays, older copies and what deleted rows left in the catalog's file; the receipt is complete then.
+    """Reclaim arrays, older catalog copies and deleted rows in the catalog file, and complete the receipt.
 
     Args:
-        unreachable: the folders that were exported to and could not be looked into, and why, for the receipt.
+        unreachable: export folders that could not be searched, with the reason, for the receipt.
 
     Raises:
-        BusyError: somebody reads a state from before the purge, so that it cannot be taken out of the file yet.
+        BusyError: a process reads a state from before the purge, so that the file cannot be rewritten yet.
     """
     pending = purge.receipt["pending"]
     integrity.reclaim(store.catalog, store.arrays)
-    there = _copies(store)  # a receipt may be a stranger's: what it names is told, and not deleted
+    there = _copies(store)  # a receipt may be from an untrusted map: files named in it are reported but not deleted
     copies = sorted({*pending.get("copies", ()), *there})
     for name in there:
         remove_file(store.folder, name)
     for folder in (store.folder, *(store.arrays.root / kind for kind in KINDS), store.arrays.staging):
         if is_folder(folder):
-            sync_folder(folder)  # or they are back when the power was gone
-    left = {group for _, group in store.arrays.groups()}  # a branch has them, too
+            sync_folder(folder)  # so that deletions survive a power cut
+    left = {group for _, group in store.arrays.groups()}  # still named by a branch
     num_bytes = [size for group, size in pending.get("groups", {}).items() if group not in left]
     receipt = {key: value for key, value in purge.receipt.items() if key != "pending"} | {
         "num_groups": len(num_bytes),
         "num_bytes": sum(num_bytes),
         "catalog_copies": copies,
-        "branches": [place.location for place in holders(store, purge.scene)],
+        "branches": [place.location for place in catalogs_with_scene(store, purge.scene)],
         "tile_files": sum(pending.get("tiles", {}).values()),
         "cleaned": sorted(pending.get("tiles", {})),
         "unreachable": list(unreachable),
     }
-    overwrite(store.catalog)
+    erase_deleted_rows(store.catalog)
     return _save(store, purge, receipt)
 
 
@@ -186,18 +188,18 @@ def _save(store: Store, purge: Purge, receipt: dict[str, Any]) -> Purge:
     return replace(purge, receipt=receipt)
 
 
-def recheck(store: Store) -> None:
-    """Bring what the receipts say of other catalogs up to date: a scene may be gone from these by now."""
-    for one in listed(store):
+def update_receipts(store: Store) -> None:
+    """Update the other catalogs that hold the scene in all receipts."""
+    for one in list_purges(store):
         if not one.is_done or not one.receipt["branches"]:
             continue
-        still = [place.location for place in holders(store, one.scene)]
+        still = [place.location for place in catalogs_with_scene(store, one.scene)]
         if still != one.receipt["branches"]:
             _save(store, one, {**one.receipt, "branches": still})
 
 
-def holders(store: Store, scene: str) -> list[Place]:
-    """The other catalogs of the map (itself, branches, tags) that know a scene."""
+def catalogs_with_scene(store: Store, scene: str) -> list[MapLocation]:
+    """Return the other catalogs of the map (itself, branches, tags) that hold a scene."""
     found = []
     for place in store.others():
         with Store.open(place.location, "r") as other, other.catalog.read() as connection:
@@ -206,16 +208,16 @@ def holders(store: Store, scene: str) -> list[Place]:
     return found
 
 
-def overwrite(catalog: Catalog) -> None:
-    """Write the catalog anew, so that nothing of deleted rows is left in its files.
+def erase_deleted_rows(catalog: Catalog) -> None:
+    """Rewrite the catalog so that its files contain nothing of deleted rows.
 
     Raises:
         BusyError: a reader holds an older state.
     """
-    with catalog.lock(), explained(catalog.folder):
+    with catalog.lock(), translate_errors(catalog.folder):
         if not catalog.is_sqlite:
             with catalog.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-                connection.execute(text("SET lock_timeout = '60s'"))  # it waits for all who read
+                connection.execute(text("SET lock_timeout = '60s'"))  # VACUUM FULL waits for all readers
                 connection.execute(text("VACUUM FULL"))
             return
         if not sqlite.vacuum(catalog.engine, catalog.folder / sqlite.FILE, erase=True):
@@ -230,7 +232,7 @@ def overwrite(catalog: Catalog) -> None:
 
 
 def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], dict[str, int]]:
-    """How many rows went, and the groups of arrays that none claims any more with their bytes."""
+    """Delete rows; returns counts by noun, and the size of each array group that lost its last referrer."""
     scene = row.id
     counts: Counter[str] = Counter()
 
@@ -279,8 +281,8 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     for number in sorted(affected):
         mine = revisions.c.number == number
         notes = connection.execute(select(revisions.c.notes).where(mine)).scalar_one()
-        said = f"the pose of {_GONE} is no longer part of this revision"
-        connection.execute(update(revisions).where(mine).values(notes=[*notes, said]))
+        remark = f"the pose of {_PURGED} is no longer part of this revision"
+        connection.execute(update(revisions).where(mine).values(notes=[*notes, remark]))
     counts["revisions"] = len(affected)
     for line in connection.execute(select(revisions.c.number, revisions.c.world)).all():
         left = [tie | {"residuals": [row for row in tie["residuals"] if row["scene"] != scene]} for tie in line.world]
@@ -290,7 +292,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
 
 
 def _forget_lookups(connection: Connection, scene: str) -> None:
-    """Drop what retrieval knows of a scene: segments that hold it, which are made anew, and its place in lookups."""
+    """Delete index segments with the scene, which are recomputed, and its lookups and candidates."""
     parts = connection.execute(select(index_segments.c.number, index_segments.c.members)).all()
     with_it = [part.number for part in parts if any(member[0] == scene for member in part.members)]
     connection.execute(delete(index_segments).where(index_segments.c.number.in_(with_it)))
@@ -303,65 +305,65 @@ def _forget_lookups(connection: Connection, scene: str) -> None:
 
 
 def _names(connection: Connection, row: Row[Any]) -> set[str]:
-    """What the scene was ever called."""
-    said = select(scene_facts.c.value).where(scene_facts.c.scene == row.id, scene_facts.c.kind == "name")
-    return {row.name, *connection.execute(said).scalars()}
+    """Return all names that the scene ever had."""
+    query = select(scene_facts.c.value).where(scene_facts.c.scene == row.id, scene_facts.c.kind == "name")
+    return {row.name, *connection.execute(query).scalars()}
 
 
 def _pattern(scene: str, names: Iterable[str]) -> re.Pattern[str]:
-    """The scene's id, its short form, and its names as words of their own."""
+    """Match the scene's id, its short form, and its names as whole words."""
     words = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
     return re.compile(rf"{scene}|\b{scene[:12]}\b|(?<!\w)(?:{words})(?!\w)")
 
 
 def _scrub(connection: Connection, scene: str, names: set[str]) -> None:
-    """Take the scene out of the remarks that gsmap itself wrote of other things."""
+    """Remove the scene from texts that gsmap generated about other things."""
     pattern = _pattern(scene, names)
-    for table, columns in _REMARKS:
+    for table, columns in _GENERATED_TEXTS:
         for line in connection.execute(select(table)).mappings().all():
-            changed = {column: _without(line[column], pattern) for column in columns}
+            changed = {column: _replace_scene(line[column], pattern) for column in columns}
             changed = {column: value for column, value in changed.items() if value != line[column]}
             if changed:
                 keys = [column == line[column.name] for column in table.primary_key.columns]
                 connection.execute(update(table).where(*keys).values(**changed))
     for row in connection.execute(select(graphs.c.key, graphs.c.about)).all():
-        notes = _without(row.about["notes"], pattern)
+        notes = _replace_scene(row.about["notes"], pattern)
         if notes != row.about["notes"]:
             about = {**row.about, "notes": notes}
             connection.execute(update(graphs).where(graphs.c.key == row.key).values(about=about))
 
 
-def _without(value: Any, pattern: re.Pattern[str]) -> Any:
+def _replace_scene(value: Any, pattern: re.Pattern[str]) -> Any:
     if isinstance(value, str):
-        return pattern.sub(_GONE, value)
+        return pattern.sub(_PURGED, value)
     if isinstance(value, list):
-        return [_without(item, pattern) for item in value]
-    if isinstance(value, dict):  # of a provenance: lists of scenes lose it
+        return [_replace_scene(item, pattern) for item in value]
+    if isinstance(value, dict):  # a provenance: remove the scene from its lists
         return {
-            key: [_without(item, pattern) for item in part if not pattern.fullmatch(str(item))]
+            key: [_replace_scene(item, pattern) for item in part if not pattern.fullmatch(str(item))]
             if isinstance(part, list)
-            else _without(part, pattern)
+            else _replace_scene(part, pattern)
             for key, part in value.items()
         }
     return value
 
 
 def _mentions(connection: Connection, scene: str, names: set[str]) -> list[str]:
-    """Where people wrote of the scene elsewhere, without its name."""
+    """Return the places where people wrote about the scene elsewhere, without its name."""
     pattern = _pattern(scene, names)
     found = []
-    for table, column, of in _WORDS:
+    for table, column, of in _USER_TEXTS:
         for line in connection.execute(select(table)).mappings():
             if pattern.search(line[column]):
-                found.append(f"a {line.get('kind', 'note')} of {of} {line[of]}")
+                found.append(f"a {line.get('kind', 'record_tile_files')} of {of} {line[of]}")
     return found
 
 
-# --- what lies elsewhere ---------------------------------------------------------------------------------------------
+# --- copies elsewhere ------------------------------------------------------------------------------------------------
 
 
 def _backups_of_map(store: Store) -> list[tuple[str, str]]:
-    """(when, name) of each snapshot; the map itself knows of those that were taken since a branch was made."""
+    """Return (time, name) of each snapshot; the map itself records those made since a branch was made."""
     with contextlib.ExitStack() as stack:
         catalogs = [store]
         if store.branch:
@@ -371,9 +373,9 @@ def _backups_of_map(store: Store) -> list[tuple[str, str]]:
 
 
 def _backups(connection: Connection, scene: Row[Any], of_map: Iterable[tuple[str, str]]) -> list[str]:
-    """Snapshots that were taken since the scene first came, and those that an earlier purge of it told of."""
+    """Return the snapshots made since the scene first existed, and those recorded by its earlier purges."""
     pairs = (registrations.c.target == scene.id) | (registrations.c.source == scene.id)
-    # `ingested_at` is its last arrival, and scenes that an old gsmap ingested have no fact of their first.
+    # `ingested_at` is the last ingest, and scenes from older releases have no fact of the first one.
     firsts = [
         select(func.min(scene_facts.c.created_at)).where(scene_facts.c.scene == scene.id),
         select(func.min(registrations.c.created_at)).where(pairs),
@@ -382,12 +384,12 @@ def _backups(connection: Connection, scene: Row[Any], of_map: Iterable[tuple[str
     seen = [connection.execute(query).scalar() for query in firsts]
     since = min([scene.ingested_at, *(when for when in seen if when is not None)])
     earlier = connection.execute(select(purges.c.receipt).where(purges.c.scene == scene.id).order_by(purges.c.number))
-    told = [name for receipt in earlier.scalars() for name in receipt["backups"]]
-    return list(dict.fromkeys([*told, *(name for when, name in of_map if when >= since)]))
+    recorded = [name for receipt in earlier.scalars() for name in receipt["backups"]]
+    return list(dict.fromkeys([*recorded, *(name for when, name in of_map if when >= since)]))
 
 
 def _linked_files(store: Store, connection: Connection, scene: str) -> int:
-    """How many of its files have other names on this disk: another map that it was merged or split into, a clone."""
+    """Count its files that have other hard links on this disk: in another map or a clone."""
     with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
     of_scene = {
         "scenes": select(scenes.c.group_id).where(scenes.c.id == scene, scenes.c.group_id.is_not(None)),
@@ -403,6 +405,6 @@ def _linked_files(store: Store, connection: Connection, scene: str) -> int:
 
 
 def _copies(store: Store) -> list[str]:
-    """The copies of the catalog that migrations left: they hold what is to be forgotten."""
+    """Return the catalog copies that migrations left, which contain the scene."""
     pattern = re.compile(re.escape(sqlite.FILE) + r"\.[0-9A-Za-z]+\.bak[a-z0-9.-]*")
     return sorted(p.name for p in store.folder.iterdir() if pattern.fullmatch(p.name) and is_file(p))

@@ -1,4 +1,4 @@
-"""How stored results were made, each recipe once."""
+"""Recipes of stored results, each stored once."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.schema import recipes
 from gsmap.types.plain import canonical, plain
 
-ASKED_AT_ONCE = 10_000  # values in one query; SQLite takes 32,766
-MOST_ASKED = 5_000
-"""Values that are named to a query; of more, all that there are are read instead, which is quicker."""
+KEYS_PER_QUERY = 10_000  # values in one query; SQLite takes 32,766
+MAX_NAMED_KEYS = 5_000
+"""Maximum number of keys named in a query; for more, reading all rows is quicker."""
 PARTS = ("stage", "method", "version", "settings", "backend")
 
 
 class Recipes:
-    """The recipes of a map, by digest (`RecipeKey.recipe`), as graphs, registrations, revisions and tiles name them."""
+    """The recipes of a map by digest (`RecipeKey.recipe`), referenced by graphs, registrations, revisions and tiles."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
 
     def get(self, digest: str) -> RecipeKey:
-        """A recipe, without inputs.
+        """Return a recipe, without inputs.
 
         Raises:
-            NotFoundError: no result was made so.
+            NotFoundError: no result has this recipe.
         """
         with self._catalog.read() as connection:
             row = connection.execute(select(recipes).where(recipes.c.digest == digest)).first()
@@ -38,14 +38,14 @@ class Recipes:
         return _recipe(row)
 
     def list(self) -> list[RecipeKey]:
-        """All recipes, in the order of their first use."""
+        """Return all recipes, in the order of their first use."""
         with self._catalog.read() as connection:
             rows = connection.execute(select(recipes).order_by(recipes.c.created_at, recipes.c.digest)).all()
         return [_recipe(row) for row in rows]
 
 
-def keep(connection: Connection, recipe: RecipeKey | Mapping[str, Any] | None) -> str | None:
-    """The digest of a recipe (a key, or its `RecipeKey.to_json`), written down where it is new; None for none."""
+def save_recipe(connection: Connection, recipe: RecipeKey | Mapping[str, Any] | None) -> str | None:
+    """Store a recipe (a key, or its `RecipeKey.to_json`) if it is new, and return its digest; None for None."""
     if not recipe:
         return None
     parts: Mapping[str, Any] = recipe.to_json() if isinstance(recipe, RecipeKey) else plain(recipe)
@@ -60,31 +60,31 @@ def keep(connection: Connection, recipe: RecipeKey | Mapping[str, Any] | None) -
 
 
 def digest_of(key: RecipeKey | str) -> str:
-    """What a result is kept under."""
+    """Return the digest of a key."""
     return key.digest if isinstance(key, RecipeKey) else key
 
 
-def kept(
+def stored_keys(
     connection: Connection,
     column: ColumnElement[str],
     keys: Iterable[RecipeKey | str],
     where: ColumnElement[bool] | None = None,
 ) -> set[str]:
-    """Those of the keys (as digests) that a column holds, in rows that meet a condition."""
+    """Return those of the keys (as digests) that a column holds, in rows that meet a condition."""
     some_of, found = {digest_of(key) for key in keys}, set()
-    if len(some_of) > MOST_ASKED:  # what is only compared with needs no check (`gsmap.store.columns`)
+    if len(some_of) > MAX_NAMED_KEYS:  # compared values need no validation (`gsmap.store.column_types`)
         query = select(type_coerce(column, Text)).where(true() if where is None else where)
         return some_of.intersection(connection.execute(query).scalars().all())
     wanted = sorted(some_of)
-    for start in range(0, len(wanted), ASKED_AT_ONCE):
-        some = column.in_(wanted[start : start + ASKED_AT_ONCE])
+    for start in range(0, len(wanted), KEYS_PER_QUERY):
+        some = column.in_(wanted[start : start + KEYS_PER_QUERY])
         query = select(column).where(some, true() if where is None else where)
         found |= set(connection.execute(query).scalars())
     return found
 
 
 def recipe_json(row: Row[Any]) -> dict[str, Any]:
-    """`RecipeKey.to_json` of a row that has a recipe's columns."""
+    """Return `RecipeKey.to_json` of a row with the columns of a recipe."""
     return {part: getattr(row, part) for part in PARTS}
 
 

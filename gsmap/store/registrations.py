@@ -1,4 +1,4 @@
-"""Registrations of pairs of scenes, and what people said of them. Nothing is overwritten."""
+"""Registrations of pairs of scenes and their reviews; rows are never overwritten."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.columns import Json, an_object, not_ours
+from gsmap.store.column_types import JsonText, is_object, malformed_as_corrupt
 from gsmap.store.matrices import matrices_of_bytes, poses_of_bytes
 from gsmap.store.scene_refs import living_ids, resolve, scene_name
 from gsmap.store.schema import registrations, reviews, scenes
@@ -41,21 +41,20 @@ from gsmap.types.plain import plain
 
 REVIEWS = ("confirm", "reject", "withdraw")
 MANUAL = "manual"
-"""`Registration.proposer` of a person's own measurement."""
+"""`Registration.proposer` of a manual measurement."""
 
 
 @dataclass(frozen=True, eq=False)
 class StoredRegistration:
-    """A registration and its place in the history.
+    """A registration in the history of its pair.
 
     Args:
         number: unique in the map, growing.
-        key: `RecipeKey.digest` of what it was computed from; empty for a person's own measurement.
-        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None for a person's own measurement, and in
-            rows that schema 0001 wrote.
-        review: a person's standing word on the pair: ``confirm``, ``reject`` or None.
-        adopts: number of the earlier registration that this one makes current again, unchanged; None where it was
-            computed.
+        key: `RecipeKey.digest` of its recipe and inputs; empty for a manual measurement.
+        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None for a manual measurement, and in rows
+            that schema 0001 wrote.
+        review: the review of the pair in force: ``confirm``, ``reject`` or None.
+        adopts: number of the earlier registration that this one makes current again; None for a computed one.
     """
 
     number: int
@@ -68,28 +67,28 @@ class StoredRegistration:
 
     @property
     def manual(self) -> bool:
-        """Whether a person measured it."""
+        """Return True for a manual measurement."""
         return self.registration.proposer == MANUAL
 
     @property
     def is_usable(self) -> bool:
-        """Whether it has a pose, and a person confirmed it, or it was accepted and nobody rejected it."""
+        """Return True if it has a pose and is confirmed, or accepted and not rejected."""
         posed = self.registration.S_target_source is not None and self.registration.information is not None
-        return posed and _may_be_used(self.registration.status, self.review)
+        return posed and _is_usable(self.registration.status, self.review)
 
 
 _UNKNOWN = float("nan")
 
 
-class Standing(NamedTuple):  # of every pair of a map, with every update: a tuple is made in a tenth of the time
-    """What counts of a pair, without its figures: all that decides whether it is used; see `StoredRegistration`.
+class EdgeSummary(NamedTuple):  # created for every pair in every update: ten times faster than a dataclass
+    """The current registration of a pair without evidence and matrices; see `StoredRegistration`.
 
     Args:
         pair: both ids with a colon between them, the lower first.
         usable: as `StoredRegistration.is_usable`.
-        disagreement: of what both scenes saw, by what counts; NaN where that is not known, it was not accepted, or not
-            asked for.
-        several: keys of all that was computed for the pair; None where it was registered once, or that was not asked.
+        disagreement: fraction of the surface seen by both scenes on which they disagree; NaN if unknown, not accepted,
+            or not read.
+        history_keys: keys of all computed registrations of the pair; None if there is one, or if they were not read.
     """
 
     number: int
@@ -100,27 +99,27 @@ class Standing(NamedTuple):  # of every pair of a map, with every update: a tupl
     review: str | None
     usable: bool
     disagreement: float = _UNKNOWN
-    several: frozenset[str] | None = None
+    history_keys: frozenset[str] | None = None
 
     @property
     def manual(self) -> bool:
-        """Whether a person measured it."""
+        """Return True for a manual measurement."""
         return not self.key
 
     @property
-    def is_told(self) -> bool:
-        """Whether a person measured or confirmed it."""
+    def is_specified(self) -> bool:
+        """Return True if a person measured or confirmed it."""
         return self.manual or self.review == "confirm"
 
     @property
     def keys(self) -> frozenset[str]:
-        """Of all that was computed for the pair, where that was asked for."""
-        return frozenset((self.key,) if self.key else ()) if self.several is None else self.several
+        """Return the keys of all computed registrations of the pair, as far as they were read."""
+        return frozenset((self.key,) if self.key else ()) if self.history_keys is None else self.history_keys
 
 
 @dataclass(frozen=True)
 class Review:
-    """A person's word on a pair (``confirm``, ``reject``, ``withdraw``), given when ``registration`` was current."""
+    """A person's review of a pair (``confirm``, ``reject``, ``withdraw``), made when ``registration`` was current."""
 
     review: str
     registration: int
@@ -129,47 +128,52 @@ class Review:
 
 
 class Registrations:
-    """The edges of a map. A pair is the same pair in either direction; a registration keeps its own.
+    """The registrations of a map. Pairs are unordered; a registration keeps its own direction.
 
-    A pair's *current* registration is, first of all, what a person said last: the pose that was confirmed, or that was
-    measured by hand (proposer ``manual``); else the newest. ``withdraw`` takes back the last word that stands: a
-    review, or else a measurement.
+    The *current* registration of a pair is what a person decided last: the confirmed pose, or the manual measurement
+    (proposer ``manual``); without either it is the newest. ``withdraw`` takes back the review in force, or otherwise
+    the measurement.
+
+    Readers: `get`, `history` and `reviews` of one pair; `current`, `current_of_scene`, `current_of_pairs`,
+    `current_usable` and `current_with_note` return current registrations; `summaries`, `all_summaries` and
+    `current_keys` read less of each; `newest_with_key`, `newest_with_keys` and `stored_keys` look up computed results.
     """
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
-        self._silent: dict[str, Standing] = {}
-        self._read_upto: tuple[int, tuple[Any, ...]] = (0, ())
+        self._unreviewed: dict[str, EdgeSummary] = {}
+        self._read_until: tuple[int, tuple[Any, ...]] = (0, ())
 
     def save(self, registration: Registration, key: RecipeKey | None = None) -> StoredRegistration:
-        """Add a registration to its pair's history; it is the pair's current one from now on, unless a person spoke.
+        """Add a registration to the history of its pair, where it becomes current unless the pair is reviewed.
 
         Args:
-            key: its recipe and inputs; None for a person's own measurement only.
+            key: its recipe and inputs; None for a manual measurement only.
 
         Raises:
             InputError: a computed registration without a key, or a measurement with one or without a pose.
         """
-        _check_told(registration, key)
+        _check_key(registration, key)
         with self._catalog.write() as connection:
             pair = _pair(connection, registration.target, registration.source)
-            return self._insert(connection, _row_of(registration, pair, key, recipes.keep(connection, key)))
+            return self._insert(connection, _row_of(registration, pair, key, recipes.save_recipe(connection, key)))
 
     def save_all(self, made: Sequence[tuple[Registration, RecipeKey]]) -> None:
-        """As `save`, of many that were computed, each with its key, in a few statements; scenes by their ids.
+        """Add many computed registrations with their keys in a few statements; scenes are named by id.
 
         Raises:
-            InputError: as `save`; a registration of what is no scene, or of one scene alone. Nothing is kept then.
+            InputError: as `save`; a registration with an unknown scene, or of a scene with itself. Nothing is stored
+                then.
         """
         for registration, key in made:
-            _check_told(registration, key)
+            _check_key(registration, key)
         if not made:
             return
         wanted = {scene for registration, _ in made for scene in (registration.target, registration.source)}
         with self._catalog.write() as connection:
-            known = recipes.kept(connection, scenes.c.id, wanted)
+            known = recipes.stored_keys(connection, scenes.c.id, wanted)
             by_recipe = {key.recipe: key for _, key in made}
-            kept = {digest: recipes.keep(connection, key) for digest, key in by_recipe.items()}
+            kept = {digest: recipes.save_recipe(connection, key) for digest, key in by_recipe.items()}
             rows = []
             for registration, key in made:
                 a, b = sorted((registration.target, registration.source))
@@ -184,7 +188,7 @@ class Registrations:
     def adopt(self, number: int) -> StoredRegistration:
         """Make an earlier registration the newest of its pair again, as if it had just been computed.
 
-        So a map that goes back to older settings has its older edges again. Nothing is written where it is the newest.
+        A map that returns to older settings so gets its older edges back. Writes nothing if it is the newest already.
 
         Raises:
             NotFoundError: no such registration.
@@ -202,116 +206,119 @@ class Registrations:
             newest = [r for r in pair if r.proposer != MANUAL][-1]
             original = row.number if row.adopts is None else row.adopts
             if original in (newest.number, newest.adopts):
-                return _stored_one(newest, _decide(pair, _reviews_of(connection, row.pair))[1])
+                return _stored_one(newest, _find_current(pair, _reviews_of(connection, row.pair))[1])
             copied = {name: value for name, value in row._mapping.items() if name != "number"}
             return self._insert(connection, copied | {"adopts": original, "created_at": now()})
 
     def current(self, *, brief: bool = False) -> list[StoredRegistration]:
-        """The current registration of each pair of living scenes, by the pair's first registration.
+        """Return the current registration of each pair of living scenes, ordered by the pair's first registration.
 
         Args:
-            brief: without evidence and notes, which are most of what there is to read.
+            brief: leave out evidence and notes, which are most of the data.
         """
         with self._catalog.read() as connection:
             return _current(connection, columns=_BRIEF if brief else _FULL)
 
-    def current_of(self, scene: str) -> list[StoredRegistration]:
-        """The same of the pairs of one scene (id)."""
+    def current_of_scene(self, scene: str) -> list[StoredRegistration]:
+        """Return the current registrations of the pairs of one scene (id)."""
         mine = or_(registrations.c.target == scene, registrations.c.source == scene)
         with self._catalog.read() as connection:
             return _current(connection, mine)
 
     def current_of_pairs(self, pairs: Iterable[tuple[str, str]]) -> list[StoredRegistration]:
-        """The same of some pairs of scenes (ids), in either direction."""
+        """Return the current registrations of some pairs of scenes (ids), in either direction."""
         wanted = sorted({":".join(sorted(pair)) for pair in pairs})
         found: list[StoredRegistration] = []
         with self._catalog.read() as connection:
-            for start in range(0, len(wanted), recipes.ASKED_AT_ONCE):
-                some = wanted[start : start + recipes.ASKED_AT_ONCE]
+            for start in range(0, len(wanted), recipes.KEYS_PER_QUERY):
+                some = wanted[start : start + recipes.KEYS_PER_QUERY]
                 found += _current(connection, registrations.c.pair.in_(some))
         return found
 
-    def standing(self, *, usable: bool = False) -> list[Standing]:
-        """What counts of each pair of living scenes, by (target, source); no matrix of any is read.
+    def summaries(self, *, usable: bool = False) -> list[EdgeSummary]:
+        """Return a summary of the current registration of each pair of living scenes, by (target, source), without
+        matrices.
 
-        Where `tried` was asked before, what it remembers is not read again.
+        Reuses what `all_summaries` has cached.
 
         Args:
-            usable: only those that are (`Standing.usable`).
+            usable: only usable ones (`EdgeSummary.usable`).
         """
         with self._catalog.read() as connection:
-            if self._silent:
-                made = self.tried()
+            if self._unreviewed:
+                made = self.all_summaries()
             else:
                 wanted = registrations.c.status == "accepted" if usable else true()
-                made = _of_silent(connection, wanted) + _of_spoken(connection)
-            alive = living_ids(connection)
-        found = (one for one in made if (one.usable or not usable) and one.target in alive and one.source in alive)
+                made = _unreviewed_summaries(connection, wanted) + _reviewed_summaries(connection)
+            living = living_ids(connection)
+        found = (one for one in made if (one.usable or not usable) and one.target in living and one.source in living)
         return sorted(found, key=_ends_of)
 
-    def noted(self, text: str) -> list[StoredRegistration]:
-        """The current registrations of which a note begins with a text, by the pair's first registration."""
+    def current_with_note(self, text: str) -> list[StoredRegistration]:
+        """Return the current registrations with a note that begins with a text, ordered by the pair's first
+        registration."""
         notes = type_coerce(registrations.c.notes, Text).contains(text, autoescape=True)
         with self._catalog.read() as connection:
-            found = _current(connection, silent_if=notes)
+            found = _current(connection, unreviewed_if=notes)
         return [one for one in found if any(note.startswith(text) for note in one.registration.notes)]
 
-    def tried(self) -> list[Standing]:
-        """The same of every pair, of scenes living or not, with what else was computed for it, in any order.
+    def all_summaries(self) -> list[EdgeSummary]:
+        """Return a summary of the current registration of every pair, of living and removed scenes, with the keys of
+        its history.
 
-        Registering asks this twice an update, so what was read is remembered: of rows that stay as they are, only new
-        ones are read again.
+        Cached, since each update needs it twice: only new rows are read again.
         """
         with self._catalog.read() as connection:
             count = connection.execute(select(func.count()).select_from(registrations)).scalar_one()
-            upto, then = self._read_upto
-            new = connection.execute(_EVERY.where(registrations.c.number > upto)).all()
-            if upto and then != (count - len(new), _last(connection, upto)):
-                self._silent.clear()
-                upto, new = 0, connection.execute(_EVERY).all()
-            _add(self._silent, new)
+            upto, then = self._read_until
+            new = connection.execute(_ALL_SUMMARY_ROWS.where(registrations.c.number > upto)).all()
+            if upto and then != (count - len(new), _fingerprint(connection, upto)):
+                self._unreviewed.clear()
+                upto, new = 0, connection.execute(_ALL_SUMMARY_ROWS).all()
+            _add_summaries(self._unreviewed, new)
             upto = new[-1].number if new else upto
-            self._read_upto = upto, (count, _last(connection, upto))
-            spoken = _of_spoken(connection)
-            said = set(connection.execute(_SPOKEN).scalars()) if spoken else set()
-        if not said:
-            return list(self._silent.values())
-        return [one for pair, one in self._silent.items() if pair not in said] + spoken
+            self._read_until = upto, (count, _fingerprint(connection, upto))
+            reviewed = _reviewed_summaries(connection)
+            reviewed_pairs = set(connection.execute(_REVIEWED_PAIRS).scalars()) if reviewed else set()
+        if not reviewed_pairs:
+            return list(self._unreviewed.values())
+        return [one for pair, one in self._unreviewed.items() if pair not in reviewed_pairs] + reviewed
 
-    def keys(self) -> list[tuple[str, str]]:
-        """Each pair (`Standing.pair`) with the key of what counts of it; empty where that is a person's word."""
-        every = select(*_as_they_lie("pair", "key")).order_by(registrations.c.number)
+    def current_keys(self) -> list[tuple[str, str]]:
+        """Return each pair (`EdgeSummary.pair`) with the key of its current registration; empty if a person decided
+        it."""
+        every = select(*_undecoded("pair", "key")).order_by(registrations.c.number)
         with self._catalog.read() as connection:
-            keys = {row[0]: row[1] for row in connection.execute(every).all()}  # the newest stays
-            spoken = _of_spoken(connection)
-            for pair in connection.execute(_SPOKEN).scalars() if spoken else ():
+            keys = {row[0]: row[1] for row in connection.execute(every).all()}  # the newest row of a pair wins
+            reviewed = _reviewed_summaries(connection)
+            for pair in connection.execute(_REVIEWED_PAIRS).scalars() if reviewed else ():
                 keys.pop(pair, None)
-        return [*keys.items(), *((one.pair, "" if one.is_told else one.key) for one in spoken)]
+        return [*keys.items(), *((one.pair, "" if one.is_specified else one.key) for one in reviewed)]
 
-    def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
-        """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
+    def current_usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
+        """Return the current registrations that are usable (`StoredRegistration.is_usable`), by (target, source).
 
         Args:
-            among: only those both of whose scenes (ids) are among these.
+            among: only pairs with both scenes (ids) among these.
         """
         inside = None
         if among is not None:
             some = sorted(among)
             inside = registrations.c.target.in_(some) & registrations.c.source.in_(some)
         with self._catalog.read() as connection:
-            found = _current(connection, inside, silent_if=registrations.c.status == "accepted")
+            found = _current(connection, inside, unreviewed_if=registrations.c.status == "accepted")
         found = [one for one in found if one.is_usable]
         return sorted(found, key=lambda one: (one.registration.target, one.registration.source))
 
     def get(self, a: str, b: str) -> StoredRegistration | None:
-        """The current registration of a pair (scene refs, either direction); None where there is none."""
+        """Return the current registration of a pair (scene references, either direction); None if there is none."""
         with self._catalog.read() as connection:
             pair = _pair(connection, a, b)
-            row, word = _decide(_rows_of(connection, pair), _reviews_of(connection, pair))
-        return None if row is None else _stored_one(row, word)
+            row, review = _find_current(_rows_of(connection, pair), _reviews_of(connection, pair))
+        return None if row is None else _stored_one(row, review)
 
-    def find(self, key: RecipeKey | str) -> StoredRegistration | None:
-        """The newest registration that is kept under a key (or its digest); None where there is none."""
+    def newest_with_key(self, key: RecipeKey | str) -> StoredRegistration | None:
+        """Return the newest registration with a key (or its digest); None if there is none."""
         digest = recipes.digest_of(key)
         if not digest:
             return None
@@ -320,55 +327,57 @@ class Registrations:
             row = connection.execute(query.limit(1)).first()
             if row is None:
                 return None
-            _, word = _decide(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
-        return _stored_one(row, word)
+            _, review = _find_current(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
+        return _stored_one(row, review)
 
-    def found(self, keys: Iterable[RecipeKey | str]) -> list[Registration]:
-        """The newest registration under each of the keys (or their digests) that has any, in the order of these."""
+    def newest_with_keys(self, keys: Iterable[RecipeKey | str]) -> list[Registration]:
+        """Return the newest registration with each of the keys (or their digests) that has one, in the order of the
+        keys."""
         wanted = list(dict.fromkeys(digest for key in keys if (digest := recipes.digest_of(key))))
         newest: dict[str, Row[Any]] = {}
         with self._catalog.read() as connection:
-            for start in range(0, len(wanted), recipes.ASKED_AT_ONCE):
-                some = registrations.c.key.in_(wanted[start : start + recipes.ASKED_AT_ONCE])
+            for start in range(0, len(wanted), recipes.KEYS_PER_QUERY):
+                some = registrations.c.key.in_(wanted[start : start + recipes.KEYS_PER_QUERY])
                 query = select(registrations).where(some).order_by(registrations.c.number)
                 newest |= {row.key: row for row in connection.execute(query)}
         return [_stored_one(newest[digest], None).registration for digest in wanted if digest in newest]
 
-    def kept(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
-        """Those of the keys (as digests) that a registration is kept under, made later than the one of a number."""
+    def stored_keys(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
+        """Return those of the keys (as digests) that have a registration with a number above ``after``."""
         with self._catalog.read() as connection:
-            return recipes.kept(connection, registrations.c.key, keys, registrations.c.number > after)
+            return recipes.stored_keys(connection, registrations.c.key, keys, registrations.c.number > after)
 
-    def newest(self) -> int:
-        """Number of the newest registration; 0 where there is none."""
+    def newest_number(self) -> int:
+        """Return the number of the newest registration; 0 if there is none."""
         with self._catalog.read() as connection:
             return connection.execute(select(func.max(registrations.c.number))).scalar_one() or 0
 
-    def pairs_after(self, number: int) -> set[tuple[str, str]]:
-        """(lower, higher) by id of the pairs that were registered after the registration of a number."""
+    def pairs_registered_after(self, number: int) -> set[tuple[str, str]]:
+        """Return the pairs, (lower, higher) by id, that were registered after the registration with a number."""
         query = select(registrations.c.pair).where(registrations.c.number > number)
         with self._catalog.read() as connection:
             found = set(connection.execute(query).scalars())
         return {(a, b) for a, b in (pair.split(":") for pair in found)}
 
     def history(self, a: str, b: str) -> list[StoredRegistration]:
-        """Every registration of a pair, oldest first."""
+        """Return every registration of a pair, oldest first."""
         with self._catalog.read() as connection:
             pair = _pair(connection, a, b)
             rows = _rows_of(connection, pair)
-            _, word = _decide(rows, _reviews_of(connection, pair))
-        return [_stored_one(row, word) for row in rows]
+            _, review = _find_current(rows, _reviews_of(connection, pair))
+        return [_stored_one(row, review) for row in rows]
 
     def review(self, a: str, b: str, review: str, note: str = "") -> StoredRegistration | None:
-        """Write down a person's word on a pair: ``confirm`` its current pose, ``reject`` it, or ``withdraw`` the last.
+        """Store a person's review of a pair: ``confirm`` its current pose, ``reject`` it, or ``withdraw`` the last
+        review.
 
         Returns:
-            The pair's current registration; None where its only one was a measurement that is now withdrawn.
+            The pair's current registration; None if its only one was a measurement that is now withdrawn.
 
         Raises:
             NotFoundError: the pair was never registered.
             InputError: there is no pose to confirm, or nothing to withdraw.
-            ConfigError: another word.
+            ConfigError: an unknown review.
         """
         if review not in REVIEWS:
             raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
@@ -395,50 +404,55 @@ class Registrations:
             return self.get(a, b)
 
     def reviews(self, a: str, b: str) -> list[Review]:
-        """Everything people said of a pair, oldest first."""
+        """Return all reviews of a pair, oldest first."""
         with self._catalog.read() as connection:
             return _reviews_of(connection, _pair(connection, a, b))
 
     def _insert(self, connection: Connection, row: dict[str, Any]) -> StoredRegistration:
         number = connection.execute(insert(registrations).returning(registrations.c.number), row).scalar_one()
         stored = connection.execute(select(registrations).where(registrations.c.number == number)).one()
-        _, word = _decide(_rows_of(connection, stored.pair), _reviews_of(connection, stored.pair))
-        return _stored_one(stored, word)
+        _, review = _find_current(_rows_of(connection, stored.pair), _reviews_of(connection, stored.pair))
+        return _stored_one(stored, review)
 
 
-class _Choice(NamedTuple):
-    """A pair's current row, and the review that stands on it."""
+class _CurrentRow(NamedTuple):
+    """The current row of a pair, and the review in force."""
 
     row: Row[Any]
-    word: Review | None
+    review: Review | None
 
 
-def _decide(rows: Sequence[Row[Any]], said: Iterable[Review]) -> tuple[Row[Any] | None, Review | None]:
-    """What counts of a pair, and the word that stands: its rows and reviews, both oldest first. See `Registrations`."""
+def _find_current(rows: Sequence[Row[Any]], history: Iterable[Review]) -> tuple[Row[Any] | None, Review | None]:
+    """Return the current row of a pair and the review in force; see `Registrations`.
+
+    Args:
+        rows: the pair's registrations, oldest first.
+        history: its reviews, oldest first.
+    """
     measured = {row.number for row in rows if row.proposer == MANUAL}
-    word: Review | None = None
+    review: Review | None = None
     withdrawn: set[int] = set()
-    for review in said:
-        if review.review != "withdraw":
-            word = review
-        elif review.registration in measured and (word is None or word.registration != review.registration):
-            withdrawn.add(review.registration)  # no review stood on it: the measurement itself is taken back
+    for one in history:
+        if one.review != "withdraw":
+            review = one
+        elif one.registration in measured and (review is None or review.registration != one.registration):
+            withdrawn.add(one.registration)  # the measurement has no review: the measurement itself is withdrawn
         else:
-            word = None
-    standing = max(measured - withdrawn, default=None)
-    if standing is not None and (word is None or word.registration <= standing):
-        if word is not None and word.registration < standing:
-            word = None  # said before it was measured
-        chosen: int | None = standing
-    elif word is not None and word.review == "confirm":
-        chosen = word.registration
+            review = None
+    measurement = max(measured - withdrawn, default=None)
+    if measurement is not None and (review is None or review.registration <= measurement):
+        if review is not None and review.registration < measurement:
+            review = None  # older than the measurement
+        chosen: int | None = measurement
+    elif review is not None and review.review == "confirm":
+        chosen = review.registration
     else:
         chosen = max((row.number for row in rows if row.proposer != MANUAL), default=None)
-    return next((row for row in rows if row.number == chosen), None), word
+    return next((row for row in rows if row.number == chosen), None), review
 
 
-def _check_told(r: Registration, key: RecipeKey | None) -> None:
-    """What a registration's row asks beside its figures; see `Registrations.save`."""
+def _check_key(r: Registration, key: RecipeKey | None) -> None:
+    """Validate that computed registrations have a key and measurements none; see `Registrations.save`."""
     if (r.proposer == MANUAL) != (key is None):
         raise InputError(
             f"a registration needs its recipe key, unless its proposer is {MANUAL!r}", code="invalid_registration"
@@ -494,7 +508,7 @@ def _review(row: Row[Any]) -> Review:
     return Review(row.review, row.registration, row.note, row.created_at)
 
 
-# --- what counts of every pair ---------------------------------------------------------------------------------------
+# --- current rows of all pairs ---------------------------------------------------------------------------------------
 
 _FULL = tuple(
     type_coerce(column, LargeBinary).label(column.name) if column.name in ("S_target_source", "information") else column
@@ -504,14 +518,14 @@ _BRIEF = tuple(null().label(column.name) if column.name in ("evidence", "notes")
 _POSED = (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed")
 
 
-def _as_they_lie(*names: str) -> tuple[ColumnElement[Any], ...]:
-    """Scenes that are none of the living ones are left out, and the rest is compared with."""
+def _undecoded(*names: str) -> tuple[ColumnElement[Any], ...]:
+    """Return columns without validation, for values that are only compared."""
     return tuple(type_coerce(registrations.c[name], Text).label(name) for name in names)
 
 
-_LEAN = (registrations.c.number, *_as_they_lie("target", "source", "pair", "key", "status"), _POSED)
+_SUMMARY_COLUMNS = (registrations.c.number, *_undecoded("target", "source", "pair", "key", "status"), _POSED)
 _SAME_PAIR = registrations.alias()
-_OUTDATED = exists().where(_SAME_PAIR.c.pair == registrations.c.pair, _SAME_PAIR.c.number > registrations.c.number)
+_SUPERSEDED = exists().where(_SAME_PAIR.c.pair == registrations.c.pair, _SAME_PAIR.c.number > registrations.c.number)
 _FIRST = (
     select(func.min(_SAME_PAIR.c.number)).where(_SAME_PAIR.c.pair == registrations.c.pair).scalar_subquery()
 ).label("first")
@@ -521,86 +535,87 @@ _EVIDENCE = case((registrations.c.status == "accepted", type_coerce(registration
 def _current(
     connection: Connection,
     of: ColumnElement[bool] | None = None,
-    silent_if: ColumnElement[bool] | None = None,
+    unreviewed_if: ColumnElement[bool] | None = None,
     columns: Sequence[ColumnElement[Any]] = _FULL,
 ) -> list[StoredRegistration]:
-    """What counts of every pair of living scenes, by the pair's first row.
+    """Return the current registration of every pair of living scenes, ordered by the pair's first row.
 
-    Of a pair on which nobody ever spoke it is the newest, which the index of pairs tells without reading the others.
+    For an unreviewed pair it is the newest, found by the index of pairs without reading the others.
 
     Args:
-        of: only pairs all of whose rows meet this.
-        silent_if: pairs on which nobody spoke only if their current row meets this.
+        of: only pairs all of whose rows meet this condition.
+        unreviewed_if: unreviewed pairs only if their current row meets this condition.
     """
     wanted = true() if of is None else of
-    silent = _silent((*columns, _FIRST)).where(wanted, true() if silent_if is None else silent_if)
-    found = [(row.first, _Choice(row, None)) for row in connection.execute(silent).all()]
-    found = sorted(found + _spoken(connection, columns, wanted), key=itemgetter(0))
-    alive = living_ids(connection)
-    return _stored_all([one for _, one in found if one.row.target in alive and one.row.source in alive])
+    unreviewed = _unreviewed((*columns, _FIRST)).where(wanted, true() if unreviewed_if is None else unreviewed_if)
+    found = [(row.first, _CurrentRow(row, None)) for row in connection.execute(unreviewed).all()]
+    found = sorted(found + _reviewed(connection, columns, wanted), key=itemgetter(0))
+    living = living_ids(connection)
+    return _stored_all([one for _, one in found if one.row.target in living and one.row.source in living])
 
 
-_SPOKEN = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
+_REVIEWED_PAIRS = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
 
 
-def _silent(columns: Sequence[ColumnElement[Any]]) -> Select[Any]:
-    """The newest row of every pair on which nobody ever spoke."""
-    return select(*columns).where(registrations.c.pair.not_in(_SPOKEN), ~_OUTDATED)
+def _unreviewed(columns: Sequence[ColumnElement[Any]]) -> Select[Any]:
+    """Select the newest row of every unreviewed pair."""
+    return select(*columns).where(registrations.c.pair.not_in(_REVIEWED_PAIRS), ~_SUPERSEDED)
 
 
-def _spoken(
+def _reviewed(
     connection: Connection, columns: Sequence[ColumnElement[Any]], wanted: ColumnElement[bool]
-) -> list[tuple[int, _Choice]]:
-    """What counts of every other pair that has any, each behind the number of the pair's first row."""
+) -> list[tuple[int, _CurrentRow]]:
+    """Return the current row of every reviewed or measured pair with the number of the pair's first row."""
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
-    every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(_SPOKEN))).all()
-    said = connection.execute(select(reviews).order_by(reviews.c.pair, reviews.c.number)).all() if every else ()
-    words = {pair: [_review(row) for row in of_pair] for pair, of_pair in groupby(said, lambda row: str(row.pair))}
+    every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(_REVIEWED_PAIRS))).all()
+    ordered_reviews = select(reviews).order_by(reviews.c.pair, reviews.c.number)
+    review_rows = connection.execute(ordered_reviews).all() if every else ()
+    by_pair = {pair: [_review(row) for row in rows] for pair, rows in groupby(review_rows, lambda row: str(row.pair))}
     found = []
     for pair, of_pair in groupby(every, lambda row: str(row.pair)):
         history = list(of_pair)
-        current, word = _decide(history, words.get(pair, []))
+        current, review = _find_current(history, by_pair.get(pair, []))
         if current is not None:
-            found.append((history[0].number, _Choice(current, word)))
+            found.append((history[0].number, _CurrentRow(current, review)))
     return found
 
 
-_OBJECT = Json(an_object).at("registrations.evidence")
-_EVERY = select(*_LEAN, _EVIDENCE).order_by(registrations.c.number)
+_OBJECT = JsonText(is_object).for_column("registrations.evidence")
+_ALL_SUMMARY_ROWS = select(*_SUMMARY_COLUMNS, _EVIDENCE).order_by(registrations.c.number)
 
 
-def _last(connection: Connection, upto: int) -> tuple[str, str] | None:
-    """What tells a registration from another one of its number; None where there is none."""
+def _fingerprint(connection: Connection, upto: int) -> tuple[str, str] | None:
+    """Return values that tell apart registrations with the same number; None if there is no such row."""
     query = select(registrations.c.key, registrations.c.created_at).where(registrations.c.number == upto)
     row = connection.execute(query).first()
     return None if row is None else (row.key, row.created_at)
 
 
-def _add(standing: dict[str, Standing], rows: Iterable[Sequence[Any]]) -> None:
-    """Let registrations, oldest first, stand in place of those before them: what counts where nobody ever spoke."""
+def _add_summaries(standing: dict[str, EdgeSummary], rows: Iterable[Sequence[Any]]) -> None:
+    """Update the summaries of unreviewed pairs by later registrations, oldest first."""
     for number, target, source, pair, key, status, posed, evidence in rows:
         before = standing.get(pair)
         keys = None if before is None else before.keys | {key} - {""}
         disagreement = _UNKNOWN if evidence is None else _disagreement(evidence)
-        usable = bool(posed) and _may_be_used(status, None)
-        standing[pair] = Standing(number, target, source, pair, key, None, usable, disagreement, keys)
+        usable = bool(posed) and _is_usable(status, None)
+        standing[pair] = EdgeSummary(number, target, source, pair, key, None, usable, disagreement, keys)
 
 
-def _of_silent(connection: Connection, wanted: ColumnElement[bool]) -> list[Standing]:
-    """What counts of pairs on which nobody ever spoke, without what disagrees and what else was computed."""
-    rows = connection.execute(_silent((*_LEAN, null())).where(wanted)).all()
-    return [_stands(tuple(row), None, {}) for row in rows]
+def _unreviewed_summaries(connection: Connection, wanted: ColumnElement[bool]) -> list[EdgeSummary]:
+    """Return summaries of unreviewed pairs, without disagreement and history keys."""
+    rows = connection.execute(_unreviewed((*_SUMMARY_COLUMNS, null())).where(wanted)).all()
+    return [_summary(tuple(row), None, {}) for row in rows]
 
 
-def _of_spoken(connection: Connection) -> list[Standing]:
-    """What counts of all others."""
-    found = _spoken(connection, (*_LEAN, _EVIDENCE, *_as_they_lie("proposer")), true())
-    several = _several(connection, registrations.c.pair.in_(_SPOKEN)) if found else {}
-    return [_stands(tuple(one.row)[:-1], one.word, several) for _, one in found]
+def _reviewed_summaries(connection: Connection) -> list[EdgeSummary]:
+    """Return summaries of reviewed and measured pairs."""
+    found = _reviewed(connection, (*_SUMMARY_COLUMNS, _EVIDENCE, *_undecoded("proposer")), true())
+    history_keys = _keys_of_repeated_pairs(connection, registrations.c.pair.in_(_REVIEWED_PAIRS)) if found else {}
+    return [_summary(tuple(one.row)[:-1], one.review, history_keys) for _, one in found]
 
 
-def _several(connection: Connection, wanted: ColumnElement[bool]) -> dict[str, set[str]]:
-    """By pairs that were registered more than once, all keys of theirs."""
+def _keys_of_repeated_pairs(connection: Connection, wanted: ColumnElement[bool]) -> dict[str, set[str]]:
+    """Return all keys of pairs that were registered more than once."""
     repeated = select(registrations.c.pair).where(wanted).group_by(registrations.c.pair).having(func.count() > 1)
     again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
     keys: dict[str, set[str]] = {}
@@ -609,24 +624,24 @@ def _several(connection: Connection, wanted: ColumnElement[bool]) -> dict[str, s
     return keys
 
 
-def _may_be_used(status: str, review: str | None) -> bool:
+def _is_usable(status: str, review: str | None) -> bool:
     return review == "confirm" or (status == "accepted" and review != "reject")
 
 
 _ends_of = attrgetter("target", "source")
 
 
-def _stands(row: tuple[Any, ...], word: Review | None, several: Mapping[str, set[str]]) -> Standing:
+def _summary(row: tuple[Any, ...], review: Review | None, history_keys: Mapping[str, set[str]]) -> EdgeSummary:
     number, target, source, pair, key, status, posed, evidence = row
     disagreement = _UNKNOWN if evidence is None else _disagreement(evidence)
-    review = None if word is None else word.review
-    usable = bool(posed) and _may_be_used(status, review)
-    keys = frozenset(several[pair] - {""}) if pair in several else None
-    return Standing(number, target, source, pair, key, review, usable, disagreement, keys)
+    value = None if review is None else review.review
+    usable = bool(posed) and _is_usable(status, value)
+    keys = frozenset(history_keys[pair] - {""}) if pair in history_keys else None
+    return EdgeSummary(number, target, source, pair, key, value, usable, disagreement, keys)
 
 
 def _disagreement(evidence: str) -> float:
-    """One number of a dozen; where they are a flat object and it is there once, the others are not made."""
+    """Parse one number of the evidence, without decoding the rest of a flat JSON object."""
     _, named, after = evidence.partition('"disagreement":')
     if named and evidence.count("{") == 1 and '"disagreement"' not in after:
         with suppress(ValueError):
@@ -634,17 +649,17 @@ def _disagreement(evidence: str) -> float:
     return float(_OBJECT.process_result_value(evidence, None).get("disagreement", _UNKNOWN))
 
 
-def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:
-    """As `_stored`; poses and matrices are taken from their bytes all at once."""
+def _stored_all(chosen: Sequence[_CurrentRow]) -> list[StoredRegistration]:
+    """Convert rows as `_stored` does, decoding poses and matrices all at once."""
     rows = [one.row for one in chosen]
-    with not_ours("registrations.S_target_source"):
+    with malformed_as_corrupt("registrations.S_target_source"):
         poses = iter(poses_of_bytes([bytes(r.S_target_source) for r in rows if r.S_target_source is not None]))
-    with not_ours("registrations.information"):
+    with malformed_as_corrupt("registrations.information"):
         matrices = iter(matrices_of_bytes([bytes(r.information) for r in rows if r.information is not None]))
     return [
         _stored(
             one.row,
-            one.word,
+            one.review,
             None if one.row.S_target_source is None else next(poses),
             None if one.row.information is None else next(matrices),
         )
@@ -652,12 +667,12 @@ def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:
     ]
 
 
-def _stored_one(row: Row[Any], word: Review | None) -> StoredRegistration:
-    return _stored(row, word, row.S_target_source, row.information)
+def _stored_one(row: Row[Any], review: Review | None) -> StoredRegistration:
+    return _stored(row, review, row.S_target_source, row.information)
 
 
 def _stored(
-    row: Row[Any], word: Review | None, S_target_source: Sim3 | None, information: np.ndarray | None
+    row: Row[Any], review: Review | None, S_target_source: Sim3 | None, information: np.ndarray | None
 ) -> StoredRegistration:
     registration = Registration(
         target=row.target,
@@ -675,5 +690,5 @@ def _stored(
         evidence=row.evidence or {},
         notes=tuple(row.notes or ()),
     )
-    review = None if word is None else word.review
-    return StoredRegistration(row.number, registration, row.key, row.created_at, review, row.recipe, row.adopts)
+    value = None if review is None else review.review
+    return StoredRegistration(row.number, registration, row.key, row.created_at, value, row.recipe, row.adopts)

@@ -1,8 +1,8 @@
-"""Revisions: every answer of the optimiser, numbered from 1, never changed.
+"""Revisions: every pose graph from the optimizer, numbered from 1, immutable.
 
-What a revision shares with the one before it is kept once: a row of `poses` and `edges` says from which revision on it
-holds and up to which (`gsmap.store.schema`). The newest poses are the rows without an end, any other revision's those
-around its number, so that reading one costs no chain of others, and forgetting some leaves nothing to be put together.
+Rows shared by consecutive revisions are stored once: a row of `poses` and `edges` is valid from one revision up to
+another (`gsmap.store.schema`). The newest poses are the rows without an end; those of another revision are the rows
+around its number, so that reading one needs no chain of others, and dropping some leaves nothing to merge.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from gsmap.errors import NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.columns import Numbers, not_ours
+from gsmap.store.column_types import PackedNumbers, malformed_as_corrupt
 from gsmap.store.matrices import covariance_bytes, covariances_of_bytes, pose_bytes, poses_of_bytes
 from gsmap.store.schema import REVISION_COUNTS, edges, poses, revisions
-from gsmap.store.ties import tie_value, ties_of
+from gsmap.store.world_ties import world_tie_to_json, world_ties_of_json
 from gsmap.types import EdgeOutcome, PoseGraph, Provenance, ScenePose
 from gsmap.types.plain import plain
 from gsmap.types.world import Georeference
@@ -47,19 +47,19 @@ PairsByRevision = dict[int, list[tuple[str, str]]]
 
 @dataclass(frozen=True)
 class Revision:
-    """One line of the history.
+    """An entry of the revision history.
 
     Args:
         number: from 1.
-        num_scenes, num_placed, num_components: scenes it knows, those with a pose, connected components.
-        num_used, num_tentative, num_unused, num_undecided: edges by their outcome (an undecided one counts twice).
-            All of these as it was made: what was purged since is counted.
+        num_scenes, num_placed, num_components: numbers of scenes, of scenes with a pose, and of connected components.
+        num_used, num_tentative, num_unused, num_undecided: edges by outcome (undecided ones are counted in addition).
+            All counts are as of its creation and include scenes purged since.
         note: why it was made.
-        dropped_at: when `prune` was allowed to reclaim what only it names; None while it is kept.
-        key: `RecipeKey.digest` of what it was solved from; one of its own kind in revisions that schema 0001 wrote.
+        dropped_at: when `prune` dropped it; None while it is kept.
+        key: `RecipeKey.digest` of what it was solved from; of another kind in revisions that schema 0001 wrote.
         recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in those.
-        settings, provenance, notes: as of `gsmap.types.PoseGraph`.
-        origin: ``map`` (its id) and ``number`` of the revision that another map solved; None where this one did.
+        settings, provenance, notes: as in `gsmap.types.PoseGraph`.
+        origin: ``map`` (its id) and ``number`` of a revision that another map solved; None for one solved by this map.
     """
 
     number: int
@@ -94,13 +94,13 @@ class Revisions:
         note: str = "",
         after: tuple[int, PoseGraph] | None = None,
     ) -> int:
-        """Add a revision; returns its number. All its scenes must be known.
+        """Add a revision and return its number. All its scenes must be in the map.
 
         Args:
-            key: its recipe, and all that it was solved from; None where it was not solved but made up.
+            key: its recipe and inputs; None for a pose graph that was not optimized.
             note: why it was made.
-            after: number and answer of the revision that it was made from. As long as that is the newest, what is the
-                very same object in both is not compared again.
+            after: number and pose graph of the revision that it was made from. If that is the newest, objects that are
+                identical in both are not compared again.
         """
         with self._catalog.write() as connection:
             newest = _newest(connection) or 0
@@ -108,32 +108,32 @@ class Revisions:
             row = {
                 "number": number,
                 "key": "" if key is None else key.digest,
-                "recipe": recipes.keep(connection, key),
+                "recipe": recipes.save_recipe(connection, key),
                 "settings": plain(graph.settings),
                 "provenance": plain(graph.provenance),
                 "notes": list(graph.notes),
-                "world": [tie_value(tie) for tie in graph.world],
+                "world": [world_tie_to_json(tie) for tie in graph.world],
                 "note": note,
                 "created_at": now(),
             }
             if after is None or after[0] != newest:
-                put(connection, row, lines_of(graph))
+                insert_revision(connection, row, rows_of_graph(graph))
             else:
                 differs = _differing(graph, after[1])
                 connection.execute(insert(revisions), {**row, **_counts(graph)})
-                _write(connection, number, lines_of(graph, differs), differs)
+                _write(connection, number, rows_of_graph(graph, differs), differs)
         return number
 
-    def current(self) -> int | None:
-        """The newest revision's number; None before the first."""
+    def newest_number(self) -> int | None:
+        """Return the number of the newest revision; None before the first."""
         with self._catalog.read() as connection:
             return _newest(connection)
 
     def get(self, number: int | None = None) -> PoseGraph | None:
-        """The answer of a revision, or of the newest (None before the first).
+        """Return the pose graph of a revision, or of the newest (None before the first).
 
         Raises:
-            NotFoundError: no such revision, or `prune` let it go.
+            NotFoundError: no such revision, or `prune` dropped it.
         """
         with self._catalog.read() as connection:
             wanted = _newest(connection) if number is None else number
@@ -152,12 +152,12 @@ class Revisions:
             return _pose_graph(connection, row)
 
     def list(self) -> list[Revision]:
-        """All revisions, oldest first."""
+        """Return all revisions, oldest first."""
         with self._catalog.read() as connection:
             return [_revision(row) for row in connection.execute(select(revisions).order_by(revisions.c.number))]
 
-    def one(self, number: int) -> Revision:
-        """One line of the history.
+    def entry(self, number: int) -> Revision:
+        """Return the history entry of a revision.
 
         Raises:
             NotFoundError: no such revision.
@@ -171,32 +171,32 @@ class Revisions:
         return _revision(row)
 
     def newest(self) -> Revision | None:
-        """The last line of the history; None before the first."""
+        """Return the history entry of the newest revision; None before the first."""
         with self._catalog.read() as connection:
             row = connection.execute(_NEWEST).first()
         return None if row is None else _revision(row)
 
     def poses(self, *scenes: str) -> dict[str, ScenePose]:
-        """The newest poses of some scenes (ids), or of all where none is named; no edge is read."""
+        """Return the newest poses of some scenes (ids), default: of all; reads no edges."""
         newest = poses.c.until.is_(None)
         with self._catalog.read() as connection:
             return _poses(connection, newest & poses.c.scene.in_(scenes) if scenes else newest)
 
     def world(self) -> tuple[Georeference, ...]:
-        """Where the components of the newest revision lie in the world, of those of which anything was observed."""
+        """Return the world ties of the components of the newest revision, for components with observations."""
         with self._catalog.read() as connection:
             row = connection.execute(_NEWEST).first()
-        return () if row is None else ties_of(row.world)
+        return () if row is None else world_ties_of_json(row.world)
 
     def outcomes(self, *scenes: str) -> dict[tuple[str, str], EdgeOutcome]:
-        """What the newest revision made of the edges of some scenes (ids), or of all where none is named."""
+        """Return the newest outcomes of the edges of some scenes (ids), default: of all."""
         newest = edges.c.until.is_(None)
         mine = or_(edges.c.target.in_(scenes), edges.c.source.in_(scenes))
         with self._catalog.read() as connection:
             return _outcomes(connection, newest & mine if scenes else newest)
 
     def changed_after(self, number: int) -> tuple[set[str], set[tuple[str, str]]]:
-        """The scenes whose newest pose, and the (target, source) of the edges whose outcome, came after a revision."""
+        """Return the scenes whose pose, and the (target, source) of edges whose outcome, changed after a revision."""
         with self._catalog.read() as connection:
             placed = connection.execute(select(poses.c.scene).where(poses.c.until.is_(None), poses.c.since > number))
             judged = select(edges.c.target, edges.c.source).where(edges.c.until.is_(None), edges.c.since > number)
@@ -209,11 +209,11 @@ class Revisions:
             return tuple(_outcomes(connection, newest))
 
     def undecided(self, number: int | None = None) -> PairsByRevision:
-        """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""
+        """Return (target, source) of undecided edges by revision; of one revision or of all."""
         query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)
         query = query.order_by(edges.c.target, edges.c.source)
         if number is not None:
-            query = query.where(_holds(edges, number))
+            query = query.where(_in_revision(edges, number))
         found: PairsByRevision = {}
         with self._catalog.read() as connection:
             end = (_newest(connection) or 0) + 1
@@ -224,38 +224,41 @@ class Revisions:
         return found
 
 
-# --- rows that hold for a while --------------------------------------------------------------------------------------
+# --- rows with a validity range --------------------------------------------------------------------------------------
 
 _NEWEST = select(revisions).order_by(revisions.c.number.desc()).limit(1)
 _ENDS: dict[str, tuple[str, ...]] = {"poses": ("scene",), "edges": ("target", "source")}
-Lines = Mapping[str, Mapping[tuple[str, ...], tuple[Any, ...]]]
-"""Of each table the rows of one revision: what follows ``until``, by scene, or by target and source."""
-Among = Mapping[str, Collection[tuple[str, ...]]]
-"""Of each table the scene, or target and source, of some rows."""
-_FEW = 1000  # scenes that one query names; beyond, all rows are read
+RevisionRows = Mapping[str, Mapping[tuple[str, ...], tuple[Any, ...]]]
+"""Rows of one revision by table: the columns after ``until``, by scene, or by target and source."""
+RowSelection = Mapping[str, Collection[tuple[str, ...]]]
+"""Selected rows by table: the scene, or target and source, of each."""
+_FEW = 1000  # scenes named in one query; for more, all rows are read
 
 
-def put(connection: Connection, row: Mapping[str, Any], lines: Lines | None) -> None:
-    """Add a revision, numbered after the newest: of its lines only those are written that differ from that one's.
+def insert_revision(connection: Connection, row: Mapping[str, Any], lines: RevisionRows | None) -> None:
+    """Insert a revision, numbered after the newest, and only those of its rows that differ from the newest.
 
     Args:
-        lines: None of one that was dropped elsewhere, of which no more is left than its row.
+        lines: None for a dropped revision, of which only its entry is left.
     """
     connection.execute(insert(revisions), dict(row) if lines is None else {**row, **_counts_of_lines(lines)})
     if lines is not None:
         _write(connection, row["number"], lines)
 
 
-def _write(connection: Connection, number: int, lines: Lines, among: Among | None = None) -> None:
-    """End the rows that no longer hold from a revision on, and add those that begin to.
+def _write(connection: Connection, number: int, lines: RevisionRows, among: RowSelection | None = None) -> None:
+    """End rows that are no longer valid from a revision on, and insert new ones.
 
     Args:
-        among: only these may do so; all where None.
+        among: consider only these rows; default: all.
     """
     for table in (poses, edges):
-        wanted, standing = lines[table.name], _standing(connection, table, None if among is None else among[table.name])
-        ended = [ends for ends, (_, values) in standing.items() if wanted.get(ends) != values]
-        begun = [ends for ends, values in wanted.items() if ends not in standing or standing[ends][1] != values]
+        wanted, current = (
+            lines[table.name],
+            _current_rows(connection, table, None if among is None else among[table.name]),
+        )
+        ended = [ends for ends, (_, values) in current.items() if wanted.get(ends) != values]
+        begun = [ends for ends, values in wanted.items() if ends not in current or current[ends][1] != values]
         names = _ENDS[table.name]
         if ended:
             mine = [table.c[name] == bindparam(f"_{name}") for name in (*names, "since")]
@@ -264,7 +267,7 @@ def _write(connection: Connection, number: int, lines: Lines, among: Among | Non
                 [
                     {
                         f"_{name}": value
-                        for name, value in zip((*names, "since"), (*ends, standing[ends][0]), strict=True)
+                        for name, value in zip((*names, "since"), (*ends, current[ends][0]), strict=True)
                     }
                     for ends in ended
                 ],
@@ -275,8 +278,8 @@ def _write(connection: Connection, number: int, lines: Lines, among: Among | Non
             connection.execute(insert(table), made)
 
 
-def _differing(graph: PoseGraph, before: PoseGraph) -> Among:
-    """What two answers do not share as the very same objects."""
+def _differing(graph: PoseGraph, before: PoseGraph) -> RowSelection:
+    """Return the poses and edges that are not identical objects in two pose graphs."""
     return {
         "poses": {
             (scene,)
@@ -291,8 +294,8 @@ def _differing(graph: PoseGraph, before: PoseGraph) -> Among:
     }
 
 
-def lines_of(graph: PoseGraph, among: Among | None = None) -> Lines:
-    """What a revision's tables hold of an answer, or of some of its scenes and edges."""
+def rows_of_graph(graph: PoseGraph, among: RowSelection | None = None) -> RevisionRows:
+    """Convert a pose graph, or some of its scenes and edges, to rows."""
     return {
         "poses": {
             (scene,): (
@@ -317,8 +320,8 @@ def lines_of(graph: PoseGraph, among: Among | None = None) -> Lines:
     }
 
 
-def stored_lines(connection: Connection, row: Row[Any]) -> Lines | None:
-    """What the tables hold of a revision; None of one that was dropped."""
+def stored_rows(connection: Connection, row: Row[Any]) -> RevisionRows | None:
+    """Return the stored rows of a revision; None for a dropped one."""
     if is_dropped(connection, row):
         return None
     return {
@@ -331,43 +334,43 @@ def stored_lines(connection: Connection, row: Row[Any]) -> Lines | None:
 
 
 def is_dropped(connection: Connection, row: Row[Any]) -> bool:
-    """Whether `prune` took poses or edges of a revision. The newest one's are those of the map, and stay."""
+    """Return True if `prune` deleted poses or edges of a revision; those of the newest always stay."""
     if row.dropped_at is None or row.number == _newest(connection):
         return False
     left = [
-        connection.execute(select(func.count()).select_from(table).where(_holds(table, row.number))).scalar_one()
+        connection.execute(select(func.count()).select_from(table).where(_in_revision(table, row.number))).scalar_one()
         for table in (poses, edges)
     ]
     return left != [row.num_scenes, row.num_used + row.num_tentative + row.num_unused]
 
 
-def named_by_kept(after: int = 0) -> Select[Any]:
-    """The scenes that have a pose in any revision that was not dropped, of those numbered after one."""
+def scenes_in_kept_revisions(after: int = 0) -> Select[Any]:
+    """Select the scenes that have a pose in any kept revision numbered above ``after``."""
     kept = revisions.c.dropped_at.is_(None) & (revisions.c.number > after)
     return select(poses.c.scene).where(exists().where(kept, holds_in_revision(poses)))
 
 
 def forget_dropped(connection: Connection) -> None:
-    """Delete what only dropped revisions hold."""
+    """Delete rows that only dropped revisions use."""
     kept = revisions.c.dropped_at.is_(None) | (revisions.c.number == (_newest(connection) or 0))
     for table in (poses, edges):
         connection.execute(delete(table).where(~exists().where(kept, holds_in_revision(table))))
 
 
 def holds_in_revision(table: Table) -> ColumnElement[bool]:
-    """That a row of poses or edges holds in a row of revisions."""
+    """Condition that a row of poses or edges is valid in a row of revisions."""
     return (revisions.c.number >= table.c.since) & or_(table.c.until.is_(None), revisions.c.number < table.c.until)
 
 
-def _holds(table: Table, number: int) -> ColumnElement[bool]:
+def _in_revision(table: Table, number: int) -> ColumnElement[bool]:
     return (table.c.since <= number) & or_(table.c.until.is_(None), table.c.until > number)
 
 
 def _where(connection: Connection, table: Table, number: int) -> ColumnElement[bool]:
-    return table.c.until.is_(None) if number == _newest(connection) else _holds(table, number)
+    return table.c.until.is_(None) if number == _newest(connection) else _in_revision(table, number)
 
 
-def _standing(
+def _current_rows(
     connection: Connection, table: Table, among: Collection[tuple[str, ...]] | None = None
 ) -> dict[tuple[str, ...], tuple[int, tuple[Any, ...]]]:
     where, firsts = table.c.until.is_(None), sorted({ends[0] for ends in among or ()})
@@ -381,18 +384,18 @@ def _standing(
 def _rows(
     connection: Connection, table: Table, where: ColumnElement[bool]
 ) -> dict[tuple[str, ...], tuple[int, tuple[Any, ...]]]:
-    """`since` and values, bytes as they lie, by scenes."""
+    """Return `since` and undecoded values by scenes."""
     count = len(_ENDS[table.name])
-    query = select(*map(_as_it_lies, table.columns)).where(where).order_by(*table.c[:count])
+    query = select(*map(_undecoded, table.columns)).where(where).order_by(*table.c[:count])
     return {tuple(row[:count]): (row[count], tuple(row[count + 2 :])) for row in map(tuple, connection.execute(query))}
 
 
-def _as_it_lies(column: Any) -> Any:
-    """A column whose bytes are not taken apart: many are at once, or none."""
-    return type_coerce(column, LargeBinary).label(column.name) if isinstance(column.type, Numbers) else column
+def _undecoded(column: Any) -> Any:
+    """Return a column without decoding its bytes, which is done for many at once, or not at all."""
+    return type_coerce(column, LargeBinary).label(column.name) if isinstance(column.type, PackedNumbers) else column
 
 
-def _counts_of_lines(lines: Lines) -> dict[str, int]:
+def _counts_of_lines(lines: RevisionRows) -> dict[str, int]:
     placed = [(pose is not None, component) for pose, component, *_ in lines["poses"].values()]
     return _counted(placed, [(use, undecided) for use, _, _, undecided in lines["edges"].values()])
 
@@ -403,7 +406,7 @@ def _counts(graph: PoseGraph) -> dict[str, int]:
 
 
 def _counted(placed: Sequence[tuple[bool, int]], judged: Sequence[tuple[str, int]]) -> dict[str, int]:
-    """What a revision knows of itself: of whether each scene has a pose, and its component; of edges' uses."""
+    """Return the counts of a revision from (has pose, component) of its scenes and (use, undecided) of its edges."""
     uses = Counter(use for use, _ in judged)
     counts = (
         len(placed),
@@ -418,7 +421,7 @@ def _counted(placed: Sequence[tuple[bool, int]], judged: Sequence[tuple[str, int
 
 
 def newest_poses(connection: Connection) -> PoseGraph | None:
-    """The newest revision's answer, as a transaction sees it; None before the first."""
+    """Return the newest pose graph within a transaction; None before the first."""
     row = connection.execute(_NEWEST).first()
     return None if row is None else _pose_graph(connection, row)
 
@@ -450,16 +453,16 @@ def _pose_graph(connection: Connection, row: Row[Any]) -> PoseGraph:
         settings=row.settings,
         provenance=_provenance(row.provenance),
         notes=tuple(row.notes),
-        world=ties_of(row.world),
+        world=world_ties_of_json(row.world),
     )
 
 
 def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, ScenePose]:
-    query = select(*map(_as_it_lies, poses.columns)).where(where).order_by(poses.c.scene)
+    query = select(*map(_undecoded, poses.columns)).where(where).order_by(poses.c.scene)
     rows = connection.execute(query).all()
-    with not_ours("poses.S_map_scene"):
+    with malformed_as_corrupt("poses.S_map_scene"):
         S_map_scene = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
-    with not_ours("poses.covariance"):
+    with malformed_as_corrupt("poses.covariance"):
         covariances = iter(covariances_of_bytes([bytes(row.covariance) for row in rows if row.covariance is not None]))
     none: Any = None
     return {
@@ -482,6 +485,6 @@ def _outcomes(connection: Connection, where: ColumnElement[bool]) -> dict[tuple[
     }
 
 
-def _provenance(said: dict[str, Any]) -> Provenance:
-    known = {part.name: said[part.name] for part in fields(Provenance) if part.name in said}
+def _provenance(value: dict[str, Any]) -> Provenance:
+    known = {part.name: value[part.name] for part in fields(Provenance) if part.name in value}
     return Provenance(**known | {"contradicted_priors": tuple(known.get("contradicted_priors", ()))})

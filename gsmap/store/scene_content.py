@@ -1,4 +1,4 @@
-"""Scenes as the catalog's rows and as arrays on disk."""
+"""Conversion of scenes to catalog rows and arrays."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from sqlalchemy import Row
 
 from gsmap.errors import InputError
 from gsmap.store import compact
-from gsmap.store.arrays import Parts, digest
-from gsmap.store.boxes import chunk_boxes
+from gsmap.store.array_archive import StreamedArray
+from gsmap.store.arrays import ChunkedArray, digest
+from gsmap.store.chunk_boxes import chunk_boxes
 from gsmap.store.layout import Shape
-from gsmap.store.packed import Column
 from gsmap.stream import blocks
 from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Thinning
 from gsmap.types.gaussians import CHUNK_ROWS as ROWS_AT_ONCE
@@ -24,12 +24,12 @@ from gsmap.types.source import origin_of_source
 
 
 def scene_id(gaussians: GaussianSource, cameras: Cameras) -> str:
-    """32 hex digits of content: the same Gaussians and cameras have the same id in every map.
+    """Compute the id of a scene: 32 hex digits of its content, equal for equal Gaussians and cameras in every map.
 
-    Gaussians about an origin are others than those about zero; cameras are in the frame of the means.
+    The origin of the Gaussians is part of the content; cameras are in the frame of the means.
     """
     shapes = gaussian_shapes(gaussians.num_gaussians, gaussians.sh_degree)
-    arrays = [Parts(shapes[name], np.dtype(np.float32), partial(gaussians.columns, name)) for name in FIELDS]
+    arrays = [ChunkedArray(shapes[name], np.dtype(np.float32), partial(gaussians.columns, name)) for name in FIELDS]
     views = [cameras.T_frame_camera, cameras.intrinsics_px, cameras.sizes_px]
     origin = origin_of_source(gaussians)
     more = [origin] if origin.any() else []
@@ -37,7 +37,7 @@ def scene_id(gaussians: GaussianSource, cameras: Cameras) -> str:
 
 
 def scene_of(row: Row[Any], tags: tuple[str, ...]) -> Scene:
-    """A scene from its row."""
+    """Convert a row to a scene."""
     return Scene(
         id=row.id,
         name=row.name,
@@ -58,7 +58,7 @@ def scene_of(row: Row[Any], tags: tuple[str, ...]) -> Scene:
 
 
 def thinning_of(value: dict[str, Any] | None) -> Thinning | None:
-    """How a scene is kept, from its column."""
+    """Parse the column of a thinned scene."""
     if value is None:
         return None
     up = value["up"]
@@ -67,7 +67,7 @@ def thinning_of(value: dict[str, Any] | None) -> Thinning | None:
 
 
 def shapes_of(row: Row[Any]) -> dict[str, Shape]:
-    """What a scene's row says of its arrays."""
+    """Return the expected shapes of a scene's arrays."""
     n, c = row.num_gaussians, row.num_cameras
     shapes: dict[str, Shape] = {**gaussian_shapes(n, row.sh_degree)}
     if row.thinned is not None:
@@ -82,13 +82,13 @@ def shapes_of(row: Row[Any]) -> dict[str, Shape]:
 
 
 def gaussian_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
-    """The shape of each field of so many Gaussians."""
+    """Return the shape of each field of ``count`` Gaussians."""
     n, k = count, (sh_degree + 1) ** 2
     return {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, k, 3)}
 
 
 class GaussianBlocks:
-    """The Gaussians of a source as arrays that are written block after block, each block read once.
+    """The Gaussians of a source as streamed arrays that are written block by block, each block read once.
 
     Args:
         source: in the order to be written.
@@ -102,10 +102,12 @@ class GaussianBlocks:
         self._block = Gaussians.empty()
         self._boxes: list[np.ndarray] = []
         shapes = gaussian_shapes(source.num_gaussians, source.sh_degree)
-        self.arrays = {name: Column(shapes[name], np.dtype(np.float32), partial(self._of, name)) for name in FIELDS}
+        self.arrays = {
+            name: StreamedArray(shapes[name], np.dtype(np.float32), partial(self._of, name)) for name in FIELDS
+        }
 
     def boxes(self) -> np.ndarray:
-        """(C, 2, 3) of the blocks, once all have been written."""
+        """Return (C, 2, 3) boxes of the blocks, once all have been written."""
         return np.array(self._boxes, dtype=np.float64).reshape(-1, 2, 3)
 
     def _of(self, name: str, start: int) -> np.ndarray:
@@ -121,10 +123,10 @@ class GaussianBlocks:
 
 @dataclass(frozen=True, eq=False)
 class StoredGaussians:
-    """A scene's Gaussians where they lie, a `GaussianSource`.
+    """The stored Gaussians of a scene, a `GaussianSource`.
 
     Args:
-        num_gaussians, sh_degree: what its row says.
+        num_gaussians, sh_degree: as in its row.
         read: reads a range of rows.
         column: reads a range of rows of one field.
     """
@@ -147,7 +149,7 @@ class StoredGaussians:
 
 
 def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:
-    """What is written of a scene's cameras, by the names of its arrays."""
+    """Return the arrays of a scene's cameras by name."""
     for name in cameras.names:
         if "\n" in name:
             raise InputError(f"camera name {name!r} has a line break", code="invalid_name")

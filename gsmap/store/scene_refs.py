@@ -1,4 +1,4 @@
-"""What people call a scene by: its name, its id, the beginning of its id; and which names are free."""
+"""Resolve references to scenes (name, id or id prefix), and find unused names."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ from gsmap.store.schema import scenes
 
 
 def living_ids(connection: Connection) -> set[str]:
-    """Of the scenes that were not removed."""
-    ids = select(type_coerce(scenes.c.id, Text)).where(scenes.c.removed_at.is_(None))  # to be compared with
+    """Return the ids of the living scenes."""
+    ids = select(type_coerce(scenes.c.id, Text)).where(scenes.c.removed_at.is_(None))  # only compared, so not validated
     return set(connection.execute(ids).scalars().all())
 
 
 def resolve(connection: Connection, ref: str) -> str:
-    """The id that a ref means; see `Scenes.get`."""
+    """Return the id of a referenced scene; see `Scenes.get`."""
     return str(find(connection, ref).id)
 
 
 def scene_name(connection: Connection, ref: str) -> str:
-    """What people call the scene that a ref means."""
+    """Return the name of a referenced scene."""
     return str(find(connection, ref).name)
 
 
 def name_taken(connection: Connection, name: str) -> bool:
-    """Whether a living scene is called so."""
+    """Return True if a living scene has this name."""
     same = select(scenes.c.id).where(scenes.c.name == name, scenes.c.removed_at.is_(None))
     return connection.execute(same).first() is not None
 
 
-def free_name(connection: Connection, wanted: str) -> str:
-    """The name, or ``name-2`` and so on where living scenes have it."""
+def unused_name(connection: Connection, wanted: str) -> str:
+    """Return the name, or ``name-2`` and so on if living scenes use it."""
     name, number = wanted, 2
     while name_taken(connection, name):
         name, number = f"{wanted}-{number}", number + 1
     return name
 
 
-def alive(connection: Connection, ref: str) -> Row[Any]:
-    """As `find`, and NotFoundError where it was removed."""
+def find_living(connection: Connection, ref: str) -> Row[Any]:
+    """Return the row of a referenced scene; raises NotFoundError if it was removed."""
     row = find(connection, ref)
     if row.removed_at is not None:
         raise NotFoundError(f"scene {ref} was removed on {row.removed_at}", code="scene_removed")
@@ -51,7 +51,7 @@ def alive(connection: Connection, ref: str) -> Row[Any]:
 
 
 def find(connection: Connection, ref: str) -> Row[Any]:
-    """The row that a ref means; see `Scenes.get`."""
+    """Return the row of a referenced scene; see `Scenes.get`."""
     living = scenes.c.removed_at.is_(None)
     row = connection.execute(select(scenes).where(scenes.c.name == ref, living)).first() or by_id(connection, ref)
     if row is not None:
@@ -73,7 +73,7 @@ def find(connection: Connection, ref: str) -> Row[Any]:
 
 
 def find_removed(connection: Connection, ref: str) -> Row[Any]:
-    """A removed scene by its id, the beginning of it, or its last name."""
+    """Return the row of a removed scene by its id, id prefix, or last name."""
     gone = scenes.c.removed_at.is_not(None)
     named = connection.execute(select(scenes).where(gone, (scenes.c.id == ref) | (scenes.c.name == ref))).all()
     if not named and ref and all(c in "0123456789abcdef" for c in ref):
@@ -93,5 +93,5 @@ def find_removed(connection: Connection, ref: str) -> Row[Any]:
 
 
 def by_id(connection: Connection, wanted: str) -> Row[Any] | None:
-    """The row of an id, living or removed; None where there is none."""
+    """Return the row with an id, living or removed; None if there is none."""
     return connection.execute(select(scenes).where(scenes.c.id == wanted)).first()

@@ -21,30 +21,30 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from gsmap.store.columns import (
-    Digest,
-    Json,
-    Key,
-    Kind,
-    Line,
-    Lines,
-    Numbers,
-    Pair,
-    RelativePath,
-    Word,
-    a_box,
-    a_direction,
-    a_graph,
-    a_pose,
-    a_thinning,
-    an_object,
-    candidates,
-    members,
-    numbers,
-    poses_by_scene,
-    sigmas,
-    texts,
-    ties,
+from gsmap.store.column_types import (
+    ArrayKindText,
+    DigestText,
+    EnumText,
+    JsonText,
+    KeyText,
+    LineText,
+    MultilineText,
+    PackedNumbers,
+    PairText,
+    RelativePathText,
+    is_box,
+    is_candidate_list,
+    is_direction,
+    is_graph,
+    is_member_list,
+    is_number_dict,
+    is_object,
+    is_pose,
+    is_poses_by_scene,
+    is_sigmas,
+    is_text_list,
+    is_thinning,
+    is_world_ties,
 )
 from gsmap.store.matrices import (
     covariance_bytes,
@@ -58,7 +58,7 @@ from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 from gsmap.types.map_object import OBJECT_FACTS
 from gsmap.types.world import OBSERVATION_KINDS
 
-HEAD = "0011"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0011"  # the newest migration; numbered, so that versions can be compared without alembic
 
 REVISION_COUNTS = (
     "num_scenes",
@@ -69,7 +69,7 @@ REVISION_COUNTS = (
     "num_unused",
     "num_undecided",
 )
-"""What a revision knows of itself when it is made, so that a list of revisions reads no pose."""
+"""Columns counted when a revision is made, so that a list of revisions reads no poses."""
 
 metadata = MetaData(
     naming_convention={
@@ -89,23 +89,23 @@ Real: TypeEngine[float] = Double().with_variant(
 
 def _table(name: str, *parts: Any) -> Table:
     for part in parts:
-        if isinstance(part, Column) and hasattr(part.type, "at"):
-            part.type = part.type.at(f"{name}.{part.name}")  # so that a message can say where
+        if isinstance(part, Column) and hasattr(part.type, "for_column"):
+            part.type = part.type.for_column(f"{name}.{part.name}")  # for messages
     return Table(name, metadata, *parts, sqlite_strict=True)
 
 
 def _scene(name: str, **options: Any) -> Column[str]:
-    return Column(name, Digest, ForeignKey("scenes.id"), nullable=False, **options)
+    return Column(name, DigestText, ForeignKey("scenes.id"), nullable=False, **options)
 
 
 def _recipe() -> Column[str]:
     """Null in rows that schema 0001 wrote."""
-    return Column("recipe", Digest, ForeignKey("recipes.digest"))
+    return Column("recipe", DigestText, ForeignKey("recipes.digest"))
 
 
 about = _table(
     "about",
-    Column("id", Digest, primary_key=True),  # of the map, random
+    Column("id", DigestText, primary_key=True),  # of the map, random
     Column("created_at", Text, nullable=False),
     Column("gsmap_version", Text, nullable=False),
 )
@@ -113,38 +113,38 @@ about = _table(
 # An immutable folder of arrays, and the digest of each of its files.
 groups = _table(
     "groups",
-    Column("id", Digest, primary_key=True),  # digest of the content
-    Column("kind", Kind, nullable=False),  # scenes, graphs, changes, indexes, views, photos
+    Column("id", DigestText, primary_key=True),  # digest of the content
+    Column("kind", ArrayKindText, nullable=False),  # scenes, graphs, changes, indexes, views, photos
     Column("created_at", Text, nullable=False),
 )
 files = _table(
     "files",
-    Column("group_id", Digest, ForeignKey("groups.id"), primary_key=True),
-    Column("path", RelativePath, primary_key=True),  # relative to the group
+    Column("group_id", DigestText, ForeignKey("groups.id"), primary_key=True),
+    Column("path", RelativePathText, primary_key=True),  # relative to the group
     Column("size_bytes", Bytes, nullable=False),
-    Column("sha256", Digest, nullable=False),
+    Column("sha256", DigestText, nullable=False),
 )
 
 scenes = _table(
     "scenes",
     Column("number", Integer, primary_key=True),
-    Column("id", Digest, nullable=False, unique=True),  # digest of Gaussians and cameras
-    Column("name", Line, nullable=False),
+    Column("id", DigestText, nullable=False, unique=True),  # digest of Gaussians and cameras
+    Column("name", LineText, nullable=False),
     Column("num_gaussians", Integer, nullable=False),
     Column("sh_degree", Integer, nullable=False),
     Column("num_cameras", Integer, nullable=False),
-    Column("bounds", Json(a_box), nullable=False),
+    Column("bounds", JsonText(is_box), nullable=False),
     Column("scale_policy", Text, nullable=False),
     Column("captured_at", Text),
     Column("ingested_at", Text, nullable=False),
     Column("source", Text, nullable=False),
     Column("cameras_synthesised", Integer, nullable=False),
     Column("antialiased", Integer, nullable=False),
-    Column("notes", Json(texts), nullable=False),
-    Column("group_id", Digest, ForeignKey("groups.id")),  # null once pruned
+    Column("notes", JsonText(is_text_list), nullable=False),
+    Column("group_id", DigestText, ForeignKey("groups.id")),  # null once pruned
     Column("removed_at", Text),  # the tombstone
-    Column("thinned", Json(a_thinning)),  # of a scene that is kept compact (`gsmap.store.compact`)
-    Column("origin", Json(a_direction)),  # of its frame in the coordinates of its file; null for zero
+    Column("thinned", JsonText(is_thinning)),  # of a scene that is kept compact (`gsmap.store.compact`)
+    Column("origin", JsonText(is_direction)),  # of its frame in the coordinates of its file; null for zero
     CheckConstraint("scale_policy in ('auto', 'known', 'unknown')", name="scale_policy"),
 )
 Index(
@@ -155,14 +155,14 @@ Index(
     postgresql_where=text("removed_at IS NULL"),
 )
 
-# What people said of a scene, from its ingest on: nothing is overwritten. `scenes` holds the newest name and date.
+# Facts about a scene since its ingest, never overwritten. `scenes` holds the newest name and date.
 scene_facts = _table(
     "scene_facts",
     Column("number", Integer, primary_key=True),
     _scene("scene", index=True),
     Column("kind", Text, nullable=False),
-    Column("value", Lines, nullable=False),  # empty: a date, or metres per unit, that was taken back
-    Column("author", Line, nullable=False),
+    Column("value", MultilineText, nullable=False),  # empty: a withdrawn date or scale
+    Column("author", LineText, nullable=False),
     Column("created_at", Text, nullable=False),
     CheckConstraint("kind in ('name', 'captured_at', 'note', 'tag', 'untag', 'metres_per_unit')", name="kind"),
 )
@@ -171,26 +171,26 @@ scene_facts = _table(
 # id, s0 = s1 = scene number, x0 x1 y0 y1 z0 z1, chunk.
 CHUNK_BOXES = "chunk_boxes"
 
-# How results were made: a `gsmap.methods.RecipeKey` without its inputs, once for all results that share it.
+# Recipes of results: a `gsmap.methods.RecipeKey` without its inputs, stored once for all results that share it.
 recipes = _table(
     "recipes",
-    Column("digest", Digest, primary_key=True),  # RecipeKey.recipe
+    Column("digest", DigestText, primary_key=True),  # RecipeKey.recipe
     Column("stage", Text, nullable=False),
     Column("method", Text, nullable=False),
-    Column("version", Json(an_object), nullable=False),
-    Column("settings", Json(an_object), nullable=False),
+    Column("version", JsonText(is_object), nullable=False),
+    Column("settings", JsonText(is_object), nullable=False),
     Column("backend", Text, nullable=False),
     Column("created_at", Text, nullable=False),
 )
 
 graphs = _table(
     "graphs",
-    Column("key", Key, primary_key=True),  # RecipeKey.digest
+    Column("key", KeyText, primary_key=True),  # RecipeKey.digest
     _recipe(),
     _scene("scene", index=True),
     Column("num_nodes", Integer, nullable=False),
-    Column("about", Json(a_graph), nullable=False),  # up, unit_m, notes, layers
-    Column("group_id", Digest, ForeignKey("groups.id"), nullable=False),
+    Column("about", JsonText(is_graph), nullable=False),  # up, unit_m, notes, layers
+    Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )
 
@@ -199,83 +199,87 @@ registrations = _table(
     Column("number", Integer, primary_key=True),
     _scene("target", index=True),
     _scene("source", index=True),
-    Column("pair", Pair, nullable=False, index=True),  # both ids, sorted: the pair in either direction
-    Column("key", Key, nullable=False, index=True),  # RecipeKey.digest; empty: a person's own measurement
+    Column("pair", PairText, nullable=False, index=True),  # both ids, sorted: the pair in either direction
+    Column("key", KeyText, nullable=False, index=True),  # RecipeKey.digest; empty for a manual measurement
     _recipe(),
     Column("adopts", Integer, ForeignKey("registrations.number")),  # the earlier row that this one makes current again
     Column("status", Text, nullable=False),
     Column("reason", Text, nullable=False),
-    Column("S_target_source", Numbers(pose_bytes, pose_of_bytes)),
-    Column("information", Numbers(matrix_bytes, matrix_of_bytes)),
+    Column("S_target_source", PackedNumbers(pose_bytes, pose_of_bytes)),
+    Column("information", PackedNumbers(matrix_bytes, matrix_of_bytes)),
     Column("num_inliers", Integer, nullable=False),
     Column("num_correspondences", Integer, nullable=False),
     Column("overlap", Real, nullable=False),
     Column("proposer", Text, nullable=False),
     Column("exact", Integer, nullable=False),
-    Column("seconds", Json(an_object), nullable=False),
-    Column("evidence", Json(an_object), nullable=False),
-    Column("notes", Json(texts), nullable=False, server_default="[]"),
+    Column("seconds", JsonText(is_object), nullable=False),
+    Column("evidence", JsonText(is_object), nullable=False),
+    Column("notes", JsonText(is_text_list), nullable=False, server_default="[]"),
     Column("created_at", Text, nullable=False),
     CheckConstraint("status in ('accepted', 'rejected', 'no_match')", name="status"),
 )
 reviews = _table(
     "reviews",
     Column("number", Integer, primary_key=True),
-    Column("pair", Pair, nullable=False, index=True),
+    Column("pair", PairText, nullable=False, index=True),
     Column("review", Text, nullable=False),
     Column("registration", Integer, ForeignKey("registrations.number"), nullable=False),
-    Column("note", Lines, nullable=False),
+    Column("note", MultilineText, nullable=False),
     Column("created_at", Text, nullable=False),
     CheckConstraint("review in ('confirm', 'reject', 'withdraw')", name="review"),
 )
 
-# What retrieval derives from graphs, and makes anew where it is lost.
+# Inverted indexes and lookups of retrieval; recomputed if lost.
 index_segments = _table(
     "index_segments",
     Column("number", Integer, primary_key=True),
-    Column("key", Key, nullable=False),  # of the recipe: what an index keeps of a graph
-    Column("members", Json(members), nullable=False),  # each: scene, key of its graph, upright, metric, coarseness
+    Column("key", KeyText, nullable=False),  # of the index recipe
+    Column(
+        "members", JsonText(is_member_list), nullable=False
+    ),  # each: scene, key of its graph, upright, metric, coarseness
     Column("num_nodes", Integer, nullable=False),
-    Column("group_id", Digest, ForeignKey("groups.id"), nullable=False),
+    Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )
 lookups = _table(
     "lookups",
     _scene("scene", primary_key=True),
-    Column("key", Key, nullable=False),  # RecipeKey.digest of how it asked, and of its graph
-    Column("candidates", Json(candidates), nullable=False),  # best first; each: scene, score, votes
-    Column("num_left", Integer),  # of these, not tried when there was enough; null until the list was gone down
+    Column("key", KeyText, nullable=False),  # RecipeKey.digest of the query recipe and the scene's graph
+    Column("candidates", JsonText(is_candidate_list), nullable=False),  # best first; each: scene, score, votes
+    Column("num_left", Integer),  # of these, candidates left when there were enough edges; null before the first run
     Column("created_at", Text, nullable=False),
 )
 
-# What the views of a scene show, which photographs are found by; made anew where it is lost.
+# Features of the views of a scene, for localizing photos; recomputed if lost.
 view_features = _table(
     "view_features",
-    Column("key", Key, primary_key=True),  # RecipeKey.digest
+    Column("key", KeyText, primary_key=True),  # RecipeKey.digest
     _recipe(),
     _scene("scene", index=True),
     Column("num_views", Integer, nullable=False),
     Column("num_features", Integer, nullable=False),
     Column("summaries", LargeBinary, nullable=False),  # empty; older maps hold a vector of each view
-    Column("group_id", Digest, ForeignKey("groups.id"), nullable=False),
+    Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )
 
-# Two captures of a place, looked at for what changed. Nothing is overwritten; of a pair the newest one counts.
+# Comparisons of two scenes, never overwritten; the newest one of a pair is current.
 comparisons = _table(
     "comparisons",
     Column("number", Integer, primary_key=True),
     _scene("older"),
     _scene("newer"),
-    Column("pair", Pair, nullable=False, index=True),  # both ids, sorted
-    Column("key", Key, nullable=False, index=True),  # RecipeKey.digest
+    Column("pair", PairText, nullable=False, index=True),  # both ids, sorted
+    Column("key", KeyText, nullable=False, index=True),  # RecipeKey.digest
     _recipe(),
-    Column("S_newer_older", Json(a_pose), nullable=False),  # the relative pose that it was made with
-    Column("S_frame_newer", Json(a_pose), nullable=False),  # takes the newer scene to the frame of boxes and voxels
+    Column("S_newer_older", JsonText(is_pose), nullable=False),  # relative pose used for it
+    Column(
+        "S_frame_newer", JsonText(is_pose), nullable=False
+    ),  # takes the newer scene to the frame of boxes and voxels
     Column("seen_share", Real, nullable=False),
-    Column("gains", Json(a_direction), nullable=False),
-    Column("notes", Json(texts), nullable=False),
-    Column("group_id", Digest, ForeignKey("groups.id")),  # null where nothing changed, and once pruned
+    Column("gains", JsonText(is_direction), nullable=False),
+    Column("notes", JsonText(is_text_list), nullable=False),
+    Column("group_id", DigestText, ForeignKey("groups.id")),  # null if nothing changed, and once pruned
     Column("created_at", Text, nullable=False),
 )
 changes = _table(
@@ -283,14 +287,14 @@ changes = _table(
     Column("number", Integer, primary_key=True),
     Column("comparison", Integer, ForeignKey("comparisons.number"), nullable=False, index=True),
     Column("place", Integer, nullable=False),  # in its comparison, from 0, surest first
-    Column("same_as", Integer, ForeignKey("changes.number")),  # the first row of the change that this one is; or null
-    Column("kind", Word(CHANGE_KINDS), nullable=False),
-    Column("box", Json(a_box), nullable=False),
-    Column("S_after_before", Json(a_pose)),
-    Column("symmetry", Word(SYMMETRIES), nullable=False),
+    Column("same_as", Integer, ForeignKey("changes.number")),  # the first row of the same change, or null
+    Column("kind", EnumText(CHANGE_KINDS), nullable=False),
+    Column("box", JsonText(is_box), nullable=False),
+    Column("S_after_before", JsonText(is_pose)),
+    Column("symmetry", EnumText(SYMMETRIES), nullable=False),
     Column("confidence", Real, nullable=False),
-    Column("evidence", Json(numbers), nullable=False),
-    Column("num_voxels", Integer, nullable=False),  # so many of each array of its comparison are its own
+    Column("evidence", JsonText(is_number_dict), nullable=False),
+    Column("num_voxels", Integer, nullable=False),  # its share of each array of its comparison
     Column("num_before", Integer, nullable=False),
     Column("num_after", Integer, nullable=False),
     CheckConstraint("kind in ('appeared', 'disappeared', 'moved', 'recoloured', 'replaced', 'lighting')", name="kind"),
@@ -301,7 +305,7 @@ change_reviews = _table(
     Column("number", Integer, primary_key=True),
     Column("change", Integer, ForeignKey("changes.number"), nullable=False, index=True),  # its first row
     Column("review", Text, nullable=False),
-    Column("note", Lines, nullable=False),
+    Column("note", MultilineText, nullable=False),
     Column("created_at", Text, nullable=False),
     CheckConstraint("review in ('confirm', 'reject', 'withdraw')", name="review"),
 )
@@ -309,31 +313,29 @@ change_reviews = _table(
 revisions = _table(
     "revisions",
     Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("key", Key, nullable=False, server_default=""),  # RecipeKey.digest
+    Column("key", KeyText, nullable=False, server_default=""),  # RecipeKey.digest
     _recipe(),
-    Column("settings", Json(an_object), nullable=False, server_default="{}"),
-    Column("provenance", Json(an_object), nullable=False, server_default="{}"),
-    Column("notes", Json(texts), nullable=False, server_default="[]"),
-    Column("world", Json(ties), nullable=False, server_default="[]"),  # where its components lie in the world
-    Column("note", Lines, nullable=False),
+    Column("settings", JsonText(is_object), nullable=False, server_default="{}"),
+    Column("provenance", JsonText(is_object), nullable=False, server_default="{}"),
+    Column("notes", JsonText(is_text_list), nullable=False, server_default="[]"),
+    Column("world", JsonText(is_world_ties), nullable=False, server_default="[]"),  # world ties of its components
+    Column("note", MultilineText, nullable=False),
     Column("created_at", Text, nullable=False),
-    Column("dropped_at", Text),  # prune may reclaim what only this revision names
-    Column(
-        "origin", Json(an_object)
-    ),  # {"map": id, "number": n} of a revision that another map solved; null where this one did
+    Column("dropped_at", Text),  # when prune dropped it
+    Column("origin", JsonText(is_object)),  # {"map": id, "number": n} of a revision solved by another map
     *(Column(name, Integer, nullable=False, server_default="0") for name in REVISION_COUNTS),
 )
-# Where scenes lie, and what became of edges: a row holds from the revision `since` to the one before `until`, or up to
-# the newest where that is null. A revision adds what differs from the one before it.
+# Poses and edge outcomes: a row is valid from the revision `since` to the one before `until`, or up to the newest if
+# that is null. A revision adds the rows that differ from the previous one.
 poses = _table(
     "poses",
     _scene("scene", primary_key=True),
     Column("since", Integer, ForeignKey("revisions.number"), primary_key=True),
     Column("until", Integer, ForeignKey("revisions.number"), index=True),
-    Column("S_map_scene", Numbers(pose_bytes, pose_of_bytes)),
+    Column("S_map_scene", PackedNumbers(pose_bytes, pose_of_bytes)),
     Column("component", Integer, nullable=False),
     Column("status", Text, nullable=False),
-    Column("covariance", Numbers(covariance_bytes, covariance_of_bytes)),
+    Column("covariance", PackedNumbers(covariance_bytes, covariance_of_bytes)),
 )
 edges = _table(
     "edges",
@@ -352,44 +354,44 @@ priors = _table(
     "priors",
     Column("number", Integer, primary_key=True),
     _scene("scene", index=True),
-    Column("S_map_scene", Json(a_pose), nullable=False),
-    Column("sigmas", Json(sigmas), nullable=False),
-    Column("up", Json(a_direction)),
+    Column("S_map_scene", JsonText(is_pose), nullable=False),
+    Column("sigmas", JsonText(is_sigmas), nullable=False),
+    Column("up", JsonText(is_direction)),
     Column("up_sigma_rad", Real, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
 )
 
-# What was observed of the world; nothing is overwritten.
+# World observations, never overwritten.
 observations = _table(
     "observations",
     Column("number", Integer, primary_key=True),
-    Column("kind", Word(OBSERVATION_KINDS), nullable=False),
-    Column("name", Line, nullable=False),
-    Column("scene", Digest, ForeignKey("scenes.id"), index=True),  # whose frame it speaks of; null of points
-    Column("other", Digest, ForeignKey("scenes.id")),  # of a scale bar's other end
-    Column("value", Json(an_object), nullable=False),  # as of `gsmap.types.world`
+    Column("kind", EnumText(OBSERVATION_KINDS), nullable=False),
+    Column("name", LineText, nullable=False),
+    Column("scene", DigestText, ForeignKey("scenes.id"), index=True),  # scene whose frame it refers to; null for points
+    Column("other", DigestText, ForeignKey("scenes.id")),  # scene of a scale bar's other end
+    Column("value", JsonText(is_object), nullable=False),  # as of `gsmap.types.world`
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
     CheckConstraint("kind in ('frame', 'point', 'image', 'fix', 'bar')", name="kind"),
 )
 
-# Photographs that are kept as evidence: when, from where, what they show; one that is taken back says when.
+# Photos kept as evidence with pose and observations; a removed one keeps its row.
 photo_sightings = _table(
     "photo_sightings",
     Column("number", Integer, primary_key=True),
-    Column("digest", Digest, nullable=False, index=True),  # SHA-256 of the file
-    Column("name", Line, nullable=False),
-    Column("captured_at", Line),
+    Column("digest", DigestText, nullable=False, index=True),  # SHA-256 of the file
+    Column("name", LineText, nullable=False),
+    Column("captured_at", LineText),
     _scene("scene", index=True),  # whose frame its pose is in
-    Column("value", Json(an_object), nullable=False),  # as of `gsmap.types.localized_photo`
-    Column("group_id", Digest, ForeignKey("groups.id")),  # of its small JPEG; null once it was taken back and pruned
+    Column("value", JsonText(is_object), nullable=False),  # as of `gsmap.types.localized_photo`
+    Column("group_id", DigestText, ForeignKey("groups.id")),  # of its small JPEG; null once removed and pruned
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
 )
 
-# Things of the map over all captures, by the number they are called by (`o12`): where each capture shows one, and what
-# people said of it. What was computed of them (`object_sets`) is made anew where it is lost or out of date.
+# Objects tracked over all scenes by number (`o12`), with their boxes in each scene and facts about them. Computed
+# object sets are recomputed if lost or stale.
 objects = _table(
     "objects",
     Column("number", Integer, primary_key=True),
@@ -399,38 +401,38 @@ object_places = _table(
     "object_places",
     Column("object", Integer, ForeignKey("objects.number"), primary_key=True),
     _scene("scene", primary_key=True, index=True),
-    Column("box", Json(a_box), nullable=False),  # around it, the scene's own frame
+    Column("box", JsonText(is_box), nullable=False),  # bounds in the scene frame
 )
 object_facts = _table(
     "object_facts",
     Column("number", Integer, primary_key=True),
     Column("object", Integer, ForeignKey("objects.number"), nullable=False, index=True),
-    Column("kind", Word(OBJECT_FACTS), nullable=False),
-    Column("value", Lines, nullable=False),  # empty: what was said before is taken back
-    Column("author", Line, nullable=False),
+    Column("kind", EnumText(OBJECT_FACTS), nullable=False),
+    Column("value", MultilineText, nullable=False),  # empty: the previous value is withdrawn
+    Column("author", LineText, nullable=False),
     Column("created_at", Text, nullable=False),
     CheckConstraint("kind in ('name', 'label', 'note', 'same_as')", name="kind"),
 )
 object_sets = _table(
     "object_sets",
     Column("number", Integer, primary_key=True),
-    Column("key", Key, nullable=False, index=True),  # RecipeKey.digest
+    Column("key", KeyText, nullable=False, index=True),  # RecipeKey.digest
     _recipe(),
-    Column("poses", Json(poses_by_scene), nullable=False),  # S_map_scene of its captures, as it was made with
-    Column("value", Json(an_object), nullable=False),  # as of `gsmap.store.objects`
+    Column("poses", JsonText(is_poses_by_scene), nullable=False),  # S_map_scene of its captures, as used for it
+    Column("value", JsonText(is_object), nullable=False),  # as of `gsmap.store.objects`
     Column("created_at", Text, nullable=False),
 )
 
 models = _table(
     "models",
     Column("number", Integer, primary_key=True),
-    Column("name", Line, nullable=False),
-    Column("kind", Line, nullable=False),
-    Column("path", Text, nullable=False),  # relative to the map where it was copied
+    Column("name", LineText, nullable=False),
+    Column("kind", LineText, nullable=False),
+    Column("path", Text, nullable=False),  # relative to the map if copied
     Column("copied", Integer, nullable=False),
-    Column("sha256", Digest, nullable=False),
+    Column("sha256", DigestText, nullable=False),
     Column("size_bytes", Bytes, nullable=False),
-    Column("options", Json(an_object), nullable=False),
+    Column("options", JsonText(is_object), nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
 )
@@ -447,46 +449,48 @@ exports = _table(
     Column("number", Integer, primary_key=True),
     Column("target", Text, nullable=False, index=True),  # the folder or file it was written to
     Column("revision", Integer, ForeignKey("revisions.number")),
-    Column("settings", Json(an_object), nullable=False),
+    Column("settings", JsonText(is_object), nullable=False),
     Column("created_at", Text, nullable=False),
 )
 tiles = _table(
     "tiles",
     Column("number", Integer, primary_key=True),
     Column("export", Integer, ForeignKey("exports.number"), nullable=False),
-    Column("key", Key, nullable=False, index=True),  # RecipeKey.digest
+    Column("key", KeyText, nullable=False, index=True),  # RecipeKey.digest
     _recipe(),
     Column("older_recipe", Text),  # of rows that schema 0001 wrote: merger and parameters as one text
     Column("component", Integer, nullable=False),
-    Column("bounds", Json(a_box), nullable=False),
-    Column("poses", Json(poses_by_scene), nullable=False),  # S_map_scene by scene id
+    Column("bounds", JsonText(is_box), nullable=False),
+    Column("poses", JsonText(is_poses_by_scene), nullable=False),  # S_map_scene by scene id
     Column("num_gaussians", Integer, nullable=False),
     Column("truncated", Integer, nullable=False),
-    Column("notes", Json(texts), nullable=False, server_default="[]"),
-    Column("path", RelativePath, nullable=False),  # relative to the target
-    Column("sha256", Key, nullable=False),
+    Column("notes", JsonText(is_text_list), nullable=False, server_default="[]"),
+    Column("path", RelativePathText, nullable=False),  # relative to the target
+    Column("sha256", KeyText, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
 )
 
-# Who is at work on what: the map, a job, another folder. A lease that is not renewed in time is nobody's.
+# Leases of processes on the map, a job, or an export folder; a lease that is not renewed expires.
 leases = _table(
     "leases",
     Column("what", Text, primary_key=True),
-    Column("token", Text, nullable=False),  # of the one holder; random
+    Column("token", Text, nullable=False),  # of its owner; random
     Column("host", Text, nullable=False),
-    Column("process", Text, nullable=False),  # its number, and what tells it from a later process of that number
-    Column("task", Text, nullable=False),  # the verb, for people
+    Column(
+        "process", Text, nullable=False
+    ),  # process id, and its start to tell it from a later process with the same id
+    Column("task", Text, nullable=False),  # the verb, for messages
     Column("since", Text, nullable=False),
     Column("expires_at", Text, nullable=False),
 )
 
-# Jobs that ended the processes they ran in, left out until a person asks for them; captures that could not be read.
+# Quarantined jobs, which crashed their processes and are skipped until requested, and unreadable captures.
 set_aside = _table(
     "set_aside",
-    Column("what", Line, primary_key=True),  # KIND and RecipeKey.digest, or a digest of a path
-    Column("about", Line, nullable=False),  # ids of scenes, a folder, or a file
-    Column("reason", Line, nullable=False),
+    Column("what", LineText, primary_key=True),  # KIND and RecipeKey.digest, or a digest of a path
+    Column("about", LineText, nullable=False),  # ids of scenes, a folder, or a file
+    Column("reason", LineText, nullable=False),
     Column("created_at", Text, nullable=False),
 )
 
@@ -494,16 +498,16 @@ backups = _table(
     "backups",
     Column("number", Integer, primary_key=True),
     Column("target", Text, nullable=False),  # where it went; no password
-    Column("snapshot", Line, nullable=False),  # its name there
+    Column("snapshot", LineText, nullable=False),  # its name there
     Column("created_at", Text, nullable=False),
     Column("num_bytes", Bytes, nullable=False),  # that it added there
 )
 
-# Scenes that were forgotten on demand: nothing of them is kept but that it happened.
+# Purged scenes: nothing of them is kept but a receipt.
 purges = _table(
     "purges",
     Column("number", Integer, primary_key=True),
-    Column("scene", Digest, nullable=False),  # its id: a digest
-    Column("receipt", Json(an_object), nullable=False),  # what went, and where else it may live
+    Column("scene", DigestText, nullable=False),  # its id: a digest
+    Column("receipt", JsonText(is_object), nullable=False),  # what was deleted, and where else copies may exist
     Column("created_at", Text, nullable=False),
 )

@@ -1,4 +1,4 @@
-"""How much of a map's disk is used by what, from the manifests alone: no file is looked at but the catalog."""
+"""Disk use of a map by kind, from the manifests alone; only the catalog file is inspected."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ CATALOG, MODELS = "catalog", "models"
 
 @dataclass(frozen=True)
 class Size:
-    """What is kept of one kind.
+    """Disk use of one kind.
 
     Args:
-        kind: of groups of arrays (``scenes``, ``graphs``, ``changes``, ``indexes``), ``models`` or ``catalog``.
-        count: how many.
-        num_bytes: of their files, as they were written.
+        kind: of array groups (``scenes``, ``graphs``, ``changes``, ``indexes``), ``models`` or ``catalog``.
+        count: number of groups or files.
+        num_bytes: size of their files, as written.
     """
 
     kind: str
@@ -31,7 +31,8 @@ class Size:
 
 
 def sizes(store: Store) -> list[Size]:
-    """By kind, most bytes first. What was removed counts until it is pruned; a catalog on a server does not."""
+    """Return disk use by kind, largest first; includes removed but unpruned data, and excludes a catalog on a
+    server."""
     bytes_of = func.coalesce(func.sum(files.c.size_bytes), 0)
     query = select(groups.c.kind, func.count(groups.c.id.distinct()), bytes_of)
     query = query.outerjoin(files, files.c.group_id == groups.c.id).group_by(groups.c.kind)
@@ -48,7 +49,7 @@ def sizes(store: Store) -> list[Size]:
 
 
 def scene_sizes(store: Store) -> dict[str, int]:
-    """Bytes of the arrays of every living scene, as they were written, by id."""
+    """Return the size of the arrays of every living scene, as written, by id."""
     query = select(scenes.c.id, func.sum(files.c.size_bytes)).join(files, files.c.group_id == scenes.c.group_id)
     with store.catalog.read() as connection:
         rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).group_by(scenes.c.id))

@@ -1,4 +1,4 @@
-"""What is particular to SQLite: how a connection is opened, how a transaction begins, when the log is folded in."""
+"""SQLite specifics: opening connections, starting transactions, checkpoints, backups and integrity checks."""
 
 from __future__ import annotations
 
@@ -16,43 +16,43 @@ from sqlalchemy import Connection, Engine, NullPool, PoolProxiedConnection, Queu
 
 from gsmap.durable import is_file, open_file
 from gsmap.errors import CorruptError, StoreError
-from gsmap.store import digests
-from gsmap.store.handles import Handle
-from gsmap.store.wal import log_of, read_log
+from gsmap.store import page_digests
+from gsmap.store.file_handles import FileHandle
+from gsmap.store.wal import read_log, wal_path
 
 FILE = "map.sqlite"
 CHECKPOINT_BYTES = 4 << 20
-_JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")  # ends a journal that names a super-journal
-_READERS_S = 1.0  # how long a writer waits for readers before it leaves the rest of the log for the next one
+_JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")  # end of a journal that names a super-journal
+_READERS_S = 1.0  # wait of a writer for readers before it leaves the rest of the log to the next checkpoint
 
 
-class _Anchor:
-    """What must outlive every connection of an engine: a handle on the file, and a connection that only reads.
+class _EngineGuard:
+    """Resources that must outlive every connection of an engine: a file handle, and a read-only connection.
 
-    SQLite folds the log in by itself when the last connection closes, past the writer lock and the digests. It does not
-    as long as another one is open, and one that only reads cannot.
+    When the last connection closes, SQLite checkpoints the log by itself, bypassing the writer lock and the digests. It
+    does not while another connection is open, and a read-only connection cannot.
     """
 
     def __init__(self, file: Path) -> None:
         self._file = file
-        self._lock = threading.RLock()  # a collected connection may leave at any moment
-        self._guard: sqlite3.Connection | None = None
+        self._lock = threading.RLock()  # reentrant: the garbage collector may close a connection at any time
+        self._read_connection: sqlite3.Connection | None = None
         self._connections = 0
-        self._handle: Handle | None = Handle(file)
+        self._handle: FileHandle | None = FileHandle(file)
 
     @property
-    def handle(self) -> Handle:
+    def handle(self) -> FileHandle:
         with self._lock:
             if self._handle is None or not self._handle.is_of(self._file):
-                self._handle = Handle(self._file)
+                self._handle = FileHandle(self._file)
             return self._handle
 
     def connect(self, uri: str, *, writable: bool) -> sqlite3.Connection:
         with self._lock:
-            if writable and self._guard is None:
-                self._guard = _connect(f"{self._file.resolve().as_uri()}?mode=ro")
-            made: _Anchored = _connect(uri, _Anchored)
-            made.anchor = self
+            if writable and self._read_connection is None:
+                self._read_connection = _connect(f"{self._file.resolve().as_uri()}?mode=ro")
+            made: _GuardedConnection = _connect(uri, _GuardedConnection)
+            made.guard = self
             self._connections += 1
             return made
 
@@ -60,58 +60,59 @@ class _Anchor:
         with self._lock:
             self._connections -= 1
 
-    def lift(self) -> bool:
-        """Let go; False as long as another thread has a connection, which then keeps all of this alive."""
+    def release(self) -> bool:
+        """Close both; returns False as long as another thread has a connection, which then keeps them alive."""
         with self._lock:
             if self._connections:
                 return False
-            if self._guard is not None:
-                self._guard.close()
-                self._guard = None
+            if self._read_connection is not None:
+                self._read_connection.close()
+                self._read_connection = None
             if self._handle is not None:
                 self._handle.close()
                 self._handle = None
             return True
 
     def __del__(self) -> None:
-        self.lift()
+        self.release()
 
 
-class _Anchored(sqlite3.Connection):
-    """A connection that is closed before its anchor is lifted."""
+class _GuardedConnection(sqlite3.Connection):
+    """A connection that is closed before its guard is released."""
 
-    anchor: _Anchor | None = None
+    guard: _EngineGuard | None = None
 
     def close(self) -> None:
         super().close()
-        anchor, self.anchor = self.anchor, None
-        if anchor is not None:
-            anchor.leave()
+        guard, self.guard = self.guard, None
+        if guard is not None:
+            guard.leave()
 
     def __del__(self) -> None:
         self.close()
 
 
-_ANCHORS: WeakKeyDictionary[Engine, _Anchor] = WeakKeyDictionary()
+_GUARDS: WeakKeyDictionary[Engine, _EngineGuard] = WeakKeyDictionary()
 
 
 def engine(file: Path, *, writable: bool) -> Engine:
-    """An engine on one file: WAL, full synchronisation, foreign keys, transactions that we begin ourselves.
+    """Create an engine on one file: WAL, full synchronization, foreign keys, explicit transactions.
 
-    Write transactions (`WRITE` in the execution options) begin IMMEDIATE: a deferred one that turns into a writer
-    fails at once when another has written meanwhile, whatever the busy timeout. As many threads may use it as like.
+    Write transactions (`gsmap_write` in the execution options) begin IMMEDIATE: a deferred one that becomes a writer
+    fails at once if another process has written meanwhile, whatever the busy timeout. Any number of threads may use the
+    engine.
     """
-    refuse_strange_files(file)
+    refuse_unexpected_files(file)
     uri = f"{file.resolve().as_uri()}?mode={'rw' if writable else 'ro'}"
-    anchor = _Anchor(file)
+    guard = _EngineGuard(file)
 
     def connect() -> sqlite3.Connection:
         try:
-            return anchor.connect(uri, writable=writable)
+            return guard.connect(uri, writable=writable)
         except sqlite3.OperationalError:
             if writable or os.access(file.parent, os.W_OK):
                 raise
-            # A reader in WAL mode must write an index, which it cannot here; then nobody is writing the log either.
+            # A reader in WAL mode must write an index, which is impossible here; so no process writes the log either.
             if _log_bytes(file):
                 raise StoreError(
                     f"{file.parent} was not closed cleanly: open it once where it can be written",
@@ -121,7 +122,7 @@ def engine(file: Path, *, writable: bool) -> Engine:
             return still
 
     made = create_engine("sqlite://", creator=connect, poolclass=QueuePool, max_overflow=-1)
-    _ANCHORS[made] = anchor
+    _GUARDS[made] = guard
 
     @event.listens_for(made, "begin")
     def begin(connection: Connection) -> None:
@@ -131,26 +132,26 @@ def engine(file: Path, *, writable: bool) -> Engine:
     return made
 
 
-def still_engine(file: Path) -> Engine:
-    """An engine that reads a database as it lies there, log included, without the index that SQLite makes for the log.
+def frozen_engine(file: Path) -> Engine:
+    """Create an engine that reads a database and its log without the index that SQLite creates for the log.
 
-    For a disk without room for that index; only while nobody writes or folds. A log with something in it is folded in
-    within memory.
+    For a disk without space for that index; only while no process writes or checkpoints. A log with content is applied
+    in memory.
     """
 
     def connect() -> sqlite3.Connection:
-        log = read_log(log_of(file))
+        log = read_log(wal_path(file))
         if not log.frames:
             made: sqlite3.Connection = _connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1")
             return made
-        with contextlib.closing(Handle(file)) as handle, open(log_of(file), "rb") as frames:
+        with contextlib.closing(FileHandle(file)) as handle, open(wal_path(file), "rb") as frames:
             content = bytearray(os.pread(handle.number, os.fstat(handle.number).st_size, 0))
-            size = digests.page_size(handle)
+            size = page_digests.page_size(handle)
             content = content[: log.num_pages * size].ljust(log.num_pages * size, b"\0")
             for number, at in log.frames.items():
                 frames.seek(at)
                 content[(number - 1) * size : number * size] = frames.read(size)
-        content[18:20] = b"\1\1"  # no WAL mode, which needs a file
+        content[18:20] = b"\1\1"  # leave WAL mode, which needs a file
         made = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
         made.deserialize(content)
         made.execute("PRAGMA query_only = ON")
@@ -160,54 +161,54 @@ def still_engine(file: Path) -> Engine:
 
 
 def needs_room(error: BaseException) -> bool:
-    """Whether SQLite could not connect for something that it wanted to write."""
+    """Return True if SQLite could not connect because of a write that it needs."""
     found: object = getattr(error, "orig", None) or error
     code = getattr(found, "sqlite_errorcode", 0) & 0xFF
     return code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
 
 
-def handle(engine: Engine) -> Handle:
-    """The handle to read an engine's file with; see `gsmap.store.handles`."""
-    return _ANCHORS[engine].handle
+def handle(engine: Engine) -> FileHandle:
+    """Return the read handle of an engine's file; see `gsmap.store.file_handles`."""
+    return _GUARDS[engine].handle
 
 
 def dispose(engine: Engine, file: Path, *, tidy: bool) -> None:
-    """Close all connections without folding the log in.
+    """Close all connections without a checkpoint.
 
     Args:
-        tidy: leave one file at rest, if the log is empty and nobody else is connected; only under the writer lock.
+        tidy: remove the log files if the log is empty and no other process is connected; requires the writer lock.
     """
     engine.dispose()
-    if _ANCHORS[engine].lift() and tidy and log_of(file).exists() and not _log_bytes(file):
+    if _GUARDS[engine].release() and tidy and wal_path(file).exists() and not _log_bytes(file):
         with contextlib.suppress(sqlite3.Error):
-            _connect(f"{file.resolve().as_uri()}?mode=rw").close()  # as the last one it removes the log's files
+            _connect(f"{file.resolve().as_uri()}?mode=rw").close()  # the last connection removes the log files
 
 
 def create_file(file: Path) -> None:
-    """An empty database in WAL mode; the mode stays with the file.
+    """Create an empty database in WAL mode, which stays with the file.
 
     Raises:
-        OSError: the disk failed, so that SQLite left the mode as it was and said nothing of it.
+        OSError: the disk failed, so that SQLite silently kept another journal mode.
     """
     connection = sqlite3.connect(file)
     connection.execute("PRAGMA journal_mode = WAL")
     connection.close()
     if not has_log(file):
         raise OSError(errno.EIO, "SQLite could not set its journal mode", str(file))
-    digests.note(file)
+    page_digests.write_digests(file)
 
 
 def has_log(file: Path) -> bool:
-    """Whether a database is in WAL mode: what is written goes to its log, and nowhere else until that is folded in."""
-    with contextlib.closing(Handle(file)) as opened:
+    """Return True if a database is in WAL mode, so that writes go only to its log until a checkpoint."""
+    with contextlib.closing(FileHandle(file)) as opened:
         return os.pread(opened.number, 2, 18) == b"\2\2"  # file format write and read version
 
 
-def refuse_strange_files(file: Path) -> None:
-    """Refuse a database that SQLite would come to other files by: a link in the place of one of its own files, or a
+def refuse_unexpected_files(file: Path) -> None:
+    """Raise for a database by which SQLite would access other files: a link instead of one of its own files, or a
     rollback journal that names a super-journal, which SQLite would delete.
 
-    gsmap's databases are in WAL mode and never attached to one another, so such a journal is not of its making.
+    gsmap's databases are in WAL mode and never attached to one another, so it never makes such a journal.
     """
     for ending in ("", "-wal", "-shm", "-journal"):
         path = file.with_name(file.name + ending)
@@ -230,21 +231,23 @@ def refuse_strange_files(file: Path) -> None:
 
 
 def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
-    """Fold a log of at least this size into the database, and keep the digests of its pages.
+    """Checkpoint a log of at least this size into the database, and update the page digests.
 
-    Only under the writer lock: in SQLite before 3.51.3 a commit at the same time can corrupt the file.
+    Requires the writer lock: in SQLite before 3.51.3 a concurrent commit can corrupt the file.
 
     Raises:
-        CorruptError: the file is not what was written. The log stays as it is, so that nothing is lost.
+        CorruptError: the file differs from its digests. The log is kept, so that nothing is lost.
     """
     if _log_bytes(file) >= at_bytes:
-        if not digests.digests_of(file).exists() and (found := structure_damage(file)):
-            raise CorruptError(digests.damaged(file, found), code="catalog_damaged")
-        digests.fold(file, handle(engine), lambda: _begun(engine), lambda: _folded(engine))
+        if not page_digests.digests_path(file).exists() and (found := structure_damage(file)):
+            raise CorruptError(page_digests.damage_message(file, found), code="catalog_damaged")
+        page_digests.fold(
+            file, handle(engine), lambda: _checkpoint_passive(engine), lambda: _checkpoint_truncate(engine)
+        )
 
 
 def num_free_bytes(engine: Engine) -> int:
-    """Of pages of the database that hold nothing."""
+    """Return the size of unused pages of the database."""
     with engine.connect() as connection:
         pages, size = (
             connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in ("freelist_count", "page_size")
@@ -253,13 +256,13 @@ def num_free_bytes(engine: Engine) -> int:
 
 
 def vacuum(engine: Engine, file: Path, *, erase: bool = False) -> bool:
-    """Write the database anew without what deleted rows left, and fold the log in; only under the writer lock.
+    """Rewrite the database without free pages, and checkpoint the log; requires the writer lock.
 
     Args:
-        erase: overwrite what is left over, too.
+        erase: also overwrite freed content.
 
     Returns:
-        Whether the log is empty then; not where a reader holds an older state.
+        True if the log is empty afterwards; False if a reader holds an older state.
     """
     raw = engine.raw_connection()
     try:
@@ -273,26 +276,28 @@ def vacuum(engine: Engine, file: Path, *, erase: bool = False) -> bool:
 
 
 def accept(engine: Engine, file: Path) -> None:
-    """Take the pages that there are for what was written, whatever they are; only under the writer lock."""
-    if not has_log(file):  # another program changed it
+    """Accept the pages as they are by writing new digests; requires the writer lock."""
+    if not has_log(file):  # changed by another program
         connection = engine.raw_connection()
         try:
             _driver(connection).execute("PRAGMA journal_mode = WAL")
         finally:
             connection.close()
     if _log_bytes(file):
-        digests.fold(file, handle(engine), lambda: _begun(engine), lambda: _folded(engine), accept=True)
+        page_digests.fold(
+            file, handle(engine), lambda: _checkpoint_passive(engine), lambda: _checkpoint_truncate(engine), accept=True
+        )
     else:
-        digests.accept(file, handle(engine))
+        page_digests.accept(file, handle(engine))
 
 
 def integrity_problems(connection: Connection) -> list[str]:
-    """What SQLite itself finds wrong with its structure; it does not notice other bytes than those written."""
+    """Return structural problems found by SQLite, which does not detect changed values."""
     return _problems(connection.exec_driver_sql)
 
 
 def file_problems(file: Path) -> list[str]:
-    """As `integrity_problems`, of a file that nobody has open; nothing is made beside it."""
+    """Return structural problems of a file that no process has open; creates no files."""
     try:
         with contextlib.closing(_connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1")) as connection:
             return _problems(connection.execute)
@@ -307,10 +312,10 @@ def _problems(execute: Callable[[str], Iterable[Any]]) -> list[str]:
 
 
 def damage(file: Path) -> list[str]:
-    """What is wrong with a file, by the digests of its pages or else by SQLite's own look; empty for a sound one."""
-    with contextlib.suppress(OSError), contextlib.closing(Handle(file)) as opened:
+    """Return problems of a file by its page digests, or otherwise by SQLite's quick check; empty for a sound file."""
+    with contextlib.suppress(OSError), contextlib.closing(FileHandle(file)) as opened:
         try:
-            found = digests.problems(file, opened, digests.load(file), read_log(log_of(file)))
+            found = page_digests.problems(file, opened, page_digests.load(file), read_log(wal_path(file)))
         except CorruptError as error:
             found = [str(error)]
         if found:
@@ -319,7 +324,7 @@ def damage(file: Path) -> list[str]:
 
 
 def structure_damage(file: Path) -> list[str]:
-    """What SQLite finds wrong with a file when it looks at all of its structure; empty also where it cannot look."""
+    """Return problems found by SQLite's quick check of the structure; also empty if the check cannot run."""
     if not file.is_file():
         return [f"{file} is missing"]
     try:
@@ -332,18 +337,18 @@ def structure_damage(file: Path) -> list[str]:
 
 
 def backup(engine: Engine, target: Path) -> None:
-    """A consistent copy of the catalog with digests of its own, whatever else is going on."""
+    """Write a consistent copy of the catalog with its own digests, during concurrent access."""
     connection = engine.raw_connection()
     try:
         with contextlib.closing(sqlite3.connect(target)) as copy:
             _driver(connection).backup(copy)
     finally:
         connection.close()
-    digests.note(target)
+    page_digests.write_digests(target)
 
 
-def _begun(engine: Engine) -> int:
-    """Let SQLite fold in what no reader needs, without waiting; how many frames of the log are committed to it."""
+def _checkpoint_passive(engine: Engine) -> int:
+    """Run a passive checkpoint, without waiting for readers; returns the number of committed frames in the log."""
     connection = engine.raw_connection()
     try:
         return int(_driver(connection).execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()[1])
@@ -351,8 +356,8 @@ def _begun(engine: Engine) -> int:
         connection.close()
 
 
-def _folded(engine: Engine) -> bool:
-    """Let SQLite fold the log in, outside any transaction; whether it got to the end in spite of readers."""
+def _checkpoint_truncate(engine: Engine) -> bool:
+    """Run a truncating checkpoint outside any transaction; returns False if readers prevented it."""
     connection = engine.raw_connection()
     try:
         driver = _driver(connection)
@@ -369,7 +374,7 @@ def _folded(engine: Engine) -> bool:
 
 def _log_bytes(file: Path) -> int:
     try:
-        return log_of(file).stat().st_size
+        return wal_path(file).stat().st_size
     except FileNotFoundError:
         return 0
 
@@ -387,7 +392,7 @@ def _connect(uri: str, factory: type[sqlite3.Connection] = sqlite3.Connection) -
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA wal_autocheckpoint = 0")  # `checkpoint` does it under the writer lock
         connection.execute("PRAGMA trusted_schema = OFF")
-        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # the file is opened only now
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # opens the file
     except BaseException:
         connection.close()
         raise

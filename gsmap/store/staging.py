@@ -1,4 +1,4 @@
-"""Folders that are made beside their place, and what is left of those whose makers died."""
+"""Staging folders for new maps, and leftovers of killed processes."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from pathlib import Path
 
 from gsmap.durable import is_folder, remove_tree
 
-# Twice where a map is made in a folder that is staged itself.
+# Doubled for a map made in a folder that is staged itself.
 _STAGED = r"\.{{1,2}}{name}(\.[0-9a-f]{{8}}){{1,2}}"
-# Files that are replaced in one step (`gsmap.durable.write_whole`), and how old one must be to be nobody's.
+# Staged files of `gsmap.durable.write_whole`, and the age from which they are abandoned.
 _STAGED_FILE = re.compile(r"\.(settings\.toml|catalog\.url|map\.sqlite[a-z0-9.]*)\.[0-9a-f]{8}|\.map\.sqlite\.sha256")
 _ABANDONED_S = 60.0
-_PART = re.compile(r"arrays|models|branches|lock|\.?(map\.sqlite|catalog\.url|settings\.toml).*")  # of a map
+_PART = re.compile(r"arrays|models|branches|lock|\.?(map\.sqlite|catalog\.url|settings\.toml).*")  # entries of a map
 
 
 @contextlib.contextmanager
 def beside(folder: Path) -> Iterator[Path]:
-    """A new folder beside ``folder``, to be renamed to it inside the block; else it is removed.
+    """Yield a new locked folder beside ``folder``, to be renamed to it inside the block; otherwise it is removed.
 
-    It is locked for as long as this process lives, so that another one can tell it from what a dead one left; such
-    leftovers of the same name are removed first.
+    The lock lasts as long as this process, so that other processes can tell it from leftovers; leftovers of the same
+    name are removed first.
     """
     _remove_leftovers(folder)
     while True:
@@ -35,7 +35,7 @@ def beside(folder: Path) -> Iterator[Path]:
         try:
             handle = _locked(staged)
         except FileNotFoundError:
-            continue  # swept away before it was locked
+            continue  # removed as a leftover before it was locked
         if os.fstat(handle).st_nlink:
             break
         os.close(handle)
@@ -43,12 +43,12 @@ def beside(folder: Path) -> Iterator[Path]:
         yield staged
     finally:
         with contextlib.suppress(OSError):
-            remove_tree(staged.parent, staged.name)  # nothing, where it has been renamed
+            remove_tree(staged.parent, staged.name)  # missing once renamed
         os.close(handle)
 
 
 def abandoned_files(folder: Path) -> dict[str, int]:
-    """Names and sizes of the files that killed processes left in a map while they replaced others."""
+    """Return names and sizes of the files that killed processes left in a map while replacing others."""
     out = {}
     for entry in os.scandir(folder):
         if _STAGED_FILE.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
@@ -64,7 +64,7 @@ def _remove_leftovers(folder: Path) -> None:
         path = folder.parent / name
         if not (staged.fullmatch(name) and is_folder(path)):
             continue
-        with contextlib.suppress(OSError):  # somebody holds it, or it is not ours: then it stays
+        with contextlib.suppress(OSError):  # locked by another process, or not permitted
             handle = _locked(path, fcntl.LOCK_NB)
             try:
                 if all(_PART.fullmatch(part) for part in os.listdir(handle)):

@@ -1,4 +1,4 @@
-"""The only door to a map's disk."""
+"""Open, create, check and prune a map on disk."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
-from gsmap.store import branches, homes, integrity, migrate, schema, staging, trust
+from gsmap.store import branches, integrity, migrate, remote_map, schema, staging, trust
 from gsmap.store import catalog as _catalog
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.backups import Backups
-from gsmap.store.branches import Branches, Place
+from gsmap.store.branches import Branches, MapLocation
 from gsmap.store.catalog import Catalog
+from gsmap.store.catalog_copy import empty_catalog
 from gsmap.store.changes import Changes
-from gsmap.store.copying import empty_catalog
-from gsmap.store.explained import explained
+from gsmap.store.error_translation import translate_errors
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
-from gsmap.store.homes import Home
 from gsmap.store.indexes import Indexes
-from gsmap.store.integrity import Check, Pruned
+from gsmap.store.integrity import CheckResult, PruneResult
 from gsmap.store.leases import Leases
 from gsmap.store.models import Models
 from gsmap.store.object_arrays import ObjectArrays
 from gsmap.store.objects import Objects
 from gsmap.store.photos import Photos
 from gsmap.store.priors import Priors
+from gsmap.store.quarantine import Quarantine
 from gsmap.store.recipes import Recipes
 from gsmap.store.registrations import Registrations
+from gsmap.store.remote_map import RemoteMap
 from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
-from gsmap.store.set_aside import SetAsides
 from gsmap.store.view_features import ViewFeatures
-from gsmap.store.world import World
+from gsmap.store.world import WorldObservations
 from gsmap.types.progress import Progress
 from gsmap.version import __version__
 
@@ -68,7 +68,7 @@ class Store:
             scene, is_new = store.scenes.add(gaussians, cameras, name="monday")
     """
 
-    def __init__(self, place: Place, catalog: Catalog) -> None:
+    def __init__(self, place: MapLocation, catalog: Catalog) -> None:
         self.home = place.home
         self.folder = place.folder
         self.branch = place.branch
@@ -90,48 +90,48 @@ class Store:
         self.objects = Objects(catalog)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
-        self.world = World(catalog)
+        self.world = WorldObservations(catalog)
         self.models = Models(catalog, self.arrays)
         self.exports = Exports(catalog)
         self.branches = Branches(place, catalog, self.arrays)
         self.backups = Backups(catalog)
         self.leases = Leases(catalog)
-        self.set_aside = SetAsides(catalog)
+        self.quarantine = Quarantine(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
-        """Make an empty map and open it for writing; it appears whole or not at all.
+        """Create an empty map and open it for writing; it appears whole or not at all.
 
         Args:
-            path: a folder that does not exist or is empty, or ``s3://BUCKET/PREFIX`` where nothing is.
-            catalog_url: an SQLAlchemy URL (an empty PostgreSQL database, for many writers) to use instead of
-                ``map.sqlite``. It is remembered in ``catalog.url`` without its password, which the driver then takes
-                from its usual places (``PGPASSWORD``, ``~/.pgpass``), and this user trusts it from now on.
+            path: a folder that does not exist or is empty, or an empty ``s3://BUCKET/PREFIX``.
+            catalog_url: SQLAlchemy URL of an empty PostgreSQL database (for many writers) to use instead of
+                ``map.sqlite``. It is stored in ``catalog.url`` without its password, which the driver takes from its
+                usual places (``PGPASSWORD``, ``~/.pgpass``), and is trusted by this user from now on.
 
         Raises:
-            ConfigError: a bucket without a ``catalog_url``.
-            StoreError: the folder or bucket is not empty, or cannot be written.
-            NotFoundError: the folder it should lie in does not exist.
+            ConfigError: a remote map without a ``catalog_url``.
+            StoreError: the folder or bucket is not empty, or not writable.
+            NotFoundError: the parent folder does not exist.
         """
-        if (home := branches.find(path).remote) is not None:
+        if (home := branches.locate(path).remote) is not None:
             _claim(home, catalog_url)
             return cls.open(path, "w", catalog_url=catalog_url)
-        folder = branches.find(homes.local(path).absolute()).folder
+        folder = branches.locate(remote_map.local_folder(path).absolute()).folder
         if folder.is_dir() and any(folder.iterdir()):
-            is_map = "is a map already" if branches.holds_catalog(folder) else "is not empty"
+            is_map = "is a map already" if branches.has_catalog(folder) else "is not empty"
             raise StoreError(f"{path} {is_map}: open it, or choose another name", code="already_exists")
         if folder.exists() and not folder.is_dir():
             raise StoreError(f"{path} is a file: a map is a folder; choose another name", code="not_a_folder")
         if not folder.parent.is_dir():
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist", code="folder_not_found")
-        with explained(folder, "no map was made"), staging.beside(folder) as staged:
+        with translate_errors(folder, "no map was made"), staging.beside(folder) as staged:
             (staged / "arrays").mkdir()
             _make_catalog(staged, catalog_url)
             sync_folder(staged)
             os.rename(staged, folder)
             sync_folder(folder.parent)
         if catalog_url is not None:
-            trust.remember(folder)
+            trust.trust_new_map(folder)
         return cls.open(path, "w", catalog_url=catalog_url)
 
     @classmethod
@@ -140,13 +140,12 @@ class Store:
 
         Args:
             mode: ``r`` to read only (works on a read-only disk), ``w`` to change it too.
-            catalog_url: in place of the remembered one, which is used only where the user trusts it
-                (`gsmap.store.trust`).
+            catalog_url: used instead of the stored URL, which is used only if the user trusts it (`gsmap.store.trust`).
 
         Raises:
             NotFoundError: no such folder.
-            StoreError: not a map, not writable, or its catalog lies on a server that the user has not trusted.
-            CorruptError: it holds links or other things that gsmap never puts there, or another map's catalog.
+            StoreError: not a map, not writable, or its catalog is on a server that the user has not trusted.
+            CorruptError: it holds links or other entries that gsmap never makes, or another map's catalog.
             SchemaVersionError: written by a newer gsmap, or an older one (``gsmap migrate``).
         """
         store = cls._connect(path, mode, catalog_url)
@@ -161,26 +160,26 @@ class Store:
 
     @staticmethod
     def exists(path: str | os.PathLike[str]) -> bool:
-        """Whether anything lies there, or the branch does that a path names.
+        """Return True if the path, or the branch that it names, exists.
 
         Raises:
             NotFoundError: the path names a branch that its map lacks.
         """
-        place = branches.find(path)
+        place = branches.locate(path)
         return place.folder.exists() if place.remote is None else place.remote.exists()
 
     @staticmethod
     def can_write(path: str | os.PathLike[str]) -> bool:
-        """Whether `open` with mode ``w`` makes sense there: not of a read-only folder, and not of a tag."""
-        place = branches.find(path)
+        """Return True unless the path is a read-only folder or a tag."""
+        place = branches.locate(path)
         if place.remote is not None:
             return True
         return not place.is_tag and (not place.folder.is_dir() or os.access(place.folder, os.W_OK))
 
     @classmethod
-    def open_even_tag(cls, path: str | os.PathLike[str]) -> Store:
-        """Open for writing, a tag as well: what is purged goes from there, too."""
-        store = cls._connect(path, "w", None, even_tags=True)
+    def open_writable(cls, path: str | os.PathLike[str]) -> Store:
+        """Open for writing, even a tag, for purges."""
+        store = cls._connect(path, "w", None, allow_tags=True)
         try:
             migrate.require_current(store.catalog)
         except BaseException:
@@ -188,36 +187,36 @@ class Store:
             raise
         return store
 
-    def others(self) -> list[Place]:
-        """Where the other catalogs over the same arrays lie: the map, its branches, its tags."""
-        return branches.other_places(self.home, self.folder)
+    def others(self) -> list[MapLocation]:
+        """Return the locations of the other catalogs over the same arrays: the map, its branches and its tags."""
+        return branches.other_locations(self.home, self.folder)
 
     @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
-        """Bring an older map (and its branches and tags) to this gsmap's schema; the version before and after."""
-        with cls._connect(path, "w", None, even_tags=True) as store:
+        """Migrate an older map, its branches and tags to the current schema; returns the versions before and after."""
+        with cls._connect(path, "w", None, allow_tags=True) as store:
             versions = migrate.upgrade(store.catalog)
-        for place in branches.places(store.home) if not store.branch else ():
-            with cls._connect(place.location, "w", None, even_tags=True) as branch:
+        for place in branches.branch_locations(store.home) if not store.branch else ():
+            with cls._connect(place.location, "w", None, allow_tags=True) as branch:
                 migrate.upgrade(branch.catalog)
         return versions
 
     @classmethod
     def accept_catalog(cls, path: str | os.PathLike[str]) -> list[str]:
-        """Take a catalog that differs from what was written as it is, and note new digests: what differed, in words.
+        """Accept a catalog that differs from its page digests, write new digests, and return the differences.
 
-        For salvage: SQLite must find it sound, but nobody knows whether its values are those that were written.
+        For salvage: SQLite must find it sound, but its values may differ from those that were written.
 
         Raises:
-            CorruptError: SQLite cannot make sense of it.
-            ConfigError: the catalog is no file of the map.
+            CorruptError: SQLite finds the catalog damaged.
+            ConfigError: the catalog is not a file of the map.
         """
-        with cls._connect(path, "w", None, verify=False, even_tags=True) as store:
+        with cls._connect(path, "w", None, verify=False, allow_tags=True) as store:
             return store.catalog.accept()
 
     @classmethod
     def id_at(cls, path: str | os.PathLike[str], catalog_url: str) -> str:
-        """The id of the map whose catalog is at a URL, whatever its schema; see `open` for the errors."""
+        """Return the id of the map whose catalog is at a URL, whatever its schema; raises as `open` does."""
         with cls._connect(path, "r", catalog_url) as store:
             return store.id
 
@@ -228,36 +227,39 @@ class Store:
         mode: str,
         catalog_url: str | None,
         *,
-        even_tags: bool = False,
+        allow_tags: bool = False,
         verify: bool = True,
     ) -> Store:
         if mode not in ("r", "w"):
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}", code="invalid_choice")
-        place = branches.find(path)
+        place = branches.locate(path)
         folder = place.folder
         if place.remote is not None:
-            place.remote.lay_out()
+            place.remote.refresh_mirror()
         if not folder.exists():
             raise NotFoundError(f"no map at {path}: make one with gsmap init {path}", code="map_not_found")
         if not branches.is_map(place.home):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
             raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init", code="not_a_map")
-        _refuse_strange_entries(place.home)
-        _refuse_strange_entries(folder)
-        refusal = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
-        if mode == "w" and place.is_tag and not even_tags:
-            raise StoreError(refusal, code="catalog_refused")
+        _refuse_unexpected_entries(place.home)
+        _refuse_unexpected_entries(folder)
+        read_only_message = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
+        if mode == "w" and place.is_tag and not allow_tags:
+            raise StoreError(read_only_message, code="catalog_refused")
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(
                 f"{path} cannot be written (read-only disk or missing permission): open it for reading",
                 code="not_writable",
             )
-        with explained(folder):
+        with translate_errors(folder):
             if catalog_url is not None:
                 engine = _catalog.url_engine(catalog_url)
             else:
                 engine = _catalog.open_engine(folder, writable=mode == "w")
-        store = cls(place, Catalog(folder, engine, writable=mode == "w", refusal=refusal if place.is_tag else ""))
+        store = cls(
+            place,
+            Catalog(folder, engine, writable=mode == "w", read_only_message=read_only_message if place.is_tag else ""),
+        )
         try:
             if verify:
                 store.catalog.verify()
@@ -268,24 +270,24 @@ class Store:
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
-        """Everything inside is committed together at the end, or not at all. Keep it short: other writers wait."""
+        """Commit all changes inside the block together, or none. Keep it short: other writers wait."""
         with self.catalog.write():
             yield
 
-    def send_settings(self) -> None:
-        """Let the home have ``settings.toml`` as it is now; in a folder it is there already."""
+    def upload_settings(self) -> None:
+        """Upload ``settings.toml`` of a remote map; does nothing for a local map."""
         if self._remote is not None:
-            self._remote.send_settings()
+            self._remote.upload_settings()
 
     @property
     def id(self) -> str:
-        """The map's own random id."""
+        """Return the map's own random id."""
         with self.catalog.read() as connection:
             return str(connection.execute(select(schema.about.c.id)).scalar_one())
 
     def _check_id(self) -> None:
-        """Refuse a database that holds another map than the folder says."""
-        known = trust.remembered(self.folder).map_id if (self.folder / trust.URL_FILE).exists() else None
+        """Raise if the database holds another map than ``catalog.url`` names."""
+        known = trust.read_address(self.folder).map_id if (self.folder / trust.URL_FILE).exists() else None
         if known is not None and known != self.id:
             raise CorruptError(
                 f"{self.folder} belongs to map {known[:12]}, but the database named for it holds map {self.id[:12]}: "
@@ -293,16 +295,16 @@ class Store:
                 code="wrong_catalog",
             )
 
-    def check(self, progress: Progress | None = None) -> Check:
-        """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`.
+    def check(self, progress: Progress | None = None) -> CheckResult:
+        """Read every byte of the map and compare it with its digests; see `gsmap.store.integrity.CheckResult`.
 
-        With the map itself its branches and tags are checked, too; a branch alone where that is what is open.
+        Checks the branches and tags of a map, too, but only the branch if one is open.
         """
         read: set[tuple[str, tuple[StoredFile, ...]]] = set()
         found = integrity.check(
             self.catalog, self.arrays, progress, read=read, location=None if self.is_tag else self.location
         )
-        for place in branches.places(self.home) if not self.branch else ():
+        for place in branches.branch_locations(self.home) if not self.branch else ():
             try:
                 with Store.open(place.location, "r") as other:
                     more = integrity.check(
@@ -313,7 +315,7 @@ class Store:
                         location=None if place.is_tag else place.location,
                     )
             except StoreError as error:
-                more = Check((str(error),), (), 0, 0)
+                more = CheckResult((str(error),), (), 0, 0)
             problems = tuple(f"{place.branch}: {problem}" for problem in more.problems)
             found = replace(
                 found,
@@ -323,12 +325,12 @@ class Store:
             )
         return found
 
-    def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
-        """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
+    def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> PruneResult:
+        """Reclaim what no kept revision uses, and leftovers of crashes; see `gsmap.store.integrity.prune`."""
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
-    def reclaim(self) -> integrity.Reclaimed:
-        """Delete arrays and models that no row names, and what crashes left."""
+    def reclaim(self) -> integrity.ReclaimResult:
+        """Delete arrays and models that no row names, and leftovers of crashes."""
         return integrity.reclaim(self.catalog, self.arrays)
 
     def close(self) -> None:
@@ -345,17 +347,17 @@ class Store:
         return f"Store({self.location!r}, mode={'w' if self.catalog.writable else 'r'!r})"
 
 
-def _refuse_strange_entries(folder: Path) -> None:
-    """Refuse a map with a link in it, which could make gsmap read or write elsewhere, or with a pipe or a device.
+def _refuse_unexpected_entries(folder: Path) -> None:
+    """Raise for a map with a link, which could redirect reads or writes, a pipe, or a device in it.
 
-    The folder itself may be a link. What lies deeper is looked at where it is used.
+    The folder itself may be a link. Deeper entries are checked when they are used.
     """
-    with explained(folder):
+    with translate_errors(folder):
         for name in sorted(os.listdir(folder)):
             try:
                 mode = os.lstat(folder / name).st_mode
             except FileNotFoundError:
-                continue  # a file that was just replaced
+                continue  # just replaced
             if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 what = "a link" if stat.S_ISLNK(mode) else "a pipe or a device"
                 raise CorruptError(
@@ -364,8 +366,8 @@ def _refuse_strange_entries(folder: Path) -> None:
                 )
 
 
-def _claim(home: Home, catalog_url: str | None) -> None:
-    """Make an empty map in a bucket."""
+def _claim(home: RemoteMap, catalog_url: str | None) -> None:
+    """Create an empty remote map."""
     if catalog_url is None:
         raise ConfigError(
             f"{home.url} is a bucket, which can hold no catalog: name an empty PostgreSQL database (gsmap init "
@@ -374,7 +376,7 @@ def _claim(home: Home, catalog_url: str | None) -> None:
         )
     if home.exists():
         raise StoreError(f"{home.url} is a map already: open it, or choose another name", code="already_exists")
-    if (found := home.place.anything()) is not None:
+    if (found := home.storage.first_name()) is not None:
         raise StoreError(f"{home.url} is not empty (it has {found}): choose another name", code="folder_not_empty")
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
         _make_catalog(Path(folder), catalog_url)
@@ -383,7 +385,7 @@ def _claim(home: Home, catalog_url: str | None) -> None:
                 f"another process made a map at {home.url} meanwhile: open it, or choose another name",
                 code="already_exists",
             )
-        trust.remember(Path(folder))
+        trust.trust_new_map(Path(folder))
 
 
 def _make_catalog(folder: Path, url: str | None) -> None:

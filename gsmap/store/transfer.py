@@ -1,4 +1,4 @@
-"""Scenes of one map, with all that is known of them, brought into another; nothing is computed."""
+"""Copy scenes with all their data from one map to another; nothing is computed."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from sqlalchemy import Connection, Row, delete, insert, select, update
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import ConfigError, StoreError
 from gsmap.store import facts
-from gsmap.store.arrays import Staged, StoredFile, link_or_copy
-from gsmap.store.boxes import get_boxes, put_boxes
+from gsmap.store.array_groups import forget_derived, has_group, manifest, name, publish
+from gsmap.store.arrays import StagedGroup, StoredFile, link_or_copy
 from gsmap.store.change_rows import named_groups
+from gsmap.store.chunk_boxes import get_boxes, put_boxes
 from gsmap.store.graphs import KIND as GRAPHS
-from gsmap.store.groups import drop_graphs, has_group, manifest, name, publish
 from gsmap.store.models import model_path
 from gsmap.store.photos import KIND as PHOTOS
-from gsmap.store.scene_refs import free_name
+from gsmap.store.scene_refs import unused_name
 from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import (
     graphs,
@@ -42,50 +42,50 @@ from gsmap.types.plain import canonical
 
 Content = dict[str, Any]
 Item = TypeVar("Item")
-_MERGE = "merge"  # author of a name that a scene got because its own was taken: nobody's word
+_MERGE = "merge"  # author of names that a merge assigned because the scene's own was in use
 
 
 @contextlib.contextmanager
-def between(
+def open_transfer(
     into: Store, source: Store, only: Collection[str] | None = None, *, mend: bool = False
 ) -> Iterator[Transfer]:
-    """One transaction on ``into``, in which scenes come from one state of ``source``; committed when the block ends.
+    """Open one transaction on ``into`` for copying from a snapshot of ``source``; committed when the block ends.
 
-    Their arrays are linked or copied beside their places first, so that the transaction is short.
+    Arrays are linked or copied to the staging folder first, so that the transaction is short.
 
     Args:
-        only: ids of the scenes to bring; None for all, the removed ones included.
-        mend: read the arrays of these that are here, too, and bring those that are damaged again.
+        only: ids of the scenes to copy; None for all, including removed ones.
+        mend: also verify the arrays of scenes that ``into`` has, and repair damaged ones.
 
     Raises:
-        ConfigError: a map into itself.
+        ConfigError: both are the same map.
         CorruptError: arrays of the source are missing or damaged; nothing was changed.
     """
     same_home = into.home.samefile(source.home)
     if same_home and into.folder.samefile(source.folder):
         raise ConfigError(f"{into.location} and {source.location} are the same map: name two", code="same_map")
     with contextlib.ExitStack() as stack:
-        staged: dict[tuple[str, str], Staged] = {}
+        staged: dict[tuple[str, str], StagedGroup] = {}
         if not same_home:
-            with source.arrays.lock():  # what this state of it names is not reclaimed until it is ours, too
+            with source.arrays.lock():  # groups of this snapshot must not be reclaimed before they are copied
                 theirs = stack.enter_context(source.catalog.read())
                 with into.catalog.read() as ours:
                     missing = _missing_groups(into, ours, theirs, only, mend)
                 staged = stack.enter_context(into.arrays.stage_copies(source.arrays, missing))
         ours = stack.enter_context(into.catalog.write())
-        into.catalog.hold(into.arrays.lock())
+        into.catalog.hold_until_commit(into.arrays.lock())
         if same_home:
             theirs = stack.enter_context(source.catalog.read())
         yield Transfer(into, source, ours, theirs, only, None if same_home else staged)
 
 
 class Transfer:
-    """What is open while scenes go from one map into another; see `between`.
+    """The state of copying scenes between maps; see `open_transfer`.
 
     Attributes:
-        counts: how much was new, by noun.
-        notes: what a person should know.
-        renamed: (old, new) names of scenes whose name was taken.
+        counts: numbers of new rows, by noun.
+        notes: remarks for the user.
+        renamed: (old, new) names of scenes whose name was in use.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Transfer:
         ours: Connection,
         theirs: Connection,
         only: Collection[str] | None,
-        staged: dict[tuple[str, str], Staged] | None,
+        staged: dict[tuple[str, str], StagedGroup] | None,
     ) -> None:
         self.into, self.source = into, source
         self.ours, self.theirs = ours, theirs
@@ -103,7 +103,7 @@ class Transfer:
         self.notes: list[str] = []
         self.renamed: list[tuple[str, str]] = []
         self._staged = staged
-        self._whole = only is None
+        self._is_whole_map = only is None
         rows = theirs.execute(select(scenes).order_by(scenes.c.number)).all()
         self._rows = [row for row in rows if only is None or row.id in only]
         self._forgotten = _forgotten(ours) & {row.id for row in self._rows}
@@ -112,7 +112,7 @@ class Transfer:
     # --- scenes ------------------------------------------------------------------------------------------------------
 
     def scenes(self) -> None:
-        """The scenes, their facts, arrays and chunk boxes. Of a scene in both maps, what was said later holds."""
+        """Copy scenes, facts, arrays and chunk boxes; for a scene in both maps the later facts are in force."""
         for scene in sorted(self._forgotten):
             self.notes.append(f"scene {scene} was forgotten here on demand, so it stays away")
         for row in self._rows:
@@ -120,25 +120,25 @@ class Transfer:
                 continue
             mine = self.ours.execute(select(scenes).where(scenes.c.id == row.id)).first()
             if mine is None or mine.group_id in (None, row.group_id) or mine.thinned is not None:
-                self.bring_group(SCENES, row.group_id)
+                self.transfer_group(SCENES, row.group_id)
             if mine is None:
                 self._add_scene(row)
                 self._join_facts(row.id, arrives=True)
             else:
-                self._join_facts(row.id, arrives=self._meet_scene(mine, row))
+                self._join_facts(row.id, arrives=self._merge_scene(mine, row))
 
     def _add_scene(self, row: Row[Any]) -> None:
         content = _content(row)
         if row.removed_at is None:
-            content["name"] = self._free_name(row.name)
+            content["name"] = self._unused_name(row.name)
         number = self.ours.execute(insert(scenes).returning(scenes.c.number), content).scalar_one()
         self._copy_boxes(row, number)
         self.counts["scenes" if row.removed_at is None else "removed"] += 1
 
-    def _meet_scene(self, mine: Row[Any], row: Row[Any]) -> bool:
-        """A scene that both maps know: the later of its arrivals and removals decides whether it lives.
+    def _merge_scene(self, mine: Row[Any], row: Row[Any]) -> bool:
+        """Merge a scene that both maps have: the later of its ingests and removals decides whether it lives.
 
-        Returns whether it arrives again.
+        Returns True if it is restored.
         """
         self.counts["known"] += 1
         values: Content = {}
@@ -148,12 +148,12 @@ class Transfer:
         elif mine.thinned is not None and row.group_id is not None and row.thinned is None:
             values |= _kept(row)
             self._copy_boxes(row, mine.number)
-            drop_graphs(self.ours, mine.id)  # made of the compact Gaussians, which have other rows
+            forget_derived(self.ours, mine.id)  # computed from the compact Gaussians, which have other rows
             self.notes.append(f"scene {mine.name} is whole again: it was thinned here, and not there")
         returns = mine.removed_at is not None and row.removed_at is None and row.ingested_at > mine.removed_at
         leaves = mine.removed_at is None and row.removed_at is not None and row.removed_at > mine.ingested_at
         if returns:
-            values |= {"removed_at": None, "ingested_at": row.ingested_at, "name": self._free_name(row.name)}
+            values |= {"removed_at": None, "ingested_at": row.ingested_at, "name": self._unused_name(row.name)}
             self.counts["scenes"] += 1
             self.notes.append(f"scene {row.name} is back: it was ingested there after it was removed here")
         elif leaves:
@@ -171,31 +171,32 @@ class Transfer:
         return returns
 
     def _join_facts(self, scene: str, *, arrives: bool) -> None:
-        """Everything that was said of a scene in either map, in the order of time.
+        """Merge the facts about a scene from both maps in the order of time.
 
         Args:
-            arrives: it comes from the other map with its name and date; else they change where that said so later.
+            arrives: the scene is copied with its name and date; otherwise these change only if the other map has later
+                facts.
         """
         query = select(scene_facts).where(scene_facts.c.scene == scene).order_by(scene_facts.c.number)
         mine = [_content(row) for row in self.ours.execute(query)]
         theirs = [_content(row) for row in self.theirs.execute(query)]
         known = {canonical(fact) for fact in mine}
-        joined = in_order(mine, theirs, time=_time, is_new=lambda fact: canonical(fact) not in known)
+        joined = merge_by_time(mine, theirs, time=_time, is_new=lambda fact: canonical(fact) not in known)
         if len(joined) > len(mine):
             self.counts["facts"] += len(joined) - len(mine)
             self.ours.execute(delete(scene_facts).where(scene_facts.c.scene == scene))
             self.ours.execute(insert(scene_facts), joined)
             if not arrives:
-                self._take_later_words(scene, mine, theirs)
+                self._adopt_later_facts(scene, mine, theirs)
         row = self.ours.execute(select(scenes).where(scenes.c.id == scene)).one()
         names = [row.value for row in self.ours.execute(query) if row.kind == "name"]
         if row.removed_at is None and names and names[-1] != row.name:
-            facts.say(self.ours, scene, [("name", row.name)], _MERGE)
+            facts.add_facts(self.ours, scene, [("name", row.name)], _MERGE)
 
-    def _take_later_words(self, scene: str, mine: Sequence[Content], theirs: Sequence[Content]) -> None:
-        """Name and date of a scene, where they were said in the other map after they were here.
+    def _adopt_later_facts(self, scene: str, mine: Sequence[Content], theirs: Sequence[Content]) -> None:
+        """Update name and date of a scene if the other map has later facts about them.
 
-        What it was called and dated by its files when it arrived there is no later word on what was said here.
+        Names and dates from its files at its ingest there are not later facts.
         """
         arrived_at = min(fact["created_at"] for fact in theirs)
         values: Content = {}
@@ -212,12 +213,12 @@ class Transfer:
         if values.get("name", row.name) == row.name or row.removed_at is not None:
             values.pop("name", None)
         else:
-            values["name"] = self._free_name(values["name"])
+            values["name"] = self._unused_name(values["name"])
         if values:
             self.ours.execute(update(scenes).where(scenes.c.id == scene).values(**values))
 
-    def _free_name(self, wanted: str) -> str:
-        free = free_name(self.ours, wanted)
+    def _unused_name(self, wanted: str) -> str:
+        free = unused_name(self.ours, wanted)
         if free != wanted:
             self.renamed.append((wanted, free))
         return free
@@ -227,13 +228,13 @@ class Transfer:
         if len(boxes):
             put_boxes(self.ours, number, boxes)
 
-    def bring_group(self, kind: str, group: str | None) -> None:
+    def transfer_group(self, kind: str, group: str | None) -> None:
         staged = None if self._staged is None or group is None else self._staged.pop((kind, group), None)
         if group is None or (staged is None and has_group(self.ours, group)):
             return
         files = manifest(self.theirs, group)
         if self._staged is None:
-            name(self.ours, kind, group, files)  # of the same map: it lies there already
+            name(self.ours, kind, group, files)  # of the same map: the group exists already
         elif staged is not None:
             publish(self.into.catalog, self.ours, self.into.arrays, staged, kind, group)
             self.counts["bytes"] += sum(file.size_bytes for file in files)
@@ -242,59 +243,59 @@ class Transfer:
                 f"{self.into.location} was pruned meanwhile; nothing was changed: try again", code="changed_meanwhile"
             )
 
-    # --- what was made of scenes, and said of pairs ------------------------------------------------------------------
+    # --- results and reviews -----------------------------------------------------------------------------------------
 
     def graphs(self) -> None:
-        """Their scene graphs; where both maps have one under a key, this map's stays."""
+        """Copy scene graphs; if both maps have one with the same key, this map's stays."""
         here = {row.key: row.group_id for row in self.ours.execute(select(graphs.c.key, graphs.c.group_id))}
         for row in self.theirs.execute(select(graphs).order_by(graphs.c.created_at)).all():
             if row.scene not in self.wanted:
                 continue
             if row.key not in here or row.group_id == here[row.key]:
-                self.bring_group(GRAPHS, row.group_id)
+                self.transfer_group(GRAPHS, row.group_id)
             if row.key not in here:
                 self.recipe(row.recipe)
                 self.ours.execute(insert(graphs), dict(row._mapping))
                 self.counts["graphs"] += 1
 
     def recipe(self, digest: str | None) -> None:
-        """The recipe that a row of theirs names."""
+        """Copy the recipe that a row of theirs names."""
         same = recipes.c.digest == digest
         if digest is not None and self.ours.execute(select(recipes.c.digest).where(same)).first() is None:
             self.ours.execute(insert(recipes), dict(self.theirs.execute(select(recipes).where(same)).one()._mapping))
             self.counts["recipes"] += 1
 
     def pairs(self) -> None:
-        """Registrations and reviews of the pairs whose scenes are both here now.
+        """Copy registrations and reviews of the pairs whose scenes are both in this map now.
 
-        Of a pair that both maps know all is kept, in the order of time, so that the newest registration and the last
-        word count.
+        For a pair in both maps all rows are kept in the order of time, so that the newest registration and the last
+        review are in force.
         """
         here = set(self.ours.execute(select(scenes.c.id)).scalars())
-        said = _by_pair(self.theirs.execute(select(reviews).order_by(reviews.c.number)))
+        their_reviews = _by_pair(self.theirs.execute(select(reviews).order_by(reviews.c.number)))
         for pair, rows in _by_pair(self.theirs.execute(select(registrations).order_by(registrations.c.number))).items():
             ends = set(pair.split(":"))
             if ends <= here and ends & self.wanted:
-                self._join_pair(pair, rows, said.get(pair, []))
+                self._join_pair(pair, rows, their_reviews.get(pair, []))
 
-    def _join_pair(self, pair: str, theirs: Sequence[Row[Any]], said: Sequence[Row[Any]]) -> None:
+    def _join_pair(self, pair: str, theirs: Sequence[Row[Any]], their_reviews: Sequence[Row[Any]]) -> None:
         of_pair, of_review = registrations.c.pair == pair, reviews.c.pair == pair
         mine = self.ours.execute(select(registrations).where(of_pair).order_by(registrations.c.number)).all()
-        spoken = self.ours.execute(select(reviews).where(of_review).order_by(reviews.c.number)).all()
+        our_reviews = self.ours.execute(select(reviews).where(of_review).order_by(reviews.c.number)).all()
         names = {(side, row.number): _identity(row) for side, rows in (("a", mine), ("b", theirs)) for row in rows}
         rows = {names["a", row.number]: ("a", row) for row in mine}
         new = {names["b", row.number]: ("b", row) for row in theirs if names["b", row.number] not in rows}
-        words = {_word(row): ("a", row) for row in spoken}
-        new_words = {_word(row): ("b", row) for row in said if _word(row) not in words}
+        words = {_review_key(row): ("a", row) for row in our_reviews}
+        new_words = {_review_key(row): ("b", row) for row in their_reviews if _review_key(row) not in words}
         if not new and not new_words:
             return
         self.counts["registrations"] += len(new)
         self.counts["reviews"] += len(new_words)
-        # Their numbers say what came after what, so that all of the pair get new ones.
+        # Numbers give the order, so that all rows of the pair are renumbered.
         self.ours.execute(delete(reviews).where(of_review))
         self.ours.execute(delete(registrations).where(of_pair))
         numbers: dict[str, int] = {}
-        joined = in_order(
+        joined = merge_by_time(
             rows.values(),
             [("b", row) for row in theirs],
             time=lambda item: str(item[1].created_at),
@@ -308,18 +309,18 @@ class Transfer:
                 content["adopts"] = numbers[names[side, row.adopts]]
             query = insert(registrations).returning(registrations.c.number)
             numbers[names[side, row.number]] = self.ours.execute(query, content).scalar_one()
-        told = in_order(
+        joined_reviews = merge_by_time(
             words.values(),
-            [("b", row) for row in said],
+            [("b", row) for row in their_reviews],
             time=lambda item: str(item[1].created_at),
-            is_new=lambda item: _word(item[1]) in new_words,
+            is_new=lambda item: _review_key(item[1]) in new_words,
         )
-        for side, row in told:
+        for side, row in joined_reviews:
             number = numbers[names[side, row.registration]]
             self.ours.execute(insert(reviews), _content(row) | {"registration": number})
 
     def priors(self) -> None:
-        """What was told of where the scenes lie; of two that stand, the later one."""
+        """Copy pose priors of the scenes; of two current ones the later one stays."""
         query = select(priors).order_by(priors.c.number)
         mine: dict[str, dict[str, Row[Any]]] = {}
         for row in self.ours.execute(query):
@@ -340,21 +341,21 @@ class Transfer:
         if standing_here:
             self.notes.append("both maps were told where scenes lie: that fits only if both mean the same frame")
         for scene in self.wanted:
-            standing = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
-            rows = self.ours.execute(select(priors).where(standing).order_by(priors.c.created_at)).all()
+            current = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
+            rows = self.ours.execute(select(priors).where(current).order_by(priors.c.created_at)).all()
             for row in rows[:-1]:
                 earlier = priors.c.number == row.number
                 self.ours.execute(update(priors).where(earlier).values(removed_at=rows[-1].created_at))
 
     def observations(self) -> None:
-        """What was observed of the world by these scenes, and the control points that their photos show.
+        """Copy world observations of these scenes, and the control points in their photos.
 
-        Of two that stand under a name the later one holds; the world frame of this map stays where it has one.
+        Of two current observations with the same name the later one stays; this map's world frame stays if it has one.
         """
         theirs = self.theirs.execute(select(observations).order_by(observations.c.number)).all()
         here = set(self.ours.execute(select(scenes.c.id)).scalars())
         shown = {row.value.get("point") for row in theirs if row.kind == "image" and row.scene in self.wanted}
-        everything = self._whole
+        everything = self._is_whole_map
 
         def comes(row: Row[Any]) -> bool:
             ends = {end for end in (row.scene, row.other) if end is not None}
@@ -376,19 +377,19 @@ class Transfer:
             elif row.removed_at is not None and known.removed_at is None:
                 taken_back = observations.c.number == known.number
                 self.ours.execute(update(observations).where(taken_back).values(removed_at=row.removed_at))
-        standing: dict[tuple[Any, ...], list[Row[Any]]] = {}
+        current: dict[tuple[Any, ...], list[Row[Any]]] = {}
         query = select(observations).where(observations.c.removed_at.is_(None)).order_by(observations.c.created_at)
         for row in self.ours.execute(query):
-            standing.setdefault((row.kind, row.name, row.scene), []).append(row)
-        for rows in standing.values():
+            current.setdefault((row.kind, row.name, row.scene), []).append(row)
+        for rows in current.values():
             for row in rows[:-1]:
                 earlier = observations.c.number == row.number
                 self.ours.execute(update(observations).where(earlier).values(removed_at=rows[-1].created_at))
 
     def photos(self) -> None:
-        """Photographs that are kept of these scenes; one that either map took back stays so."""
+        """Copy photos of these scenes; a photo that either map removed stays removed."""
         mine = {_identity(row, "removed_at", "group_id"): row for row in self.ours.execute(select(photo_sightings))}
-        standing = {row.digest for row in mine.values() if row.removed_at is None}
+        current = {row.digest for row in mine.values() if row.removed_at is None}
         for row in self.theirs.execute(select(photo_sightings).order_by(photo_sightings.c.number)).all():
             known = mine.get(_identity(row, "removed_at", "group_id"))
             if row.scene not in self.wanted:
@@ -397,32 +398,32 @@ class Transfer:
                 if row.removed_at is not None and known.removed_at is None:
                     taken_back = photo_sightings.c.number == known.number
                     self.ours.execute(update(photo_sightings).where(taken_back).values(removed_at=row.removed_at))
-            elif row.removed_at is None and row.digest not in standing:
-                self.bring_group(PHOTOS, row.group_id)
+            elif row.removed_at is None and row.digest not in current:
+                self.transfer_group(PHOTOS, row.group_id)
                 self.ours.execute(insert(photo_sightings), _content(row))
                 self.counts["photos"] += 1
 
     def models(self) -> None:
-        """Models of kinds that this map lacks; where both have one under a name, this map's stays."""
+        """Copy models whose names this map lacks; if both have one with the same name, this map's stays."""
         here = self.ours.execute(select(models).order_by(models.c.number)).all()
-        standing = {row.name: row for row in here if row.removed_at is None}
+        current = {row.name: row for row in here if row.removed_at is None}
         taken_back = {(row.name, row.sha256): row.removed_at for row in here if row.removed_at is not None}
         for row in self.theirs.execute(select(models).where(models.c.removed_at.is_(None))).all():
-            mine = standing.get(row.name)
+            mine = current.get(row.name)
             if mine is not None:
                 if mine.sha256 != row.sha256:
                     self.notes.append(
                         f"model {row.name} stays the one of this map: graphs made with the other are stale"
                     )
             elif taken_back.get((row.name, row.sha256), "") < row.created_at:
-                place = model_path(self.into.home, row)  # the other map may be a stranger's
+                place = model_path(self.into.home, row)  # validates the path, which may come from an untrusted map
                 if row.copied and not place.is_file():
                     place.parent.mkdir(exist_ok=True)
                     source = model_path(self.source.home, row)
-                    self.source.arrays.bring_model(row.path)
+                    self.source.arrays.fetch_model(row.path)
                     os.close(open_file(source))  # a plain file
                     write_whole(place, partial(link_or_copy, source))
-                    self.into.arrays.send_model(row.path)
+                    self.into.arrays.upload_model(row.path)
                 self.ours.execute(insert(models), _content(row))
                 self.counts["models"] += 1
                 self.notes.append(f"model {row.name} came along: graphs made without it are out of date")
@@ -431,7 +432,7 @@ class Transfer:
 def _missing_groups(
     into: Store, ours: Connection, theirs: Connection, only: Collection[str] | None, mend: bool
 ) -> dict[tuple[str, str], tuple[StoredFile, ...]]:
-    """Manifests of the groups that wanted scenes need and this map lacks (or has damaged), by (kind, id)."""
+    """Return manifests of the groups that the scenes need and this map lacks (or has damaged), by (kind, id)."""
     named = [(SCENES, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
     of_whole = graphs.join(scenes, scenes.c.id == graphs.c.scene)
     kept = select(graphs.c.key, graphs.c.group_id).select_from(of_whole).where(scenes.c.thinned.is_(None))
@@ -454,50 +455,50 @@ def _missing_groups(
 
 
 def _forgotten(connection: Connection) -> set[str]:
-    """Scenes that were purged, and have not been ingested again."""
+    """Return scenes that were purged and have not been ingested again."""
     purged = set(connection.execute(select(purges.c.scene)).scalars())
     return purged - set(connection.execute(select(scenes.c.id)).scalars())
 
 
 def _content(row: Row[Any]) -> Content:
-    """A row without its number, which is each map's own."""
+    """Return a row without its number, which differs between maps."""
     return {column: value for column, value in row._mapping.items() if column != "number"}
 
 
 def _kept(row: Row[Any]) -> Content:
-    """How a scene's arrays are kept."""
+    """Return the columns that describe a scene's arrays."""
     return {name: getattr(row, name) for name in ("group_id", "num_gaussians", "thinned")}
 
 
 def _identity(row: Row[Any], *besides: str) -> str:
-    """What is equal where two maps hold the same row."""
+    """Return a text that is equal for equal rows of two maps."""
     return canonical({k: v for k, v in _content(row).items() if k not in ("adopts", *besides)})
 
 
-def _word(row: Row[Any]) -> tuple[str, str, str]:
+def _review_key(row: Row[Any]) -> tuple[str, str, str]:
     return row.review, row.note, row.created_at
 
 
-def in_order(
+def merge_by_time(
     mine: Iterable[Item],
     theirs: Iterable[Item],
     *,
     time: Callable[[Item], str],
     is_new: Callable[[Item], bool] = lambda item: True,
 ) -> list[Item]:
-    """What was written in two maps as one sequence: by time, and each map's own in the order in which it was written.
+    """Merge rows of two maps by time, keeping the order within each map.
 
     Args:
-        mine, theirs: all that either map has, as it was written.
-        time: when an item was written.
-        is_new: whether an item of theirs is not among mine.
+        mine, theirs: rows of each map, in the order they were written.
+        time: time of a row.
+        is_new: True for rows of theirs that are not among mine.
     """
     joined = [*timed(mine, time), *(one for one in timed(theirs, time) if is_new(one[1]))]
     return [item for _, item in sorted(joined, key=lambda one: one[0])]
 
 
 def timed(items: Iterable[Item], time: Callable[[Item], str]) -> list[tuple[str, Item]]:
-    """Items with their times; where a clock went back, an item has the latest time before it."""
+    """Return rows with their times, made non-decreasing where a clock went back."""
     out, newest = [], ""
     for item in items:
         newest = max(newest, time(item))

@@ -1,4 +1,4 @@
-"""What changed between scenes, and what was said of it, brought from one map into another; nothing is computed."""
+"""Copy comparisons, changes and their reviews between maps; nothing is computed."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
 
-from gsmap.store.change_rows import KIND, newest_of_all, same_changes
+from gsmap.store.change_rows import KIND, match_changes, newest_of_all
 from gsmap.store.matrices import to_array, to_pose
 from gsmap.store.schema import change_reviews, changes, comparisons, scenes
 from gsmap.store.transfer import Transfer
 
 
-def comparisons_of(transfer: Transfer) -> None:
-    """Comparisons of the pairs whose scenes are both here now, with what people said of the changes.
+def transfer_comparisons(transfer: Transfer) -> None:
+    """Copy comparisons of the pairs whose scenes are both in this map now, with the reviews of their changes.
 
-    Of a pair that both maps compared all is kept; the later comparison counts. Where a change of theirs is one of ours
-    it takes our number, so that the words on it join.
+    For a pair compared in both maps all comparisons are kept, and the latest is current. A change of theirs that
+    matches one of ours takes our number, so that their reviews are merged.
     """
     ours, theirs = transfer.ours, transfer.theirs
     here = set(ours.execute(select(scenes.c.id)).scalars())
     newest = {row.number for row in newest_of_all(theirs)}
-    numbers: dict[int, int] = {}  # of changes: theirs, ours
+    numbers: dict[int, int] = {}  # our change number by theirs
     query = select(comparisons).order_by(comparisons.c.created_at, comparisons.c.number)
     for row in theirs.execute(query).all():
         ends = {row.older, row.newer}
         if not (ends <= here and ends & transfer.wanted):
             continue
         group = row.group_id if row.number in newest else None
-        transfer.bring_group(KIND, group)
+        transfer.transfer_group(KIND, group)
         mine = ours.execute(select(comparisons).where(*_same(row))).first()
         if mine is None:
             _add(transfer, row, group, numbers)
@@ -43,7 +43,7 @@ def comparisons_of(transfer: Transfer) -> None:
 
 
 def _same(row: Row[Any]) -> tuple[Any, ...]:
-    """That a comparison is this one, in whichever map it lies."""
+    """Return conditions that a comparison is the same one in another map."""
     return tuple(getattr(comparisons.c, name) == getattr(row, name) for name in ("older", "newer", "key", "created_at"))
 
 
@@ -53,7 +53,7 @@ def _add(transfer: Transfer, row: Row[Any], group: str | None, numbers: dict[int
     lines = _lines(transfer.theirs, row.number)
     taken = {numbers[_first(line)] for line in lines if _first(line) in numbers}
     boxes = [(line.kind, to_array(line.box)) for line in lines]
-    ours_by_place = same_changes(transfer.ours, row.older, row.newer, to_pose(row.S_frame_newer), boxes)
+    ours_by_place = match_changes(transfer.ours, row.older, row.newer, to_pose(row.S_frame_newer), boxes)
     number = transfer.ours.execute(insert(comparisons).returning(comparisons.c.number), content).scalar_one()
     transfer.counts["comparisons"] += 1
     for place, line in enumerate(lines):
@@ -72,7 +72,7 @@ def _lines(connection: Connection, comparison: int) -> list[Row[Any]]:
 
 
 def _first(line: Row[Any]) -> int:
-    """The number of the change that a row is of."""
+    """Return the number of the change of a row."""
     return int(line.number if line.same_as is None else line.same_as)
 
 

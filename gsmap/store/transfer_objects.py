@@ -1,4 +1,4 @@
-"""Objects of the map and what was said of them, brought from one map into another; nothing is computed."""
+"""Copy objects and facts about them between maps; nothing is computed."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from sqlalchemy import delete, insert, select
 
 from gsmap.store.catalog import now
-from gsmap.store.objects import forget_sets, matched, number_of
+from gsmap.store.objects import forget_sets, match_objects, number_of
 from gsmap.store.schema import object_facts, object_places, objects
-from gsmap.store.transfer import Transfer, in_order
+from gsmap.store.transfer import Transfer, merge_by_time
 
 
-def objects_of(transfer: Transfer) -> None:
-    """The objects that the scenes that come show, with where they show them and what people said of them.
+def transfer_objects(transfer: Transfer) -> None:
+    """Copy the objects that the copied scenes show, with boxes and facts.
 
-    One that this map knows at the same place of a scene keeps its number here, so that the words on it join; the others
-    get new ones. What was computed of them stays behind: it is made again of the scenes that are here then.
+    An object with overlapping boxes in this map takes its number here, so that the facts are merged; others get new
+    numbers. Computed object sets are not copied.
     """
     ours, theirs = transfer.ours, transfer.theirs
     found: dict[int, dict[str, np.ndarray]] = {}
@@ -26,7 +26,7 @@ def objects_of(transfer: Transfer) -> None:
         if row.scene in transfer.wanted:
             found.setdefault(row.object, {})[row.scene] = np.array(row.box, np.float64)
     numbers: dict[int, int] = {}
-    for their_number, number in zip(found, matched(ours, list(found.values())), strict=True):
+    for their_number, number in zip(found, match_objects(ours, list(found.values())), strict=True):
         if number is None:
             made = insert(objects).returning(objects.c.number)
             number = int(ours.execute(made, {"created_at": now()}).scalar_one())
@@ -43,10 +43,10 @@ def objects_of(transfer: Transfer) -> None:
 
 
 def _join_facts(transfer: Transfer, numbers: Mapping[int, int]) -> None:
-    """Everything that was said of objects in either map; each map's own order stays.
+    """Merge facts about objects from both maps, keeping the order of each.
 
     Args:
-        numbers: of objects here, by their numbers there.
+        numbers: object numbers in this map, by those in the other map.
     """
     ours, theirs = transfer.ours, transfer.theirs
     names = ("object", "kind", "value", "author", "created_at")
@@ -54,7 +54,7 @@ def _join_facts(transfer: Transfer, numbers: Mapping[int, int]) -> None:
     mine: dict[int, list[tuple[Any, ...]]] = {}
     for row in ours.execute(query):
         mine.setdefault(row.object, []).append(tuple(getattr(row, name) for name in names))
-    said_there: dict[int, list[tuple[Any, ...]]] = {}
+    their_facts: dict[int, list[tuple[Any, ...]]] = {}
     for row in theirs.execute(query).all():
         if row.object not in numbers:
             continue
@@ -62,14 +62,14 @@ def _join_facts(transfer: Transfer, numbers: Mapping[int, int]) -> None:
         if row.kind == "same_as" and value:
             other = numbers.get(number_of(value) or 0)
             if other is None or other == numbers[row.object]:
-                continue  # the other one stays behind, or is this one here
+                continue  # the other object is not copied, or is this one
             value = f"o{other}"
-        said = (numbers[row.object], row.kind, value, row.author, row.created_at)
-        said_there.setdefault(numbers[row.object], []).append(said)
-    for number, said_of_it in said_there.items():
+        fact = (numbers[row.object], row.kind, value, row.author, row.created_at)
+        their_facts.setdefault(numbers[row.object], []).append(fact)
+    for number, there in their_facts.items():
         here = mine.get(number, [])
-        joined = in_order(here, said_of_it, time=lambda said: str(said[-1]), is_new=lambda said: said not in here)  # noqa: B023
+        joined = merge_by_time(here, there, time=lambda fact: str(fact[-1]), is_new=lambda fact: fact not in here)  # noqa: B023
         if len(joined) > len(here):
             transfer.counts["object_facts"] += len(joined) - len(here)
             ours.execute(delete(object_facts).where(object_facts.c.object == number))
-            ours.execute(insert(object_facts), [dict(zip(names, said, strict=True)) for said in joined])
+            ours.execute(insert(object_facts), [dict(zip(names, fact, strict=True)) for fact in joined])

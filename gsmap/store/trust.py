@@ -1,9 +1,9 @@
-"""Which catalogs on servers this user has named or trusted.
+"""Catalog servers that this user has named or trusted.
 
-A map may come from a stranger, and its ``catalog.url`` would have gsmap connect to any server with the user's password
-(``PGPASSWORD``, ``~/.pgpass``). So a URL that a map remembers is used only where the user said so: by making the map
-with it, by ``gsmap trust``, or in the environment variable `ENVIRONMENT`. The yes is kept in the user's configuration,
-by the map's id, without password, and holds for those very URLs.
+A map may come from an untrusted source, and its ``catalog.url`` would make gsmap connect to any server with the user's
+password (``PGPASSWORD``, ``~/.pgpass``). So a stored URL is used only if the user created the map with it, ran ``gsmap
+trust``, or set the environment variable `ENVIRONMENT`. Trust is stored in the user's configuration, by map id and exact
+URL without password.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from sqlalchemy.exc import ArgumentError
 
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import CorruptError, StoreError
-from gsmap.store.columns import is_digest
-from gsmap.store.explained import called
+from gsmap.store.column_types import is_digest
+from gsmap.store.error_translation import display_name
 from gsmap.texts import control_characters
 
 _log = logging.getLogger("gsmap.store")
 
 ENVIRONMENT = "GSMAP_CATALOG"
 URL_FILE = "catalog.url"
-_MAX_BYTES = 4096  # of a catalog.url; longer ones are not read
+_MAX_BYTES = 4096  # maximum size of a catalog.url
 _DRIVER = re.compile(r"postgresql(\+[a-z0-9]+)?")
 
 
 @dataclass(frozen=True)
-class Remembered:
-    """What a map says of its catalog.
+class CatalogAddress:
+    """The catalog of a map on a server.
 
     Args:
         url: of the database, without password.
@@ -47,7 +47,7 @@ class Remembered:
 
     @property
     def server(self) -> str:
-        """The machine (and port), or the folder of a socket, that would be connected to."""
+        """Return the host and port, or the socket folder, of the server."""
         url = make_url(self.url)
         hosts = [url.host, *_listed(url.query.get("host")), *_listed(url.query.get("hostaddr"))]
         named = ", ".join(host for host in hosts if host) or "this machine"
@@ -63,11 +63,11 @@ class Remembered:
         return make_url(self.url).username or ""
 
 
-def remembered(folder: Path) -> Remembered:
-    """What a map's ``catalog.url`` says; nothing is connected to.
+def read_address(folder: Path) -> CatalogAddress:
+    """Read a map's ``catalog.url``, without connecting.
 
     Raises:
-        CorruptError: it is no plain file, or names anything but a PostgreSQL database.
+        CorruptError: not a plain file, or not the URL of a PostgreSQL database.
     """
     path = folder / URL_FILE
     with open(open_file(path), "rb") as file:
@@ -81,59 +81,59 @@ def remembered(folder: Path) -> Remembered:
         fits = False
     if not fits:
         raise CorruptError(
-            f"{called(folder)}/{URL_FILE} does not name a PostgreSQL database (postgresql+psycopg://...), and gsmap "
-            f"writes nothing else there: name the catalog in {ENVIRONMENT}, and do not trust a map that was sent to "
-            "you so",
+            f"{display_name(folder)}/{URL_FILE} does not name a PostgreSQL database (postgresql+psycopg://...), and "
+            f"gsmap writes nothing else there: name the catalog in {ENVIRONMENT}, and do not trust a map that was sent "
+            "to you so",
             code="catalog_invalid",
         )
-    return Remembered(lines[0], lines[1] if len(lines) > 1 else None)
+    return CatalogAddress(lines[0], lines[1] if len(lines) > 1 else None)
 
 
 def write(folder: Path, url: str, map_id: str) -> None:
-    """Write a map's ``catalog.url``: the URL (without password), and the map's id, a line each."""
+    """Write a map's ``catalog.url``: the URL (without password) and the map's id, one per line."""
     text = f"{url}\n{map_id}\n"
     write_whole(folder / URL_FILE, lambda staged: staged.write_text(text, encoding="utf-8"))
 
 
-def named_url(folder: Path) -> str:
-    """The URL to open a map's catalog with: what the environment names, else what the map remembers if that is trusted.
+def catalog_url(folder: Path) -> str:
+    """Return the URL of a map's catalog: from the environment, or the stored one if it is trusted.
 
     Raises:
         StoreError: the user has neither named nor trusted it.
-        CorruptError: see `remembered`.
+        CorruptError: see `read_address`.
     """
     if named := os.environ.get(ENVIRONMENT):
         return named
-    found = remembered(folder)
+    found = read_address(folder)
     if is_trusted(found):
         return found.url
     raise StoreError(
-        f"{called(folder)} would connect to {found.server} (database {found.database!r}, user {found.user!r}), which "
-        f"you have not trusted yet: run gsmap trust {called(folder)} if that is right, or name the catalog's URL in "
-        f"{ENVIRONMENT}",
+        f"{display_name(folder)} would connect to {found.server} (database {found.database!r}, user {found.user!r}), "
+        f"which you have not trusted yet: run gsmap trust {display_name(folder)} if that is right, or name the "
+        f"catalog's URL in {ENVIRONMENT}",
         code="untrusted_catalog",
     )
 
 
-def is_trusted(found: Remembered) -> bool:
-    """Whether this user trusts the very URL that a map remembers.
+def is_trusted(found: CatalogAddress) -> bool:
+    """Return True if this user trusts the exact URL of a map.
 
     Raises:
-        StoreError: as `trusted`.
+        StoreError: as `trusted_urls`.
     """
-    return found.map_id is not None and found.url in trusted().get(found.map_id, ())
+    return found.map_id is not None and found.url in trusted_urls().get(found.map_id, ())
 
 
-def trusted() -> dict[str, tuple[str, ...]]:
-    """The URLs (without password) that this user trusts, by map id: a restored map has the id of the one it was.
+def trusted_urls() -> dict[str, tuple[str, ...]]:
+    """Return the URLs (without password) that this user trusts, by map id, which a restored map shares.
 
     Raises:
-        StoreError: the user's file of them cannot be read.
+        StoreError: the file of trusted URLs cannot be read.
     """
     path = config_file()
     try:
         found = json.loads(path.read_text(encoding="utf-8"))["catalogs"]
-        # Once there was one URL, and no list, for an id.
+        # older files have one URL instead of a list
         known = {key: (urls,) if isinstance(urls, str) else tuple(urls) for key, urls in found.items()}
         if not all(isinstance(key, str) and all(isinstance(url, str) for url in known[key]) for key in known):
             raise TypeError("it maps ids to URLs")
@@ -148,14 +148,14 @@ def trusted() -> dict[str, tuple[str, ...]]:
 
 
 def trust(map_id: str, url: str) -> None:
-    """Remember that this user trusts a URL (without password) as the catalog of a map."""
+    """Store that this user trusts a URL (without password) as the catalog of a map."""
     path = config_file()
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX)  # two at once would forget what one of them says
-            known = trusted()
+            fcntl.flock(handle, fcntl.LOCK_EX)  # concurrent updates would lose one
+            known = trusted_urls()
             known[map_id] = tuple(dict.fromkeys((*known.get(map_id, ()), url)))
             text = json.dumps({"catalogs": known}, indent=1) + "\n"
             write_whole(path, lambda staged: _write_private(staged, text))
@@ -168,18 +168,18 @@ def trust(map_id: str, url: str) -> None:
         ) from error
 
 
-def remember(folder: Path) -> None:
-    """Trust the catalog of a map that this user has just made; where that cannot be kept, a warning says so."""
-    found = remembered(folder)
+def trust_new_map(folder: Path) -> None:
+    """Trust the catalog of a map that this user has just made; logs a warning if that cannot be stored."""
+    found = read_address(folder)
     try:
         if found.map_id is not None:
             trust(found.map_id, found.url)
-    except StoreError as error:  # the map is made; it is opened by naming its catalog again
+    except StoreError as error:  # the map exists and can be opened by naming its catalog
         _log.warning("%s", error)
 
 
 def config_file() -> Path:
-    """Where this user's trusted catalogs are listed."""
+    """Return the path of this user's list of trusted catalogs."""
     base = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
     return Path(base).expanduser() / "gsmap" / "catalogs.json"
 

@@ -1,7 +1,6 @@
-"""What the views of each scene show (`SceneFeatures`), kept under what they were made from and how.
+"""Local features of the views of each scene (`SceneFeatures`), stored under their recipe and inputs.
 
-By which views a photograph is looked for, the index of views says (`gsmap.store.indexes`). Losing any of it costs time
-only.
+Candidate views of a photo come from the index of views (`gsmap.store.indexes`). All of it can be recomputed.
 """
 
 from __future__ import annotations
@@ -14,10 +13,10 @@ from sqlalchemy import delete, insert, select
 from gsmap.errors import MALFORMED, CorruptError, InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
+from gsmap.store.array_groups import manifest, publish, unless_pruned, unname
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import manifest, publish, unless_pruned, unname
+from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import view_features
 from gsmap.types import Cameras
@@ -37,17 +36,17 @@ _ARRAYS = {
 
 
 class ViewFeatures:
-    """The features of the scenes of a map, of each scene one set for every key that they were made under."""
+    """The view features of a map, one set per scene."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
 
     def save(self, found: SceneFeatures, key: RecipeKey) -> None:
-        """Keep the features of a scene; others of the same key, and of older recipes of that scene, go.
+        """Store the features of a scene, replacing all earlier ones of that scene.
 
         Args:
-            key: its recipe; among its inputs is the scene.
+            key: its recipe; the scene must be among its inputs.
         """
         if found.scene not in key.inputs:
             raise InputError(
@@ -72,7 +71,7 @@ class ViewFeatures:
             "group_id": group_id,
         }
         staging = self._arrays.stage(arrays, KIND, group_id)
-        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+        with translate_errors(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             resolve(connection, found.scene)
             known = manifest(connection, group_id)
             if not known or self._arrays.problems(KIND, group_id, known):
@@ -82,20 +81,20 @@ class ViewFeatures:
             connection.execute(delete(view_features).where(mine))
             for gone in older:
                 unname(connection, gone)
-            made = {"recipe": recipes.keep(connection, key), "created_at": now()}
+            made = {"recipe": recipes.save_recipe(connection, key), "created_at": now()}
             connection.execute(insert(view_features), row | made)
 
-    def kept(self, keys: Iterable[RecipeKey | str]) -> set[str]:
-        """Those of the keys (as digests) that features are kept under."""
+    def stored_keys(self, keys: Iterable[RecipeKey | str]) -> set[str]:
+        """Return those of the keys (as digests) that have features."""
         with self._catalog.read() as connection:
-            return recipes.kept(connection, view_features.c.key, keys)
+            return recipes.stored_keys(connection, view_features.c.key, keys)
 
     def load(self, scene: str, key: RecipeKey | str) -> SceneFeatures | None:
-        """Read the features of a scene; None where none are kept under this key.
+        """Load the features of a scene; None if there are none with this key.
 
         Raises:
-            CorruptError: bytes on disk are missing or differ, or are no features.
-            NotFoundError: others made them anew meanwhile.
+            CorruptError: bytes on disk are missing, differ, or are not valid features.
+            NotFoundError: another process replaced them meanwhile.
         """
         wanted = view_features.c.key == recipes.digest_of(key)
         with self._catalog.read() as connection:

@@ -1,6 +1,6 @@
-"""SQLite's write-ahead log, read without SQLite: which pages it holds, and whether it lost anything that was committed.
+"""Reader of SQLite's write-ahead log that finds its pages and any lost commits.
 
-https://www.sqlite.org/fileformat2.html#walformat. SQLite takes the frames up to the first that fails its checksum and
+https://www.sqlite.org/fileformat2.html#walformat. SQLite reads frames up to the first with a wrong checksum and
 silently drops the rest: right for the torn end that a power cut leaves, wrong for a flipped bit in the middle.
 """
 
@@ -23,13 +23,13 @@ _INDEX_VERSION = 3_007_000
 
 
 @dataclass(frozen=True)
-class Log:
-    """What a log holds.
+class WalContent:
+    """Content of a write-ahead log.
 
     Args:
-        frames: by page number (from 1), where its newest committed content begins in the log's file.
-        num_pages: of the database after the last commit; 0 where nothing is committed.
-        problem: what was committed and cannot be read any more, in words; empty for a sound log.
+        frames: offset of the newest committed content of each page in the log file, by page number (from 1).
+        num_pages: of the database after the last commit; 0 if nothing is committed.
+        problem: description of lost commits; empty for a sound log.
     """
 
     frames: dict[int, int] = field(default_factory=dict)
@@ -38,22 +38,22 @@ class Log:
 
 
 @dataclass(frozen=True)
-class Noted:
-    """What the log's index (``-shm``) says: how many frames are committed in the log that has this salt."""
+class IndexHeader:
+    """Header of the log's index (``-shm``): number of committed frames of the log with this salt."""
 
     salt: bytes
     num_frames: int
 
 
-def log_of(file: Path) -> Path:
-    """Where the log of a database lies."""
+def wal_path(file: Path) -> Path:
+    """Return the path of the log of a database."""
     return file.with_name(file.name + "-wal")
 
 
-def index_note(file: Path) -> Noted | None:
-    """What the index of a database's log says of it; None where there is none, or one that says nothing.
+def read_index_header(file: Path) -> IndexHeader | None:
+    """Read the header of the index of a database's log; None if it is missing or not initialized.
 
-    Only for a process that has no connection to the database: closing the index drops the locks of all of them.
+    Only for a process without a connection to the database: closing the index drops the locks of all connections.
     """
     try:
         content = file.with_name(file.name + "-shm").read_bytes()[:96]
@@ -63,42 +63,42 @@ def index_note(file: Path) -> Noted | None:
         return None
     version, _, _, is_init = struct.unpack("=IIIB", content[:13])
     (num_frames,) = struct.unpack("=I", content[16:20])
-    return Noted(content[32:40], num_frames) if version == _INDEX_VERSION and is_init else None
+    return IndexHeader(content[32:40], num_frames) if version == _INDEX_VERSION and is_init else None
 
 
-def read_log(path: Path, noted: Noted | None = None, *, at_most: int | None = None) -> Log:
-    """Read a log's every frame.
+def read_log(path: Path, stored: IndexHeader | None = None, *, at_most: int | None = None) -> WalContent:
+    """Read all frames of a log.
 
-    A log has lost something where a commit beyond the first bad frame was followed by a later frame (which is written
-    only once that commit is on the disk), or where its index has more frames than can be read. A torn end is no loss.
+    A log has lost a commit if a later frame follows a commit beyond the first bad frame (frames are written only once
+    the previous commit is on disk), or if its index has more frames than can be read. A torn end is no loss.
 
     Args:
-        noted: what `index_note` said before anybody connected.
-        at_most: look at so many frames only. What follows them may be of a commit whose fsync failed: it is whole, and
-            taken back all the same.
+        noted: header of the index from before any connection.
+        at_most: number of frames to read. Later frames may be of a commit whose fsync failed, which is complete but
+            rolled back.
     """
     try:
         with open(path, "rb", buffering=0) as opened:
             size = os.fstat(opened.fileno()).st_size
-            return _read(opened.fileno(), size, noted, size if at_most is None else at_most)
+            return _read(opened.fileno(), size, stored, size if at_most is None else at_most)
     except FileNotFoundError:
-        return Log()
+        return WalContent()
 
 
-def _read(handle: int, size: int, noted: Noted | None, at_most: int) -> Log:
+def _read(handle: int, size: int, stored: IndexHeader | None, at_most: int) -> WalContent:
     head = os.pread(handle, _HEADER, 0)
     if len(head) < _HEADER or not any(head):
-        return Log()
+        return WalContent()
     magic, version, page_size, _, salt, seed = struct.unpack(">IIII8s8s", head)
     big = magic & 1
     words = np.frombuffer(head, ">u4" if big else "<u4").astype(np.uint32)
     sound = magic & ~1 == _MAGIC and version == _INDEX_VERSION and 512 <= page_size <= 65536
     if not sound or _summed(words[None, :6])[0].tolist() != list(struct.unpack(">II", seed)):
-        return Log(problem="its header is damaged" if size > _HEADER else "")
-    committed = noted.num_frames if noted is not None and noted.salt == salt else 0
+        return WalContent(problem="its header is damaged" if size > _HEADER else "")
+    committed = stored.num_frames if stored is not None and stored.salt == salt else 0
 
     frames: dict[int, int] = {}
-    ahead: dict[int, int] = {}  # of a transaction whose commit has not been seen yet
+    ahead: dict[int, int] = {}  # frames of a transaction without a commit so far
     num_pages = good = at = 0
     broken = lost = False
     last = np.frombuffer(seed, ">u4").astype(np.uint32)
@@ -115,7 +115,7 @@ def _read(handle: int, size: int, noted: Noted | None, at_most: int) -> Log:
         ours = (heads[:, 2:4] == np.frombuffer(salt, ">u4")).all(1)
         for i, (page, after) in enumerate(heads[:, :2].tolist()):
             if at + i >= at_most:
-                return Log(frames, num_pages)
+                return WalContent(frames, num_pages)
             if not broken and links[i] and ours[i]:
                 ahead[page] = _HEADER + (at + i) * (_FRAME + page_size) + _FRAME
                 if after:
@@ -124,7 +124,7 @@ def _read(handle: int, size: int, noted: Noted | None, at_most: int) -> Log:
                     num_pages, good = after, at + i + 1
             else:
                 chained = links[i]
-                if broken and not chained:  # its stored checksum may be what is damaged
+                if broken and not chained:  # its stored checksum may be the damaged part
                     chained = (_advanced(computed[None], body.shape[1] // 2)[0] + own[i] == heads[i, 4:6]).all()
                 lost |= bool(broken and last_commits and ours[i] and chained)
                 broken = True
@@ -132,12 +132,14 @@ def _read(handle: int, size: int, noted: Noted | None, at_most: int) -> Log:
         last = heads[-1, 4:6]
         at += len(block)
     if lost or committed > good:
-        return Log(frames, num_pages, f"its frame {good + 1} or one after it is damaged, and what follows is lost")
-    return Log(frames, num_pages)
+        return WalContent(
+            frames, num_pages, f"its frame {good + 1} or one after it is damaged, and what follows is lost"
+        )
+    return WalContent(frames, num_pages)
 
 
 def _blocks(handle: int, size: int, page_size: int) -> Iterator[np.ndarray]:
-    """The whole frames of a log in order, as rows of big-endian words."""
+    """Yield the whole frames of a log in order, as rows of big-endian words."""
     step = _FRAME + page_size
     many = max(1, _BLOCK_BYTES // step)
     offset = _HEADER
@@ -151,26 +153,26 @@ def _blocks(handle: int, size: int, page_size: int) -> Iterator[np.ndarray]:
 
 
 def _summed(words: np.ndarray) -> np.ndarray:
-    """(N, 2) checksums of N rows of words, each begun at 0."""
+    """Compute (N, 2) checksums of N rows of words, each starting at 0."""
     weights = _weights(words.shape[1] // 2)
     return np.stack([(words * weights[i]).sum(1, dtype=np.uint32) for i in range(2)], axis=1)
 
 
 def _advanced(seeds: np.ndarray, num_pairs: int) -> np.ndarray:
-    """What (N, 2) checksums become after so many pairs of zeros."""
+    """Advance (N, 2) checksums by a number of zero pairs."""
     (a, b), (c, d) = _power(num_pairs)
     return np.stack([seeds[:, 0] * a + seeds[:, 1] * b, seeds[:, 0] * c + seeds[:, 1] * d], axis=1)
 
 
 @lru_cache(maxsize=8)
 def _weights(num_pairs: int) -> np.ndarray:
-    """(2, 2 * num_pairs) how much each word counts in the two sums.
+    """Compute (2, 2 * num_pairs) weights of each word in the two sums.
 
     A pair (x, y) turns the sums (s, t) into (s + t + x, s + 2 t + x + y), modulo 2**32; that is linear, so that all
     frames are summed at once instead of word by word.
     """
     out = np.zeros((2, 2 * num_pairs), np.uint32)
-    a, b, c, d = 1, 0, 0, 1  # the power of ((1, 1), (1, 2)) that the later pairs amount to
+    a, b, c, d = 1, 0, 0, 1  # power of ((1, 1), (1, 2)) for the later pairs
     for i in reversed(range(num_pairs)):
         out[:, 2 * i] = (a + b) & 0xFFFFFFFF, (c + d) & 0xFFFFFFFF
         out[:, 2 * i + 1] = b, d

@@ -1,8 +1,8 @@
-"""What was observed of the world: control points, photos of them, positions, scale bars, and the frame they are in.
+"""World observations: control points, their photos, position fixes, scale bars, and the world frame.
 
-Observations are kept as they were made, each in its own coordinate reference system, and none is overwritten: one that
-is told again retires the earlier one. A row's ``scene`` is the one whose frame it speaks of; a bar may name another,
-``other``. Photos of a point hold their camera, so that nothing else is needed to solve from them.
+Observations are stored as made, each in its own coordinate reference system, and never overwritten: a new one retires
+the earlier one of the same name. ``scene`` of a row is the scene whose frame it refers to; a scale bar may refer to a
+second one, ``other``. Photos of a control point include their camera, so that solving needs nothing else.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ _TEXTS = {"name", "crs", "image", "scene"}
 _TUPLES = {"sigma_m", "common_sigma_m", "scenes", "point_sigmas"}
 
 
-class World:
-    """The observations of a map."""
+class WorldObservations:
+    """The world observations of a map."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
 
     def add(self, items: Iterable[Observation]) -> int:
-        """Note observations, each in place of one of its name that stands; returns how many are new or differ."""
+        """Add observations, each replacing the current one with its name; returns how many are new or differ."""
         count = 0
         with self._catalog.write() as connection:
-            standing = {_key(row): row for row in connection.execute(_standing())}
+            current = {_key(row): row for row in connection.execute(_current_rows())}
             for item in items:
                 made = _row(item)
-                before = standing.get(_key_of(made))
+                before = current.get(_key_of(made))
                 if before is not None and before.value == made["value"]:
                     continue
                 if before is not None:
@@ -57,14 +57,14 @@ class World:
         return count
 
     def survey(self, coming: Iterable[Observation] = ()) -> Survey:
-        """All that stands, of living scenes, in the order of names.
+        """Return all current observations of living scenes, by name.
 
         Args:
-            coming: observations that are taken as if they had been added; of living scenes.
+            coming: further observations of living scenes, treated as if added.
         """
         with self._catalog.read() as connection:
-            alive = living_ids(connection)
-            rows = [row for row in connection.execute(_standing()) if _lives(row, alive)]
+            living = living_ids(connection)
+            rows = [row for row in connection.execute(_current_rows()) if _has_living_scenes(row, living)]
         items: dict[tuple[str, str, str], Any] = {_key(row): _item(row) for row in rows}
         items |= {_key_of(_row(item)): item for item in coming}
         by_kind: dict[str, list[Any]] = {kind: [] for kind in _TYPES}
@@ -79,27 +79,27 @@ class World:
         )
 
     def remove(self, names: Sequence[str] = (), *, kinds: Sequence[str] = (), scene: str | None = None) -> int:
-        """Take observations back; returns how many.
+        """Remove observations; returns how many.
 
         Args:
-            names: of points (with their photos), photos, fixes or bars; all where none is named.
-            kinds: only of these kinds; of all but the frame where none is named, with it where nothing else is chosen.
-            scene: only those of this one (id).
+            names: of points (with their photos), photos, fixes or bars; default: all.
+            kinds: only these kinds; default: all but the frame, or including the frame if nothing else is chosen.
+            scene: only those of this scene (id).
 
         Raises:
-            NotFoundError: one of the names is none.
+            NotFoundError: a name is unknown.
         """
         chosen = tuple(kinds) or (tuple(_TYPES) if not names and scene is None else ("point", "image", "fix", "bar"))
         wanted, found = set(names), set()
         with self._catalog.write() as connection:
             gone = []
-            for row in connection.execute(_standing()).all():
-                said = {row.name, row.value.get("point")} if row.kind == "image" else {row.name}
+            for row in connection.execute(_current_rows()).all():
+                row_names = {row.name, row.value.get("point")} if row.kind == "image" else {row.name}
                 if row.kind not in chosen or (scene is not None and row.scene != scene):
                     continue
-                if not wanted or said & wanted:
+                if not wanted or row_names & wanted:
                     gone.append(row.number)
-                    found |= said & wanted
+                    found |= row_names & wanted
             missing = sorted(wanted - found)
             if missing:
                 raise NotFoundError(
@@ -113,8 +113,8 @@ class World:
 
 
 def inherit(connection: Connection, old: str, new: str) -> None:
-    """Let a scene have the observations of another, in whose frame it is."""
-    for row in connection.execute(_standing()).all():
+    """Copy the observations of a scene to another one in the same frame."""
+    for row in connection.execute(_current_rows()).all():
         if old not in (row.scene, row.other):
             continue
         values = _renamed(dict(row._mapping), old, new)
@@ -131,12 +131,12 @@ def _renamed(row: dict[str, Any], old: str, new: str) -> dict[str, Any]:
     return row | ends | {"value": value}
 
 
-def _standing() -> Any:
+def _current_rows() -> Any:
     return select(observations).where(observations.c.removed_at.is_(None)).order_by(observations.c.number)
 
 
-def _lives(row: Row[Any], alive: set[str]) -> bool:
-    return all(scene is None or scene in alive for scene in (row.scene, row.other))
+def _has_living_scenes(row: Row[Any], living: set[str]) -> bool:
+    return all(scene is None or scene in living for scene in (row.scene, row.other))
 
 
 def _key(row: Row[Any]) -> tuple[str, str, str]:
@@ -144,7 +144,7 @@ def _key(row: Row[Any]) -> tuple[str, str, str]:
 
 
 def _key_of(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    # Of a bar the name alone: it may be picked again in other scenes.
+    # A scale bar is identified by its name alone: it may be measured again in other scenes.
     return row["kind"], row["name"], row["scene"] or ""
 
 

@@ -1,7 +1,16 @@
-"""Streams of Gaussians (`gsmap.types.GaussianSource`): memory is bounded by a chunk, not by a scene."""
+"""Streams of Gaussians (`gsmap.types.GaussianSource`) with memory bounded by a chunk instead of a scene."""
 
-from gsmap.stream.infinities import clamped, clamped_column, num_clamped
-from gsmap.stream.order import in_morton_order
-from gsmap.stream.rows import about, blocks, bounds, loaded
+from gsmap.stream.blocks import blocks, bounds, load_all, shift_origin
+from gsmap.stream.infinities import clamp_column, clamp_infinities, count_clamped
+from gsmap.stream.morton_sort import sorted_along_morton_curve
 
-__all__ = ["about", "blocks", "bounds", "clamped", "clamped_column", "in_morton_order", "loaded", "num_clamped"]
+__all__ = [
+    "shift_origin",
+    "blocks",
+    "bounds",
+    "clamp_column",
+    "clamp_infinities",
+    "count_clamped",
+    "load_all",
+    "sorted_along_morton_curve",
+]

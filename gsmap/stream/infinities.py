@@ -1,4 +1,4 @@
-"""Infinities that are values and not damage: an opacity of exactly 0 or 1, and a Gaussian without thickness."""
+"""Infinities that are valid values: an opacity of exactly 0 or 1, and a Gaussian without thickness."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ MAX_LOGIT = np.float32(25 * np.log(2))  # its opacity is 1 in float32
 MIN_LOG_SCALE = np.float32(np.log(2e-9))  # of the unit
 
 
-def clamped(gaussians: Gaussians) -> Gaussians:
-    """Replace infinite logits, and logarithms of scales of minus infinity, by finite values that draw the same.
+def clamp_infinities(gaussians: Gaussians) -> Gaussians:
+    """Replace infinite logits, and log-scales of minus infinity, by finite values that render the same.
 
-    Scales of plus infinity and infinities elsewhere stay: they are damage (`gsmap.ingest.validate`).
+    Scales of plus infinity and other infinities are damage and stay (`gsmap.ingest.validate`).
     """
-    logits = clamped_column("logit_opacities", gaussians.logit_opacities)
-    log_scales = clamped_column("log_scales", gaussians.log_scales)
+    logits = clamp_column("logit_opacities", gaussians.logit_opacities)
+    log_scales = clamp_column("log_scales", gaussians.log_scales)
     if logits is gaussians.logit_opacities and log_scales is gaussians.log_scales:
         return gaussians
     return replace(gaussians, log_scales=log_scales, logit_opacities=logits)
 
 
-def clamped_column(name: str, column: np.ndarray) -> np.ndarray:
-    """One field of Gaussians, as `clamped`; the array itself where there is nothing to replace."""
+def clamp_column(name: str, column: np.ndarray) -> np.ndarray:
+    """Clamp one field of Gaussians as `clamp_infinities` does; returns the array itself if nothing changes."""
     if name not in ("logit_opacities", "log_scales") or not np.isinf(column).any():
         return column
     column = column.copy()
@@ -37,7 +37,7 @@ def clamped_column(name: str, column: np.ndarray) -> np.ndarray:
     return column
 
 
-def num_clamped(gaussians: Gaussians) -> tuple[int, int]:
-    """How many opacities and how many scales have the value that `clamped` gives them."""
+def count_clamped(gaussians: Gaussians) -> tuple[int, int]:
+    """Count the opacities and the scales that have the values of `clamp_infinities`."""
     logits, log_scales = gaussians.logit_opacities, gaussians.log_scales
     return int((np.abs(logits) == MAX_LOGIT).sum()), int((log_scales == MIN_LOG_SCALE).sum())

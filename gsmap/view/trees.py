@@ -141,7 +141,7 @@ def write_tree(
     Every tile's name ends with the beginning of the digest of its bytes.
 
     Args:
-        source: along the Morton curve of its means (`gsmap.stream.in_morton_order`), as scenes are stored.
+        source: along the Morton curve of its means (`gsmap.stream.sorted_along_morton_curve`), as scenes are stored.
 
     Returns:
         The root. Errors are how far, in the scene's unit, what a tile draws lies from the originals: what a twentieth

@@ -89,7 +89,7 @@ def test_one_bad_capture_ends_nothing(tmp_path: Path, kind: str, caplog: pytest.
         assert [scene.name for scene in m.scenes()] == ["night0", "night2", "night3"]
         (todo,) = [row for row in m.status().todo if row.what == "set_aside"]
         assert "night1" in todo.meaning
-        (aside,) = m.store.set_aside.met.values()
+        (aside,) = m.store.quarantine.encountered.values()
         assert Path(aside.about).name.startswith("night1.")
         assert aside.reason in caplog.text
 
@@ -99,8 +99,8 @@ def test_one_bad_capture_ends_nothing(tmp_path: Path, kind: str, caplog: pytest.
         (tmp_path / "night1.json").unlink(missing_ok=True)
         m.ingest(tmp_path)
         assert len(m.scenes()) == 4
-        assert m.store.set_aside.list() == []
-        assert m.store.set_aside.met == {}
+        assert m.store.quarantine.list() == []
+        assert m.store.quarantine.encountered == {}
 
 
 def test_the_command_goes_on_ends_with_3_and_names_it(cli: Run, captures: Path, tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_a_map_that_fails_is_no_bad_capture(tmp_path: Path, monkeypatch: pytest.
         monkeypatch.setattr(m.store.scenes, "add", full)
         with pytest.raises(DiskFullError):
             m.ingest(tmp_path)
-        assert m.store.set_aside.list() == []
+        assert m.store.quarantine.list() == []
 
 
 # -- folders
@@ -202,7 +202,7 @@ def test_clouds_meshes_maps_and_exports_are_skipped_and_named(tmp_path: Path) ->
     assert all(str(one.path) in one.reason for one in search.skipped)
     with gsmap.map.open(drop / "site.gsmap") as m:
         assert [row.scene_name for row in m.ingest(drop)] == ["hall"]
-        assert m.store.set_aside.met == {}
+        assert m.store.quarantine.encountered == {}
 
 
 def looking_at() -> Cameras:
@@ -282,11 +282,11 @@ def test_a_folder_that_cannot_be_listed_is_set_aside(tmp_path: Path, monkeypatch
     monkeypatch.setattr(Path, "iterdir", refused)  # as root nothing is refused
     with gsmap.map.create(tmp_path / "site.gsmap") as m:
         assert [row.scene_name for row in m.ingest(tmp_path)] == ["a"]
-        (aside,) = m.store.set_aside.list()
+        (aside,) = m.store.quarantine.list()
         assert aside.about == str(tmp_path / "locked")
         monkeypatch.undo()
         m.ingest(tmp_path)
-        assert m.store.set_aside.list() == []
+        assert m.store.quarantine.list() == []
 
 
 # -- wrong first commands

@@ -27,7 +27,7 @@ def test_a_second_export_to_a_folder_says_who_is_at_it(cli: Callable[..., Any], 
 
 def test_status_says_who_is_at_work(cli: Callable[..., Any], site: Path) -> None:
     assert cli("status", site, "--json").json["at_work"] == []
-    with Store.open(site) as store, store.leases.attend("update"):
+    with Store.open(site) as store, store.leases.announce("update"):
         (row,) = cli("status", site, "--json").json["at_work"]
         assert (row["what"], row["task"], row["process"]) == ("map", "update", os.getpid())
         assert str(os.getpid()) in cli("status", site).stdout

@@ -15,7 +15,7 @@ import zarr
 from hostile_world import World, case
 from zarr.storage import ZipStore
 
-from gsmap.store import packed
+from gsmap.store import array_archive
 from gsmap.store.layout import CHUNK_ROWS
 
 READ = ("check MAP", "show MAP a", "export MAP TILES --tile-size 0 --merge voxel", "look MAP")
@@ -219,7 +219,7 @@ def chunks_that_zarr_would_look_for_elsewhere(w: World) -> None:
 
 
 def _arrays_of(group: Path) -> dict[str, np.ndarray]:
-    with ZipStore(group / packed.FILE, mode="r") as store:
+    with ZipStore(group / array_archive.FILE, mode="r") as store:
         return {name: np.asarray(array[...]) for name, array in zarr.open_group(store, mode="r").arrays()}
 
 
@@ -228,7 +228,7 @@ def _archived(
 ) -> None:
     """Change the members of every scene's archive, and have the catalog agree."""
     for group in (w.map / "arrays" / kind).iterdir():
-        path = group / packed.FILE
+        path = group / array_archive.FILE
         with zipfile.ZipFile(path) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
         change(members)
@@ -241,7 +241,7 @@ def _archived(
 def _edited(w: World, change: Callable[[bytearray, int], object]) -> None:
     """Change the bytes of every scene's archive, whose table of contents begins there, and have the catalog agree."""
     for group in (w.map / "arrays" / "scenes").iterdir():
-        path = group / packed.FILE
+        path = group / array_archive.FILE
         data = bytearray(path.read_bytes())
         change(data, int.from_bytes(data[-6:-2], "little"))
         path.write_bytes(data)
@@ -336,9 +336,9 @@ def camera_names_that_are_no_text(w: World) -> None:
     """In the place of the good ones, packed as gsmap packs them."""
     for group in (w.map / "arrays" / "scenes").iterdir():
         arrays = _arrays_of(group)
-        (group / packed.FILE).unlink()
+        (group / array_archive.FILE).unlink()
         arrays["cameras.names"] = np.frombuffer(b"\xff\xfe\xfd", np.uint8)
-        packed.write(group / packed.FILE, arrays, chunk_rows=CHUNK_ROWS)
-        w.restated(group / packed.FILE)
+        array_archive.write(group / array_archive.FILE, arrays, chunk_rows=CHUNK_ROWS)
+        w.restated(group / array_archive.FILE)
     w.set("UPDATE tiles SET removed_at = '2026'")
     shutil.rmtree(w.tiles)

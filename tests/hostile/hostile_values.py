@@ -10,7 +10,7 @@ from pathlib import Path
 from hostile_world import World, case
 
 import gsmap.map
-from gsmap.store import digests
+from gsmap.store import page_digests
 
 OVER_ALL = (
     "list MAP scenes",
@@ -38,7 +38,7 @@ def _set(file: Path, statement: str, *values: object) -> None:
     connection.execute(statement, values)
     connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     connection.close()
-    digests.note(file)
+    page_digests.write_digests(file)
 
 
 @case(r"is a link", verbs=OVER_ALL)

@@ -19,7 +19,7 @@ from gsmap import formats
 from gsmap.change import recipe_key
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.methods import RecipeKey
-from gsmap.store import Store, digests, packed
+from gsmap.store import Store, array_archive, page_digests
 from gsmap.types import (
     Cameras,
     Change,
@@ -173,10 +173,10 @@ class World:
         """Make all groups of a kind folders of a file for every key, as schema 0006 has them; their folders."""
         groups = sorted((self.map / "arrays" / kind).iterdir())
         for group in groups:
-            with zipfile.ZipFile(group / packed.FILE) as archive:
+            with zipfile.ZipFile(group / array_archive.FILE) as archive:
                 archive.extractall(group)
                 names = archive.namelist()
-            (group / packed.FILE).unlink()
+            (group / array_archive.FILE).unlink()
             self.set("DELETE FROM files WHERE group_id = ?", group.name)
             for name in names:
                 self.restated(group / name)
@@ -193,7 +193,7 @@ class World:
         finally:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             connection.close()
-            digests.note(self.map / "map.sqlite")  # a stranger has gsmap, too
+            page_digests.write_digests(self.map / "map.sqlite")  # a stranger has gsmap, too
 
     def set(self, statement: str, *values: object) -> None:
         with self.sql() as connection:

@@ -147,7 +147,7 @@ def test_a_reader_waits_for_no_lock_that_a_link_leads_to(tmp_path):
         (store.folder / "lock").unlink()
         (store.folder / "lock").symlink_to(tmp_path / "theirs")
         fcntl.flock(theirs, fcntl.LOCK_EX)
-        with store.catalog.still():
+        with store.catalog.pause_writers():
             pass
         (store.folder / "lock").unlink()
 
@@ -169,12 +169,12 @@ def test_whom_the_user_trusts_is_the_users_own_file(tmp_path, monkeypatch):
     trust.trust("0" * 32, "postgresql://me@here/a")
     trust.trust("1" * 32, "postgresql://me@here/b")
     trust.trust("1" * 32, "postgresql://me@here/b")
-    assert trust.trusted() == {"0" * 32: ("postgresql://me@here/a",), "1" * 32: ("postgresql://me@here/b",)}
+    assert trust.trusted_urls() == {"0" * 32: ("postgresql://me@here/a",), "1" * 32: ("postgresql://me@here/b",)}
     assert stat.S_IMODE(trust.config_file().stat().st_mode) == 0o600
     for text in ("[]", '{"catalogs": {"0": 5}}', '{"catalogs": {"0": [5]}}'):
         trust.config_file().write_text(text)
         with raises(StoreError, code="trust_file_unreadable"):
-            trust.trusted()
+            trust.trusted_urls()
 
 
 def test_a_map_that_was_restored_to_another_database_leaves_the_first_one_trusted(tmp_path, monkeypatch):
@@ -183,18 +183,18 @@ def test_a_map_that_was_restored_to_another_database_leaves_the_first_one_truste
     trust.config_file().write_text(json.dumps({"catalogs": {"0" * 32: "postgresql://me@here/a"}}))  # of an older gsmap
     trust.trust("0" * 32, "postgresql://me@here/b")
     for database, known in (("a", True), ("b", True), ("c", False)):
-        assert trust.is_trusted(trust.Remembered(f"postgresql://me@here/{database}", "0" * 32)) == known
-    assert not trust.is_trusted(trust.Remembered("postgresql://me@here/a", "1" * 32))
-    assert not trust.is_trusted(trust.Remembered("postgresql://me@here/a", None))
+        assert trust.is_trusted(trust.CatalogAddress(f"postgresql://me@here/{database}", "0" * 32)) == known
+    assert not trust.is_trusted(trust.CatalogAddress("postgresql://me@here/a", "1" * 32))
+    assert not trust.is_trusted(trust.CatalogAddress("postgresql://me@here/a", None))
 
 
 def test_where_a_remembered_catalog_lies(tmp_path):
     url = "postgresql+psycopg://me@/site?host=/run/pg&port=5433"
     trust.write(tmp_path, url, "0" * 32)
-    found = trust.remembered(tmp_path)
+    found = trust.read_address(tmp_path)
     assert (found.server, found.database, found.user) == ("/run/pg, port 5433", "site", "me")
     (tmp_path / "catalog.url").write_text("postgresql://a@good,evil/x?hostaddr=10.0.0.1\n")
-    assert trust.remembered(tmp_path).server == "good,evil, 10.0.0.1"
+    assert trust.read_address(tmp_path).server == "good,evil, 10.0.0.1"
 
 
 def test_only_postgresql_holds_a_catalog(tmp_path):

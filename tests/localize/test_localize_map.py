@@ -383,7 +383,7 @@ def test_the_index_of_views_is_made_once_and_grows_by_what_is_new(made, world, t
         (before,) = _segments(m.store)
         assert before.num_nodes > 100
         asked = []
-        put = m.store.indexes.put
+        put = m.store.indexes.save_segment
         monkeypatch.setattr(m.store.indexes, "put", lambda *a, **k: asked.append(a) or put(*a, **k))
         again = m.localize(folder / "photo.png", intrinsics=lens).results[0]
         assert np.array_equal(again.T_map_camera, report.results[0].T_map_camera)
@@ -450,7 +450,7 @@ def test_features_come_and_go_with_their_scene(made, world, tmp_path) -> None:
         (key,) = feature_keys(store, [scene], settings_of({})).values()
         held = store.view_features.load(scene.id, key)
         assert np.array_equal(held.points, world.placed.features.points) or held.num_features > 100
-        assert store.view_features.kept([key, "0" * 32]) == {key.digest}
+        assert store.view_features.stored_keys([key, "0" * 32]) == {key.digest}
         assert store.view_features.load(scene.id, "0" * 32) is None
         (archive,) = (store.arrays.root / "views").glob("*/*")
         os.chmod(archive, 0o644)
@@ -462,5 +462,5 @@ def test_features_come_and_go_with_their_scene(made, world, tmp_path) -> None:
     with gsmap.map.open(tmp_path / "c.gsmap") as m:
         assert not m.check().ok
         m.purge("room")
-        assert m.store.view_features.kept([key]) == set()
+        assert m.store.view_features.stored_keys([key]) == set()
         assert m.check().ok

@@ -26,7 +26,7 @@ def street(tmp_path: Path) -> Iterator[Filled]:
 
 def work(street: Filled) -> _RegistrationContext:
     store, settings = street.map.store, street.map.settings
-    scenes = store.scenes.brief()
+    scenes = store.scenes.summaries()
     return _RegistrationContext(store, scenes, graph_keys(store, scenes, settings), settings, lambda *_: None)
 
 

@@ -272,20 +272,20 @@ def test_observations_that_have_no_solution_are_refused_and_the_map_stays_usable
 
     with flights(tmp_path / "m.gsmap", site, [DRONE, DRONE], ["flight0", "flight1"]) as m:
         before = {row.scene: row.S_map_scene.matrix() for row in m.pose_rows()}
-        revision = m.store.revisions.current()
+        revision = m.store.revisions.newest_number()
         with monkeypatch.context() as patched:
             patched.setattr(System, "factor", fails)
             with raises(InputError, code="unsolvable_observations"):
                 m.georeference(Request(exif=tmp_path / "photos"))
         assert not m.store.world.survey()
-        assert m.store.revisions.current() == revision
+        assert m.store.revisions.newest_number() == revision
         assert not m.georeference().stale
         # What was solved is kept as it was solved, once.
         (tie,) = m.georeference(Request(exif=tmp_path / "photos")).components
         assert tie.problem == ""
-        assert m.store.revisions.current() == revision + 1
+        assert m.store.revisions.newest_number() == revision + 1
         m.georeference(Request(exif=tmp_path / "photos"))
-        assert m.store.revisions.current() == revision + 1
+        assert m.store.revisions.newest_number() == revision + 1
         # A map that has observations which cannot be solved any more has the poses of its edges, and says so.
         with monkeypatch.context() as patched:
             patched.setattr(System, "factor", fails)

@@ -82,10 +82,10 @@ def test_a_newcomer_alone_asks(made: Described, site: Path, read: Counter[str]) 
     with gsmap.map.open(site) as m:
         made.ingest(m, NAMES[3])
         read.clear()
-        before = {one: at[0] for one, at in m.store.indexes.asked().items()}
+        before = {one: at[0] for one, at in m.store.indexes.lookup_states().items()}
         rows = m.register("auto")
         assert len(rows) == 3
-        asked = m.store.indexes.asked()
+        asked = m.store.indexes.lookup_states()
         assert {one: asked[one][0] for one in before} == before
         assert len(asked) == 4
         (new,) = set(asked) - set(before)
@@ -145,7 +145,7 @@ def test_an_interrupted_run_goes_on_with_what_it_had_proposed(
             patch.setattr(stage, "run_jobs", killed)
             with pytest.raises(KeyboardInterrupt):
                 m.register("auto")
-        assert None in {left for _, left in m.store.indexes.asked().values()}
+        assert None in {left for _, left in m.store.indexes.lookup_states().values()}
         (why,) = [step for step in m.why(f"{NAMES[0]}:{NAMES[3]}").steps if step.name == "retrieval"]
         assert "the next gsmap update tries" in str(why.value)
         assert "the next gsmap update tries" in m.why(f"{NAMES[0]}:{NAMES[3]}").advice
@@ -161,7 +161,7 @@ def test_pairs_are_not_tried_where_the_map_is_rigid(made: Described, tmp_path: P
         # Each newcomer is tied by its first pair, and most of its list over the scene that it is tied to.
         tried = pairs(m)
         assert 3 <= len(tried) < 6
-        left = {m.store.scenes.get(one).name: count for one, (_, count) in m.store.indexes.asked().items()}
+        left = {m.store.scenes.get(one).name: count for one, (_, count) in m.store.indexes.lookup_states().items()}
         assert sum(count or 0 for count in left.values()) == 6 - len(tried)
         untried = next(f"{a}:{b}" for a in NAMES for b in NAMES if a < b and frozenset((a, b)) not in tried)
         (why,) = [step for step in m.why(untried).steps if step.name == "retrieval"]

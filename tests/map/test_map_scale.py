@@ -52,7 +52,7 @@ def note(street: Filled, name: str, num: int, work: Callable[[], object]) -> Non
 
 def is_new(m: Map, scene: str, pose: ScenePose) -> bool:
     """Whether the newest revision has put a scene anywhere else than the one before."""
-    last = m.store.revisions.current()
+    last = m.store.revisions.newest_number()
     assert last is not None
     before = m.store.revisions.get(last - 1)
     assert before is not None
@@ -133,14 +133,14 @@ def test_who_is_stopped_keeps_the_pairs_that_are_done(alone: Filled, monkeypatch
                 raise KeyboardInterrupt
             yield made
 
-    before = alone.map.store.registrations.newest()
+    before = alone.map.store.registrations.newest_number()
     pairs = [(alone.order[0], other) for other in alone.order[1:8]]
     # Undone in the order in which they were made: the other way round one would stay.
     stopping = mock.patch.object(register, "run_jobs", stops)
     with alone.standing_in(lookup=True), stopping, pytest.raises(KeyboardInterrupt) as stopped:
         alone.map.register(pairs)
     assert "3 of 7 pairs are registered and kept" in stopped.value.__notes__
-    assert alone.map.store.registrations.newest() == before + done
+    assert alone.map.store.registrations.newest_number() == before + done
     assert alone.map.store.leases.list() == []
 
 

@@ -71,17 +71,17 @@ def test_it_is_left_out_until_it_is_asked_for(site: Map, tmp_path: Path, monkeyp
     monkeypatch.setenv("GSMAP_TEST_HEAVY", "nobody")  # more memory
     site.describe()
     assert described(site) == {"light", "other"}
-    assert len(site.store.set_aside.list()) == 1
+    assert len(site.store.quarantine.list()) == 1
     site.describe("heavy")
     assert described(site) == {"heavy", "light", "other"}
-    assert site.store.set_aside.list() == []
+    assert site.store.quarantine.list() == []
 
 
 def test_asked_for_and_killed_again_it_stays_aside(site: Map) -> None:
     site.describe()
-    (before,) = site.store.set_aside.list()
+    (before,) = site.store.quarantine.list()
     site.describe("heavy")
-    (after,) = site.store.set_aside.list()
+    (after,) = site.store.quarantine.list()
     assert (after.what, after.about) == (before.what, before.about)
     assert after.created_at >= before.created_at
 
@@ -101,7 +101,7 @@ def test_the_exit_code_says_that_something_is_left(site: Map, capsys: pytest.Cap
 def test_a_scene_that_is_purged_takes_its_row_along(site: Map) -> None:
     site.describe()
     site.purge("heavy")
-    assert site.store.set_aside.list() == []
+    assert site.store.quarantine.list() == []
 
 
 def die(path: str, scene: str, *_: Any) -> SceneGraph:

@@ -10,7 +10,7 @@ import pytest
 from gsmap.errors import CorruptError
 from gsmap.optimize import optimize
 from gsmap.optimize.survey_common_points import CommonPoints
-from gsmap.store.ties import tie_value, ties_of
+from gsmap.store.world_ties import world_tie_to_json, world_ties_of_json
 from gsmap.types import Sim3
 from gsmap.types.world import CAUSES, Contradiction, Georeference, Survey, WorldFrame
 from gsmap_synthetic.surveyed import SiteParams, surveyed_site
@@ -204,15 +204,15 @@ def test_contradictions_are_kept_with_the_tie() -> None:
     )
     bars = Contradiction("bars", "points", "feet", (), "against", ratio=3.28, count=2)
     tie = Georeference(0, problem="x", problem_code="contradiction", contradictions=(one, bars))
-    value = tie_value(tie)
-    (again,) = ties_of([value])
+    value = world_tie_to_json(tie)
+    (again,) = world_ties_of_json([value])
     assert again.contradictions == (one, bars)
     assert again.problem_code == "contradiction"
     old = {k: v for k, v in value.items() if k not in ("problem_code", "contradictions")}
-    assert ties_of([old])[0].problem_code == "undetermined"
+    assert world_ties_of_json([old])[0].problem_code == "undetermined"
     assert set(CAUSES) >= {one.cause}
     with pytest.raises(CorruptError):
-        ties_of([value | {"contradictions": [{**value["contradictions"][0], "cause": "nobody"}]}])
+        world_ties_of_json([value | {"contradictions": [{**value["contradictions"][0], "cause": "nobody"}]}])
 
 
 def test_a_map_of_equal_captures_gives_the_same_answer_in_any_order() -> None:

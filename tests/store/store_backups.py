@@ -11,9 +11,9 @@ from test_store_nouns import graph_of, layer, registration, tile
 
 from gsmap.store import Store
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.repository import SNAPSHOTS, Backup, Snapshot, listed, object_name
-from gsmap.store.copying import one_state, tables
-from gsmap.store.places import Place
+from gsmap.store.backup.repository import SNAPSHOTS, Backup, Snapshot, format_file_list, object_name
+from gsmap.store.catalog_copy import snapshot_read, tables
+from gsmap.store.storage import Storage
 from gsmap.types import Prior, SceneGraph, Sim3
 
 PASSING = {"leases", "backups"}  # who is at work, and where it went: no part of what a map holds
@@ -37,7 +37,7 @@ def fill(store: Store, folder: Path) -> None:
 
 def holdings(path: Path) -> dict[str, Any]:
     """Everything that a map holds: the rows of its tables, and the digests of its files."""
-    with Store.open(path, "r") as store, one_state(store.catalog) as connection:
+    with Store.open(path, "r") as store, snapshot_read(store.catalog) as connection:
         rows = {
             table.name: [tuple(row) for row in connection.execute(select(table).order_by(*table.primary_key))]
             for table in tables()
@@ -53,7 +53,7 @@ def holdings(path: Path) -> dict[str, Any]:
     return {**rows, "files": files}
 
 
-def put(place: Place, content: bytes) -> str:
+def put(place: Storage, content: bytes) -> str:
     """Store bytes as an object; their digest."""
     sha256 = hashlib.sha256(content).hexdigest()
     place.put(object_name(sha256), [content], len(content))
@@ -61,12 +61,12 @@ def put(place: Place, content: bytes) -> str:
 
 
 def make_snapshot(
-    place: Place, map_id: str, content: dict[str, bytes], lines: bytes | None = None, /, **changed: Any
+    place: Storage, map_id: str, content: dict[str, bytes], lines: bytes | None = None, /, **changed: Any
 ) -> Snapshot:
     """A snapshot with these files, whatever they are; and with another list of files, or other fields, than is true."""
     Backup.at_or_new(place, map_id)
     stored = [StoredFile(path, len(data), put(place, data)) for path, data in content.items()]
-    text = listed(stored) if lines is None else lines
+    text = format_file_list(stored) if lines is None else lines
     fields: dict[str, Any] = {
         "name": "",
         "map_id": map_id,

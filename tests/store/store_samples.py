@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsmap.methods import RecipeKey
-from gsmap.store.objects import Computed, ObjectSet
+from gsmap.store.objects import ComputedObjects, ObjectSet
 from gsmap.types import Cameras, Change, ChangeReport, Gaussians, MapObject, ObjectObservation, Sim3
 from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 
@@ -44,7 +44,7 @@ def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newe
     identity = Sim3.identity()
     made = key("change", older, newer, version=version)
     poses = {"S_newer_older": S or identity, "S_frame_newer": S_frame_newer or identity}
-    return store.changes.save(report, made, older=older, newer=newer, counted=counted, **poses)
+    return store.changes.save(report, made, older=older, newer=newer, num_at_comparison=counted, **poses)
 
 
 JPEG = b"\xff\xd8\xff\xe0" + bytes(range(200))
@@ -75,7 +75,7 @@ def keep_objects(store, *places, seed="") -> list[str]:
     return [thing.id for thing in store.objects.save([computed(*places, seed=seed)])[0].objects]
 
 
-def computed(*places, seed="") -> Computed:
+def computed(*places, seed="") -> ComputedObjects:
     """Objects of a component that captures show in these boxes of their own frames."""
     boxes = [{scene: np.array(box, np.float64) for scene, box in one.items()} for one in places]
     scenes = list(dict.fromkeys(scene for one in boxes for scene in one))
@@ -98,4 +98,4 @@ def computed(*places, seed="") -> Computed:
     recipe = key("objects", *scenes, seed)
     known = dict.fromkeys(scenes, Sim3.identity())
     made = ObjectSet(recipe.digest, recipe.recipe, 1.0, known, dict.fromkeys(scenes, "0"), tuple(found))
-    return Computed(made, boxes, recipe)
+    return ComputedObjects(made, boxes, recipe)

@@ -12,11 +12,11 @@ from page_samples import PAGE, flip
 from raising import raises
 
 from gsmap.errors import CorruptError, StoreError
-from gsmap.store import Store, digests, sqlite
+from gsmap.store import Store, page_digests, sqlite
 
 
 def without_digests(path: Path) -> None:
-    digests.digests_of(path / sqlite.FILE).unlink()
+    page_digests.digests_path(path / sqlite.FILE).unlink()
 
 
 def test_what_cannot_be_verified_is_said(closed):
@@ -34,7 +34,7 @@ def test_what_cannot_be_verified_is_said(closed):
 def test_the_note_of_an_older_gsmap_counts_until_the_next_write(closed):
     file = closed / sqlite.FILE
     without_digests(closed)
-    note, stamp = digests.older_digest_of(file), file.stat()
+    note, stamp = page_digests.legacy_digest_path(file), file.stat()
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
     note.write_text(json.dumps({"sha256": sha256, "size_bytes": stamp.st_size, "mtime_ns": stamp.st_mtime_ns}))
     Store.open(closed, "r").close()
@@ -47,7 +47,7 @@ def test_the_note_of_an_older_gsmap_counts_until_the_next_write(closed):
         assert note.exists()
         store.scenes.edit("monday", note="a write")
     assert not note.exists()
-    assert digests.load(file) is not None
+    assert page_digests.load(file) is not None
 
 
 def test_damage_is_not_taken_for_what_was_written_where_there_are_no_digests(closed):
@@ -60,7 +60,7 @@ def test_damage_is_not_taken_for_what_was_written_where_there_are_no_digests(clo
         opened.write(b"\xff" * PAGE * 3)
     with pytest.raises(CorruptError):
         store.close()
-    assert not digests.digests_of(file).exists()
+    assert not page_digests.digests_path(file).exists()
 
 
 def test_a_person_accepts_the_catalog(closed):
@@ -78,13 +78,13 @@ def test_a_person_accepts_the_catalog(closed):
 
 
 def test_what_sqlite_finds_broken_cannot_be_accepted(closed):
-    noted = digests.load(closed / sqlite.FILE)
+    noted = page_digests.load(closed / sqlite.FILE)
     with open(closed / sqlite.FILE, "rb+") as opened:
         opened.seek(4 * PAGE)
         opened.write(b"\xff" * PAGE * 8)
     with pytest.raises(StoreError):
         Store.accept_catalog(closed)
-    assert digests.load(closed / sqlite.FILE) == noted
+    assert page_digests.load(closed / sqlite.FILE) == noted
 
 
 def test_a_backup_that_was_put_back_is_known(closed):

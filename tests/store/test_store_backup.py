@@ -21,16 +21,16 @@ from gsmap.errors import ConfigError, CorruptError, DiskFullError, NotFoundError
 from gsmap.store import Store
 from gsmap.store.backup import Backup, restore, save
 from gsmap.store.backup import saving as saving_module
+from gsmap.store.backup.backup_lease import EXPIRES_S, SAVE, SWEEP, BackupLease
 from gsmap.store.backup.repository import object_name
 from gsmap.store.backup.saving import sweep
-from gsmap.store.backup.sharing import EXPIRES_S, SAVE, SWEEP, Lease
 from gsmap.store.catalog import Catalog
-from gsmap.store.places import FolderPlace, place_of
+from gsmap.store.storage import FolderStorage, open_storage
 
 
 @pytest.fixture
 def place(tmp_path):
-    return FolderPlace(tmp_path / "backup")
+    return FolderStorage(tmp_path / "backup")
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def test_a_damaged_catalog_is_not_backed_up(tmp_path, place):
     assert Backup.at(place).names() == []
 
 
-class Meddling(FolderPlace):
+class Meddling(FolderStorage):
     """A place at which something happens before an object is put."""
 
     def __init__(self, root, before):
@@ -146,7 +146,7 @@ class Meddling(FolderPlace):
 
 
 def test_scenes_that_are_pruned_meanwhile(filled, tmp_path, monkeypatch):
-    whole, tries = saving_module.capture, []
+    whole, tries = saving_module.capture_state, []
 
     def capture(store, folder, **options):
         state = whole(store, folder, **options)
@@ -156,11 +156,11 @@ def test_scenes_that_are_pruned_meanwhile(filled, tmp_path, monkeypatch):
         tries.append(state)
         return state
 
-    monkeypatch.setattr(saving_module, "capture", capture)
-    made = save(filled, place_of(tmp_path / "backup"))
+    monkeypatch.setattr(saving_module, "capture_state", capture)
+    made = save(filled, open_storage(tmp_path / "backup"))
     assert len(tries) == 2
     assert made.snapshot.counts["scenes"] == 1
-    restore(place_of(tmp_path / "backup"), tmp_path / "r")
+    restore(open_storage(tmp_path / "backup"), tmp_path / "r")
     with Store.open(tmp_path / "r") as store:
         assert [scene.name for scene in store.scenes.list()] == ["a"]
         assert store.check().ok
@@ -169,7 +169,7 @@ def test_scenes_that_are_pruned_meanwhile(filled, tmp_path, monkeypatch):
 def test_scenes_that_are_pruned_all_the_time(filled, tmp_path, monkeypatch):
     """Whatever is listed is gone before it is read: the last try holds the writers back."""
     tries, threads = [], []
-    whole, send = saving_module.capture, saving_module._Run._send
+    whole, send = saving_module.capture_state, saving_module._BackupRun._send
 
     def capture(store, folder, **options):
         state = whole(store, folder, **options)
@@ -190,12 +190,12 @@ def test_scenes_that_are_pruned_all_the_time(filled, tmp_path, monkeypatch):
         send(*arguments)
 
     filled.scenes.add(make_gaussians(50, seed=10), make_cameras(), name="n0")
-    monkeypatch.setattr(saving_module, "capture", capture)
-    monkeypatch.setattr(saving_module._Run, "_send", send_after_change)
-    save(filled, place_of(tmp_path / "backup"))
+    monkeypatch.setattr(saving_module, "capture_state", capture)
+    monkeypatch.setattr(saving_module._BackupRun, "_send", send_after_change)
+    save(filled, open_storage(tmp_path / "backup"))
     threads[-1].join()
     assert len(tries) == saving_module._TRIES + 1
-    restore(place_of(tmp_path / "backup"), tmp_path / "r")
+    restore(open_storage(tmp_path / "backup"), tmp_path / "r")
     assert Store.open(tmp_path / "r").check().ok
 
 
@@ -217,14 +217,16 @@ def test_the_last_try_waits_for_a_writer_who_waits_for_the_arrays(filled, tmp_pa
         except Exception as error:
             errors.append(error)
 
-    look = Catalog._look
+    look = Catalog._compare_pages
     monkeypatch.setattr(saving_module, "_TRIES", 0)
-    monkeypatch.setattr(Catalog, "_look", lambda c, *args: ["changing"] if is_locked(c.folder) else look(c, *args))
+    monkeypatch.setattr(
+        Catalog, "_compare_pages", lambda c, *args: ["changing"] if is_locked(c.folder) else look(c, *args)
+    )
     thread = threading.Thread(target=write)
     thread.start()
     assert begun.wait(5.0)
     began = time.monotonic()
-    save(filled, place_of(tmp_path / "backup"))
+    save(filled, open_storage(tmp_path / "backup"))
     thread.join()
     assert errors == []
     assert time.monotonic() - began < 4.0
@@ -241,7 +243,7 @@ def is_locked(folder):
 
 
 def test_what_is_listed_is_not_asked_for_again(filled, tmp_path):
-    class Counting(FolderPlace):
+    class Counting(FolderStorage):
         asked = 0
         lagging = False
 
@@ -273,7 +275,7 @@ def test_a_backup_that_is_interrupted_goes_on(filled, tmp_path):
 
     with pytest.raises(Stop):
         save(filled, Meddling(tmp_path / "backup", stop))
-    place = place_of(tmp_path / "backup")
+    place = open_storage(tmp_path / "backup")
     with raises(NotFoundError, code="snapshot_not_found"):
         restore(place, tmp_path / "r")
     sent = len(objects(place))
@@ -371,7 +373,7 @@ def test_keep_deletes_nothing_when_a_snapshot_cannot_be_read(filled, place):
 
 def test_nothing_is_deleted_while_another_saves(filled, place):
     save(filled, place)
-    with Lease(place, SAVE) as other:
+    with BackupLease(place, SAVE) as other:
         before = objects(place)
         made = save(filled, place, keep=1)
         assert made.deleted == ()
@@ -385,7 +387,7 @@ def test_nothing_is_deleted_while_another_saves(filled, place):
 def test_a_backup_waits_for_who_deletes(filled, place):
     save(filled, place)
     done = []
-    with Lease(place, SWEEP):
+    with BackupLease(place, SWEEP):
         thread = threading.Thread(target=lambda: done.append(save(filled, place)))
         thread.start()
         thread.join(0.5)
@@ -403,7 +405,7 @@ def test_one_whose_lease_was_taken_away_stops(filled, place):
 
     meddling = Meddling(place.root, take)
     save(filled, meddling)  # it is renewed; only who deletes must be sure of it
-    with Lease(place, SWEEP) as lease:
+    with BackupLease(place, SWEEP) as lease:
         (place.root / lease.name).unlink()
         with raises(StoreError, code="lease_lost"):
             lease.others()
@@ -423,7 +425,7 @@ def test_who_died_on_this_machine_is_not_waited_for(place, task):
         name = f"leases/{task}-{len(leases):032x}.json"
         place.put(name, [told.encode()], len(told))
         leases[name] = told
-    with Lease(place, SAVE) as lease:
+    with BackupLease(place, SAVE) as lease:
         assert sorted(lease.others()) == sorted(leases)[1:]
     assert {f"leases/{path.name}" for path in (place.root / "leases").iterdir()} == set(sorted(leases)[1:])
 
@@ -453,18 +455,18 @@ def test_two_backups_at_once(filled, place, tmp_path):
 def test_places_that_are_refused(filled, place, tmp_path):
     for target in ("ftp://host/x", "s3://key:secret@bucket/x", "s3:///x", "file://host/x", "s3://bucket/x?secret=1"):
         with pytest.raises(ConfigError) as caught:
-            place_of(target)
+            open_storage(target)
         assert "secret" not in str(caught.value)
-    assert place_of(f"file://{tmp_path}/a%20b").root == tmp_path / "a b"
+    assert open_storage(f"file://{tmp_path}/a%20b").root == tmp_path / "a b"
     with raises(ConfigError, code="place_inside_map"):
-        save(filled, FolderPlace(filled.catalog.folder / "backup"))
+        save(filled, FolderStorage(filled.catalog.folder / "backup"))
     with raises(StoreError, code="folder_not_empty"):
-        save(filled, FolderPlace(tmp_path))
+        save(filled, FolderStorage(tmp_path))
     save(filled, place)
     with Store.create(tmp_path / "other") as other, raises(StoreError, code="backup_of_another_map"):
         save(other, place)
     with raises(NotFoundError, code="not_a_backup"):
-        restore(FolderPlace(tmp_path / "nowhere"), tmp_path / "r")
+        restore(FolderStorage(tmp_path / "nowhere"), tmp_path / "r")
 
 
 def test_a_map_that_cannot_be_written_is_backed_up(filled, place, tmp_path):
@@ -507,14 +509,14 @@ def test_a_full_disk(filled, tmp_path):
         pytest.skip("needs the right to mount a small file system")
     try:
         with raises(DiskFullError, code="disk_full"):
-            save(filled, FolderPlace(disk / "backup"))
+            save(filled, FolderStorage(disk / "backup"))
         assert not list((disk / "backup" / "snapshots").glob("*"))
         subprocess.run(["mount", "-o", "remount,size=20m", disk], check=True)
-        save(filled, FolderPlace(disk / "backup"))
+        save(filled, FolderStorage(disk / "backup"))
         used = sum(p.stat().st_blocks for p in disk.rglob("*")) // 2
         subprocess.run(["mount", "-o", f"remount,size={used + 60}k", disk], check=True)
         with raises(DiskFullError, code="disk_full"):
-            restore(FolderPlace(disk / "backup"), disk / "r")
+            restore(FolderStorage(disk / "backup"), disk / "r")
         assert sorted(p.name for p in disk.iterdir()) == ["backup"]
     finally:
         subprocess.run(["umount", disk], check=True)
@@ -531,7 +533,7 @@ def test_a_lease_that_a_sweeper_takes_for_a_leftover_is_written_again(place, mon
             place.drop_leftovers()
         replace(staged, target)
 
-    monkeypatch.setattr("gsmap.store.places.os.replace", swept_first)
+    monkeypatch.setattr("gsmap.store.storage.os.replace", swept_first)
     place.put("leases/save-1.json", [b"{}"], 2)
     assert b"".join(place.get("leases/save-1.json")) == b"{}"
     assert swept

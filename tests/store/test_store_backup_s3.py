@@ -9,10 +9,10 @@ from store_samples import make_cameras, make_gaussians
 from store_swift import BUCKET, ENVIRONMENT, Wire
 
 from gsmap.errors import CorruptError, MissingDependencyError, NotFoundError, StoreError
-from gsmap.store import places as places_module
+from gsmap.store import storage as places_module
 from gsmap.store.backup import Backup, restore, save
 from gsmap.store.backup.repository import object_name
-from gsmap.store.places import place_of
+from gsmap.store.storage import open_storage
 
 _numbers = itertools.count()
 
@@ -21,7 +21,7 @@ _numbers = itertools.count()
 def place(server, monkeypatch):
     for name, value in {**ENVIRONMENT, "AWS_ENDPOINT_URL": server.url}.items():
         monkeypatch.setenv(name, value)
-    return place_of(f"s3://{BUCKET}/maps/site {next(_numbers)}")
+    return open_storage(f"s3://{BUCKET}/maps/site {next(_numbers)}")
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_a_restored_map_holds_what_was_saved(filled, place, tmp_path):
     again = save(filled, place)
     assert again.num_files_new == 2  # the catalog and the list of files
     with raises(NotFoundError, code="not_a_backup"):
-        restore(place_of(f"{place.url}x"), tmp_path / "r2")
+        restore(open_storage(f"{place.url}x"), tmp_path / "r2")
 
 
 def test_verify_and_keep(filled, place, tmp_path):
@@ -82,10 +82,10 @@ def test_large_objects_go_in_parts_and_appear_whole(filled, place, tmp_path, mon
 def test_answers_that_are_lost_are_no_errors(server, filled, place, tmp_path, monkeypatch):
     wire = Wire(server.url, every=4)
     monkeypatch.setenv("AWS_ENDPOINT_URL", wire.url)
-    save(filled, place_of(place.url))
+    save(filled, open_storage(place.url))
     filled.scenes.add(make_gaussians(seed=5), make_cameras(), name="c")
-    save(filled, place_of(place.url), verify=True, keep=1)
-    restore(place_of(place.url), tmp_path / "r")
+    save(filled, open_storage(place.url), verify=True, keep=1)
+    restore(open_storage(place.url), tmp_path / "r")
     assert wire.lost > 10
     wire.close()
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
@@ -123,12 +123,12 @@ def _refuse(*arguments, **options):
 
 def test_what_cannot_be_reached_is_said_in_one_line(filled, place, monkeypatch, tmp_path):
     with pytest.raises(StoreError) as caught:
-        save(filled, place_of("s3://nobody/x"))
+        save(filled, open_storage("s3://nobody/x"))
     assert "\n" not in str(caught.value)
     assert "s3://nobody/x" in str(caught.value)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "a-wrong-secret")
     with raises(StoreError, code="place_refused") as caught:
-        save(filled, place_of(place.url))
+        save(filled, open_storage(place.url))
     assert "a-wrong-secret" not in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -136,4 +136,4 @@ def test_what_cannot_be_reached_is_said_in_one_line(filled, place, monkeypatch, 
 def test_without_the_package(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "obstore", None)
     with raises(MissingDependencyError, code="missing_dependency"):
-        place_of("s3://bucket/x")
+        open_storage("s3://bucket/x")

@@ -53,7 +53,7 @@ def test_a_branch_changes_nothing_of_the_map_and_copies_no_array(store):
         branch.scenes.remove(first)
         assert branch.check().ok
     assert [s.name for s in store.scenes.list()] == ["scene0"]
-    assert store.revisions.current() == 1
+    assert store.revisions.newest_number() == 1
     assert (store.home / "arrays" / "scenes" / second).is_dir()  # new arrays are shared, too
     assert store.check().ok
     assert not store.check().orphans
@@ -249,9 +249,9 @@ def test_the_same_content_in_two_branches_is_one_group(store, monkeypatch):
     scene = add(store, 0)
     place = store.home / "arrays" / "scenes" / scene
     inode = place.stat().st_ino
-    from gsmap.store import packed
+    from gsmap.store import array_archive
 
-    monkeypatch.setattr(packed, "_ZSTD_LEVEL", 9)  # another version would write other bytes
+    monkeypatch.setattr(array_archive, "_ZSTD_LEVEL", 9)  # another version would write other bytes
     with Store.open(at(store, "b")) as branch:
         assert add(branch, 0) == scene
         assert place.stat().st_ino == inode
@@ -269,16 +269,16 @@ def test_nothing_is_reclaimed_between_a_rename_and_its_commit(store, monkeypatch
     """A branch that has put a group in its place, and not yet committed, against a prune of the map."""
     store.branches.make("b")
     published, pruned = threading.Event(), threading.Event()
-    from gsmap.store import groups
+    from gsmap.store import array_groups
 
-    name = groups.name
+    name = array_groups.name
 
     def slow(*arguments):
         published.set()
         pruned.wait(1.0)  # longer than a prune takes
         name(*arguments)
 
-    monkeypatch.setattr(groups, "name", slow)
+    monkeypatch.setattr(array_groups, "name", slow)
 
     def ingest():
         with Store.open(at(store, "b")) as branch:

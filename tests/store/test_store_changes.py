@@ -11,8 +11,8 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store
 from gsmap.store.backup import clone, restore, save
 from gsmap.store.merging import merge, split
-from gsmap.store.places import FolderPlace
-from gsmap.store.superseding import inherit
+from gsmap.store.scene_replacement import inherit
+from gsmap.store.storage import FolderStorage
 from gsmap.types import ChangeReport, PoseGraph, SceneGraph, ScenePose, Sim3
 
 CHAIR = np.array([[0.0, 0, 0], [1, 1, 1]])
@@ -219,8 +219,8 @@ def test_backup_restore_and_clone_bring_them(store, ids, tmp_path):
     save_comparison(store, *ids, made_change(CHAIR))
     kept = save_comparison(store, *ids, made_change(CHAIR), version=2)
     store.changes.review(1, "confirm", "seen")
-    save(store, FolderPlace(tmp_path / "backup"))
-    restore(FolderPlace(tmp_path / "backup"), tmp_path / "back.gsmap")
+    save(store, FolderStorage(tmp_path / "backup"))
+    restore(FolderStorage(tmp_path / "backup"), tmp_path / "back.gsmap")
     clone(store, tmp_path / "clone.gsmap")
     for path in (tmp_path / "back.gsmap", tmp_path / "clone.gsmap"):
         with Store.open(path) as copy:

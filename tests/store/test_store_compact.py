@@ -27,7 +27,7 @@ def sorted_gaussians(n=500, degree=1, seed=0) -> Gaussians:
 @pytest.mark.parametrize("n", [1, 700, CHUNK_ROWS + 9])
 def test_compact_gaussians_differ_by_less_than_a_step(n, degree):
     g = sorted_gaussians(n, degree)
-    back = compact.rounded(g)
+    back = compact.round_trip(g)
     assert back.sh.shape == g.sh.shape
     assert np.abs(back.means - g.means).max() <= 10 / 65535
     turn = np.einsum("nij,nkj->nik", quats_to_matrices(back.quats), quats_to_matrices(g.quats))
@@ -45,7 +45,7 @@ def test_compact_gaussians_differ_by_less_than_a_step(n, degree):
 def test_values_that_are_all_equal_and_extreme_opacities_come_back():
     g = sorted_gaussians(20)
     same = Gaussians(np.tile(g.means[:1], (20, 1)), g.quats, g.log_scales[:1].repeat(20, 0), np.full(20, 40.0), g.sh)
-    back = compact.rounded(same)
+    back = compact.round_trip(same)
     np.testing.assert_allclose(back.means, same.means, atol=1e-6)
     np.testing.assert_allclose(back.log_scales, same.log_scales, atol=1e-6)
     assert np.isfinite(back.logit_opacities).all()

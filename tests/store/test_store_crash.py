@@ -50,8 +50,8 @@ def kill_at_random(tmp_path, start, kills: int, seed: int) -> None:
             else:
                 assert found == alive
             alive = found
-            assert revisions <= (store.revisions.current() or 0) <= revisions + 1
-            revisions = store.revisions.current() or 0
+            assert revisions <= (store.revisions.newest_number() or 0) <= revisions + 1
+            revisions = store.revisions.newest_number() or 0
             for scene in random.Random(kill).sample(sorted(found), min(2, len(found))):
                 assert len(store.scenes.gaussians(scene)) == 300
             if kill % 10 == 9:

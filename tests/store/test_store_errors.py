@@ -19,9 +19,8 @@ from gsmap.errors import (
     StoreError,
     of_system,
 )
-from gsmap.store import Store, sqlite
-from gsmap.store import explained as explaining
-from gsmap.store.explained import NOT_KEPT, UNCERTAIN, explained
+from gsmap.store import Store, error_translation, sqlite
+from gsmap.store.error_translation import NOT_KEPT, UNCERTAIN, translate_errors
 
 ERRORS = {
     "SQLITE_BUSY": BusyError,
@@ -82,7 +81,7 @@ CODES = {
 
 
 def said(raised: BaseException, folder, state="", **more) -> StoreError:
-    with pytest.raises(StoreError) as caught, explained(folder, state, **more):
+    with pytest.raises(StoreError) as caught, translate_errors(folder, state, **more):
         raise raised
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(f"{folder}: ")
@@ -113,7 +112,7 @@ def test_codes_of_sqlite(store, name, wrapped):
     "name", ["SQLITE_CANTOPEN", "SQLITE_IOERR_SHMSIZE", "SQLITE_IOERR_WRITE", "SQLITE_READONLY_CANTINIT"]
 )
 def test_a_full_disk_is_known_whatever_sqlite_calls_it(store, monkeypatch, name):
-    monkeypatch.setattr(explaining, "is_full", lambda folder: True)
+    monkeypatch.setattr(error_translation, "is_full", lambda folder: True)
     found = said(sqlite_error(name), store.folder)
     assert type(found) is DiskFullError
     assert "prune" in str(found)
@@ -137,16 +136,16 @@ def test_codes_of_the_system(tmp_path, code):
     assert type(found) is CODES[code] is of_system(OSError(code, ""))
     assert os.strerror(code) in str(found)
     assert NOT_KEPT in str(found)
-    with raises(StoreError, code=found.code, match=r"^/some/file: "), explained(tmp_path):
+    with raises(StoreError, code=found.code, match=r"^/some/file: "), translate_errors(tmp_path):
         raise OSError(code, os.strerror(code), "/some/file")
 
 
 def test_our_own_errors_pass(tmp_path):
     ours = InputError("a name with a line break", code="invalid_name")
     for error in (ours, StatementError("", "SELECT 1", {}, ours)):
-        with raises(InputError, code="invalid_name"), explained(tmp_path):
+        with raises(InputError, code="invalid_name"), translate_errors(tmp_path):
             raise error
-    with pytest.raises(ZeroDivisionError), explained(tmp_path):
+    with pytest.raises(ZeroDivisionError), translate_errors(tmp_path):
         raise ZeroDivisionError
 
 

@@ -156,11 +156,11 @@ def test_what_was_lost_is_not_taken_back(store: Store) -> None:
 
 
 def test_several_attend_and_each_sees_the_others(store: Store) -> None:
-    with Store.open(store.folder) as second, store.leases.attend("update") as before:
-        with second.leases.attend("describe") as others:
+    with Store.open(store.folder) as second, store.leases.announce("update") as before:
+        with second.leases.announce("describe") as others:
             assert before == []
             assert [(other.what, other.task, other.pid) for other in others] == [("map", "update", os.getpid())]
-            with second.leases.attend("register") as again:  # within what it does already
+            with second.leases.announce("register") as again:  # within what it does already
                 assert len(again) == 1
             assert len(store.leases.list()) == 2
             assert second.leases.try_hold("graph k", "jobs")  # is part of what it does
@@ -171,9 +171,9 @@ def test_several_attend_and_each_sees_the_others(store: Store) -> None:
 
 
 def test_a_map_opened_for_reading_is_told_nothing(store: Store) -> None:
-    with Store.open(store.folder, "r") as reader, store.leases.attend("update"):
+    with Store.open(store.folder, "r") as reader, store.leases.announce("update"):
         before = rows(store)
-        with reader.leases.attend("status") as others:
+        with reader.leases.announce("status") as others:
             assert [lease.task for lease in others] == ["update"]
             assert rows(store) == before
 
@@ -185,17 +185,17 @@ def test_what_cannot_be_told_is_no_error(store: Store, monkeypatch: pytest.Monke
         raise StoreError("the disk is full")
 
     monkeypatch.setattr(store.catalog, "write", full)
-    with store.leases.attend("export") as others:
+    with store.leases.announce("export") as others:
         assert others == []
 
 
 def test_no_more_are_taken_than_asked_for_and_none_that_is_done(store: Store) -> None:
     assert store.leases.try_hold("c", "update")
     with Store.open(store.folder) as second:
-        taken = second.leases.take("abcdef", "update", limit=2, done=lambda whats: set(whats) & {"a", "d"})
+        taken = second.leases.acquire("abcdef", "update", limit=2, done=lambda whats: set(whats) & {"a", "d"})
         assert taken.ours == ("b", "e")
         assert taken.done == {"a", "d"}
-        taken = second.leases.take("abcdef", "update", limit=2, give_back=["b"])
+        taken = second.leases.acquire("abcdef", "update", limit=2, give_back=["b"])
         assert taken.ours == ("a", "b")
         assert set(rows(store)) == {"a", "b", "c", "e"}
 
@@ -209,7 +209,7 @@ def compete(openers: Sequence[Callable[[], Store]]) -> None:
         with opener() as mine:
             everyone.wait()
             for _ in range(4):
-                won.extend(mine.leases.take([str(i) for i in range(12)], "update", limit=3).ours)
+                won.extend(mine.leases.acquire([str(i) for i in range(12)], "update", limit=3).ours)
             everyone.wait()  # all hold what they have while others ask
 
     threads = [threading.Thread(target=take, args=(opener,)) for opener in openers]
@@ -237,9 +237,9 @@ def test_on_postgres_the_server_s_clock_counts(
             return datetime.now(tz) + timedelta(days=1)
 
     with Store.create(tmp_path / "m", catalog_url=postgres_database) as first, Store.open(tmp_path / "m") as second:
-        assert first.leases.take(["x", "y"], "update").ours == ("x", "y")
+        assert first.leases.acquire(["x", "y"], "update").ours == ("x", "y")
         monkeypatch.setattr("gsmap.store.leases.datetime", Wrong)  # this machine's clock is a day ahead
-        assert second.leases.take(["x", "z"], "update").ours == ("z",)
+        assert second.leases.acquire(["x", "z"], "update").ours == ("z",)
         assert {lease.what for lease in second.leases.others()} == {"x", "y"}
         first.leases.release(["x"])
         assert second.leases.try_hold("x", "update")

@@ -12,7 +12,7 @@ from store_samples import key, make_cameras, make_gaussians
 from gsmap.errors import ConfigError, CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store
-from gsmap.store.merging import bring_scene, merge, split
+from gsmap.store.merging import import_scene, merge, split
 from gsmap.types import EdgeOutcome, PoseGraph, Prior, Registration, SceneGraph, ScenePose, Sim3
 
 
@@ -431,7 +431,7 @@ def test_a_scene_comes_from_another_map(store, other):
     other.scenes.edit(a, note="wet")
     store.scenes.remove(a)
     store.prune()
-    brought = bring_scene(store, other, a)
+    brought = import_scene(store, other, a)
     assert [s.id for s in store.scenes.list(removed=True)] == []
     assert {s.id for s in store.scenes.list()} == {a, b}
     assert brought.graphs == 1
@@ -465,17 +465,17 @@ def test_damaged_arrays_come_from_another_map(store, other, removed):
     assert not store.check().ok
     damage(other, "scenes", a)
     with raises(CorruptError, code="bytes_differ"):
-        bring_scene(store, other, a)
+        import_scene(store, other, a)
     assert (store.scenes.removed_at(a) is not None) == removed
     shutil.rmtree(other.home / "arrays" / "scenes" / a)
     other.scenes.add(make_gaussians(60, seed=1), make_cameras(), name="scene1")
-    brought = bring_scene(store, other, a)
+    brought = import_scene(store, other, a)
     assert brought.num_bytes > 0
     assert store.check().ok
     assert bytes_of(store.home / "arrays") == before
     assert [s.id for s in store.scenes.list()] == [a]
     assert [dump(store)[table] for table in ("files", "groups", "graphs")] == rows
-    assert bring_scene(store, other, a).num_bytes == 0
+    assert import_scene(store, other, a).num_bytes == 0
     assert len(store.scenes.gaussians(a)) == 60
 
 
@@ -484,7 +484,7 @@ def test_damaged_arrays_cannot_come_from_a_branch_of_the_same_map(store):
     store.branches.make("b")
     damage(store, "scenes", a)
     with Store.open(f"{store.home}@b", "r") as branch, raises(CorruptError, code="arrays_corrupt"):
-        bring_scene(store, branch, a)
+        import_scene(store, branch, a)
 
 
 def test_what_was_said_last_of_a_scene_counts_after_a_merge_though_a_clock_was_ahead(store, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ from raising import raises
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import SchemaVersionError
-from gsmap.store import Store, branches, digests, migrate, schema, sqlite
+from gsmap.store import Store, branches, migrate, page_digests, schema, sqlite
 from gsmap.store.catalog import Catalog
 
 
@@ -59,7 +59,7 @@ def test_every_step_up_and_down_with_data(tmp_path):
         migrate.upgrade(catalog, number)
         assert migrate.version(catalog.engine, catalog.folder) == number
     first = ddl(catalog)
-    with Store(branches.Place(catalog.folder, catalog.folder), catalog) as store:
+    with Store(branches.MapLocation(catalog.folder, catalog.folder), catalog) as store:
         store.scenes.add(make_gaussians(), make_cameras(), name="a")
         for number in [*numbers[-2::-1], "base"]:
             migrate.upgrade(catalog, number)
@@ -100,7 +100,7 @@ def test_a_newer_map_is_left_alone(tmp_path):
     connection.execute("UPDATE alembic_version SET version_num = '9999'")
     connection.commit()
     connection.close()
-    digests.note(tmp_path / "m" / "map.sqlite")
+    page_digests.write_digests(tmp_path / "m" / "map.sqlite")
     before = (tmp_path / "m" / "map.sqlite").read_bytes()
     with raises(SchemaVersionError, code="map_too_new"):
         Store.migrate(tmp_path / "m")

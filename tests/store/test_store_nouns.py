@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, StoreError
-from gsmap.store import MANUAL, Pruned, Store
+from gsmap.store import MANUAL, PruneResult, Store
 from gsmap.types import (
     EdgeOutcome,
     NodeLayer,
@@ -212,15 +212,15 @@ def test_history_and_current(store, two_scenes):
     a, b = (s.id for s in two_scenes)
     k1, k2 = key("register", "1"), key("register", "2")
     assert store.registrations.get(a, b) is None
-    assert store.registrations.find(k1) is None
-    assert store.registrations.find("") is None
+    assert store.registrations.newest_with_key(k1) is None
+    assert store.registrations.newest_with_key("") is None
     store.registrations.save(registration(a, b, num_inliers=1), k1)
     store.registrations.save(registration(b, a, num_inliers=2), k2)  # the other direction is the same pair
     assert [r.registration.num_inliers for r in store.registrations.history(a, b)] == [1, 2]
     assert [r.registration.num_inliers for r in store.registrations.current()] == [2]
     assert store.registrations.get(a, b).registration.target == b
-    assert store.registrations.find(k1).registration.num_inliers == 1
-    assert store.registrations.find(k1.digest).number == 1
+    assert store.registrations.newest_with_key(k1).registration.num_inliers == 1
+    assert store.registrations.newest_with_key(k1.digest).number == 1
     store.scenes.remove("scene0")
     assert store.registrations.current() == []
     with raises(InputError, code="same_scene"):
@@ -234,7 +234,7 @@ def test_going_back_to_older_settings_makes_the_older_result_current(store, two_
     k1, k2 = key("register", gate=1), key("register", gate=2)
     first = store.registrations.save(registration(a, b, num_inliers=1), k1)
     store.registrations.save(registration(b, a, num_inliers=2), k2)
-    adopted = store.registrations.adopt(store.registrations.find(k1).number)
+    adopted = store.registrations.adopt(store.registrations.newest_with_key(k1).number)
     assert (adopted.adopts, adopted.key, adopted.recipe) == (first.number, k1.digest, k1.recipe)
     assert_pose(adopted.registration.S_target_source, first.registration.S_target_source)
     assert adopted.registration.evidence == first.registration.evidence
@@ -242,8 +242,8 @@ def test_going_back_to_older_settings_makes_the_older_result_current(store, two_
     assert [r.number for r in store.registrations.current()] == [adopted.number]
     for number in (first.number, adopted.number):  # it is the newest already
         assert store.registrations.adopt(number).number == adopted.number
-    again = store.registrations.adopt(store.registrations.find(k2).number)
-    third = store.registrations.adopt(store.registrations.find(k1).number)  # which is an adopted row itself
+    again = store.registrations.adopt(store.registrations.newest_with_key(k2).number)
+    third = store.registrations.adopt(store.registrations.newest_with_key(k1).number)  # which is an adopted row itself
     assert (again.adopts, third.adopts) == (2, first.number)
     assert [r.number for r in store.registrations.history(a, b)] == [1, 2, 3, 4, 5]
     with raises(NotFoundError, code="registration_not_found"):
@@ -363,7 +363,7 @@ def graph_of(scenes, shift: float = 0.0) -> PoseGraph:
 
 
 def test_revisions(store, two_scenes):
-    assert store.revisions.current() is None
+    assert store.revisions.newest_number() is None
     assert store.revisions.get() is None
     made = key("optimize", "all edges", gate=0.999)
     assert store.revisions.save(graph_of(two_scenes)) == 1
@@ -504,13 +504,13 @@ def test_several_changes_in_one_transaction(store, two_scenes):
         with store.transaction():
             store.registrations.save(registration(a, b), key("register"))
             store.revisions.save(graph_of(two_scenes))
-            assert store.revisions.current() == 1  # seen from inside
+            assert store.revisions.newest_number() == 1  # seen from inside
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
         change()
     assert store.registrations.current() == []
-    assert store.revisions.current() is None
+    assert store.revisions.newest_number() is None
 
 
 # -- prune
@@ -569,5 +569,5 @@ def test_a_dry_run_counts_everything_and_changes_nothing(store, two_scenes, tmp_
     assert (would.scenes, would.num_orphans, would.num_models) == (("scene1",), 1, 1)
     assert would.num_bytes > 11_000
     assert store.prune() == replace(would, dry_run=False)
-    assert store.prune(dry_run=True) == Pruned(dry_run=True)
+    assert store.prune(dry_run=True) == PruneResult(dry_run=True)
     assert store.check().ok

@@ -7,7 +7,7 @@ from sqlalchemy import func, insert, select, update
 from store_samples import computed, keep_objects, make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
-from gsmap.store import Store, merging, purging, schema, superseding
+from gsmap.store import Store, merging, purging, scene_replacement, schema
 
 A, B, FAR = [[0, 0, 0], [1, 1, 1]], [[4, 0, 0], [5, 1, 1]], [[9, 9, 0], [10, 10, 1]]
 
@@ -39,14 +39,14 @@ def test_numbers_stay_and_new_things_get_new_ones(store, scenes):
     nearly = np.array(B) + 0.1
     assert keep_objects(store, {may: FAR}, {may: nearly, june: B}, {may: A}) == ["o3", "o2", "o1"]
     assert len(store.objects.sets()) == 1, "what knew a capture before is out of date"
-    assert store.objects.numbers([{may: B}, {june: FAR}]) == [2, None]
+    assert store.objects.match_numbers([{may: B}, {june: FAR}]) == [2, None]
 
 
 def test_a_picture_on_a_wall_is_known_again(store, scenes):
     picture = [[0, 0, 1], [0.5, 0.001, 1.5]]
     keep_objects(store, {scenes[0]: picture})
-    assert store.objects.numbers([{scenes[0]: np.array(picture) + np.array([0, 0.004, 0])}]) == [1]
-    assert store.objects.numbers([{scenes[0]: np.array(picture) + np.array([0.6, 0, 0])}]) == [None]
+    assert store.objects.match_numbers([{scenes[0]: np.array(picture) + np.array([0, 0.004, 0])}]) == [1]
+    assert store.objects.match_numbers([{scenes[0]: np.array(picture) + np.array([0.6, 0, 0])}]) == [None]
 
 
 def test_two_that_become_one_and_part_again_have_their_numbers(store, scenes):
@@ -62,14 +62,14 @@ def test_numbers_are_unique_in_a_map_when_a_component_comes_apart(store):
     apart = computed({c: A}), computed({a: A, b: A}, {a: B, b: B})
     assert [[thing.id for thing in made.objects] for made in store.objects.save(apart)] == [["o3"], ["o1", "o2"]]
     shown = {1: [a, b], 2: [a, b], 3: [c]}
-    assert store.objects.parted(shown) == {3: 1}
+    assert store.objects.split_objects(shown) == {3: 1}
     # Each part is made again by itself, from boxes that differ a little: numbers stay.
     for shift in (0.02, -0.01, 0.03):
         assert keep_objects(store, {c: np.array(A) + shift}, seed=str(shift)) == ["o3"]
         assert keep_objects(store, {a: np.array(A) + shift, b: A}, {a: B, b: B}, seed=str(shift)) == ["o1", "o2"]
-    assert store.objects.numbers([{c: A}, {a: A, b: A}, {a: B, b: B}]) == [3, 1, 2]
+    assert store.objects.match_numbers([{c: A}, {a: A, b: A}, {a: B, b: B}]) == [3, 1, 2]
     assert keep_objects(store, {a: A, b: A, c: np.array(A) + 0.03}, {a: B, b: B}) == ["o1", "o2"], "one again"
-    assert store.objects.parted({1: [a, b, c], 2: [a, b, c]}) == {}
+    assert store.objects.split_objects({1: [a, b, c], 2: [a, b, c]}) == {}
 
 
 def test_words_are_kept_with_their_history(store, scenes):
@@ -77,8 +77,8 @@ def test_words_are_kept_with_their_history(store, scenes):
     store.objects.edit(1, name="sofa", label="seat", author="ann")
     store.objects.edit(1, name="sofa")  # says nothing new
     store.objects.edit(1, label="", note="oak\nold")
-    assert store.objects.words()["o1"].name == "sofa"
-    assert (store.objects.words()["o1"].label, store.objects.words()["o1"].note) == ("", "oak\nold")
+    assert store.objects.annotations()["o1"].name == "sofa"
+    assert (store.objects.annotations()["o1"].label, store.objects.annotations()["o1"].note) == ("", "oak\nold")
     assert [(f.kind, f.value, f.author) for f in store.objects.facts()["o1"]] == [
         ("name", "sofa", "ann"),
         ("label", "seat", "ann"),
@@ -102,7 +102,7 @@ def test_words_are_kept_with_their_history(store, scenes):
         store.objects.edit(3, name="x")
     with pytest.raises(NotFoundError):
         store.objects.edit(1, same_as=3)
-    assert "o2" not in store.objects.words()
+    assert "o2" not in store.objects.annotations()
 
 
 @pytest.mark.parametrize(
@@ -139,20 +139,20 @@ def test_merging_maps_joins_numbers_and_words(store, scenes, tmp_path):
     store.objects.edit(3, label="lamp", same_as=1)
     with Store.create(tmp_path / "part") as part:
         assert merging.split(store, part, [june]).objects == 2
-        assert part.objects.numbers([{june: A}, {june: FAR}]) == [1, 2]
-        assert part.objects.words()["o1"].name == "sofa"
-        assert part.objects.words()["o2"].same_as == "", "o1 stayed behind"
+        assert part.objects.match_numbers([{june: A}, {june: FAR}]) == [1, 2]
+        assert part.objects.annotations()["o1"].name == "sofa"
+        assert part.objects.annotations()["o2"].same_as == "", "o1 stayed behind"
         part.objects.edit(1, note="red")
     with Store.create(tmp_path / "other") as other:
         other.scenes.add(make_gaussians(50, 9), make_cameras(), name="attic")
         keep_objects(other, {other.scenes.get("attic").id: A})
         done = merging.merge(other, store)
         assert (done.objects, done.object_facts) == (3, 3)
-        assert other.objects.words()["o4"].same_as == "o2", "their numbers become ours"
+        assert other.objects.annotations()["o4"].same_as == "o2", "their numbers become ours"
         with Store.open(tmp_path / "part") as part:
             again = merging.merge(other, part)
         assert (again.objects, again.object_facts) == (0, 1)
-        assert other.objects.words()["o3"].note == "red"
+        assert other.objects.annotations()["o3"].note == "red"
         assert merging.merge(other, store).object_facts == 0, "again it adds nothing"
 
 
@@ -164,7 +164,7 @@ def test_a_purge_forgets_what_only_that_scene_showed(store, scenes):
     receipt = purging.begin(store, may).receipt
     assert receipt["rows"]["object_facts"] == 1
     assert receipt["rows"]["object_places"] == 2
-    assert set(store.objects.words()) == {"o1"}
+    assert set(store.objects.annotations()) == {"o1"}
     assert store.objects.sets() == []
     assert store.objects.places(1).keys() == {june}
     assert keep_objects(store, {june: FAR}) == ["o3"], "a number is not given again"
@@ -173,8 +173,8 @@ def test_a_purge_forgets_what_only_that_scene_showed(store, scenes):
 def test_a_capture_in_the_place_of_another_shows_its_objects(store, scenes):
     may, june = scenes
     keep_objects(store, {may: A})
-    superseding.inherit(store, may, june)
-    assert store.objects.numbers([{june: A}]) == [1]
+    scene_replacement.inherit(store, may, june)
+    assert store.objects.match_numbers([{june: A}]) == [1]
     assert store.objects.sets() == []
 
 
@@ -185,7 +185,7 @@ def test_prune_drops_what_was_made_with_captures_that_are_gone(store, scenes):
     store.scenes.remove(may)
     store.prune()
     assert store.objects.sets() == []
-    assert store.objects.words()["o1"].name == "sofa", "the scene may be restored from elsewhere"
+    assert store.objects.annotations()["o1"].name == "sofa", "the scene may be restored from elsewhere"
     with store.catalog.read() as connection:
         assert connection.execute(select(func.count()).select_from(schema.object_places)).scalar_one() == 1
 
@@ -211,5 +211,5 @@ def test_a_word_counts_that_was_said_last_whatever_the_clock_said(store, scenes,
         other.objects.edit(1, label="seat")
         merging.merge(store, other)
         for one in (store, other):
-            assert (one.objects.words()["o1"].name, one.objects.words()["o1"].label) == ("second", "seat")
+            assert (one.objects.annotations()["o1"].name, one.objects.annotations()["o1"].label) == ("second", "seat")
             assert [fact.value for fact in one.objects.facts()["o1"]] == ["first", "second", "seat"]

@@ -8,7 +8,7 @@ from raising import raises
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import BusyError, ConfigError, CorruptError, NotFoundError, SchemaVersionError, StoreError
-from gsmap.store import Store, digests, schema
+from gsmap.store import Store, page_digests, schema
 
 
 def test_create_and_open(tmp_path):
@@ -64,7 +64,7 @@ def test_other_schema_is_refused(tmp_path, version, code):
     with sqlite3.connect(tmp_path / "m" / "map.sqlite") as connection:
         connection.execute("UPDATE alembic_version SET version_num = ?", (version,))
     connection.close()
-    digests.note(tmp_path / "m" / "map.sqlite")
+    page_digests.write_digests(tmp_path / "m" / "map.sqlite")
     for mode in "rw":
         with raises(SchemaVersionError, code=code):
             Store.open(tmp_path / "m", mode)

@@ -11,7 +11,7 @@ from store_samples import JPEG, kept_photo, make_cameras, make_gaussians
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.store import Store, merging, schema
 from gsmap.store.photos import MAX_BYTES
-from gsmap.store.superseding import inherit
+from gsmap.store.scene_replacement import inherit
 from gsmap.types.localized_photo import PhotoObjectObservation
 
 

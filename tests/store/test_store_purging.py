@@ -514,4 +514,4 @@ def test_a_receipt_is_true_after_the_branches_were_purged(place):
         report = m.purge(secret)
         assert report.branches == ()
         assert report.maps == (str(place),)
-        assert all(row.receipt["branches"] == [] for row in purging.listed(m.store))
+        assert all(row.receipt["branches"] == [] for row in purging.list_purges(m.store))

@@ -16,12 +16,12 @@ from gsmap.store import Store
 from gsmap.store.backup import Backup, clone, restore, save
 from gsmap.store.backup import restoring as restoring_module
 from gsmap.store.backup.repository import object_name
-from gsmap.store.places import FolderPlace
+from gsmap.store.storage import FolderStorage
 
 
 @pytest.fixture
 def place(tmp_path):
-    return FolderPlace(tmp_path / "backup")
+    return FolderStorage(tmp_path / "backup")
 
 
 @pytest.fixture

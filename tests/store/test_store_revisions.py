@@ -83,7 +83,7 @@ def test_every_revision_is_read_as_it_was_saved(store):
         store.revisions.save(graph)
     for number, graph in enumerate(made, 1):
         same(store.revisions.get(number), graph)
-        line = store.revisions.one(number)
+        line = store.revisions.entry(number)
         assert (line.num_scenes, line.num_components) == (
             len(graph.poses),
             len({pose.component for pose in graph.poses.values()}),
@@ -182,7 +182,7 @@ def test_what_stands_of_every_pair_is_what_a_person_said_or_the_newest(store):
     assert any(one.review for one in alone.values())
     firsts = [store.registrations.history(*pair)[0].number for pair in listed]
     assert firsts == sorted(firsts)
-    standing = store.registrations.standing()
+    standing = store.registrations.summaries()
     assert [(one.target, one.source) for one in standing] == sorted(alone)
     for one in standing:
         stored = alone[one.target, one.source]
@@ -193,34 +193,34 @@ def test_what_stands_of_every_pair_is_what_a_person_said_or_the_newest(store):
             stored.manual,
         )
         assert one.usable == stored.is_usable
-    assert store.registrations.standing(usable=True) == [one for one in standing if one.usable]
-    fresh = {name: store.registrations.standing(usable=name) for name in (False, True)}
+    assert store.registrations.summaries(usable=True) == [one for one in standing if one.usable]
+    fresh = {name: store.registrations.summaries(usable=name) for name in (False, True)}
     living = {":".join(sorted(ends)) for ends in alone}
-    tried = {one.pair: one for one in store.registrations.tried() if one.pair in living}
+    tried = {one.pair: one for one in store.registrations.all_summaries() if one.pair in living}
     assert set(tried) == living
     for pair, stored in alone.items():
         one = tried[":".join(pair)]
         assert (one.key, one.usable) == (stored.key, stored.is_usable)
-        assert one.is_told == (stored.manual or stored.review == "confirm")
+        assert one.is_specified == (stored.manual or stored.review == "confirm")
         disagreement = stored.registration.evidence.get("disagreement", float("nan"))
         accepted = stored.registration.status == "accepted"
         assert np.array_equal(one.disagreement, disagreement if accepted else float("nan"), equal_nan=True)
         assert one.keys == {stored.key for stored in store.registrations.history(*pair)} - {""}
     for usable_only, told in fresh.items():  # the same of what is remembered now
-        assert [one[:7] for one in store.registrations.standing(usable=usable_only)] == [one[:7] for one in told]
-    usable = store.registrations.usable()
+        assert [one[:7] for one in store.registrations.summaries(usable=usable_only)] == [one[:7] for one in told]
+    usable = store.registrations.current_usable()
     assert [one.number for one in usable] == [one.number for one in standing if one.usable]
     some = ids[1:4]
-    among = [one.number for one in store.registrations.usable(some)]
+    among = [one.number for one in store.registrations.current_usable(some)]
     assert among == [one.number for one in standing if one.usable and {one.target, one.source} <= set(some)]
     assert 0 < len(among) < len(usable)
-    half = store.registrations.newest() // 2
-    assert store.registrations.pairs_after(half) == {
+    half = store.registrations.newest_number() // 2
+    assert store.registrations.pairs_registered_after(half) == {
         (a, b)
         for a, b in combinations(sorted(ids), 2)
         if any(r.number > half for r in store.registrations.history(a, b))
     }
-    of_one = {one.number for one in store.registrations.current_of(ids[1])}
+    of_one = {one.number for one in store.registrations.current_of_scene(ids[1])}
     assert of_one == {one.number for pair, one in alone.items() if ids[1] in pair}
     pairs = sorted(alone)[:4]
     assert {one.number for one in store.registrations.current_of_pairs([p[::-1] for p in pairs])} == {
@@ -250,10 +250,10 @@ def test_registrations_are_kept_together_as_one_by_one(store):
         evidence = {"disagreement": 0.1 * k}
         made.append((Registration(a, b, status, evidence=evidence, **pose), key("register", a, b, turn=k % 3)))
     one_by_one = [store.registrations.save(*one) for one in made]
-    newest = store.registrations.newest()
+    newest = store.registrations.newest_number()
     store.registrations.save_all(made)
-    assert store.registrations.newest() == newest + len(made)
-    found = store.registrations.found([name for _, name in made])
+    assert store.registrations.newest_number() == newest + len(made)
+    found = store.registrations.newest_with_keys([name for _, name in made])
     for saved, (registration, _), read in zip(one_by_one, made, found, strict=True):
         last = store.registrations.history(registration.target, registration.source)[-1]
         assert (last.key, last.recipe, last.number > newest) == (saved.key, saved.recipe, True)
@@ -261,11 +261,14 @@ def test_registrations_are_kept_together_as_one_by_one(store):
         if registration.information is not None:
             np.testing.assert_array_equal(last.registration.information, registration.information)
             assert matrices.pose_bytes(read.S_target_source) == matrices.pose_bytes(registration.S_target_source)
-    assert [one.source for one in store.registrations.found(["0" * 32, made[1][1], made[0][1]])] == [ids[2], ids[1]]
+    assert [one.source for one in store.registrations.newest_with_keys(["0" * 32, made[1][1], made[0][1]])] == [
+        ids[2],
+        ids[1],
+    ]
     for wrong in ((made[0][0], None), (Registration(ids[0], "0" * 32, "no_match"), made[0][1])):
         with pytest.raises(InputError):
             store.registrations.save_all([made[1], wrong])
-    assert store.registrations.newest() == newest + len(made)
+    assert store.registrations.newest_number() == newest + len(made)
     store.registrations.save_all([])
 
 
@@ -304,14 +307,14 @@ def test_brief_scenes_and_what_graphs_say_are_what_lists_have(store):
     store.scenes.edit("s02", captured_at="2026-05-31T14:00:00+02:00")
     store.scenes.remove("s03")
     for _ in range(2):  # the second time from memory
-        said = store.graphs.says()
+        said = store.graphs.frames()
         listed = store.graphs.list()
         assert [(g.key, g.scene, g.unit_m, g.up) for g in said] == [(g.key, g.scene, g.unit_m, g.up) for g in listed]
         graph = SceneGraph(store.scenes.list()[0].id, {}, np.array([1.0, 0, 0]), 2.0)
         store.graphs.save(graph, key("describe", graph.scene_id))  # in place of what was said
-    assert {g.unit_m for g in store.graphs.says()} == {0.5, 2.0}
+    assert {g.unit_m for g in store.graphs.frames()} == {0.5, 2.0}
     names = ("id", "name", "scale_policy", "captured_at", "thinning")
-    assert [[getattr(one, name) for name in names] for one in store.scenes.brief()] == [
+    assert [[getattr(one, name) for name in names] for one in store.scenes.summaries()] == [
         [getattr(one, name) for name in names] for one in store.scenes.list()
     ]
     assert {scene.id: scene.bounds.tolist() for scene in store.scenes.list()} == {
@@ -322,7 +325,7 @@ def test_brief_scenes_and_what_graphs_say_are_what_lists_have(store):
     with store.catalog.write() as connection:
         connection.execute(graphs.update().where(graphs.c.scene == some[0]).values(about={"up": [1, "x", 0]}))
     with Store.open(store.folder, "r") as other, raises(CorruptError, code="catalog_invalid"):
-        other.graphs.says()
+        other.graphs.frames()
 
 
 @pytest.mark.parametrize(
@@ -360,19 +363,19 @@ def test_of_pairs_and_graphs_what_is_new_is_read(store, monkeypatch):
     for scene in ids:
         notes = ("a remark that is longer than all else that a graph says of its frame, and as JSON quite long",)
         store.graphs.save(SceneGraph(scene, {}, np.array([0.0, 0.6, 0.8]), 0.5, notes=notes), key("describe", scene))
-    add, loads = module._add, json.loads
-    monkeypatch.setattr(module, "_add", lambda known, rows: read.append(len(rows)) or add(known, rows))
+    add, loads = module._add_summaries, json.loads
+    monkeypatch.setattr(module, "_add_summaries", lambda known, rows: read.append(len(rows)) or add(known, rows))
     monkeypatch.setattr(json, "loads", lambda text: parsed.append(len(text)) or loads(text))
-    store.registrations.tried()
-    said = store.graphs.says()
+    store.registrations.all_summaries()
+    said = store.graphs.frames()
     assert read == [len(ids) * (len(ids) - 1) // 2]
     assert max(parsed, default=0) < 60
     assert {(one.unit_m, one.up) for one in said} == {(0.5, (0.0, 0.6, 0.8))}
     store.registrations.save(Registration(*ids[:2], "no_match"), key("register", *ids[:2], turn=1))
     parsed.clear()
     for _ in range(2):
-        store.registrations.standing()
-        store.graphs.says()
+        store.registrations.summaries()
+        store.graphs.frames()
     assert (read[1:], parsed) == ([1, 0], [])
 
 
@@ -390,7 +393,7 @@ def test_what_is_remembered_of_pairs_is_what_is_read_anew(store):
         elif kind == 2:
             store.registrations.review(a, b, "confirm" if stored.review is None else "withdraw")
         else:  # a purge takes the newest, and the next one its number
-            newest, said = store.registrations.newest(), select(reviews.c.registration)
+            newest, said = store.registrations.newest_number(), select(reviews.c.registration)
             with store.catalog.write() as connection:
                 mine = (registrations.c.number == newest) & registrations.c.number.not_in(said)
                 connection.execute(delete(registrations).where(mine))
@@ -398,7 +401,7 @@ def test_what_is_remembered_of_pairs_is_what_is_read_anew(store):
                 posed = {"S_target_source": some_pose(rng), "information": np.eye(7)}
                 store.registrations.save(Registration(a, b, "accepted", **posed), key("register", a, b, turn=k))
         anew = Registrations(store.catalog)
-        assert sorted(map(str, store.registrations.tried())) == sorted(map(str, anew.tried()))
-        assert dict(store.registrations.keys()) == {
-            one.pair: "" if one.is_told else one.key for one in store.registrations.tried()
+        assert sorted(map(str, store.registrations.all_summaries())) == sorted(map(str, anew.all_summaries()))
+        assert dict(store.registrations.current_keys()) == {
+            one.pair: "" if one.is_specified else one.key for one in store.registrations.all_summaries()
         }

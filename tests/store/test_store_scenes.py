@@ -7,7 +7,7 @@ from store_samples import make_cameras, make_gaussians
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.morton import morton_order
 from gsmap.store import Store, scene_id
-from gsmap.store.boxes import chunk_boxes
+from gsmap.store.chunk_boxes import chunk_boxes
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.types import Gaussians
 

@@ -11,7 +11,7 @@ from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError
 from gsmap.store import Store, sqlite
-from gsmap.store.wal import index_note, log_of, read_log
+from gsmap.store.wal import read_index_header, read_log, wal_path
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def killed(tmp_path):
 
 @pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_flip_in_the_log_is_found(killed, count):
-    log = log_of(killed / sqlite.FILE)
+    log = wal_path(killed / sqlite.FILE)
     rng = random.Random(1)
     for _ in range(count):
         at = rng.randrange(log.stat().st_size)
@@ -42,7 +42,7 @@ def test_a_flip_in_the_log_is_found(killed, count):
 
 def test_a_torn_end_of_the_log_is_no_damage(killed):
     """A power cut leaves what was not synchronised in any order; it was not acknowledged either."""
-    log = log_of(killed / sqlite.FILE)
+    log = wal_path(killed / sqlite.FILE)
     log.with_name("map.sqlite-shm").unlink()
     whole = log.read_bytes()
     frame = PAGE + 24
@@ -63,9 +63,9 @@ def test_a_torn_end_of_the_log_is_no_damage(killed):
 
 def test_the_log_is_read_as_sqlite_reads_it(killed):
     file = killed / sqlite.FILE
-    log = read_log(log_of(file), index_note(file))
+    log = read_log(wal_path(file), read_index_header(file))
     content = bytearray(file.read_bytes().ljust(log.num_pages * PAGE, b"\0"))
-    frames = log_of(file).read_bytes()
+    frames = wal_path(file).read_bytes()
     for number, at in log.frames.items():
         content[(number - 1) * PAGE : number * PAGE] = frames[at : at + PAGE]
     with sqlite3.connect(file) as connection:
@@ -78,4 +78,4 @@ def test_adding_to_a_map_whose_log_was_left_behind(killed):
     with Store.open(killed) as store:
         store.scenes.add(make_gaussians(), make_cameras(), name="a")
         assert store.check().ok
-    assert not log_of(killed / sqlite.FILE).exists()
+    assert not wal_path(killed / sqlite.FILE).exists()

@@ -10,7 +10,7 @@ import pytest
 from stream_sources import Pieces, same, scattered
 
 from gsmap.geometry.morton import morton_order
-from gsmap.stream import blocks, bounds, in_morton_order, loaded
+from gsmap.stream import blocks, bounds, load_all, sorted_along_morton_curve
 from gsmap.types import Gaussians
 from gsmap.types.source import gathered
 
@@ -19,7 +19,7 @@ from gsmap.types.source import gathered
 def test_what_is_read_in_pieces_is_the_whole(rows):
     g = scattered(1000)
     source = Pieces(g, rows)
-    assert same(loaded(source), g)
+    assert same(load_all(source), g)
     np.testing.assert_array_equal(bounds(source), [g.means.min(0), g.means.max(0)])
     wanted = np.array([0, 3, 4, 500, 999])
     np.testing.assert_array_equal(gathered(source, "sh", wanted), g.sh[wanted])
@@ -32,7 +32,9 @@ def test_what_is_read_in_pieces_is_the_whole(rows):
 def sorted_on_disk(g: Gaussians, tmp_path, rows: int, pieces: int = 97) -> Gaussians:
     row_bytes = 4 * (11 + 3 * g.sh.shape[1])
     source = Pieces(g, pieces)
-    with in_morton_order(source, bounds(source), tmp_path / "scratch", bucket_bytes=rows * row_bytes) as ordered:
+    with sorted_along_morton_curve(
+        source, bounds(source), tmp_path / "scratch", bucket_bytes=rows * row_bytes
+    ) as ordered:
         assert (tmp_path / "scratch").exists()
         assert ordered.num_gaussians == len(g)
         assert ordered.sh_degree == g.sh_degree
@@ -65,7 +67,7 @@ def test_sorting_on_disk_is_sorting_in_memory(change, rows, tmp_path):
 
 def test_what_fits_is_sorted_in_memory(tmp_path):
     g = scattered(1000)
-    with in_morton_order(g, bounds(g), tmp_path / "scratch") as ordered:
+    with sorted_along_morton_curve(g, bounds(g), tmp_path / "scratch") as ordered:
         assert not (tmp_path / "scratch").exists()
         assert same(ordered.load(), g[morton_order(g.means)])
 
@@ -74,7 +76,7 @@ def test_scratch_goes_with_an_error(tmp_path):
     g = scattered(1000)
     with (
         pytest.raises(KeyboardInterrupt),
-        in_morton_order(Pieces(g, 100), bounds(g), tmp_path / "scratch", bucket_bytes=4000),
+        sorted_along_morton_curve(Pieces(g, 100), bounds(g), tmp_path / "scratch", bucket_bytes=4000),
     ):
         raise KeyboardInterrupt
     assert not (tmp_path / "scratch").exists()
@@ -84,7 +86,7 @@ def test_sorting_on_disk_holds_a_bucket_in_memory(tmp_path):
     g = scattered(200_000, sh_degree=3)
     source = Pieces(g, 5000)
     tracemalloc.start()
-    with in_morton_order(source, bounds(source), tmp_path / "scratch", bucket_bytes=2 << 20) as ordered:
+    with sorted_along_morton_curve(source, bounds(source), tmp_path / "scratch", bucket_bytes=2 << 20) as ordered:
         for _ in ordered.chunks():
             pass
     _, peak = tracemalloc.get_traced_memory()

@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from gsmap.store import Store, packed
+from gsmap.store import Store, array_archive
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
         with Store.open(path, "r") as store:
             for scene in store.scenes.list():
                 _row(store, scene.name, options.repeat)
-            for archive in (path / "arrays" / "graphs").glob(f"*/{packed.FILE}"):
+            for archive in (path / "arrays" / "graphs").glob(f"*/{array_archive.FILE}"):
                 shares.update(_shares(archive))
     print()
     for name, num_bytes in shares.most_common():
@@ -68,7 +68,7 @@ def _shares(archive: Path) -> Counter[str]:
             return file.read(stop - start)
 
         size = archive.stat().st_size
-        members = packed.members(size, read)
+        members = array_archive.read_members(size, read)
     out = Counter({"(names and places)": size - sum(m.size for key, m in members.items() if "/c/" in key)})
     for key, member in members.items():
         if "/c/" in key:

@@ -134,7 +134,7 @@ class World:
                 there = []
         whole = merged(parts)
         store = gsmap.map.create(work / "crowd" / "crowd.gsmap").store
-        store.indexes.put(index_recipe(), [m for m in whole.members if m is not None], whole.arrays, ())
+        store.indexes.save_segment(index_recipe(), [m for m in whole.members if m is not None], whole.arrays, ())
         held.index = view_index([*held.index.segments, *store.indexes.segments(index_recipe())])
 
     def anchor(self, component: int) -> str:

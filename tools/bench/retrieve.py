@@ -231,7 +231,7 @@ def put(store: Store, key: str, new: Sequence[SceneNodes]) -> None:
     old = [segments[k] for k in to_merge([len(segment.members) for segment in segments], len(new))]
     whole = merged([*old, new_segment(new)])
     members = [member for member in whole.members if member is not None]
-    store.indexes.put(key, members, whole.arrays, [segment.id for segment in old])
+    store.indexes.save_segment(key, members, whole.arrays, [segment.id for segment in old])
 
 
 def _copy(voters: SceneNodes, scene: str, rng: np.random.Generator | None) -> SceneNodes:

@@ -26,8 +26,8 @@ from unittest import mock
 import numpy as np
 
 from gsmap import formats
-from gsmap.store import Store, arrays, packed
-from gsmap.store.object_arrays import MAX_REQUESTS, joined
+from gsmap.store import Store, array_archive, arrays
+from gsmap.store.object_arrays import MAX_REQUESTS, merge_ranges
 from gsmap.types import Cameras, Gaussians
 from gsmap_synthetic.city import PER_BLOCK, City
 
@@ -105,7 +105,7 @@ def boxes(folder: Path, g: Gaussians, share: float = 0.026, count: int = 12) -> 
     asked: list[list[tuple[int, int]]] = []
     with Store.create(folder / "map") as store:
         store.scenes.add(g, one_camera(), name="scene")
-        size = (next((folder / "map" / "arrays").rglob(packed.FILE))).stat().st_size
+        size = (next((folder / "map" / "arrays").rglob(array_archive.FILE))).stat().st_size
         with mock.patch.object(arrays._Files, "expect", lambda self, file, ranges: asked.append(list(ranges))):
             for name, shape in (("cube", (1.0, 1.0, 1.0)), ("wall", (1.0, 0.25, 1.0))):
                 rng, found = np.random.default_rng(5), []
@@ -114,7 +114,7 @@ def boxes(folder: Path, g: Gaussians, share: float = 0.026, count: int = 12) -> 
                     reach = np.quantile(away, share) * np.array(shape)
                     asked.clear()
                     hit = len(store.scenes.gaussians("scene", np.stack([centre - reach, centre + reach])))
-                    few = [part for ranges in asked for part in joined(ranges, MAX_REQUESTS)]
+                    few = [part for ranges in asked for part in merge_ranges(ranges, MAX_REQUESTS)]
                     found.append((len(few), sum(b - a for a, b in few) / (size * hit / len(g)), hit))
                 requests, times, hits = np.median(found, axis=0)
                 print(

@@ -119,7 +119,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             store = gsmap.map.create(Path(folder) / "crowd.gsmap").store
             whole = crowd(fitted, count, params)
-            store.indexes.put(index_recipe(), [m for m in whole.members if m is not None], whole.arrays, ())
+            store.indexes.save_segment(index_recipe(), [m for m in whole.members if m is not None], whole.arrays, ())
             (stored,) = store.indexes.segments(index_recipe())
             size = store.arrays.size_bytes("indexes", stored.id) / 1e6
             print(f"{count} scenes: {stored.num_nodes} features, {size:.0f} MB on the disk")

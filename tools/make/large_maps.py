@@ -37,8 +37,8 @@ from gsmap.register import recipe_key
 from gsmap.retrieve import SceneNodes, index_recipe, new_segment, select_nodes
 from gsmap.retrieve.codes import with_signs
 from gsmap.store import recipes
-from gsmap.store.boxes import get_boxes, put_boxes
 from gsmap.store.catalog import now
+from gsmap.store.chunk_boxes import get_boxes, put_boxes
 from gsmap.store.graphs import Graphs
 from gsmap.store.indexes import Lookup
 from gsmap.store.schema import files, graphs, registrations, scene_facts, scenes
@@ -264,7 +264,7 @@ class Filled:
         """What names the graphs of scenes."""
         store = self.map.store
         some = set(ids)
-        wanted = [scene for scene in store.scenes.brief() if scene.id in some]
+        wanted = [scene for scene in store.scenes.summaries() if scene.id in some]
         return describe.graph_keys(store, wanted, self.map.settings)
 
 
@@ -330,7 +330,7 @@ def _fill_index(one: Filled) -> None:
         old = [old[k] for k in to_merge([len(s.members) for s in old], len(some))]
         whole = merged([*old, segment])
         members = [member for member in whole.members if member is not None]
-        store.indexes.put(recipe, members, whole.arrays, [s.id for s in old])
+        store.indexes.save_segment(recipe, members, whole.arrays, [s.id for s in old])
     named = keys_of_lookups(keys, params)
     said = []
     for k, scene in enumerate(one.order):
@@ -338,7 +338,7 @@ def _fill_index(one: Filled) -> None:
         candidates = tuple(Candidate(other, float(TRIED - i), 1.0) for i, other in enumerate(before))
         said.append(Lookup(scene, named[scene], candidates, 0))
     for start in range(0, len(said), 1000):
-        store.indexes.note(said[start : start + 1000])
+        store.indexes.save_lookups(said[start : start + 1000])
 
 
 def _alike(voters: SceneNodes, lists: np.ndarray, scene: str, graph: str, rng: np.random.Generator) -> SceneNodes:

@@ -171,7 +171,7 @@ def compare(m: Map) -> None:
 def keep_objects(m: Map) -> None:
     """Two objects, one of them seen in two captures and named; a room."""
     from gsmap.objects import recipe_key as object_recipe
-    from gsmap.store.objects import Computed, ObjectSet
+    from gsmap.store.objects import ComputedObjects, ObjectSet
     from gsmap.types import MapObject, ObjectObservation, Room
 
     placed = m.pose_graph().poses
@@ -187,7 +187,7 @@ def keep_objects(m: Map) -> None:
     key = object_recipe(m.settings.objects).of(a, b)
     poses = {scene: placed[scene].S_map_scene for scene in (a, b)}
     made = ObjectSet(key.digest, key.recipe, 1.0, poses, dict.fromkeys((a, b), "0" * 32), (sofa, lamp), rooms=(room,))
-    m.store.objects.save([Computed(made, [{a: box, b: box}, {a: box + 2}], key)])
+    m.store.objects.save([ComputedObjects(made, [{a: box, b: box}, {a: box + 2}], key)])
     m.store.objects.edit(1, name="grandmother's sofa", label="sofa", note="oak")
     m.store.objects.edit(2, same_as=1, author="ann")
 

@@ -87,7 +87,7 @@ def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
 
 def edges_of_scene(store: Store, scene: Scene) -> list[EdgeRow]:
     """List the current edge of every registered pair of a scene."""
-    return _edge_rows(store, store.registrations.current_of(scene.id), scene.id)
+    return _edge_rows(store, store.registrations.current_of_scene(scene.id), scene.id)
 
 
 def _edge_rows(store: Store, edges: Iterable[StoredRegistration], *scenes: str) -> list[EdgeRow]:

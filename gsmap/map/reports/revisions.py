@@ -42,7 +42,7 @@ def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionR
 def revision_row(store: Store, number: int) -> RevisionRow:
     """Return the row of a revision."""
     undecided = store.revisions.undecided(number).get(number, ())
-    return _revision_row(store.revisions.one(number), undecided, names(store))
+    return _revision_row(store.revisions.entry(number), undecided, names(store))
 
 
 def _revision_row(revision: Revision, undecided: Sequence[tuple[str, str]], name_of: Mapping[str, str]) -> RevisionRow:
@@ -111,7 +111,9 @@ class HistoryPosition:
 @snapshot_read
 def history_position(store: Store) -> HistoryPosition:
     """Return the current position in the history."""
-    return HistoryPosition(store.revisions.current() or 0, store.registrations.newest(), store.graphs.groups().keys())
+    return HistoryPosition(
+        store.revisions.newest_number() or 0, store.registrations.newest_number(), store.graphs.groups().keys()
+    )
 
 
 @snapshot_read
@@ -126,8 +128,8 @@ def update_report(
     scenes, pairs = store.revisions.changed_after(since.revision)
     scenes |= {scene for group, scene in store.graphs.groups().items() if group not in since.graphs}
     scenes |= {row.scene for row in ingested if row.new or row.dated}
-    pairs |= store.registrations.pairs_after(since.registration)
-    newest = store.revisions.current()
+    pairs |= store.registrations.pairs_registered_after(since.registration)
+    newest = store.revisions.newest_number()
     return UpdateReport(
         ingested=tuple(ingested),
         scenes=tuple(scene_rows(store, metres=metres() if scenes else None, among=scenes)),

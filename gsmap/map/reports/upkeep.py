@@ -10,7 +10,7 @@ from gsmap.map.reports.common import names, refs
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.settings import leaves
 from gsmap.store import Store
-from gsmap.store.integrity import Check, Pruned
+from gsmap.store.integrity import CheckResult, PruneResult
 from gsmap.types import Tile
 from gsmap.types.rows import CheckReport, ExportReport, ModelRow, PruneReport, SettingRow, TileRow
 
@@ -83,7 +83,7 @@ def setting_rows(settings: Settings) -> list[SettingRow]:
     ]
 
 
-def check_report(found: Check) -> CheckReport:
+def check_report(found: CheckResult) -> CheckReport:
     """Return the result of a check of every stored byte."""
     return CheckReport(
         ok=found.ok,
@@ -95,7 +95,7 @@ def check_report(found: Check) -> CheckReport:
     )
 
 
-def prune_report(pruned: Pruned, dry_run: bool) -> PruneReport:
+def prune_report(pruned: PruneResult, dry_run: bool) -> PruneReport:
     """Return what was, or would be, reclaimed."""
     return PruneReport(
         dry_run=dry_run,

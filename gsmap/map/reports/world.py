@@ -42,7 +42,7 @@ def world_report(store: Store, *, stale: bool, notes: Sequence[str] = ()) -> Wor
         origin=None if frame is None else (frame.latitude_deg, frame.longitude_deg, frame.height_m),
         components=tuple(_tie_row(tie, sizes[tie.component], name_of) for tie in ties),
         unseen=tuple(point.name for point in survey.points if point.name not in shown),
-        revision=store.revisions.current(),
+        revision=store.revisions.newest_number(),
         stale=stale,
         notes=(*notes, *_sea_level_note(survey)),
     )

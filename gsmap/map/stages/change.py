@@ -134,7 +134,7 @@ def compare(
                 newer=newer.scene,
                 S_newer_older=newer.S_map_scene.inverse() @ older.S_map_scene,
                 S_frame_newer=newer.S_map_scene,
-                counted=counted,
+                num_at_comparison=counted,
             )
             shared.saved(key, f"{names[older.scene]}-{names[newer.scene]}: {len(found.changes)} changes")
     return len(jobs)

@@ -16,11 +16,11 @@ from gsmap.map.shared_jobs import SharedJobs, note_interruption
 from gsmap.methods import RecipeKey
 from gsmap.render import backend
 from gsmap.store import Store
-from gsmap.store.scenes import BriefScene
+from gsmap.store.scenes import SceneSummary
 from gsmap.types import Scene
 from gsmap.types.progress import StageProgress
 
-AnyScene = TypeVar("AnyScene", Scene, BriefScene)
+AnyScene = TypeVar("AnyScene", Scene, SceneSummary)
 
 
 def graph_keys(store: Store, scenes: Sequence[AnyScene], settings: Settings) -> dict[str, RecipeKey]:
@@ -31,7 +31,7 @@ def graph_keys(store: Store, scenes: Sequence[AnyScene], settings: Settings) -> 
 
 def without_graph(store: Store, keys: Mapping[str, RecipeKey]) -> list[str]:
     """Return the ids of scenes without a graph under their key, in the order of the keys; no array is read."""
-    present = store.graphs.kept(keys.values())
+    present = store.graphs.stored_keys(keys.values())
     return [scene for scene, key in keys.items() if key.digest not in present]
 
 
@@ -60,7 +60,7 @@ def describe(
     jobs = {keys[scene.id].digest: (store.location, scene.id, specs, params) for scene in missing}
 
     def done(wanted: Collection[str]) -> set[str]:
-        return store.graphs.kept(wanted) - store.graphs.damaged(damaged.intersection(wanted))
+        return store.graphs.stored_keys(wanted) - store.graphs.damaged(damaged.intersection(wanted))
 
     about = {keys[scene.id].digest: (scene.id,) for scene in missing}
     shared = SharedJobs(store, "describe", "graph", jobs, about, done, progress, again=verify)
@@ -75,4 +75,4 @@ def describe(
         others = [graph.key for graph in store.graphs.list() if graph.scene in keys]
         if beyond_help := store.graphs.damaged(others):
             store.graphs.forget(beyond_help)
-    return {scene: key for scene, key in keys.items() if f"graph {key.digest}" not in store.set_aside.met}
+    return {scene: key for scene, key in keys.items() if f"graph {key.digest}" not in store.quarantine.encountered}

@@ -146,7 +146,7 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
         recipe_key(method, params), request.format, request.provenance, request.budget_s, request.uncompressed
     )
     _check(request, recipe)
-    revision = store.revisions.current() if request.revision is None else request.revision
+    revision = store.revisions.newest_number() if request.revision is None else request.revision
     graph, placed = _placed(store, revision, request.component)
     metres = map_metres(store, settings, graph)
     living = {scene.id: scene for scene in store.scenes.list()}
@@ -259,7 +259,7 @@ def export(
         waited = True
         progress(0.0, text)
 
-    with folder_lock(out, wait=wait, waiting=waiting), store.leases.attend("export", f"export {out.resolve()}"):
+    with folder_lock(out, wait=wait, waiting=waiting), store.leases.announce("export", f"export {out.resolve()}"):
         if waited:
             planned = plan(store, request, settings, known)  # the map may have other poses now
         return _export(store, out, request, planned, settings, progress), planned.notes
@@ -378,10 +378,10 @@ def _put_aside(store: Store, out: Path, planned: ExportPlan, result: ExportResul
     if not store.catalog.writable:
         return
     with suppress(DiskFullError, ReadOnlyError):
-        if before := {one.what for one in store.set_aside.list() if one.about == about} - now.keys():
-            store.set_aside.forget(before)
+        if before := {one.what for one in store.quarantine.list() if one.about == about} - now.keys():
+            store.quarantine.forget(before)
         for what, (tile, reason) in now.items():
-            store.set_aside.add(what, about, f"component_{tile.component}/{tile.name}: {reason}")
+            store.quarantine.add(what, about, f"component_{tile.component}/{tile.name}: {reason}")
 
 
 def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Request]]:
@@ -430,7 +430,7 @@ def _placed(store: Store, revision: int | None, component: int | None) -> tuple[
     graph = store.revisions.get(revision)
     if graph is None:
         raise NotFoundError("the map has no poses yet: run gsmap update or gsmap optimize first", code="no_poses")
-    living = {s.id for s in store.scenes.list()} if revision == store.revisions.current() else set(graph.poses)
+    living = {s.id for s in store.scenes.list()} if revision == store.revisions.newest_number() else set(graph.poses)
     placed = {s: p for s, p in graph.poses.items() if s in living}
     if component is not None:
         placed = {s: p for s, p in placed.items() if p.component == component}

@@ -24,7 +24,7 @@ from gsmap.ingest import (
 )
 from gsmap.map.shared_jobs import note_interruption
 from gsmap.store import Store
-from gsmap.store.set_aside import CAPTURE
+from gsmap.store.quarantine import CAPTURE
 from gsmap.texts import escaped
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import StageProgress
@@ -117,11 +117,11 @@ def _set_aside(store: Store, bad: Sequence[SkippedPath], done: Sequence[Path]) -
     """
     for one in bad:
         _log.warning("a capture is set aside: %s", one.reason)
-        store.set_aside.add(_what(one.path), escaped(str(one.path.absolute())), escaped(one.reason))
+        store.quarantine.add(_what(one.path), escaped(str(one.path.absolute())), escaped(one.reason))
     still, mended = {_what(one.path) for one in bad}, {_what(path) for path in done}
     places = {place for path in done for place in (path.absolute(), path.resolve())}
     forgotten = []
-    for aside in store.set_aside.list():
+    for aside in store.quarantine.list():
         if not aside.what.startswith(f"{CAPTURE} ") or aside.what in still:
             continue
         path = Path(aside.about)
@@ -131,7 +131,7 @@ def _set_aside(store: Store, bad: Sequence[SkippedPath], done: Sequence[Path]) -
         if is_deleted or aside.what in mended or not places.isdisjoint((path, *path.parents)):
             forgotten.append(aside.what)
     if forgotten:
-        store.set_aside.forget(forgotten)
+        store.quarantine.forget(forgotten)
 
 
 def _what(path: Path) -> str:

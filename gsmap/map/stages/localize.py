@@ -120,7 +120,7 @@ class Localizer:
 
     def _scene_index(self) -> SceneIndex:
         """Return the index of the scenes with features; quarantined jobs leave scenes without."""
-        kept = self.store.view_features.kept(self.keys.values())
+        kept = self.store.view_features.stored_keys(self.keys.values())
         return SceneIndex(
             self.store,
             localizing.index_recipe(),
@@ -296,7 +296,7 @@ def ensure(
     held: dict[str, SceneFeatures],
 ) -> None:
     """Make the missing features and store them, or keep them in ``held`` if the map is read-only."""
-    kept = store.view_features.kept(keys.values())
+    kept = store.view_features.stored_keys(keys.values())
     missing = [scene for scene in scenes if keys[scene.id].digest not in kept]
     if not missing:
         return
@@ -312,7 +312,7 @@ def ensure(
         return
 
     def done(wanted: Collection[str]) -> set[str]:
-        return store.view_features.kept(wanted)
+        return store.view_features.stored_keys(wanted)
 
     about = {keys[scene.id].digest: (scene.id,) for scene in missing}
     shared = SharedJobs(store, "localize", "views", jobs, about, done, progress)

@@ -29,7 +29,7 @@ from gsmap.objects import (
 )
 from gsmap.objects.fuse import SegmentId
 from gsmap.store import Store
-from gsmap.store.objects import ObjectSet, Places
+from gsmap.store.objects import ObjectBoxes, ObjectSet
 from gsmap.texts import few
 from gsmap.types import Gaussians, ObservationState, PoseGraph, Room, Scene, SceneGraph, Segments, Sim3
 from gsmap.types.progress import Progress, StageProgress
@@ -47,7 +47,7 @@ class ComponentObjects:
 
     component: int
     made: ObjectSet
-    places: Sequence[Places] | None
+    places: Sequence[ObjectBoxes] | None
     key: RecipeKey | None
 
 

@@ -19,7 +19,7 @@ from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
-from gsmap.store.scenes import BriefScene
+from gsmap.store.scenes import SceneSummary
 from gsmap.types import Edge, PoseGraph, Prior
 from gsmap.types.plain import canonical, of_plain
 from gsmap.types.progress import StageProgress
@@ -73,12 +73,12 @@ def pose_basis(store: Store, settings: Settings, observed: Survey | None = None)
     Args:
         observed: replaces the stored observations of the world.
     """
-    living, priors = store.scenes.brief(), store.priors.list()
+    living, priors = store.scenes.summaries(), store.priors.list()
     captured = {scene.id: None if scene.captured_at is None else parse_moment(scene.captured_at) for scene in living}
     hours = settings.optimize.same_visit_h
     named, same_visits = {}, set()
     # By id, not in the order in which workers happened to finish: the same key whenever they were made.
-    for one in store.registrations.standing(usable=True):
+    for one in store.registrations.summaries(usable=True):
         same = _is_same_visit(captured[one.target], captured[one.source], hours)
         named[one.target, one.source] = f"{one.key or one.number} {one.review}" + " same visit" * same
         if same:
@@ -125,7 +125,7 @@ def _edges(store: Store, basis: PoseBasis, among: Collection[str] | None = None)
             same_visit=(stored.registration.target, stored.registration.source) in basis.same_visits,
             log_odds_wrong=solver.log_odds_wrong(stored.registration.evidence, stored.registration.overlap),
         )
-        for stored in store.registrations.usable(among)
+        for stored in store.registrations.current_usable(among)
         if stored.registration.S_target_source is not None and stored.registration.information is not None
     ]
 
@@ -165,9 +165,9 @@ def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool
     return a is not None and b is not None and abs(a - b).total_seconds() < 3600 * hours
 
 
-def _ups(store: Store, living: Sequence[BriefScene], settings: Settings) -> dict[str, np.ndarray]:
+def _ups(store: Store, living: Sequence[SceneSummary], settings: Settings) -> dict[str, np.ndarray]:
     """Return the up direction of each scene by its current graph, else its newest one."""
-    said = store.graphs.says()
+    said = store.graphs.frames()
     times = Counter(graph.scene for graph in said)
     several = [scene for scene in living if times[scene.id] > 1]
     present = {key.digest for key in graph_keys(store, several, settings).values()} if several else set[str]()

@@ -57,11 +57,11 @@ def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, 
     with ExitStack() as stack:
         catalogs = [store]
         if branches:
-            catalogs += [stack.enter_context(Store.open_even_tag(place.location)) for place in store.others()]
-        done = [(one, _finish(one, p)) for one in catalogs for p in purging.listed(one) if not p.is_done]
+            catalogs += [stack.enter_context(Store.open_writable(place.location)) for place in store.others()]
+        done = [(one, _finish(one, p)) for one in catalogs for p in purging.list_purges(one) if not p.is_done]
         scene = _scene(catalogs, ref)
         if scene is None:
-            done = done or [(one, p) for one in catalogs for p in purging.listed(one) if p.scene == ref]
+            done = done or [(one, p) for one in catalogs for p in purging.list_purges(one) if p.scene == ref]
             if not done:
                 raise NotFoundError(
                     f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes", code="scene_not_found"
@@ -71,8 +71,8 @@ def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, 
             begun = [(one, purging.begin(one, scene)) for one in holding]
             done = [(one, _finish(one, one_purge)) for one, one_purge in begun]
         for one in catalogs:
-            purging.recheck(one)
-        return [(one.location, p) for one, made in done for p in purging.listed(one) if p.number == made.number]
+            purging.update_receipts(one)
+        return [(one.location, p) for one, made in done for p in purging.list_purges(one) if p.number == made.number]
 
 
 def _scene(catalogs: Sequence[Store], ref: str) -> str | None:
@@ -95,7 +95,7 @@ def _finish(store: Store, begun: Purge) -> Purge:
     unreachable = []
     levels = TreeCache(cache_folder(), 0)
     if num_files := levels.num_files(begun.scene):
-        begun = purging.note(store, begun, str(levels.root), num_files)
+        begun = purging.record_tile_files(store, begun, str(levels.root), num_files)
         levels.forget(begun.scene)
     for target in begun.receipt["pending"]["targets"]:
         try:
@@ -105,14 +105,14 @@ def _finish(store: Store, begun: Purge) -> Purge:
                     begun = _clean(store, out, begun)
             elif is_file(out) and owner_of(out) == store.id:
                 remove_file(out.parent, out.name)  # it shows all scenes; gsmap report makes it anew
-                begun = purging.note(store, begun, str(out), 1)
+                begun = purging.record_tile_files(store, begun, str(out), 1)
             elif os.path.lexists(out / SITE):
                 if site_owner(out) == store.id:  # it shows all scenes; gsmap view --export makes it anew
-                    begun = purging.note(store, begun, str(out), len(site_files(out)) + 1)
+                    begun = purging.record_tile_files(store, begun, str(out), len(site_files(out)) + 1)
                     remove_site(out)
             elif os.path.lexists(out / PICTURES):
                 if gone := PictureFolder.load(out, store.id).forget(out, begun.scene):
-                    begun = purging.note(store, begun, str(out), gone)
+                    begun = purging.record_tile_files(store, begun, str(out), gone)
             else:
                 unreachable.append(f"{out}: it is not there, or no report, and holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
@@ -148,7 +148,7 @@ def _clean(store: Store, out: Path, begun: Purge) -> Purge:
             stale.append(folder)
     num_files = len(paths) + sum(_num_levels(out, folder) for folder in stale)
     if num_files or made_with_it:
-        begun = purging.note(store, begun, str(out), num_files)
+        begun = purging.record_tile_files(store, begun, str(out), num_files)
     for leftover in leftovers(out):
         remove_tree(out, *leftover)  # what an interrupted export left may be such a tile
     if made_with_it:

@@ -23,8 +23,8 @@ from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import PairSchedule, ScenePosition, directed, neighbours
 from gsmap.store import MANUAL, Store
-from gsmap.store.registrations import Standing
-from gsmap.store.scenes import BriefScene
+from gsmap.store.registrations import EdgeSummary
+from gsmap.store.scenes import SceneSummary
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.sim3 import check_sim3
@@ -46,7 +46,7 @@ def register(
     Args:
         known: state from an earlier call in the same update; only later changes are read.
     """
-    scenes = store.scenes.brief()
+    scenes = store.scenes.summaries()
     work = _RegistrationContext(store, scenes, graph_keys(store, scenes, settings), settings, progress)
     known = RegisteredPairs() if known is None else known
     if pairs == "auto":
@@ -56,7 +56,7 @@ def register(
         known.update(work)
         return work.register([pair for pair in everything if not known.has(*pair)], after=0)
     # What is named is registered again: only what comes later counts.
-    return work.register(_named(store, pairs, work), after=store.registrations.newest(), again=True)
+    return work.register(_named(store, pairs, work), after=store.registrations.newest_number(), again=True)
 
 
 class _RegistrationContext:
@@ -69,7 +69,7 @@ class _RegistrationContext:
     def __init__(
         self,
         store: Store,
-        scenes: Sequence[BriefScene],
+        scenes: Sequence[SceneSummary],
         graphs: Mapping[str, RecipeKey],
         settings: Settings,
         progress: StageProgress,
@@ -96,7 +96,7 @@ class _RegistrationContext:
             key: (store.location, (a, self.graphs[a].digest), (b, self.graphs[b].digest), settings.register)
             for key, (a, b) in edges.items()
         }
-        done = partial(store.registrations.kept, after=after)
+        done = partial(store.registrations.stored_keys, after=after)
         shared = SharedJobs(store, "register", "edge", jobs, edges, done, self.progress, again=again)
         made = shared.batches(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
         names = {scene.id: scene.name for scene in self.scenes}
@@ -106,7 +106,7 @@ class _RegistrationContext:
                 store.registrations.save_all([(edge, self.key(*edges[key])) for key, edge in batch])
                 for key, edge in batch:
                     shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
-        return store.registrations.found(edges)
+        return store.registrations.newest_with_keys(edges)
 
 
 class RegisteredPairs:
@@ -116,7 +116,7 @@ class RegisteredPairs:
     those pairs are judged of which something else stands by now.
 
     Args:
-        held: pairs with a usable edge that is not doubtful, by `Standing.pair`.
+        held: pairs with a usable edge that is not doubtful, by `EdgeSummary.pair`.
         stale: pairs of described scenes registered by other settings or versions.
     """
 
@@ -144,7 +144,7 @@ class RegisteredPairs:
 
     def _forget(self) -> None:
         self.held.clear()
-        self._judged: dict[str, Standing] = {}
+        self._judged: dict[str, EdgeSummary] = {}
         self._registered: set[str] = set()
         self._replaced: dict[str, tuple[Pair, frozenset[str]]] = {}
 
@@ -155,7 +155,7 @@ class RegisteredPairs:
             work.settings.optimize.max_disagreement,
             {scene: key.digest for scene, key in work.graphs.items()},
         )
-        tried = work.store.registrations.tried()
+        tried = work.store.registrations.all_summaries()
         if by != self._by:
             self._forget()
             self._by = by
@@ -164,7 +164,7 @@ class RegisteredPairs:
             self._forget()
             self._judge_all(work, tried)
 
-    def _judge_all(self, work: _RegistrationContext, tried: Sequence[Standing]) -> None:
+    def _judge_all(self, work: _RegistrationContext, tried: Sequence[EdgeSummary]) -> None:
         judged, digest_of, (_, max_disagreement, graphs) = self._judged, work.recipe.digest_of, self._by
         for one in tried:
             pair = one.pair
@@ -185,14 +185,14 @@ class RegisteredPairs:
             current = one.key in mine
             if current or not one.keys.isdisjoint(mine):
                 self._registered.add(pair)
-            if not current and not one.is_told:
+            if not current and not one.is_specified:
                 self._replaced[pair] = (a, b), one.keys
-            elif one.usable and (one.is_told or not one.disagreement > max_disagreement):
+            elif one.usable and (one.is_specified or not one.disagreement > max_disagreement):
                 self.held[pair] = (a, b)
 
     def _adopt(self, work: _RegistrationContext, pair: Pair, keys: frozenset[str]) -> bool:
         mine = [key for key in _keys(work, pair) if key in keys]
-        known = [work.store.registrations.find(key) for key in mine]
+        known = [work.store.registrations.newest_with_key(key) for key in mine]
         if known:
             work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
         return bool(known)
@@ -211,7 +211,7 @@ def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> 
     """
     store, params = work.store, work.settings.retrieve
     known.update(work)
-    asked, keys = store.indexes.asked(), keys_of_lookups(work.described, params)
+    asked, keys = store.indexes.lookup_states(), keys_of_lookups(work.described, params)
     new = sorted(scene for scene in work.described if asked.get(scene, ("", None))[0] != keys[scene])
     if new:
         look_up_scenes(store, work.described, new, params, work.progress)
@@ -244,7 +244,7 @@ def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> 
                 rounds.add_edge(edge.target, edge.source)
         pairs = rounds.next()
     if lists:
-        store.indexes.leave({scene: len(set(mine) - rounds.tried) for scene, mine in lists.items()})
+        store.indexes.set_num_left({scene: len(set(mine) - rounds.tried) for scene, mine in lists.items()})
     return made
 
 

@@ -22,7 +22,7 @@ from gsmap.register.metric_scene import target_unit_m
 from gsmap.render import backend
 from gsmap.store import Store, scene_id
 from gsmap.store.registrations import StoredRegistration
-from gsmap.store.superseding import inherit
+from gsmap.store.scene_replacement import inherit
 from gsmap.types import Registration, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.registration import Proposal

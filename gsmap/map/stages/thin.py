@@ -84,7 +84,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
                 continue
             own = PosedScene(store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id), scene.id)
             stays = find_visible(own, settings.thin)
-            kept = compact.rounded(own.gaussians[stays])
+            kept = compact.round_trip(own.gaussians[stays])
             fidelity = measure_fidelity_db(own, kept, settings.thin)
             if fidelity < settings.thin.min_fidelity_db:
                 why = f"compact, its pictures would keep {fidelity:.1f} dB"

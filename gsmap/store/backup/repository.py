@@ -1,4 +1,4 @@
-"""What lies in a backup, and reading it: nothing is used before it is held against its digest.
+"""Layout of a backup, and reading it: everything is verified against its digest before use.
 
 ::
 
@@ -21,9 +21,9 @@ from typing import Any
 
 from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.states import check_path, checked
-from gsmap.store.catalog import after
-from gsmap.store.places import Place, place_of
+from gsmap.store.backup.map_state import check_path, verify_chunks
+from gsmap.store.catalog import timestamp_after
+from gsmap.store.storage import Storage, open_storage
 from gsmap.version import __version__
 
 FORMAT = 1
@@ -34,20 +34,20 @@ _NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-[0-9a-f]{16}")
 _TIME = "%Y%m%dT%H%M%S.%f"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _LINE = re.compile(r"([0-9a-f]{64}) (\d{1,18}) (.+)")
-_MAX_TEXT_BYTES = 1 << 30  # of a list of files: ten million of them
+_MAX_TEXT_BYTES = 1 << 30  # of a list of files: ten million lines
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One state in a backup.
+    """A snapshot in a backup.
 
     Args:
-        name: its time, and the beginning of the digest of the bytes that describe it.
-        map_id, created_at, schema, revision, counts: see `gsmap.store.backup.states.State`.
-        gsmap_version: which gsmap took it.
+        name: its time, and a prefix of the digest of its description.
+        map_id, created_at, schema, revision, counts: see `gsmap.store.backup.map_state.MapState`.
+        gsmap_version: version of gsmap that made it.
         files: digest of the object that lists its files.
-        num_files, num_bytes: of all of them.
-        num_bytes_new: how many of them were sent for it.
+        num_files, num_bytes: of all its files.
+        num_bytes_new: bytes that were sent for it.
     """
 
     name: str
@@ -65,110 +65,113 @@ class Snapshot:
 
     @property
     def time(self) -> str:
-        """``created_at`` as the name has it."""
+        """Return ``created_at`` in the format of names."""
         return _compact(self.created_at)
 
     def packed(self) -> tuple[str, bytes]:
-        """The name that its bytes give it, and the bytes."""
+        """Return the name derived from its bytes, and the bytes."""
         fields = {name: value for name, value in asdict(self).items() if name != "name"}
         text = json.dumps({"format": FORMAT, **fields}, indent=1).encode() + b"\n"
         return f"{self.time}Z-{hashlib.sha256(text).hexdigest()[:16]}", text
 
 
 class Backup:
-    """A place with snapshots of one map."""
+    """A storage with snapshots of one map."""
 
-    def __init__(self, place: Place, map_id: str) -> None:
-        self.place = place
+    def __init__(self, storage: Storage, map_id: str) -> None:
+        self.storage = storage
         self.map_id = map_id
 
     @classmethod
     def open(cls, target: str | os.PathLike[str]) -> Backup:
-        """The backup at a place.
+        """Open the backup in a storage.
 
         Raises:
-            NotFoundError: there is none.
+            NotFoundError: there is no backup.
             StoreError: its format is newer than this gsmap, or it cannot be reached.
         """
-        return cls.at(place_of(target))
+        return cls.at(open_storage(target))
 
     @classmethod
-    def at(cls, place: Place) -> Backup:
-        """As `open`."""
+    def at(cls, storage: Storage) -> Backup:
+        """Open the backup in an open storage; see `open`."""
         try:
-            text = _read(place, MARKER, 1 << 16)
+            text = _read(storage, MARKER, 1 << 16)
         except NotFoundError:
-            raise NotFoundError(f"{place.url} is no backup of a map: it lacks {MARKER}", code="not_a_backup") from None
-        marker = _object(text, f"{place.url}/{MARKER}")
-        return cls(place, _field(marker, "map_id", str, f"{place.url}/{MARKER}"))
+            raise NotFoundError(
+                f"{storage.url} is no backup of a map: it lacks {MARKER}", code="not_a_backup"
+            ) from None
+        marker = _object(text, f"{storage.url}/{MARKER}")
+        return cls(storage, _field(marker, "map_id", str, f"{storage.url}/{MARKER}"))
 
     @classmethod
-    def at_or_new(cls, place: Place, map_id: str) -> Backup:
-        """The backup at a place, which is made where there is nothing.
+    def at_or_new(cls, storage: Storage, map_id: str) -> Backup:
+        """Open the backup in a storage, or create one in an empty storage.
 
         Raises:
-            StoreError: the place holds something else, or a backup of another map.
+            StoreError: the storage holds other files, or a backup of another map.
         """
         try:
-            found = cls.at(place)
+            found = cls.at(storage)
         except NotFoundError:
-            found = cls._begun(place, map_id)
+            found = cls._begun(storage, map_id)
         if found.map_id != map_id:
             raise StoreError(
-                f"{place.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its own place",
+                f"{storage.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its own place",
                 code="backup_of_another_map",
             )
         return found
 
     @classmethod
-    def _begun(cls, place: Place, map_id: str) -> Backup:
-        other = place.anything()
+    def _begun(cls, storage: Storage, map_id: str) -> Backup:
+        other = storage.first_name()
         if other is None:
             text = json.dumps({"format": FORMAT, "map_id": map_id}, indent=1).encode() + b"\n"
-            place.put(MARKER, [text], len(text))
+            storage.put(MARKER, [text], len(text))
         try:
-            return cls.at(place)  # which another may have begun at the same moment
+            return cls.at(storage)  # another process may have created it at the same moment
         except NotFoundError:
             raise StoreError(
-                f"{place.url} holds other things ({other}): give the backup a place of its own", code="folder_not_empty"
+                f"{storage.url} holds other things ({other}): give the backup a place of its own",
+                code="folder_not_empty",
             ) from None
 
     def names(self) -> list[str]:
-        """Names of the snapshots, oldest first."""
-        listed = [name[len(SNAPSHOTS) :].removesuffix(".json") for name in self.place.list(SNAPSHOTS)]
-        return sorted(name for name in listed if _NAME.fullmatch(name))
+        """Return the names of the snapshots, oldest first."""
+        format_file_list = [name[len(SNAPSHOTS) :].removesuffix(".json") for name in self.storage.list(SNAPSHOTS)]
+        return sorted(name for name in format_file_list if _NAME.fullmatch(name))
 
     def time_of_next(self, now: str) -> str:
-        """The time of the next snapshot: ``now``, or the first after the newest one where the clock was wrong once.
+        """Return the time of the next snapshot: ``now``, or the first time after the newest one if a clock was wrong.
 
-        So the order of names is the order in which snapshots were taken, whatever clocks said.
+        So the order of names is the order of creation, whatever the clocks.
 
         Args:
             now: ISO 8601, UTC.
 
         Raises:
-            StoreError: there is no time after the newest one.
+            StoreError: no time is after the newest one.
         """
         names = self.names()
         newest = names[-1].split("Z-")[0] if names else ""
         if newest < _compact(now):
             return now
         try:
-            return after(datetime.strptime(newest, _TIME).replace(tzinfo=UTC))
+            return timestamp_after(datetime.strptime(newest, _TIME).replace(tzinfo=UTC))
         except (ValueError, OverflowError) as error:
             raise StoreError(
-                f"snapshot {names[-1]} of {self.place.url} has a time that nothing comes after: delete its file",
+                f"snapshot {names[-1]} of {self.storage.url} has a time that nothing comes after: delete its file",
                 code="snapshot_in_future",
             ) from error
 
     def snapshot(self, name: str) -> Snapshot:
-        """One snapshot by its whole name.
+        """Load a snapshot by its full name.
 
         Raises:
-            CorruptError: it is not what was written.
+            CorruptError: the snapshot is damaged.
         """
-        where = f"{self.place.url}/{SNAPSHOTS}{name}.json"
-        text = _read(self.place, f"{SNAPSHOTS}{name}.json", 1 << 20)
+        where = f"{self.storage.url}/{SNAPSHOTS}{name}.json"
+        text = _read(self.storage, f"{SNAPSHOTS}{name}.json", 1 << 20)
         if hashlib.sha256(text).hexdigest()[:16] != name[-16:]:
             raise CorruptError(f"{where} is damaged: restore an earlier one, and delete it", code="backup_damaged")
         data = _object(text, where)
@@ -184,23 +187,23 @@ class Backup:
         return found
 
     def snapshots(self) -> list[Snapshot]:
-        """All snapshots, oldest first."""
+        """Load all snapshots, oldest first."""
         return [self.snapshot(name) for name in self.names()]
 
     def find(self, name: str | None = None, *, at: str | None = None) -> Snapshot:
-        """A snapshot: the newest one, or the one that is asked for.
+        """Load the newest snapshot, or the requested one.
 
         Args:
-            name: its name, or six digits or more of the digest at its end.
-            at: the last one at or before this time, ISO 8601 in UTC.
+            name: its name, or at least six digits of the digest at its end.
+            at: load the last one at or before this time, ISO 8601 in UTC.
 
         Raises:
-            NotFoundError: there is none such.
+            NotFoundError: no snapshot matches.
         """
         names = self.names()
         if not names:
             raise NotFoundError(
-                f"{self.place.url} has no snapshot yet: a backup was begun there and never finished",
+                f"{self.storage.url} has no snapshot yet: a backup was begun there and never finished",
                 code="snapshot_not_found",
             )
         if name is not None:
@@ -208,29 +211,29 @@ class Backup:
             if len(found) != 1:
                 hint = "gsmap backup MAP DEST --list shows what there is"
                 raise NotFoundError(
-                    f"{self.place.url} has no snapshot {name!r}, and it is no time either: {hint}",
+                    f"{self.storage.url} has no snapshot {name!r}, and it is no time either: {hint}",
                     code="snapshot_not_found",
                 )
             return self.snapshot(found[0])
         earlier = [one for one in names if at is None or one.split("Z-")[0] <= _compact(at)]
         if not earlier:
             raise NotFoundError(
-                f"{self.place.url} has no snapshot at or before {at}: the first one is {names[0]}",
+                f"{self.storage.url} has no snapshot at or before {at}: the first one is {names[0]}",
                 code="snapshot_not_found",
             )
         return self.snapshot(earlier[-1])
 
     def files(self, snapshot: Snapshot) -> list[StoredFile]:
-        """The files of a snapshot: relative to the map, inside it, each once.
+        """Return the files of a snapshot, with validated, unique paths relative to the map.
 
         Raises:
-            CorruptError: the list is damaged or names what no map has.
+            CorruptError: the list is damaged or has invalid paths.
         """
-        where = f"{self.place.url}/{object_name(snapshot.files)}"
+        where = f"{self.storage.url}/{object_name(snapshot.files)}"
         if snapshot.files_bytes > _MAX_TEXT_BYTES:
             raise CorruptError(f"{where} is too long for a list of files", code="backup_damaged")
-        listed = StoredFile("", snapshot.files_bytes, snapshot.files)
-        text = b"".join(self.read(listed)).decode("utf-8", errors="replace")
+        format_file_list = StoredFile("", snapshot.files_bytes, snapshot.files)
+        text = b"".join(self.read(format_file_list)).decode("utf-8", errors="replace")
         out: dict[str, StoredFile] = {}
         for line in text.splitlines():
             parts = _LINE.fullmatch(line)
@@ -240,46 +243,46 @@ class Backup:
         return list(out.values())
 
     def read(self, file: StoredFile) -> Generator[bytes, None, None]:
-        """The bytes of an object, compared with its digest while they are read.
+        """Yield the bytes of an object, and verify its digest at the end.
 
         Raises:
-            CorruptError: it is missing or damaged. What was read so far is of no use then.
+            CorruptError: the object is missing or damaged. Bytes read so far must be discarded.
         """
-        what = f"{self.place.url}/{object_name(file.sha256)}" + (f" ({file.path})" if file.path else "")
+        what = f"{self.storage.url}/{object_name(file.sha256)}" + (f" ({file.path})" if file.path else "")
         try:
-            yield from checked(self.place.get(object_name(file.sha256)), file, what)
+            yield from verify_chunks(self.storage.get(object_name(file.sha256)), file, what)
         except NotFoundError:
             raise CorruptError(f"{what} is missing", code="backup_damaged") from None
 
 
-def listed(files: list[StoredFile]) -> bytes:
-    """The list of files of a snapshot, as an object has it: a line for each, digest, size and path."""
+def format_file_list(files: list[StoredFile]) -> bytes:
+    """Format the list of files of a snapshot: a line each with digest, size and path."""
     return "".join(f"{file.sha256} {file.size_bytes} {file.path}\n" for file in files).encode()
 
 
 def object_name(sha256: str) -> str:
-    """Where bytes lie."""
+    """Return the name of the object with this digest."""
     return f"{OBJECTS}{sha256[:2]}/{sha256}"
 
 
 def digest_of(name: str) -> str | None:
-    """The digest whose object has this name; None where that is no object."""
+    """Return the digest in the name of an object; None for other names."""
     sha256 = name.rpartition("/")[2]
     return sha256 if _DIGEST.fullmatch(sha256) and name == object_name(sha256) else None
 
 
 def _compact(time: str) -> str:
-    """An ISO time of UTC as a file's name can have it: 20261121T194500.123456."""
+    """Format an ISO time of UTC for file names: 20261121T194500.123456."""
     text = re.sub(r"[-:]", "", time.removesuffix("+00:00").removesuffix("Z"))
     return text if "." in text else f"{text}.000000"
 
 
-def _read(place: Place, name: str, most_bytes: int) -> bytes:
+def _read(storage: Storage, name: str, most_bytes: int) -> bytes:
     out = bytearray()
-    for chunk in place.get(name):
+    for chunk in storage.get(name):
         out += chunk
         if len(out) > most_bytes:
-            raise CorruptError(f"{place.url}/{name} is too long", code="backup_damaged")
+            raise CorruptError(f"{storage.url}/{name} is too long", code="backup_damaged")
     return bytes(out)
 
 

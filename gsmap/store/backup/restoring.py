@@ -1,4 +1,4 @@
-"""From a state back to a map: staged beside its place, every byte held against its digest, put there by one rename."""
+"""Restore or clone a map: staged beside its path, verified byte by byte, and moved into place by one rename."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from gsmap.errors import CorruptError, DiskError, DiskFullError, GsmapError, Not
 from gsmap.store import catalog as _catalog
 from gsmap.store import migrate, schema, sqlite, staging, trust
 from gsmap.store.arrays import StoredFile
+from gsmap.store.backup.map_state import ARRAYS, MapState, OutdatedStateError, capture_state, read_file, read_state
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
-from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
 from gsmap.store.branches import FOLDER as BRANCHES
 from gsmap.store.catalog import Catalog
-from gsmap.store.copying import copy_catalog, empty_catalog, make_own, own_catalog
-from gsmap.store.explained import explained
-from gsmap.store.places import Place
+from gsmap.store.catalog_copy import copy_catalog, empty_catalog, make_independent, open_sqlite_catalog
+from gsmap.store.error_translation import translate_errors
+from gsmap.store.storage import Storage
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__
 
-_TRIES = 4  # states to begin with where others prune meanwhile
+_TRIES = 4  # attempts while other processes prune
 _log = logging.getLogger("gsmap.store")
 
 
 @dataclass(frozen=True)
-class Restored:
-    """A map that was restored.
+class RestoreResult:
+    """A restored map.
 
     Args:
-        path: where it lies now.
-        snapshot: what it was restored from.
-        schema: of its catalog now; older than this gsmap's where it waits for ``gsmap migrate``.
+        path: of the map.
+        snapshot: that it was restored from.
+        schema: of its catalog; older than this gsmap's if it needs ``gsmap migrate``.
     """
 
     path: Path
@@ -52,14 +52,14 @@ class Restored:
 
 
 @dataclass(frozen=True)
-class Cloned:
-    """A map that was made from another.
+class CloneResult:
+    """A cloned map.
 
     Args:
-        path: where it lies.
-        map_id: its own.
-        num_linked, num_copied: files that it shares with the other map, and files of its own.
-        num_bytes_copied: of the latter.
+        path: of the clone.
+        map_id: its own id.
+        num_linked, num_copied: numbers of files shared with the other map, and of copies.
+        num_bytes_copied: size of the copies.
     """
 
     path: Path
@@ -70,35 +70,35 @@ class Cloned:
 
 
 def restore(
-    place: Place,
+    place: Storage,
     path: str | os.PathLike[str],
     *,
     snapshot: str | None = None,
     at: str | None = None,
     catalog_url: str | None = None,
     progress: Progress = silent,
-) -> Restored:
-    """Make a map from a backup; it appears whole or not at all, and is the same map, with the same id.
+) -> RestoreResult:
+    """Restore a map from a backup; it appears whole or not at all, with the id of the original.
 
     Args:
         path: a folder that does not exist.
-        snapshot, at: which one; see `Backup.find`.
-        catalog_url: an empty database to keep the catalog in, as in `Store.create`, instead of ``map.sqlite``.
+        snapshot, at: see `Backup.find`.
+        catalog_url: URL of an empty database for the catalog, as in `Store.create`, instead of ``map.sqlite``.
 
     Raises:
-        NotFoundError: there is no such backup or snapshot, or no folder to make the map in.
-        CorruptError: something in the backup is not what was written, or names what no map has.
-        StoreError: there is something at ``path``, or it cannot be written.
+        NotFoundError: no such backup or snapshot, or the parent folder does not exist.
+        CorruptError: the backup is damaged, or has invalid paths.
+        StoreError: ``path`` exists, or is not writable.
     """
     backup = Backup.at(place)
     chosen = backup.find(snapshot, at=at)
-    target = _free(path)
+    target = _check_target(path)
     files = backup.files(chosen)
     _require_room(target.parent, sum(file.size_bytes for file in files))
     with _staged(target) as folder, contextlib.ExitStack() as undo:
         _fetch_all(backup, files, folder, progress)
-        state = _compared(folder, files, chosen)
-        _settle(folder)
+        state = _verify_catalogs(folder, files, chosen)
+        _reset_catalogs(folder)
         if catalog_url is not None:
             state = _move_catalog(folder, catalog_url, undo)
         _synchronise(folder)
@@ -106,27 +106,27 @@ def restore(
         undo.pop_all()
         _confirm(target)
     if catalog_url is not None:
-        trust.remember(target)
-    return Restored(target, chosen, state.schema)
+        trust.trust_new_map(target)
+    return RestoreResult(target, chosen, state.schema)
 
 
-def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> Cloned:
-    """Make another map with what one holds now: new id, its own catalog (SQLite), arrays shared where links can be.
+def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> CloneResult:
+    """Clone a map: a new id, its own catalog (SQLite), and shared arrays where the disk supports hard links.
 
-    Arrays are never changed in place, so what one map does the other does not see. Branches, exports, backups and
-    leases stay behind: they are the other map's.
+    Arrays are never changed in place, so that changes of one map do not affect the other. Branches, exports, backups
+    and leases are not cloned.
 
     Raises:
         StoreError, CorruptError, NotFoundError: as `restore`.
     """
-    target = _free(path)
+    target = _check_target(path)
     for _ in range(_TRIES):
-        with _staged(target) as folder, contextlib.suppress(Vanished):
-            state = capture(store, folder, branches=False)
+        with _staged(target) as folder, contextlib.suppress(OutdatedStateError):
+            state = capture_state(store, folder, branches=False)
             made = _link_all(store, state, folder, target, progress)
-            _settle(folder)
-            others = (schema.tiles, schema.exports, schema.backups)  # exported and backed up was the other map
-            make_own(folder, others, id=made.map_id, created_at=_catalog.now(), gsmap_version=__version__)
+            _reset_catalogs(folder)
+            others = (schema.tiles, schema.exports, schema.backups)  # records of the original map
+            make_independent(folder, others, id=made.map_id, created_at=_catalog.now(), gsmap_version=__version__)
             (folder / _catalog.LOCK_FILE).unlink(missing_ok=True)
             _synchronise(folder)
             _put_in_place(folder, target)
@@ -139,8 +139,8 @@ def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silen
     )
 
 
-def _note(store: Store, made: Cloned) -> None:
-    """Let a map remember its clones, as it does its backups: what it forgets on demand may live on there."""
+def _note(store: Store, made: CloneResult) -> None:
+    """Record a clone in the original map, as a place where purged scenes may still exist."""
     if store.catalog.writable:
         try:
             store.backups.add(str(made.path), f"clone {made.map_id}", made.num_bytes_copied)
@@ -148,7 +148,7 @@ def _note(store: Store, made: Cloned) -> None:
             _log.warning("the clone is complete, but the map could not note it: %s", error)
 
 
-def _free(path: str | os.PathLike[str]) -> Path:
+def _check_target(path: str | os.PathLike[str]) -> Path:
     target = Path(path).absolute()
     if os.path.lexists(target) and not (target.is_dir() and not target.is_symlink() and not any(target.iterdir())):
         raise StoreError(
@@ -161,7 +161,7 @@ def _free(path: str | os.PathLike[str]) -> Path:
 
 @contextlib.contextmanager
 def _staged(target: Path) -> Iterator[Path]:
-    """A folder beside the target, on the same disk; what is left of it goes at the end, or with the next one."""
+    """Yield a staging folder beside the target, on the same disk."""
     with _writing(target), staging.beside(target) as folder:
         (folder / ARRAYS).mkdir()
         yield folder
@@ -187,11 +187,11 @@ def _fetch_all(backup: Backup, files: list[StoredFile], folder: Path, progress: 
             raise
 
 
-def _link_all(store: Store, state: State, folder: Path, target: Path, progress: Progress) -> Cloned:
+def _link_all(store: Store, state: MapState, folder: Path, target: Path, progress: Progress) -> CloneResult:
     linked = copied = num_bytes = 0
     for i, file in enumerate(state.files):
         place = folder / file.path
-        if place.exists():  # the catalog and the settings, by `capture`
+        if place.exists():  # catalog and settings, from `capture_state`
             continue
         place.parent.mkdir(parents=True, exist_ok=True)
         source = store.arrays.root.parent / file.path
@@ -201,12 +201,12 @@ def _link_all(store: Store, state: State, folder: Path, target: Path, progress: 
                 place.unlink()
                 raise FileNotFoundError(errno.ENOENT, "not what was written", str(source))
             linked += 1
-        except OSError:  # another disk, or one without links; or it is gone, which `read_file` explains
+        except OSError:  # another disk, or one without links; `read_file` raises if the file is gone
             with contextlib.closing(read_file(store, file, folder)) as chunks:
                 _write(place, chunks)
             copied, num_bytes = copied + 1, num_bytes + file.size_bytes
         progress(i / len(state.files), f"sharing, {i} of {len(state.files)} files")
-    return Cloned(target, uuid.uuid4().hex, linked, copied, num_bytes)
+    return CloneResult(target, uuid.uuid4().hex, linked, copied, num_bytes)
 
 
 def _write(path: Path, chunks: Iterator[bytes]) -> None:
@@ -217,8 +217,8 @@ def _write(path: Path, chunks: Iterator[bytes]) -> None:
         os.fsync(file.fileno())
 
 
-def _compared(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> State:
-    """What the catalogs name must be there, and the map be the one that the backup is of."""
+def _verify_catalogs(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> MapState:
+    """Raise unless all files that the catalogs name are present and the map is the one in the snapshot."""
     there = {file.path: (file.size_bytes, file.sha256) for file in files}
     if sqlite.FILE not in there:
         raise CorruptError(f"snapshot {snapshot.name} has no {sqlite.FILE}", code="snapshot_lacks_file")
@@ -245,10 +245,10 @@ def _compared(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> Stat
     return state
 
 
-def _settle(folder: Path) -> None:
-    """Nobody is at work on a map that was just made; and its catalogs get the digests that catalogs have."""
+def _reset_catalogs(folder: Path) -> None:
+    """Delete leases and leftover log files, and write page digests."""
     for one in (folder, *_branches(folder)):
-        with contextlib.closing(own_catalog(one)) as catalog, catalog.write() as connection:
+        with contextlib.closing(open_sqlite_catalog(one)) as catalog, catalog.write() as connection:
             if inspect(connection).has_table("leases"):
                 connection.execute(delete(schema.leases))
         for left in (_catalog.LOCK_FILE, f"{sqlite.FILE}-wal", f"{sqlite.FILE}-shm"):
@@ -259,15 +259,15 @@ def _branches(folder: Path) -> list[Path]:
     return sorted(file.parent for file in (folder / BRANCHES).glob(f"*/{sqlite.FILE}"))
 
 
-def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> State:
-    """Copy ``map.sqlite`` into another database, with the present schema, and let the map remember it instead."""
-    with contextlib.closing(own_catalog(folder)) as own:
+def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> MapState:
+    """Copy ``map.sqlite`` to another database with the current schema, and store its URL in the map."""
+    with contextlib.closing(open_sqlite_catalog(folder)) as own:
         migrate.upgrade(own)
         with own.read() as connection:
             map_id = connection.execute(select(schema.about.c.id)).scalar_one()
         there = empty_catalog(folder, url, map_id)
-        undo.callback(_empty_again, there)
-        with explained(folder):
+        undo.callback(_drop_tables, there)
+        with translate_errors(folder):
             copy_catalog(own, there, leave_out=("leases",))
     state = read_state(folder / sqlite.FILE)
     for left in folder.glob(f"{sqlite.FILE}*"):
@@ -276,11 +276,11 @@ def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> State:
     return state
 
 
-def _empty_again(catalog: Catalog) -> None:
-    """Take the tables back from a database whose map did not come to be."""
+def _drop_tables(catalog: Catalog) -> None:
+    """Drop the tables from a database whose map was not restored."""
     try:
         migrate.upgrade(catalog, "base")
-        with explained(catalog.folder), catalog.engine.begin() as connection:
+        with translate_errors(catalog.folder), catalog.engine.begin() as connection:
             connection.execute(text("DROP TABLE alembic_version"))
     except GsmapError as error:
         _log.warning("the database %r keeps tables of a map that was not restored: %s", catalog.engine.url, error)
@@ -296,18 +296,18 @@ def _synchronise(folder: Path) -> None:
     for root, _, names in os.walk(folder):
         for name in names:
             if root.startswith(str(folder / ARRAYS)):
-                continue  # synchronised when it was written, or a link to what was
+                continue  # synchronized when written, or a link to a synchronized file
             with open(Path(root) / name, "rb") as file:
                 os.fsync(file.fileno())
         sync_folder(Path(root))
 
 
 def _put_in_place(folder: Path, target: Path) -> None:
-    os.rename(folder, target)  # replaces nothing but an empty folder
+    os.rename(folder, target)  # replaces only an empty folder
 
 
 def _confirm(target: Path) -> None:
-    """Make the name survive a power cut; the map is there already, so that nothing is taken back."""
+    """Make the name durable; the map is in place already, so that a failure undoes nothing."""
     try:
         sync_folder(target.parent)
     except OSError as error:
@@ -322,5 +322,5 @@ def _writing(target: Path) -> Iterator[None]:
         yield
     except OSError as error:
         kind = of_system(error)
-        said = "the disk is full" if kind is DiskFullError else error.strerror or str(error)
-        raise kind(f"{target} was not made: {said}") from error
+        reason = "the disk is full" if kind is DiskFullError else error.strerror or str(error)
+        raise kind(f"{target} was not made: {reason}") from error

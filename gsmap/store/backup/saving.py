@@ -1,4 +1,4 @@
-"""Taking a backup: a state of the map is read, what the place lacks is sent, and the snapshot is written last."""
+"""Save a backup: capture a state of the map, send missing objects, and write the snapshot last."""
 
 from __future__ import annotations
 
@@ -13,31 +13,38 @@ from pathlib import Path
 
 from gsmap.errors import ConfigError, CorruptError, GsmapError, StoreError
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.repository import OBJECTS, SNAPSHOTS, Backup, Snapshot, digest_of, listed, object_name
-from gsmap.store.backup.sharing import SAVE, SWEEP, Lease
-from gsmap.store.backup.states import State, Vanished, capture, home_of, read_file, still
-from gsmap.store.places import FolderPlace, Place
+from gsmap.store.backup.backup_lease import SAVE, SWEEP, BackupLease
+from gsmap.store.backup.map_state import (
+    MapState,
+    OutdatedStateError,
+    capture_state,
+    map_folder,
+    pause_writers,
+    read_file,
+)
+from gsmap.store.backup.repository import OBJECTS, SNAPSHOTS, Backup, Snapshot, digest_of, format_file_list, object_name
+from gsmap.store.storage import FolderStorage, Storage
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__
 
-TRANSFERS = 8  # objects on their way at a time: a store far away answers slowly, but many at once
-_TRIES = 4  # states that are begun with while others prune; for the last one they wait
+TRANSFERS = 8  # concurrent transfers, because of the latency of remote storage
+_TRIES = 4  # attempts while other processes prune; they are paused for the last one
 
 
 @dataclass(frozen=True)
-class Saved:
-    """What a backup did.
+class BackupResult:
+    """Result of a backup.
 
     Args:
-        target: where it went.
+        target: folder or URL of the backup.
         snapshot: the new one.
-        num_files_new: objects that were sent.
-        deleted: names of snapshots that were dropped.
-        num_bytes_freed: by that.
-        num_verified: objects that were read again; None where nobody asked for that.
-        problems: damage in the backup that the map could not mend.
-        notes: what a person should know.
+        num_files_new: number of objects sent.
+        deleted: names of the snapshots deleted.
+        num_bytes_freed: size of the objects deleted.
+        num_verified: number of objects read again; None without verification.
+        problems: damage in the backup that could not be repaired from the map.
+        notes: remarks for the user.
     """
 
     target: str
@@ -51,39 +58,39 @@ class Saved:
 
 
 def save(
-    store: Store, place: Place, *, verify: bool = False, keep: int | None = None, progress: Progress = silent
-) -> Saved:
-    """Back a map up, while others read and write it.
+    store: Store, storage: Storage, *, verify: bool = False, keep: int | None = None, progress: Progress = silent
+) -> BackupResult:
+    """Back up a map while other processes read and write it.
 
     Args:
-        verify: read every object that is there already, and send again what is damaged.
-        keep: afterwards delete all but this many of the newest snapshots, and what only they needed.
+        verify: read every existing object, and send damaged ones again.
+        keep: afterwards delete all but this many of the newest snapshots, and the objects that only they need.
 
     Raises:
         CorruptError: the map is damaged: nothing damaged is sent, and no snapshot is written.
-        StoreError: the place cannot be reached or written, is full, or holds something else.
-        BusyError: others are at work for too long.
+        StoreError: the storage cannot be reached or written, is full, or holds other files.
+        BusyError: another process is deleting for too long.
         ConfigError: ``keep`` is less than 1; a branch instead of the map; a folder inside the map.
     """
     if keep is not None and keep < 1:
         raise ConfigError(f"the number of snapshots to keep must be at least 1, got {keep}", code="out_of_range")
-    home = home_of(store).resolve()
+    home = map_folder(store).resolve()
     if store.catalog.folder.resolve() != home:
         raise ConfigError(f"branches are backed up with their map: name {home}", code="backup_of_branch")
-    if isinstance(place, FolderPlace) and place.root.resolve().is_relative_to(home):
+    if isinstance(storage, FolderStorage) and storage.root.resolve().is_relative_to(home):
         raise ConfigError(
-            f"{place.url} lies inside the map: a backup must survive it; name another folder", code="place_inside_map"
+            f"{storage.url} lies inside the map: a backup must survive it; name another folder", code="place_inside_map"
         )
-    backup = Backup.at_or_new(place, store.id)
-    with Lease(place, SAVE) as lease:
+    backup = Backup.at_or_new(storage, store.id)
+    with BackupLease(storage, SAVE) as lease:
         lease.wait_for_sweepers()
-        run = _Run(store, backup, lease, progress)
+        run = _BackupRun(store, backup, lease, progress)
         found = run.verify() if verify else None
         snapshot = run.save()
-        problems = run.unmended(found) if found is not None else ()
+        problems = run.remaining_problems(found) if found is not None else ()
     notes = (*run.notes, *run.note(snapshot))
-    saved = Saved(
-        place.url,
+    saved = BackupResult(
+        storage.url,
         snapshot,
         run.num_sent,
         num_verified=None if found is None else found.num_read,
@@ -92,28 +99,29 @@ def save(
     )
     if keep is None:
         return saved
-    deleted, freed, said = sweep(backup, keep, made=snapshot.name)
-    return replace(saved, deleted=deleted, num_bytes_freed=freed, notes=(*notes, *said))
+    deleted, freed, sweep_notes = sweep(backup, keep, made=snapshot.name)
+    return replace(saved, deleted=deleted, num_bytes_freed=freed, notes=(*notes, *sweep_notes))
 
 
 def sweep(backup: Backup, keep: int, *, made: str = "") -> tuple[tuple[str, ...], int, tuple[str, ...]]:
     """Delete all but the newest snapshots, then the objects that no remaining one names.
 
-    Nothing is deleted while anybody else is at work there: a backup relies on objects that no snapshot names yet.
+    Nothing is deleted while another process is working in the backup, since it may rely on objects that no snapshot
+    names yet.
 
     Args:
-        made: name of the snapshot that was just taken, which stays in any case.
+        made: name of the snapshot that was just made, which is always kept.
 
     Returns:
-        Names of the snapshots that went, the bytes of objects that went, and remarks.
+        Names of the snapshots deleted, bytes of the objects deleted, and notes.
 
     Raises:
-        CorruptError: a snapshot that stays cannot be read; nothing was deleted, since it is not known what it needs.
+        CorruptError: a kept snapshot cannot be read; nothing was deleted, since the objects that it needs are unknown.
     """
-    place = backup.place
-    with Lease(place, SWEEP) as lease:
+    storage = backup.storage
+    with BackupLease(storage, SWEEP) as lease:
         if lease.others():
-            return (), 0, (f"others are at work in {place.url}: old snapshots go with the next --keep",)
+            return (), 0, (f"others are at work in {storage.url}: old snapshots go with the next --keep",)
         names = backup.names()
         kept = [*names[-keep:], *(name for name in names[:-keep] if name == made)]
         doomed = [name for name in names if name not in kept]
@@ -123,31 +131,31 @@ def sweep(backup: Backup, keep: int, *, made: str = "") -> tuple[tuple[str, ...]
             needed |= {snapshot.files, *(file.sha256 for file in backup.files(snapshot))}
         for name in doomed:
             lease.require()
-            place.delete(f"{SNAPSHOTS}{name}.json")
+            storage.delete(f"{SNAPSHOTS}{name}.json")
         freed = 0
-        for name, about in place.list(OBJECTS).items():
+        for name, about in storage.list(OBJECTS).items():
             sha256 = digest_of(name)
             if sha256 is not None and sha256 not in needed:
                 lease.require()
-                place.delete(name)
+                storage.delete(name)
                 freed += about.size_bytes
-        place.drop_leftovers()
+        storage.drop_leftovers()
     return tuple(doomed), freed, ()
 
 
 @dataclass(frozen=True)
-class _Found:
-    """What `_Run.verify` found: how many objects it read, the damaged ones, and which snapshots need which."""
+class _VerifiedObjects:
+    """Result of `_BackupRun.verify`: number of objects read, damaged ones, and the snapshots that need each object."""
 
     num_read: int
     damaged: dict[str, str]
     needed: dict[str, tuple[StoredFile, list[str]]]
 
 
-class _Run:
+class _BackupRun:
     """One run of `save`."""
 
-    def __init__(self, store: Store, backup: Backup, lease: Lease, progress: Progress) -> None:
+    def __init__(self, store: Store, backup: Backup, lease: BackupLease, progress: Progress) -> None:
         self.store = store
         self.backup = backup
         self.lease = lease
@@ -156,19 +164,20 @@ class _Run:
         self.notes: list[str] = []
         self._bytes_sent = 0
         self._counting = threading.Lock()
-        self._bad: set[str] = set()  # objects that are there and damaged
+        self._bad: set[str] = set()  # digests of damaged objects
 
     def save(self) -> Snapshot:
-        """States are begun with until all of one is there."""
+        """Capture states until all files of one are sent."""
         for trial in range(_TRIES + 1):
             with contextlib.ExitStack() as until_sent, self._folder() as folder:
                 if trial == _TRIES:
-                    with still(self.store):  # first, in the order of writers, who may wait for the other lock with it
+                    # Writers take the catalog lock before the arrays lock, so take both in this order.
+                    with pause_writers(self.store):
                         until_sent.enter_context(self.store.arrays.lock())
-                        state = capture(self.store, folder)
+                        state = capture_state(self.store, folder)
                 else:
-                    state = capture(self.store, folder)
-                with contextlib.suppress(Vanished):
+                    state = capture_state(self.store, folder)
+                with contextlib.suppress(OutdatedStateError):
                     self._send(state, folder)
                     return self._write(state)
         name = self.store.catalog.folder
@@ -177,9 +186,9 @@ class _Run:
             code="changed_meanwhile",
         )
 
-    def verify(self) -> _Found:
-        """Read every object that is there and compare it with its name, and with what the snapshots need."""
-        there = {sha: about for name, about in self.backup.place.list(OBJECTS).items() if (sha := digest_of(name))}
+    def verify(self) -> _VerifiedObjects:
+        """Read every object and compare it with its digest, and find missing ones."""
+        there = {sha: about for name, about in self.backup.storage.list(OBJECTS).items() if (sha := digest_of(name))}
         damaged: dict[str, str] = {}
         needed: dict[str, tuple[StoredFile, list[str]]] = {}
 
@@ -193,24 +202,24 @@ class _Run:
             return None
 
         with ThreadPoolExecutor(TRANSFERS) as pool:
-            for i, (sha256, said) in enumerate(zip(there, pool.map(problem, there), strict=True)):
+            for i, (sha256, problem_text) in enumerate(zip(there, pool.map(problem, there), strict=True)):
                 self.progress(i / len(there), f"reading what is there, {i} of {len(there)}")
-                if said is not None:
-                    damaged[sha256] = said
+                if problem_text is not None:
+                    damaged[sha256] = problem_text
         for name in self.backup.names():
-            with contextlib.suppress(CorruptError):  # told by `unmended`
+            with contextlib.suppress(CorruptError):  # reported by `remaining_problems`
                 snapshot = self.backup.snapshot(name)
                 own = StoredFile("", snapshot.files_bytes, snapshot.files)
                 for file in [own, *self.backup.files(snapshot)]:
                     needed.setdefault(file.sha256, (file, []))[1].append(name)
         for sha256, (file, _) in needed.items():
             if sha256 not in there:
-                damaged[sha256] = f"{self.backup.place.url}/{object_name(sha256)} ({file.path}) is missing"
+                damaged[sha256] = f"{self.backup.storage.url}/{object_name(sha256)} ({file.path}) is missing"
         self._bad = set(damaged)
-        return _Found(len(there), damaged, needed)
+        return _VerifiedObjects(len(there), damaged, needed)
 
-    def unmended(self, found: _Found) -> tuple[str, ...]:
-        """What is still wrong with the backup after everything that the map has was sent."""
+    def remaining_problems(self, found: _VerifiedObjects) -> tuple[str, ...]:
+        """Return the damage that is left in the backup after all files of the map were sent."""
         out = []
         for name in self.backup.names():
             try:
@@ -222,14 +231,16 @@ class _Run:
         for sha256 in sorted(self._bad):
             file, names = found.needed.get(sha256, (None, []))
             if file is not None:
-                out.append(f"{found.damaged[sha256]}; the map has it no longer, and {_many(names)} cannot be restored")
+                out.append(
+                    f"{found.damaged[sha256]}; the map has it no longer, and {_format_names(names)} cannot be restored"
+                )
             elif sha256 in found.damaged:
-                self.backup.place.delete(object_name(sha256))  # nobody needs it, and it must not pass for the real one
+                self.backup.storage.delete(object_name(sha256))  # unneeded, and must not be taken for a sound object
         return tuple(out)
 
     def note(self, snapshot: Snapshot) -> tuple[str, ...]:
-        """Let the map remember where it was backed up to."""
-        target = self.backup.place.url
+        """Record the backup in the map; returns notes."""
+        target = self.backup.storage.url
         if not self.store.catalog.writable:
             return ("the map cannot be written, so it does not remember this backup",)
         try:
@@ -238,15 +249,15 @@ class _Run:
             return (f"the backup is complete, but the map could not note it: {error}",)
         return ()
 
-    def _send(self, state: State, folder: Path) -> None:
-        """Everything of a state that the place lacks; each object once, in any order."""
-        there = self._there()
+    def _send(self, state: MapState, folder: Path) -> None:
+        """Send all objects of a state that the storage lacks, each once, in any order."""
+        there = self._sound_sizes()
         missing = {f.sha256: f for f in state.files if there.get(f.sha256) != f.size_bytes}
 
         def send(file: StoredFile) -> None:
             self.lease.require()
             with contextlib.closing(read_file(self.store, file, folder)) as chunks:
-                self.backup.place.put(object_name(file.sha256), chunks, file.size_bytes)
+                self.backup.storage.put(object_name(file.sha256), chunks, file.size_bytes)
             self._count(file)
 
         with ThreadPoolExecutor(TRANSFERS) as pool:
@@ -260,20 +271,20 @@ class _Run:
                     future.cancel()
                 raise
 
-    def _write(self, state: State) -> Snapshot:
-        """The list of files, a last look at whether all of it is there, and then the snapshot."""
-        text = listed(list(state.files))
+    def _write(self, state: MapState) -> Snapshot:
+        """Write the list of files, check that all of them are present, and write the snapshot."""
+        text = format_file_list(list(state.files))
         own = StoredFile("", len(text), hashlib.sha256(text).hexdigest())
-        if self._there().get(own.sha256) != own.size_bytes:
-            self.backup.place.put(object_name(own.sha256), [text], len(text))
+        if self._sound_sizes().get(own.sha256) != own.size_bytes:
+            self.backup.storage.put(object_name(own.sha256), [text], len(text))
             self._count(own)
-        there = self._there()
+        there = self._sound_sizes()
         for file in [own, *state.files]:
             name = object_name(file.sha256)
             listed_so = there.get(file.sha256) == file.size_bytes
-            # A listing may lag behind; asking for each object alone is a request for each.
-            if not listed_so and self.backup.place.size_bytes(name) != file.size_bytes:
-                raise StoreError(f"{self.backup.place.url} lost {name}: run it again", code="backup_file_missing")
+            # Listings may lag behind, so check missing objects one by one.
+            if not listed_so and self.backup.storage.size_bytes(name) != file.size_bytes:
+                raise StoreError(f"{self.backup.storage.url} lost {name}: run it again", code="backup_file_missing")
         created_at = self.backup.time_of_next(state.created_at)
         if created_at != state.created_at:
             self.notes.append(
@@ -296,13 +307,13 @@ class _Run:
         )
         name, packed = snapshot.packed()
         self.lease.require()
-        Backup.at_or_new(self.backup.place, state.map_id)  # still ours
-        self.backup.place.put(f"{SNAPSHOTS}{name}.json", [packed], len(packed))
+        Backup.at_or_new(self.backup.storage, state.map_id)  # still the same map
+        self.backup.storage.put(f"{SNAPSHOTS}{name}.json", [packed], len(packed))
         return self.backup.snapshot(name)
 
-    def _there(self) -> dict[str, int]:
-        """Size of every sound object by digest."""
-        found = self.backup.place.list(OBJECTS)
+    def _sound_sizes(self) -> dict[str, int]:
+        """Return the size of every sound object by digest."""
+        found = self.backup.storage.list(OBJECTS)
         sizes = {digest_of(name): about.size_bytes for name, about in found.items()}
         return {sha: size for sha, size in sizes.items() if sha is not None and sha not in self._bad}
 
@@ -314,15 +325,15 @@ class _Run:
 
     @contextlib.contextmanager
     def _folder(self) -> Iterator[Path]:
-        """Where the catalog is copied to: in the backup if that is a folder, which has room for it."""
-        place = self.backup.place
-        if isinstance(place, FolderPlace):
-            with place.staging() as folder:
+        """Yield the folder for catalog copies: inside a folder backup, which has space for them, or a temporary one."""
+        storage = self.backup.storage
+        if isinstance(storage, FolderStorage):
+            with storage.staging() as folder:
                 yield folder
         else:
             with tempfile.TemporaryDirectory(prefix="gsmap-") as name:
                 yield Path(name)
 
 
-def _many(names: list[str]) -> str:
+def _format_names(names: list[str]) -> str:
     return f"snapshot {names[0]}" + (f" and {len(names) - 1} more" if len(names) > 1 else "")

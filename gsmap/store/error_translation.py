@@ -1,4 +1,4 @@
-"""What databases and operating systems say, in our words: told apart by their codes, true of the map's state."""
+"""Translate errors of databases and the operating system to gsmap errors, by error code and the state of the disk."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from gsmap.errors import (
 from gsmap.store import sqlite
 
 NOT_KEPT = "this step was not kept, what was finished before it is"
-"""Of an error inside a transaction: it was rolled back."""
+"""Consequence of an error inside a transaction: it was rolled back."""
 
 UNCERTAIN = "whether this last step was kept shows once that is mended; what was finished before it is kept"
-"""Of an error while a transaction was committed: the disk or the connection failed when its bytes were on their way."""
+"""Consequence of a disk or connection failure during a commit."""
 
-LITTLE_BYTES = 64 << 10  # with less than this left a disk is full: SQLite's index of its log alone takes half of it
+LITTLE_BYTES = 64 << 10  # a disk with less is full: the index of SQLite's log alone takes half of it
 
-_Said = tuple[type[StoreError], str, str, str]  # the error, its code, what is wrong, and what to do
+_Explanation = tuple[type[StoreError], str, str, str]  # error class, code, problem, advice
 PRUNE_MAY = " (gsmap prune may)"
-_FULL: _Said = (DiskFullError, "disk_full", "the disk is full", f"free some space{PRUNE_MAY} and try again")
-_READ_ONLY: _Said = (ReadOnlyError, "read_only", "the disk is read-only", "")
-_DENIED: _Said = (ReadOnlyError, "no_permission", "permission is missing", "check who may read and write there")
-_FAILED: _Said = (
+_FULL: _Explanation = (DiskFullError, "disk_full", "the disk is full", f"free some space{PRUNE_MAY} and try again")
+_READ_ONLY: _Explanation = (ReadOnlyError, "read_only", "the disk is read-only", "")
+_DENIED: _Explanation = (ReadOnlyError, "no_permission", "permission is missing", "check who may read and write there")
+_FAILED: _Explanation = (
     DiskError,
     "disk_failed",
     "the disk failed",
     "run gsmap check once it works (a quota that is used up looks the same)",
 )
-_TOO_MANY: _Said = (StoreError, "too_many_open_files", "too many files are open", "raise the limit (ulimit -n)")
-_REFUSED: _Said = (StoreError, "system_refused", "the system refused", "")
-_BUSY: _Said = (BusyError, "catalog_busy", "another process holds the catalog", "try again later")
-_SAID_NO: _Said = (StoreError, "catalog_refused", "the catalog refused", "")
-_GONE: _Said = (StoreError, "server_lost", "the catalog's server went away", "try again once it is back")
-_PASSWORD: _Said = (
+_TOO_MANY: _Explanation = (StoreError, "too_many_open_files", "too many files are open", "raise the limit (ulimit -n)")
+_REFUSED: _Explanation = (StoreError, "system_refused", "the system refused", "")
+_BUSY: _Explanation = (BusyError, "catalog_busy", "another process holds the catalog", "try again later")
+_CATALOG_REFUSED: _Explanation = (StoreError, "catalog_refused", "the catalog refused", "")
+_GONE: _Explanation = (StoreError, "server_lost", "the catalog's server went away", "try again once it is back")
+_PASSWORD: _Explanation = (
     StoreError,
     "password_refused",
     "the catalog's server wants another password",
@@ -56,47 +56,47 @@ _PASSWORD: _Said = (
 )
 
 
-_CALLED: dict[Path, str] = {}
+_DISPLAY_NAMES: dict[Path, str] = {}
 
 
-def call(folder: Path, name: str) -> None:
-    """Let a folder that stands for something else be called by that in messages."""
-    _CALLED[folder] = name
+def set_display_name(folder: Path, name: str) -> None:
+    """Set the name that messages use for a folder, such as the URL of a local mirror."""
+    _DISPLAY_NAMES[folder] = name
 
 
-def called(folder: Path) -> str:
-    """What a folder is called in messages."""
-    return _CALLED.get(folder, str(folder))
+def display_name(folder: Path) -> str:
+    """Return the name that messages use for a folder."""
+    return _DISPLAY_NAMES.get(folder, str(folder))
 
 
 @contextlib.contextmanager
-def explained(folder: Path, state: str = "", *, committing: bool = False) -> Iterator[None]:
-    """Turn what a database or the operating system says into one line of ours.
+def translate_errors(folder: Path, state: str = "", *, committing: bool = False) -> Iterator[None]:
+    """Translate errors of databases and the operating system to gsmap errors with a one-line message.
 
     Args:
-        folder: of the map or whatever else is worked on.
-        state: what became of the step that failed, such as `NOT_KEPT`; empty where nothing was to change.
-        committing: the step may have been kept all the same where the disk or the server failed.
+        folder: folder of the map or of the other files in use.
+        state: consequence for the failed step, such as `NOT_KEPT`; empty if nothing was to change.
+        committing: the step may have been committed although the disk or the server failed.
 
     Raises:
-        DiskFullError, ReadOnlyError, DiskError, BusyError, CorruptError, StoreError: see there.
+        DiskFullError, ReadOnlyError, DiskError, BusyError, CorruptError, StoreError: by the error translated.
     """
     try:
         yield
     except GsmapError:
         raise
     except (SQLAlchemyError, sqlite3.Error) as error:
-        said = _database_said(error, folder)
-        if said is None:
+        explanation = _explain_database(error, folder)
+        if explanation is None:
             raise
-        uncertain = committing and said[:3] in (_FAILED[:3], _GONE[:3])
-        raise _error(folder, said, _text(error), UNCERTAIN if uncertain else state) from error
+        uncertain = committing and explanation[:3] in (_FAILED[:3], _GONE[:3])
+        raise _error(folder, explanation, _text(error), UNCERTAIN if uncertain else state) from error
     except OSError as error:
         where = Path(os.fsdecode(error.filename)) if isinstance(error.filename, (str, bytes)) else folder
-        raise _error(where, _system_said(error), error.strerror or str(error), state) from error
+        raise _error(where, _explain_system(error), error.strerror or str(error), state) from error
 
 
-def _system_said(error: OSError) -> _Said:
+def _explain_system(error: OSError) -> _Explanation:
     kind = of_system(error)
     if kind is DiskFullError:
         return _FULL
@@ -108,7 +108,7 @@ def _system_said(error: OSError) -> _Said:
 
 
 def is_full(folder: Path) -> bool:
-    """Whether the disk that a folder lies on has no room left for us, in bytes or in files."""
+    """Return True if the disk of a folder has no bytes or inodes left for gsmap."""
     try:
         disk = os.statvfs(folder)
     except OSError:
@@ -118,15 +118,17 @@ def is_full(folder: Path) -> bool:
 
 
 def sqlite_code(error: BaseException) -> int | None:
-    """The (extended) result code of SQLite behind an error; None where it is not one of SQLite's."""
+    """Return the (extended) result code of SQLite behind an error; None for other errors."""
     found: object = getattr(error, "orig", None) or error
     code = getattr(found, "sqlite_errorcode", None)
     return code if isinstance(code, int) else None
 
 
-def _error(where: Path, said: _Said, text: str, state: str) -> StoreError:
-    kind, code, what, advice = said
-    return kind("; ".join(part for part in (f"{called(where)}: {what} ({text})", state, advice) if part), code=code)
+def _error(where: Path, explanation: _Explanation, text: str, state: str) -> StoreError:
+    kind, code, what, advice = explanation
+    return kind(
+        "; ".join(part for part in (f"{display_name(where)}: {what} ({text})", state, advice) if part), code=code
+    )
 
 
 def _text(error: BaseException) -> str:
@@ -134,33 +136,33 @@ def _text(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def _database_said(error: SQLAlchemyError | sqlite3.Error, folder: Path) -> _Said | None:
+def _explain_database(error: SQLAlchemyError | sqlite3.Error, folder: Path) -> _Explanation | None:
     if isinstance(error, StatementError) and isinstance(error.orig, GsmapError):
-        raise error.orig from error  # one of ours, on its way through SQLAlchemy
+        raise error.orig from error  # a gsmap error wrapped by SQLAlchemy
     if isinstance(error, (NoResultFound, MultipleResultsFound)):
         return CorruptError, "catalog_invalid", "the catalog lacks a row, or has it twice", "restore it from a backup"
     code = sqlite_code(error)
     if code is not None:
-        return _sqlite_said(code, folder)
+        return _explain_sqlite(code, folder)
     if isinstance(error, PoolTimeoutError):
         return BusyError, "catalog_busy", "too many threads use the catalog", "try again later"
     state = getattr(getattr(error, "orig", None), "sqlstate", None)
     if isinstance(state, str):
-        return _server_said(state)
-    if "password" in _text(error).lower():  # while connecting there is no code yet
+        return _explain_server(state)
+    if "password" in _text(error).lower():  # errors while connecting have no code
         return _PASSWORD
-    return _SAID_NO if isinstance(error, (DBAPIError, sqlite3.Error)) else None
+    return _CATALOG_REFUSED if isinstance(error, (DBAPIError, sqlite3.Error)) else None
 
 
-def _sqlite_said(code: int, folder: Path) -> _Said:
-    """What a result code of SQLite means here; https://www.sqlite.org/rescode.html."""
+def _explain_sqlite(code: int, folder: Path) -> _Explanation:
+    """Explain a result code of SQLite; https://www.sqlite.org/rescode.html."""
     primary = code & 0xFF
     if primary in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_PROTOCOL):
         return _BUSY
     if primary == sqlite3.SQLITE_FULL:
         return _FULL
     if primary in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-        found = sqlite.damage(folder / sqlite.FILE)  # nothing is called damaged on one code's word
+        found = sqlite.damage(folder / sqlite.FILE)  # verify the file instead of trusting the code
         if found:
             return (
                 CorruptError,
@@ -179,21 +181,22 @@ def _sqlite_said(code: int, folder: Path) -> _Said:
     if code == sqlite3.SQLITE_READONLY_DBMOVED:
         return StoreError, "catalog_moved", "the catalog was moved or replaced while it was open", "open the map again"
     if primary in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM):
-        return _disk_said(primary, folder)
-    return _SAID_NO
+        return _explain_disk(primary, folder)
+    return _CATALOG_REFUSED
 
 
-def _disk_said(primary: int, folder: Path) -> _Said:
-    """SQLite does not hand on the system's own code, so the disk is asked.
+def _explain_disk(primary: int, folder: Path) -> _Explanation:
+    """Explain a disk error of SQLite, which hides the system's error code, by testing the disk.
 
-    A full disk has many faces: the log cannot be made (CANTOPEN), its index cannot (READONLY) or cannot grow (IOERR).
+    A full disk causes several codes: the log cannot be created (CANTOPEN), its index cannot (READONLY) or cannot grow
+    (IOERR).
     """
     try:
         os.close(os.open(folder, os.O_RDONLY | os.O_DIRECTORY))
         if os.statvfs(folder).f_flag & os.ST_RDONLY and primary != sqlite3.SQLITE_IOERR:
             return _READ_ONLY
     except OSError as error:
-        return _system_said(error)
+        return _explain_system(error)
     if is_full(folder):
         return _FULL
     if primary == sqlite3.SQLITE_IOERR:
@@ -203,8 +206,8 @@ def _disk_said(primary: int, folder: Path) -> _Said:
     return _DENIED
 
 
-def _server_said(state: str) -> _Said:
-    """What an SQLSTATE of PostgreSQL means here; appendix A of its manual."""
+def _explain_server(state: str) -> _Explanation:
+    """Explain an SQLSTATE of PostgreSQL; appendix A of its manual."""
     if state == "53100":
         return (
             DiskFullError,
@@ -227,10 +230,10 @@ def _server_said(state: str) -> _Said:
         return BusyError, "catalog_busy", "the catalog's server is busy", "try again later"
     if state.startswith("28"):
         return _PASSWORD
-    return _GONE if state.startswith(("08", "57P")) else _SAID_NO
+    return _GONE if state.startswith(("08", "57P")) else _CATALOG_REFUSED
 
 
 def summary(found: list[str], most: int = 3) -> str:
-    """The first findings, and how many more there are."""
+    """List the first findings and the number of the others."""
     more = f", and {len(found) - most} more" if len(found) > most else ""
     return ", ".join(found[:most]) + more

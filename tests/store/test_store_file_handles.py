@@ -7,7 +7,7 @@ import pytest
 from sqlalchemy import text
 from store_children import add, messages
 
-from gsmap.store import Store, handles, sqlite
+from gsmap.store import Store, file_handles, sqlite
 
 
 def come_and_go(path, seed, pipe):
@@ -70,9 +70,9 @@ def test_nothing_of_a_file_stays_open_with_nobody_at_it(tmp_path):
     with Store.open(path) as one, Store.open(path) as other:
         assert one.check().ok
         one.close()
-        assert key in handles._OPEN
+        assert key in file_handles._OPEN
         assert other.check().ok
-    assert key not in handles._OPEN
+    assert key not in file_handles._OPEN
     assert not [name for name in os.listdir("/proc/self/fd") if _target(name).startswith(str(path))]
 
 

@@ -1,8 +1,8 @@
-"""Reading a file that SQLite has open in the same process.
+"""Shared read handles for database files that SQLite has open in this process.
 
 POSIX locks belong to the process: closing *any* handle on a file drops every lock that SQLite holds on it. Another
-process that closes the database then takes itself for the last one and deletes the log, with the commits that this one
-still writes there. So a handle of ours on a catalog is opened once and closed after the last connection of the process.
+process that closes the database then assumes that it is the last one and deletes the log, with commits that this
+process is still writing. So a handle on a catalog is opened once and closed after the last connection of the process.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ import os
 import threading
 from pathlib import Path
 
-from gsmap.store.wal import Noted, index_note
+from gsmap.store.wal import IndexHeader, read_index_header
 
-_LOCK = threading.RLock()  # a collected connection may close its handle at any moment
-_OPEN: dict[tuple[int, int], list[int]] = {}  # by device and inode: the handle, and how many use it
+_LOCK = threading.RLock()  # reentrant: the garbage collector may close a handle at any time
+_OPEN: dict[tuple[int, int], list[int]] = {}  # handle and number of users by (device, inode)
 
 
-class Handle:
-    """A handle for reading, shared by all users of a file in this process.
+class FileHandle:
+    """A read handle, shared by all users of a file in this process.
 
     Args:
-        file: it must exist.
+        file: an existing file.
 
     Raises:
-        OSError: what the system says.
+        OSError: the file cannot be opened.
     """
 
     def __init__(self, file: Path) -> None:
@@ -38,17 +38,17 @@ class Handle:
             entry = _OPEN[self._key]
             entry[1] += 1
             self.number = entry[0]
-            self.index: Noted | None = index_note(file) if entry[1] == 1 else None
-            """What the index of its log said before anybody in this process connected; None where somebody has."""
+            self.index: IndexHeader | None = read_index_header(file) if entry[1] == 1 else None
+            """Header of the log's index before this process connected; None if it was connected already."""
         self._closed = False
 
     def is_of(self, file: Path) -> bool:
-        """Whether the file at a path is still the one that was opened."""
+        """Return True if the path still names the opened file."""
         found = os.stat(file)
         return (found.st_dev, found.st_ino) == self._key
 
     def close(self) -> None:
-        """Done; only after the connections of whoever opened it. Twice is once."""
+        """Close the handle, after the connections of its user; may be called twice."""
         with _LOCK:
             if self._closed:
                 return

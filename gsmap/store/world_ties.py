@@ -1,4 +1,4 @@
-"""Where components lie in the world, as a revision's row holds it."""
+"""Conversion of world ties (poses of components in the world) to JSON and back."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from gsmap.types.world import Contradiction, Georeference, Residual, WorldFrame
 _PAIRS = ("error_m", "sigma_m", "error_px")
 
 
-def tie_value(tie: Georeference) -> dict[str, Any]:
-    """As JSON holds it, to the last bit."""
+def world_tie_to_json(tie: Georeference) -> dict[str, Any]:
+    """Convert a world tie to JSON, exactly."""
     return {
         "component": int(tie.component),
         "S_world_map": from_pose(tie.S_world_map),
@@ -31,11 +31,11 @@ def tie_value(tie: Georeference) -> dict[str, Any]:
     }
 
 
-def ties_of(values: list[dict[str, Any]]) -> tuple[Georeference, ...]:
-    """The reverse.
+def world_ties_of_json(values: list[dict[str, Any]]) -> tuple[Georeference, ...]:
+    """Convert JSON to world ties.
 
     Raises:
-        CorruptError: gsmap did not write that.
+        CorruptError: not written by gsmap.
     """
     try:
         return tuple(_tie(value) for value in values)
@@ -71,7 +71,7 @@ def _tie(value: dict[str, Any]) -> Georeference:
         tuple(rows),
         str(value["problem"]),
         tuple(map(str, value["notes"])),
-        # Ties of earlier releases were written without these.
+        # missing in ties of earlier releases
         str(value.get("problem_code", "undetermined" if value["problem"] else "")),
         tuple(_contradiction(one) for one in value.get("contradictions", [])),
     )

@@ -1,8 +1,8 @@
-"""Sorting more Gaussians than memory holds along a space-filling curve: a sample sort with buckets on disk.
+"""External sort of Gaussians along a Morton curve: a sample sort with buckets on disk.
 
-A sample of the codes says where to cut the curve so that every bucket fits in memory; one pass writes each Gaussian
-into the file of its bucket, and each bucket is sorted when it is read. Every step keeps the order of equal codes, so
-that the result is exactly what sorting all of them at once gives.
+A sample of the codes gives the cuts of the curve, so that every bucket fits in memory; one pass writes each Gaussian to
+the file of its bucket, and each bucket is sorted when it is read. Every step is stable, so that the result equals that
+of sorting all at once.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.gaussians import CHUNK_ROWS
 
 BUCKET_BYTES = 128 << 20
-"""What is sorted in memory at once; the sort needs about three times as much."""
+"""Bytes sorted in memory at once; the sort needs about three times as much memory."""
 
 _SAMPLES = 1 << 20
 _MAX_BUCKETS = 256  # files that are open at once
 
 
 @contextlib.contextmanager
-def in_morton_order(
+def sorted_along_morton_curve(
     source: GaussianSource, box: np.ndarray, scratch: Path, *, bucket_bytes: int = BUCKET_BYTES
 ) -> Iterator[GaussianSource]:
-    """The Gaussians of a source along the Morton curve of its box, as `gsmap.geometry.morton.morton_order` has them.
+    """Sort the Gaussians of a source along the Morton curve of its box, as `gsmap.geometry.morton.morton_order` does.
 
     Args:
         source: with finite means.
-        box: (2, 3) of its means (`gsmap.stream.bounds`).
-        scratch: a folder that does not exist, for as many bytes as the Gaussians have; gone when the block ends.
-        bucket_bytes: a source of so many bytes is sorted in memory, and no folder is made.
+        box: (2, 3) bounds of its means (`gsmap.stream.bounds`).
+        scratch: a folder that does not exist, on a disk with space for all Gaussians; deleted when the block ends.
+        bucket_bytes: a source of at most this size is sorted in memory, without a folder.
     """
     row_bytes = 4 * _width(source.sh_degree)
     if source.num_gaussians * row_bytes <= bucket_bytes:
@@ -55,7 +55,7 @@ def in_morton_order(
 
 @dataclass(frozen=True, eq=False)
 class _Buckets:
-    """Gaussians in the files of their buckets, sorted as each is read."""
+    """Gaussians in bucket files, sorted as each is read."""
 
     folder: Path
     counts: np.ndarray
@@ -78,13 +78,13 @@ class _Buckets:
             yield getattr(chunk, name)
 
     def load(self) -> Gaussians:
-        from gsmap.stream.rows import loaded
+        from gsmap.stream.blocks import load_all
 
-        return loaded(self)
+        return load_all(self)
 
 
 def _cuts(source: GaussianSource, box: np.ndarray, rows: int) -> np.ndarray:
-    """Codes at which to cut the curve so that about ``rows`` Gaussians lie between two of them."""
+    """Compute codes that cut the curve into parts of about ``rows`` Gaussians."""
     step = -(-source.num_gaussians // _SAMPLES)
     sampled, at = [], 0
     for means in source.columns("means"):
@@ -96,7 +96,7 @@ def _cuts(source: GaussianSource, box: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _distribute(source: GaussianSource, box: np.ndarray, cuts: np.ndarray, folder: Path) -> np.ndarray:
-    """Write every Gaussian into the file of its bucket; how many each got."""
+    """Write every Gaussian to the file of its bucket; returns the counts."""
     counts = np.zeros(len(cuts) + 1, np.int64)
     with contextlib.ExitStack() as opened:
         files = [opened.enter_context(open(_file(folder, i), "xb")) for i in range(len(counts))]
@@ -116,12 +116,12 @@ def _file(folder: Path, bucket: int) -> Path:
 
 
 def _width(sh_degree: int) -> int:
-    """Numbers of a Gaussian."""
+    """Return the number of values per Gaussian."""
     return 3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2
 
 
 def _table(gaussians: Gaussians) -> np.ndarray:
-    """(n, width) float32."""
+    """Convert Gaussians to (n, width) float32."""
     g = gaussians
     return np.concatenate(
         [g.means, g.quats, g.log_scales, g.logit_opacities[:, None], g.sh.reshape(len(g), -1)], axis=1

@@ -1,4 +1,4 @@
-"""Groups of arrays and the rows that name them."""
+"""Array groups and the catalog rows that name them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 from sqlalchemy import Connection, delete, insert, select
 
 from gsmap.errors import CorruptError, NotFoundError
-from gsmap.store.arrays import Arrays, Staged, StoredFile
-from gsmap.store.branches import Others
+from gsmap.store.arrays import Arrays, StagedGroup, StoredFile
+from gsmap.store.branches import OtherCatalogs
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.schema import files, graphs, groups, view_features
 
@@ -18,13 +18,15 @@ def has_group(connection: Connection, group_id: str) -> bool:
     return connection.execute(select(groups.c.id).where(groups.c.id == group_id)).first() is not None
 
 
-def publish(catalog: Catalog, connection: Connection, arrays: Arrays, staged: Staged, kind: str, group_id: str) -> None:
-    """Move a staged group into place and name it, inside a write transaction; it replaces a damaged one.
+def publish(
+    catalog: Catalog, connection: Connection, arrays: Arrays, staged: StagedGroup, kind: str, group_id: str
+) -> None:
+    """Move a staged group to its final path and name it, inside a write transaction; replaces a damaged group.
 
-    Where a branch of the map has the group already and it is whole, it stays as that branch knows it.
+    Where another branch has the group and its files are sound, they are kept with that branch's manifest.
     """
-    catalog.hold(arrays.lock())
-    known = Others(arrays.root.parent, catalog.folder).manifests(group_id)
+    catalog.hold_until_commit(arrays.lock())
+    known = OtherCatalogs(arrays.root.parent, catalog.folder).manifests(group_id)
     whole = next((manifest for manifest in known if not arrays.problems(kind, group_id, manifest)), None)
     if whole is None:
         arrays.publish(staged, kind, group_id)
@@ -32,7 +34,7 @@ def publish(catalog: Catalog, connection: Connection, arrays: Arrays, staged: St
 
 
 def name(connection: Connection, kind: str, group_id: str, manifest: Sequence[StoredFile]) -> None:
-    """Write down that a group counts, and the files it must have."""
+    """Insert the rows that name a group and its files."""
     if not has_group(connection, group_id):
         connection.execute(insert(groups), {"id": group_id, "kind": kind, "created_at": now()})
     connection.execute(delete(files).where(files.c.group_id == group_id))
@@ -41,13 +43,13 @@ def name(connection: Connection, kind: str, group_id: str, manifest: Sequence[St
 
 
 def unname(connection: Connection, group_id: str) -> None:
-    """Let a group count no longer; whoever claimed it is changed in the same transaction."""
+    """Delete the rows that name a group; its referrers must change in the same transaction."""
     connection.execute(delete(files).where(files.c.group_id == group_id))
     connection.execute(delete(groups).where(groups.c.id == group_id))
 
 
-def drop_graphs(connection: Connection, scene: str) -> None:
-    """Forget the graphs of a scene whose Gaussians become others, and the features of its views."""
+def forget_derived(connection: Connection, scene: str) -> None:
+    """Delete the graphs and view features of a scene whose stored Gaussians change."""
     for table in (graphs, view_features):
         made = table.c.scene == scene
         old = list(connection.execute(select(table.c.group_id).where(made)).scalars())
@@ -58,13 +60,13 @@ def drop_graphs(connection: Connection, scene: str) -> None:
 
 @contextlib.contextmanager
 def unless_pruned(catalog: Catalog, group_id: str, gone: str) -> Iterator[None]:
-    """Tell a group that others reclaimed while it was read from a damaged one.
+    """Raise `NotFoundError` instead of `CorruptError` if the group was pruned while it was read.
 
     Args:
-        gone: what it was of, and what became of that.
+        gone: description of what happened to the group, for the message.
 
     Raises:
-        NotFoundError: it could not be read, and no row names it any more.
+        NotFoundError: the group could not be read, and no row names it any more.
     """
     try:
         yield
@@ -78,11 +80,11 @@ def unless_pruned(catalog: Catalog, group_id: str, gone: str) -> Iterator[None]:
 
 
 def num_bytes(connection: Connection, group_id: str) -> int:
-    """Of a group's files, as they were written."""
+    """Return the size of a group's files, as written."""
     return sum(file.size_bytes for file in manifest(connection, group_id))
 
 
 def manifest(connection: Connection, group_id: str) -> tuple[StoredFile, ...]:
-    """The files a group must have, with their digests."""
+    """Return the files of a group with their digests."""
     rows = connection.execute(select(files).where(files.c.group_id == group_id).order_by(files.c.path))
     return tuple(StoredFile(r.path, r.size_bytes, r.sha256) for r in rows)

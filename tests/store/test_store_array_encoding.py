@@ -8,8 +8,8 @@ from raising import raises
 
 from gsmap.describe.precision import round_graph
 from gsmap.errors import CorruptError
+from gsmap.store.array_encoding import decode_array, encode_array, encoded_shape
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
-from gsmap.store.narrow import narrow, shape_of, widen
 from gsmap.types import NodeLayer, SceneGraph, Segments
 
 RNG = np.random.default_rng(0)
@@ -37,18 +37,18 @@ RNG = np.random.default_rng(0)
     ],
 )
 def test_every_value_comes_back_to_the_bit(values, kept):
-    stored, how = narrow(values)
+    stored, how = encode_array(values)
     assert how["as"] == kept
     assert stored.nbytes == values.size * np.dtype(kept).itemsize
-    assert stored.shape == shape_of(how)
-    back = widen(stored, how)
+    assert stored.shape == encoded_shape(how)
+    back = decode_array(stored, how)
     assert (back.dtype, back.shape, back.tobytes()) == (values.dtype, values.shape, values.tobytes())
 
 
 def test_what_is_stored_in_another_type_is_refused():
-    stored, how = narrow(np.array([1.0, 2.0]))
+    stored, how = encode_array(np.array([1.0, 2.0]))
     with pytest.raises(ValueError, match="the catalog says"):
-        widen(stored.astype(np.float64), how)
+        decode_array(stored.astype(np.float64), how)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_what_is_stored_in_another_type_is_refused():
 )  # fmt: skip
 def test_what_no_array_is_kept_as_is_refused(bad):
     with raises(CorruptError, code="catalog_invalid"):
-        shape_of({"is": "f8", "as": "i2", "step": 0.5, "shape": [4, 3]} | bad)
+        encoded_shape({"is": "f8", "as": "i2", "step": 0.5, "shape": [4, 3]} | bad)
 
 
 def layer(m, width, features, *, exact=True):

@@ -11,9 +11,9 @@ from raising import raises
 from store_children import messages
 
 from gsmap.errors import CorruptError, DiskError
-from gsmap.store import Store, digests, sqlite
-from gsmap.store.handles import Handle
-from gsmap.store.wal import log_of, read_log
+from gsmap.store import Store, page_digests, sqlite
+from gsmap.store.file_handles import FileHandle
+from gsmap.store.wal import read_log, wal_path
 from tools.check import flips as check_flips
 
 
@@ -27,7 +27,7 @@ def test_every_flip_is_found(closed, count):
 
 def test_a_flip_in_each_page_and_in_its_digest_is_named(closed):
     file = closed / sqlite.FILE
-    noted = digests.load(file)
+    noted = page_digests.load(file)
     assert noted.count * PAGE == file.stat().st_size
     for number in range(1, noted.count + 1):
         at = (number - 1) * PAGE + 100 + number
@@ -35,7 +35,7 @@ def test_a_flip_in_each_page_and_in_its_digest_is_named(closed):
         with raises(CorruptError, code="catalog_damaged", match=f"page {number} "):
             Store.open(closed, "r")
         flip(file, at)
-    side = digests.digests_of(file)
+    side = page_digests.digests_path(file)
     for at in range(0, side.stat().st_size, 31):
         flip(side, at)
         with raises(CorruptError, code="catalog_damaged"):
@@ -59,21 +59,21 @@ def test_damage_that_comes_while_a_map_is_open_is_not_blessed(closed):
     """The next fold looks first: what was written stays in the log, and the damage stays to be seen."""
     store = Store.open(closed)
     file = closed / sqlite.FILE
-    noted = digests.load(file)
+    noted = page_digests.load(file)
     flip(file, file.stat().st_size - 50)
     store.scenes.edit("monday", note="seen")  # in the log
     with raises(CorruptError, code="catalog_damaged", match=f"page {noted.count} "):
         store.close()
-    assert digests.load(file) == noted
+    assert page_digests.load(file) == noted
     for mode in "rw":
         with pytest.raises(CorruptError):
             Store.open(closed, mode)
-    assert log_of(file).stat().st_size
+    assert wal_path(file).stat().st_size
     flip(file, file.stat().st_size - 50)
     with Store.open(closed) as store:  # nothing is lost once the page is as it was
         assert "note" in [fact.kind for fact in store.scenes.facts("monday")]
         assert store.check().ok
-    assert digests.load(file) != noted
+    assert page_digests.load(file) != noted
 
 
 def stages_of_a_fold(path: Path, copies: Path, monkeypatch) -> list[Path]:
@@ -84,7 +84,7 @@ def stages_of_a_fold(path: Path, copies: Path, monkeypatch) -> list[Path]:
         shutil.copytree(path, copies / name)
         return copies / name
 
-    real_save, real_fold = digests.save, sqlite._folded
+    real_save, real_fold = page_digests.save, sqlite._checkpoint_truncate
 
     def save(file, noted):
         keep(f"{len(list(copies.iterdir()))} before digests")
@@ -99,8 +99,8 @@ def stages_of_a_fold(path: Path, copies: Path, monkeypatch) -> list[Path]:
     store = Store.open(path)
     fill(store, 8)
     with monkeypatch.context() as patch:
-        patch.setattr(digests, "save", save)
-        patch.setattr(sqlite, "_folded", folded)
+        patch.setattr(page_digests, "save", save)
+        patch.setattr(sqlite, "_checkpoint_truncate", folded)
         store.close()
     out = sorted(copies.iterdir())
     assert len(out) == 5
@@ -110,7 +110,7 @@ def stages_of_a_fold(path: Path, copies: Path, monkeypatch) -> list[Path]:
 def test_killed_anywhere_in_a_fold(closed, tmp_path, monkeypatch):
     stages = stages_of_a_fold(closed, tmp_path / "stages", monkeypatch)
     before, under_way, after = (stages[i] / sqlite.FILE for i in (1, 1, 2))
-    noted = digests.load(before)
+    noted = page_digests.load(before)
     assert noted.next_count > noted.count
     # In the middle some pages are new, some old, some not there yet; a power cut may tear the one being written.
     rng = random.Random(3)
@@ -138,7 +138,7 @@ def test_killed_anywhere_in_a_fold(closed, tmp_path, monkeypatch):
         with Store.open(stage) as store:
             assert len(store.exports.list()) == 8
             store.scenes.edit("monday", note="after the kill")
-        assert digests.load(stage / sqlite.FILE).next_count == 0
+        assert page_digests.load(stage / sqlite.FILE).next_count == 0
         with Store.open(stage, "r") as store:
             assert store.check().problems == ()
 
@@ -155,7 +155,7 @@ def test_a_catalog_that_shrinks(closed, tmp_path, monkeypatch):
     raw = store.catalog.engine.raw_connection()
     raw.driver_connection.execute("VACUUM")
     raw.close()
-    real = sqlite._folded
+    real = sqlite._checkpoint_truncate
 
     def folded(engine):
         shutil.copytree(closed, tmp_path / "before")
@@ -164,7 +164,7 @@ def test_a_catalog_that_shrinks(closed, tmp_path, monkeypatch):
         return done
 
     with monkeypatch.context() as patch:
-        patch.setattr(sqlite, "_folded", folded)
+        patch.setattr(sqlite, "_checkpoint_truncate", folded)
         store.close()
     assert (closed / sqlite.FILE).stat().st_size < before
     for path in (tmp_path / "before", tmp_path / "after", closed):
@@ -177,8 +177,8 @@ def test_a_catalog_that_shrinks(closed, tmp_path, monkeypatch):
 def test_a_page_that_was_folded_in_is_verified_without_the_log(closed, tmp_path, monkeypatch):
     """Killed between the fold and its last note, pages may be old or new, and nothing else."""
     stage = stages_of_a_fold(closed, tmp_path / "stages", monkeypatch)[2]
-    assert not log_of(stage / sqlite.FILE).exists() or not log_of(stage / sqlite.FILE).stat().st_size
-    for number in digests.load(stage / sqlite.FILE).next:
+    assert not wal_path(stage / sqlite.FILE).exists() or not wal_path(stage / sqlite.FILE).stat().st_size
+    for number in page_digests.load(stage / sqlite.FILE).next:
         flip(stage / sqlite.FILE, number * PAGE - 9)
         with raises(CorruptError, code="catalog_damaged", match=f"page {number} "):
             Store.open(stage, "r")
@@ -194,14 +194,14 @@ def test_a_reader_that_keeps_the_log_from_being_folded_in(closed, monkeypatch):
             connection.exec_driver_sql("SELECT count(*) FROM exports").scalar()
             monkeypatch.setattr(sqlite, "CHECKPOINT_BYTES", 1)
             fill(store)
-            assert digests.load(file).next_count
+            assert page_digests.load(file).next_count
             Store.open(closed, "r").close()
             fill(store)
             assert store.check().problems == ()
         fill(store)
-        assert not digests.load(file).next_count
+        assert not page_digests.load(file).next_count
         assert store.check().problems == ()
-    assert not log_of(file).exists()
+    assert not wal_path(file).exists()
     with Store.open(closed, "r") as store:
         assert len(store.exports.list()) == 12
 
@@ -250,7 +250,7 @@ def test_reading_the_file_drops_no_lock_of_sqlite(tmp_path, start):
 
 def test_handles_are_shared_and_closed_with_the_last(tmp_path):
     (tmp_path / "a").write_bytes(b"x")
-    one, two = Handle(tmp_path / "a"), Handle(tmp_path / "a")
+    one, two = FileHandle(tmp_path / "a"), FileHandle(tmp_path / "a")
     assert one.number == two.number
     one.close()
     one.close()
@@ -264,13 +264,13 @@ def test_a_store_that_is_never_closed_does_not_fold_past_the_digests(tmp_path):
     Store.create(path).close()
     store = Store.open(path)
     fill(store)
-    noted = digests.load(path / sqlite.FILE)
+    noted = page_digests.load(path / sqlite.FILE)
     del store
     import gc
 
     gc.collect()
-    assert log_of(path / sqlite.FILE).stat().st_size
-    assert digests.load(path / sqlite.FILE) == noted
+    assert wal_path(path / sqlite.FILE).stat().st_size
+    assert page_digests.load(path / sqlite.FILE) == noted
     with Store.open(path) as store:
         assert len(store.exports.list()) == 3
         assert store.check().ok
@@ -293,7 +293,7 @@ def test_more_threads_than_connections_are_kept(store, two_scenes):
 
 def test_a_long_catalog_is_verified_by_check_alone(closed, monkeypatch):
     """Opening it takes no seconds then, and a write blesses no damage: neither in pages it changes nor in others."""
-    monkeypatch.setattr(digests, "WHOLE_BYTES", 1000)
+    monkeypatch.setattr(page_digests, "WHOLE_BYTES", 1000)
     file = closed / sqlite.FILE
     flip(file, file.stat().st_size - 50)
     with Store.open(closed, "r") as store:
@@ -305,7 +305,7 @@ def test_a_long_catalog_is_verified_by_check_alone(closed, monkeypatch):
     flip(file, file.stat().st_size - 50)
     store = Store.open(closed)
     store.scenes.edit("monday", note="a write there")
-    number = min(read_log(log_of(file)).frames)
+    number = min(read_log(wal_path(file)).frames)
     flip(file, number * PAGE - 50)
     with raises(CorruptError, code="catalog_damaged", match=f"page {number} "):
         store.close()
@@ -315,14 +315,14 @@ def test_a_long_catalog_is_verified_by_check_alone(closed, monkeypatch):
 
 
 def test_digests_survive_their_own_format(tmp_path):
-    noted = digests.Digests(PAGE, bytes(range(64)), 9, {7: b"a" * 16, 2: b"b" * 16})
+    noted = page_digests.PageDigests(PAGE, bytes(range(64)), 9, {7: b"a" * 16, 2: b"b" * 16})
     (tmp_path / "x").touch()
     for name in (".x.digests.0a1b2c3d", ".x.sha256", "x.sha256"):  # what a kill and an older gsmap left
         (tmp_path / name).touch()
-    digests.save(tmp_path / "x", noted)
+    page_digests.save(tmp_path / "x", noted)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x", "x.digests"]
-    assert digests.load(tmp_path / "x") == noted
-    assert digests.pages([1, 2, 3, 7, 9, 10]) == "pages 1-3, 7, 9-10"
+    assert page_digests.load(tmp_path / "x") == noted
+    assert page_digests.format_pages([1, 2, 3, 7, 9, 10]) == "pages 1-3, 7, 9-10"
 
 
 def test_a_catalog_in_another_journal_mode_is_refused_until_it_is_accepted(closed):
@@ -333,7 +333,7 @@ def test_a_catalog_in_another_journal_mode_is_refused_until_it_is_accepted(close
     with sqlite3.connect(file) as connection:
         assert connection.execute("PRAGMA journal_mode = DELETE").fetchone() == ("delete",)
     connection.close()
-    digests.note(file)
+    page_digests.write_digests(file)
     with raises(CorruptError, code="catalog_damaged"):
         Store.open(closed)
     Store.accept_catalog(closed)

@@ -1,4 +1,4 @@
-"""One committed state of a map: its catalogs as files that lie still, and what they name."""
+"""Consistent states of a map for backups and clones: copies of its catalogs, and the files that they name."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from gsmap.store import sqlite
 from gsmap.store.arrays import StoredFile
 from gsmap.store.branches import FOLDER as BRANCHES
 from gsmap.store.branches import MARKER as BRANCH_FILE
-from gsmap.store.branches import places
+from gsmap.store.branches import branch_locations
 from gsmap.store.catalog import Catalog
-from gsmap.store.copying import copy_catalog, empty_catalog
-from gsmap.store.explained import explained
-from gsmap.store.layout import mend
+from gsmap.store.catalog_copy import copy_catalog, empty_catalog
+from gsmap.store.error_translation import translate_errors
+from gsmap.store.layout import repair_advice
 from gsmap.store.models import FOLDER as MODELS
-from gsmap.store.places import chunks_of
+from gsmap.store.storage import chunks_of
 
 if TYPE_CHECKING:
     from gsmap.store.store import Store
@@ -34,21 +34,22 @@ ARRAYS = "arrays"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
-class Vanished(Exception):
-    """A file that a state names is no longer in the map, rightly: it was pruned, or mended, since the state was."""
+class OutdatedStateError(Exception):
+    """A file that a state names was pruned or repaired since, so that the state must be captured again."""
 
 
 @dataclass(frozen=True)
-class State:
-    """What a map holds at one moment.
+class MapState:
+    """The files of a map at one moment.
 
     Args:
         map_id: of the map.
-        created_at: when it was read, UTC; everything that was committed before is in it.
+        created_at: when it was read, UTC; includes everything that was committed before.
         schema: of its catalog.
         files: paths relative to the map, with sizes and digests: arrays, models, settings and the catalogs.
-        revision: the newest one; None before the first.
-        counts: how many ``scenes`` (``removed`` ones apart), ``groups``, ``graphs``, ``registrations``, ``revisions``.
+        revision: number of the newest revision; None before the first.
+        counts: numbers of ``scenes`` (without ``removed`` ones), ``groups``, ``graphs``, ``registrations``,
+            ``revisions``.
     """
 
     map_id: str
@@ -63,25 +64,25 @@ class State:
         return sum(file.size_bytes for file in self.files)
 
 
-def home_of(store: Store) -> Path:
-    """The map's folder, of a branch too."""
+def map_folder(store: Store) -> Path:
+    """Return the root folder of a map, also for a branch."""
     return store.arrays.root.parent
 
 
-def capture(store: Store, folder: Path, *, branches: bool = True) -> State:
-    """Copy the catalogs and settings of a map to an empty folder, and say what they name.
+def capture_state(store: Store, folder: Path, *, branches: bool = True) -> MapState:
+    """Copy the catalogs and settings of a map to an empty folder, and list the files that they name.
 
-    ``map.sqlite`` there is one committed state whatever others write meanwhile: by SQLite's own backup, or row by row
-    in one transaction of another database. So is that of every branch, each at its own moment.
+    The ``map.sqlite`` there is a snapshot whatever other processes write meanwhile: by SQLite's own backup, or row by
+    row in one transaction of another database. So are the catalogs of branches, each at its own moment.
 
     Raises:
-        CorruptError: the catalog's bytes are not those that were written, or it names what no map holds.
+        CorruptError: the catalog differs from its page digests, or names a file that the map lacks.
     """
     created_at = _catalog.now()
-    home = home_of(store)
+    home = map_folder(store)
     state = _capture_catalog(store.catalog, folder)
     files = {file.path: file for file in state.files}
-    for place in places(home) if branches else ():
+    for place in branch_locations(home) if branches else ():
         own = folder / BRANCHES / place.branch
         own.mkdir(parents=True)
         try:
@@ -89,30 +90,31 @@ def capture(store: Store, folder: Path, *, branches: bool = True) -> State:
         except (StoreError, FileNotFoundError):
             if place.folder.exists():
                 raise
-            shutil.rmtree(own)  # deleted meanwhile
+            shutil.rmtree(own)  # the branch was deleted meanwhile
     for path in folder.rglob("*"):
         if path.name in (sqlite.FILE, SETTINGS, BRANCH_FILE):
             files[path.relative_to(folder).as_posix()] = _stored(path, folder)
-    return State(
+    return MapState(
         state.map_id, created_at, state.schema, tuple(files[p] for p in sorted(files)), state.revision, state.counts
     )
 
 
 @contextlib.contextmanager
-def still(store: Store) -> Iterator[None]:
-    """Keep everybody from writing to any catalog of a map, so that `capture` inside waits for nobody."""
+def pause_writers(store: Store) -> Iterator[None]:
+    """Keep all processes from writing to any catalog of a map, so that `capture_state` inside waits for no other
+    process."""
     with contextlib.ExitStack() as held:
-        held.enter_context(store.catalog.still())
-        for place in places(home_of(store)):
-            held.enter_context(_catalog.still(place.folder, store.catalog.patience_s))
+        held.enter_context(store.catalog.pause_writers())
+        for place in branch_locations(map_folder(store)):
+            held.enter_context(_catalog.pause_writers(place.folder, store.catalog.patience_s))
         yield
 
 
-def read_state(file: Path, created_at: str = "") -> State:
-    """What a catalog names: a ``map.sqlite`` of any schema that nobody writes to.
+def read_state(file: Path, created_at: str = "") -> MapState:
+    """List the files that a catalog names: a ``map.sqlite`` of any schema that no process writes to.
 
     Raises:
-        CorruptError: it cannot be read, or names a path outside the map.
+        CorruptError: the catalog cannot be read, or names a path outside the map.
     """
     connection = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
     try:
@@ -132,7 +134,7 @@ def read_state(file: Path, created_at: str = "") -> State:
             "removed": "scenes WHERE removed_at IS NOT NULL",
             **{name: name for name in ("groups", "graphs", "registrations", "revisions")},
         }
-        return State(
+        return MapState(
             map_id=str(_one(connection, "SELECT id FROM about")),
             created_at=created_at,
             schema=str(_one(connection, "SELECT version_num FROM alembic_version")),
@@ -147,10 +149,10 @@ def read_state(file: Path, created_at: str = "") -> State:
 
 
 def check_path(path: object) -> str:
-    """A path of a file in a map, relative to it: what every list of files is held against before it is used.
+    """Validate the relative path of a file in a map, before a list of files is used.
 
     Raises:
-        CorruptError: it would lie outside the map, or where a map keeps nothing.
+        CorruptError: the path leads outside the map, or where a map keeps no files.
     """
     if not isinstance(path, str) or not path.isprintable() or "\\" in path:
         raise CorruptError(f"no path of a file in a map: {path!r}", code="invalid_stored_name")
@@ -171,22 +173,22 @@ def check_path(path: object) -> str:
 
 
 def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, None, None]:
-    """The bytes of a file that a state names, compared with its digest while they are read.
+    """Yield the bytes of a file of a state, and verify its digest at the end.
 
     Args:
-        folder: where `capture` copied the catalogs to; the other files are in the map.
+        folder: where `capture_state` copied the catalogs to; other files are read from the map.
 
     Raises:
-        Vanished: the map has it no longer, and its catalog says the same.
-        CorruptError: it is missing or differs from what was written. Then what was read so far is of no use.
+        OutdatedStateError: the file is gone, and no catalog names it any more.
+        CorruptError: the file is missing or differs from its digest. Bytes read so far must be discarded.
     """
     immutable = file.path.split("/")[0] in (ARRAYS, MODELS)
-    path = (home_of(store) if immutable else folder) / file.path
+    path = (map_folder(store) if immutable else folder) / file.path
     try:
-        yield from checked(_bytes_of(store, file, path), file, str(path))
+        yield from verify_chunks(_bytes_of(store, file, path), file, str(path))
     except (CorruptError, FileNotFoundError, NotADirectoryError, NotFoundError) as error:
         if immutable and not _still_named(store, file):
-            raise Vanished(file.path) from error
+            raise OutdatedStateError(file.path) from error
         if isinstance(error, CorruptError):
             raise CorruptError(f"{error}: {_mend(file)}", code="map_damaged") from error
         raise CorruptError(
@@ -199,23 +201,23 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, 
 def _bytes_of(store: Store, file: StoredFile, path: Path) -> Iterator[bytes]:
     top, *rest = file.path.split("/")
     if top == MODELS:
-        store.arrays.bring_model(file.path)
+        store.arrays.fetch_model(file.path)
     if top != ARRAYS:
         return chunks_of(path)
     kind, group, *within = rest
-    return store.arrays.chunks(kind, group, replace(file, path="/".join(within)))
+    return store.arrays.file_chunks(kind, group, replace(file, path="/".join(within)))
 
 
 def _mend(file: StoredFile) -> str:
     top, kind, *_ = file.path.split("/")
-    return mend(kind) if top == ARRAYS else "restore it from a backup"
+    return repair_advice(kind) if top == ARRAYS else "restore it from a backup"
 
 
-def checked(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[bytes]:
-    """The same bytes, and an error at the end where they are not those of the digest.
+def verify_chunks(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[bytes]:
+    """Yield the same bytes, and raise at the end if they do not match the digest.
 
     Raises:
-        CorruptError: too many or too few bytes, or others.
+        CorruptError: too many or too few bytes, or another digest.
     """
     seen, digest = 0, hashlib.sha256()
     for chunk in chunks:
@@ -230,10 +232,10 @@ def checked(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[by
         raise CorruptError(f"{what} differs from what was written", code="bytes_differ")
 
 
-def _capture_catalog(source: Catalog, folder: Path) -> State:
+def _capture_catalog(source: Catalog, folder: Path) -> MapState:
     file = folder / sqlite.FILE
     if source.is_sqlite:
-        with explained(source.folder):
+        with translate_errors(source.folder):
             for problem in source.page_problems():
                 raise CorruptError(f"{problem}: run gsmap check; nothing was backed up", code="map_damaged")
             sqlite.backup(source.engine, file)
@@ -247,12 +249,12 @@ def _capture_catalog(source: Catalog, folder: Path) -> State:
             copy_catalog(source, made, leave_out=("leases",))
         finally:
             made.close()
-    with explained(source.folder), contextlib.suppress(FileNotFoundError):
+    with translate_errors(source.folder), contextlib.suppress(FileNotFoundError):
         (folder / SETTINGS).write_bytes((source.folder / SETTINGS).read_bytes())
     return read_state(file)
 
 
-def _capture_branch(source: Path, folder: Path) -> State:
+def _capture_branch(source: Path, folder: Path) -> MapState:
     engine = _catalog.open_engine(source, writable=False)
     catalog = Catalog(source, engine, writable=False)
     try:
@@ -269,10 +271,10 @@ def _stored(path: Path, folder: Path) -> StoredFile:
 
 
 def _still_named(store: Store, file: StoredFile) -> bool:
-    """Whether any catalog of the map still says that it has this very file."""
+    """Return True if any catalog of the map still names the file with this digest."""
     if _names(store.catalog, file):
         return True
-    for place in places(home_of(store)):
+    for place in branch_locations(map_folder(store)):
         catalog = Catalog(place.folder, _catalog.open_engine(place.folder, writable=False), writable=False)
         try:
             if _names(catalog, file):
@@ -290,8 +292,8 @@ def _names(catalog: Catalog, file: StoredFile) -> bool:
     top, *rest = file.path.split("/")
     with catalog.read() as connection:
         if top == MODELS:
-            standing = (models.c.path == file.path) & models.c.removed_at.is_(None)
-            return connection.execute(select(models.c.number).where(standing)).first() is not None
+            current = (models.c.path == file.path) & models.c.removed_at.is_(None)
+            return connection.execute(select(models.c.number).where(current)).first() is not None
         same = (files.c.group_id == rest[1]) & (files.c.path == "/".join(rest[2:])) & (files.c.sha256 == file.sha256)
         return connection.execute(select(files.c.path).where(same)).first() is not None
 

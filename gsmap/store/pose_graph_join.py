@@ -1,4 +1,4 @@
-"""One pose graph of two maps' newest: the other's scenes beside our own, in our frame where shared scenes tell it."""
+"""Join the newest pose graphs of two maps, aligned by shared scenes."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from gsmap.geometry.umeyama import umeyama
 from gsmap.types import PoseGraph, ScenePose, Sim3
 from gsmap.types.world import Georeference
 
-# Scenes in both maps agree where their poses differ by no more than what both solutions leave open. The covariance of
-# the scene that holds a component's frame is next to nothing, so that this much is always allowed: [rad, scene units,
-# log scale].
-_FLOOR = np.array([2e-3] * 3 + [0.02] * 3 + [2e-3])
+# Shared scenes agree if their poses differ by no more than the covariances of both solutions allow. The covariance of
+# the anchor of a component is almost zero, so that these sigmas are always allowed: [rad, scene units, log scale].
+_MIN_SIGMAS = np.array([2e-3] * 3 + [0.02] * 3 + [2e-3])
 _QUANTILE = 0.999
 
 
-def joined(ours: PoseGraph, theirs: PoseGraph, living: Collection[str], bounds: Mapping[str, np.ndarray]) -> PoseGraph:
-    """Our poses as they are, and theirs of the scenes that only they have placed.
+def join_pose_graphs(
+    ours: PoseGraph, theirs: PoseGraph, living: Collection[str], bounds: Mapping[str, np.ndarray]
+) -> PoseGraph:
+    """Join our poses with theirs of the scenes that only they have placed; nothing is optimized.
 
-    A component of theirs that shares scenes with one of ours is moved into its frame by one similarity if all shared
-    scenes then agree; else it stays a component of its own, and a note says so. Nothing is solved.
+    A component of theirs that shares scenes with one of ours is moved to our frame by one similarity if all shared
+    scenes then agree; otherwise it stays a separate component, with a note.
 
     Args:
-        living: scenes that the answer may hold.
+        living: scenes that the result may contain.
         bounds: (2, 3) box of each scene in its own frame, by id.
     """
     poses = {scene: pose for scene, pose in ours.poses.items() if scene in living}
@@ -64,7 +65,7 @@ def joined(ours: PoseGraph, theirs: PoseGraph, living: Collection[str], bounds: 
     world = _ties(ours, placed, {scene: pose.component for scene, pose in ours.poses.items()})
     known_in_world = {tie.component for tie in world}
     apart = {pose.scene: pose.component for pose in theirs.poses.values() if pose.scene not in ours.poses}
-    # A component of theirs that came into a frame of ours left its own, and its tie with it.
+    # A component of theirs that was moved to a frame of ours loses its world tie.
     left = {pose.component for pose in theirs.poses.values() if pose.scene in ours.poses}
     world += tuple(
         tie
@@ -74,8 +75,8 @@ def joined(ours: PoseGraph, theirs: PoseGraph, living: Collection[str], bounds: 
     return PoseGraph(placed, outcomes, settings=ours.settings, notes=tuple(notes), world=world)
 
 
-def restricted(graph: PoseGraph, scenes: Collection[str]) -> PoseGraph:
-    """The poses of some scenes, and what became of the edges among them."""
+def restrict_pose_graph(graph: PoseGraph, scenes: Collection[str]) -> PoseGraph:
+    """Restrict a pose graph to some scenes and the edges among them."""
     poses = {scene: pose for scene, pose in graph.poses.items() if scene in scenes}
     outcomes = {pair: outcome for pair, outcome in graph.outcomes.items() if set(pair) <= set(poses)}
     placed = _largest_first(poses)
@@ -84,10 +85,10 @@ def restricted(graph: PoseGraph, scenes: Collection[str]) -> PoseGraph:
 
 
 def _ties(graph: PoseGraph, placed: Mapping[str, ScenePose], before: Mapping[str, int]) -> tuple[Georeference, ...]:
-    """Where components lie in the world, under their new numbers; of what was observed, that of scenes that are here.
+    """Return the world ties of components under their new numbers, with the residuals of scenes that are present.
 
     Args:
-        before: component of scenes in ``graph``, of those whose frame is what it was.
+        before: component of each scene of ``graph`` whose component keeps its frame.
     """
     now = {component: placed[scene].component for scene, component in before.items() if scene in placed}
     return tuple(
@@ -106,7 +107,7 @@ def _components(graph: PoseGraph) -> list[int]:
 
 
 def _between(common: list[tuple[ScenePose, ScenePose]], bounds: Mapping[str, np.ndarray]) -> Sim3:
-    """``S_ours_theirs`` from where both put the corners of the scenes they share; exact for one scene."""
+    """Estimate ``S_ours_theirs`` by Umeyama's method from the box corners of shared scenes; exact for one scene."""
     if len(common) == 1:
         mine, other = common[0]
         return mine.S_map_scene @ other.S_map_scene.inverse()
@@ -123,7 +124,7 @@ def _agree(common: list[tuple[ScenePose, ScenePose]], S_ours_theirs: Sim3) -> bo
     off = [mine.S_map_scene.inverse() @ S_ours_theirs @ other.S_map_scene for mine, other in common]
     bar = float(chi2_quantile(_QUANTILE, 7))
     for (mine, other), xi in zip(common, Similarities.stack(off).log(), strict=True):
-        covariance = np.diag(_FLOOR**2)
+        covariance = np.diag(_MIN_SIGMAS**2)
         for pose in (mine, other):
             if pose.covariance is not None and np.isfinite(pose.covariance).all():
                 covariance = covariance + pose.covariance
@@ -133,7 +134,7 @@ def _agree(common: list[tuple[ScenePose, ScenePose]], S_ours_theirs: Sim3) -> bo
 
 
 def _largest_first(poses: Mapping[str, ScenePose]) -> dict[str, ScenePose]:
-    """Components numbered anew, the largest first; of equal ones the one that was first."""
+    """Renumber components, the largest first; ties keep their order."""
     sizes = Counter(pose.component for pose in poses.values())
     order = {component: i for i, component in enumerate(sorted(sizes, key=lambda k: (-sizes[k], k)))}
     return {scene: replace(pose, component=order[pose.component]) for scene, pose in poses.items()}

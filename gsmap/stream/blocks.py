@@ -1,4 +1,4 @@
-"""Reading a source in other pieces than its own."""
+"""Read a Gaussian source whole, in blocks of other sizes, or about another origin."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gsmap.types.gaussians import FIELDS
 from gsmap.types.source import origin_of_source
 
 
-def loaded(source: GaussianSource) -> Gaussians:
-    """All Gaussians of a source in memory; beside them no more than a chunk."""
+def load_all(source: GaussianSource) -> Gaussians:
+    """Load all Gaussians of a source, using no more than a chunk of further memory."""
     n, k = source.num_gaussians, (source.sh_degree + 1) ** 2
     shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, k, 3)}
     out = {name: np.empty(shapes[name], np.float32) for name in FIELDS}
@@ -29,7 +29,7 @@ def loaded(source: GaussianSource) -> Gaussians:
 
 
 def blocks(source: GaussianSource, rows: int) -> Iterator[Gaussians]:
-    """All Gaussians of a source in order, ``rows`` at a time; fewer at the end."""
+    """Yield all Gaussians of a source in order, ``rows`` at a time; fewer at the end."""
     held: list[Gaussians] = []
     count = 0
     for chunk in source.chunks():
@@ -46,13 +46,13 @@ def blocks(source: GaussianSource, rows: int) -> Iterator[Gaussians]:
         yield Gaussians.concatenate(held)
 
 
-def about(source: GaussianSource, origin: np.ndarray) -> GaussianSource:
-    """The Gaussians of a source about another origin (3,)."""
-    return source.about(origin) if isinstance(source, Gaussians) else _About(source, origin)
+def shift_origin(source: GaussianSource, origin: np.ndarray) -> GaussianSource:
+    """Return the Gaussians of a source about another origin (3,)."""
+    return source.about(origin) if isinstance(source, Gaussians) else _ShiftedSource(source, origin)
 
 
 @dataclass(frozen=True, eq=False)
-class _About:
+class _ShiftedSource:
     source: GaussianSource
     origin: np.ndarray
 
@@ -81,6 +81,6 @@ class _About:
 
 
 def bounds(source: GaussianSource) -> np.ndarray:
-    """(2, 3) float32 lowest and highest coordinates of the means of a source that is not empty."""
+    """Compute the (2, 3) float32 bounds of the means of a source that is not empty."""
     corners = [box_around(means) for means in source.columns("means") if len(means)]
     return box_around(np.concatenate(corners))

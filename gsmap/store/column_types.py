@@ -1,8 +1,7 @@
-"""Column types that check what they hold: a map may come from a stranger, and rows become paths, keys and text.
+"""Column types that validate their values, because a map may come from an untrusted source.
 
-A value that gsmap cannot have written raises where its row is read, before anything is done with it, and one that it
-must not write raises before it is written. Values that are only compared with are not checked, and neither is what
-passes by the tables: SQL given as text.
+A value that gsmap cannot have written raises when its row is read, before it is used, and an invalid value raises
+before it is written. Values in comparisons and in textual SQL are not validated.
 """
 
 from __future__ import annotations
@@ -22,23 +21,24 @@ from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
 KINDS = ("scenes", "graphs", "changes", "indexes", "views", "photos")
-"""Of groups of arrays: the folders below ``arrays``."""
+"""Kinds of array groups: the folders below ``arrays``."""
 
 
-@lru_cache(maxsize=1 << 16)  # the same ids are read again and again
+@lru_cache(maxsize=1 << 16)  # the same ids are read repeatedly
 def is_digest(text: str) -> bool:
-    """Whether a text is 32 or 64 hex digits."""
+    """Return True for 32 or 64 hex digits."""
     return _DIGEST.fullmatch(text) is not None
 
 
 def is_relative(path: str) -> bool:
-    """Whether a path leads downwards only: parts with ``/`` between them, none empty, ``.`` or ``..``."""
+    """Return True for a relative path that leads downwards only: non-empty parts separated by ``/``, without ``.`` and
+    ``..``."""
     parts = path.split("/")
     return not control_characters(path) and "\\" not in path and not any(part in ("", ".", "..") for part in parts)
 
 
-class _Checked(TypeDecorator[Any]):
-    """A text column whose values are checked."""
+class _CheckedText(TypeDecorator[Any]):
+    """A text column with validated values."""
 
     impl = Text
     cache_ok = True
@@ -48,28 +48,28 @@ class _Checked(TypeDecorator[Any]):
         super().__init__()
         self.where = where
 
-    def at(self, where: str) -> _Checked:
-        """The same type, knowing its column (``table.column``)."""
-        made: _Checked = self.copy()
+    def for_column(self, where: str) -> _CheckedText:
+        """Return a copy of this type that names its column (``table.column``) in messages."""
+        made: _CheckedText = self.copy()
         made.where = where
         return made
 
-    def fits(self, value: str) -> bool:
+    def is_valid(self, value: str) -> bool:
         raise NotImplementedError
 
     def process_bind_param(self, value: Any, dialect: Any) -> Any:
-        if value is not None and not (isinstance(value, str) and self.fits(value)):
+        if value is not None and not (isinstance(value, str) and self.is_valid(value)):
             raise InputError(f"{self.where} must be {self.what}, got {_short(value)}", code="invalid_column_value")
         return value
 
     def result_processor(self, dialect: Any, coltype: Any) -> Callable[[Any], Any] | None:
-        # In place of `process_result_value`: a map has millions of values, and a call around each is half its cost.
-        fits, where, what = self.fits, self.where, self.what
+        # Instead of `process_result_value`: with millions of values, a wrapper call would take half of the time.
+        is_valid, where, what = self.is_valid, self.where, self.what
 
         def checked(value: Any) -> Any:
-            if value is None or (isinstance(value, str) and fits(value)):
+            if value is None or (isinstance(value, str) and is_valid(value)):
                 return value
-            raise corrupt(where, value, what)
+            raise corrupt_value(where, value, what)
 
         return checked
 
@@ -77,48 +77,48 @@ class _Checked(TypeDecorator[Any]):
         return Text()
 
 
-class Digest(_Checked):
+class DigestText(_CheckedText):
     """32 or 64 hex digits."""
 
     cache_ok = True
     what = "32 or 64 hex digits"
 
-    def fits(self, value: str) -> bool:
+    def is_valid(self, value: str) -> bool:
         return is_digest(value)
 
 
-class Key(_Checked):
-    """What a result is kept under: compared and shown, never a path. A digest today; schema 0001 had other words."""
+class KeyText(_CheckedText):
+    """The key of a result, never used as a path: a digest, or any text in maps of schema 0001."""
 
     cache_ok = True
     what = "a text without control characters"
 
-    def fits(self, value: str) -> bool:
+    def is_valid(self, value: str) -> bool:
         return not control_characters(value)
 
 
-class Pair(_Checked):
-    """Two scene ids with a colon between them."""
+class PairText(_CheckedText):
+    """Two scene ids separated by a colon."""
 
     cache_ok = True
     what = "two digests with a colon between them"
 
-    def fits(self, value: str) -> bool:
+    def is_valid(self, value: str) -> bool:
         return all(map(is_digest, value.split(":"))) and value.count(":") == 1
 
 
-class Kind(_Checked):
-    """The kind of a group of arrays: the name of a folder."""
+class ArrayKindText(_CheckedText):
+    """The kind of an array group: the name of a folder."""
 
     cache_ok = True
     what = " or ".join(KINDS)
 
-    def fits(self, value: str) -> bool:
+    def is_valid(self, value: str) -> bool:
         return value in KINDS
 
 
-class Word(_Checked):
-    """One of a few words."""
+class EnumText(_CheckedText):
+    """One of a fixed set of words."""
 
     cache_ok = True
 
@@ -127,46 +127,46 @@ class Word(_Checked):
         self.words = words
         self.what = f"one of {', '.join(words)}"
 
-    def fits(self, value: str) -> bool:
+    def is_valid(self, value: str) -> bool:
         return value in self.words
 
 
-class RelativePath(_Checked):
-    """A path that leads downwards only; empty where there is no file."""
+class RelativePathText(_CheckedText):
+    """A path that leads downwards only; empty if there is no file."""
 
     cache_ok = True
     what = "a path that stays inside"
 
-    def fits(self, value: str) -> bool:
+    def is_valid(self, value: str) -> bool:
         return not value or is_relative(value)
 
 
-class Line(_Checked):
-    """What a person wrote, on one line. Read as it is: it is escaped where it is printed."""
+class LineText(_CheckedText):
+    """One line of text written by a person; not validated when read, but escaped when printed."""
 
     cache_ok = True
     what = "a text without control characters"
     lines = False
 
-    def fits(self, value: str) -> bool:
+    def is_valid(self, value: str) -> bool:
         return not control_characters(value, lines=self.lines)
 
     def result_processor(self, dialect: Any, coltype: Any) -> None:
         return None
 
 
-class Lines(Line):
-    """What a person wrote, on any number of lines."""
+class MultilineText(LineText):
+    """Lines of text written by a person."""
 
     cache_ok = True
     lines = True
 
 
-class Json(TypeDecorator[Any]):
-    """JSON in a text column: the same on every database, floats to the last bit, infinity allowed.
+class JsonText(TypeDecorator[Any]):
+    """JSON in a text column: identical on every database, with exact floats and infinity.
 
     Args:
-        fits: what a value that is read must be, one of the functions below; anything where None.
+        fits: predicate for values that are read, one of the functions below; default: any value.
     """
 
     impl = Text
@@ -177,9 +177,9 @@ class Json(TypeDecorator[Any]):
         self.fits = fits
         self.where = where
 
-    def at(self, where: str) -> Json:
-        """The same type, knowing its column (``table.column``)."""
-        made: Json = self.copy()
+    def for_column(self, where: str) -> JsonText:
+        """Return a copy of this type that names its column (``table.column``) in messages."""
+        made: JsonText = self.copy()
         made.where = where
         return made
 
@@ -192,18 +192,20 @@ class Json(TypeDecorator[Any]):
         try:
             found = json.loads(value)
         except (ValueError, TypeError, RecursionError) as error:
-            raise corrupt(self.where, value, "JSON") from error
+            raise corrupt_value(self.where, value, "JSON") from error
         if self.fits is not None and not self.fits(found):
-            raise corrupt(self.where, value, f"JSON of {self.fits.__name__.strip('_').replace('_', ' ')}")
+            raise corrupt_value(
+                self.where, value, f"JSON of {self.fits.__name__.removeprefix('is_').replace('_', ' ')}"
+            )
         return found
 
 
-class Numbers(TypeDecorator[Any]):
-    """Numbers as bytes (`gsmap.store.matrices`): a tenth of the time of JSON, a third of the room.
+class PackedNumbers(TypeDecorator[Any]):
+    """Numbers as bytes (`gsmap.store.matrices`): a tenth of the time and a third of the space of JSON.
 
     Args:
-        pack: the bytes of a value; bytes are taken as they are.
-        unpack: the value of bytes; raises `InputError` where they are none.
+        pack: converts a value to bytes; bytes are stored as they are.
+        unpack: converts bytes to a value; raises `InputError` for invalid bytes.
     """
 
     impl = LargeBinary
@@ -213,9 +215,9 @@ class Numbers(TypeDecorator[Any]):
         super().__init__()
         self.pack, self.unpack, self.where = pack, unpack, where
 
-    def at(self, where: str) -> Numbers:
-        """The same type, knowing its column (``table.column``)."""
-        made: Numbers = self.copy()
+    def for_column(self, where: str) -> PackedNumbers:
+        """Return a copy of this type that names its column (``table.column``) in messages."""
+        made: PackedNumbers = self.copy()
         made.where = where
         return made
 
@@ -225,13 +227,13 @@ class Numbers(TypeDecorator[Any]):
     def process_result_value(self, value: Any, dialect: Any) -> Any:
         if value is None:
             return None
-        with not_ours(self.where):
+        with malformed_as_corrupt(self.where):
             return self.unpack(bytes(value))
 
 
 @contextmanager
-def not_ours(where: str) -> Iterator[None]:
-    """Let bytes of a column that are no numbers of gsmap's be told as such."""
+def malformed_as_corrupt(where: str) -> Iterator[None]:
+    """Raise `CorruptError` for errors while decoding the bytes of a column."""
     try:
         yield
     except GsmapError as error:
@@ -242,32 +244,32 @@ def not_ours(where: str) -> Iterator[None]:
         ) from error
 
 
-def an_object(value: Any) -> bool:
+def is_object(value: Any) -> bool:
     return isinstance(value, dict)
 
 
-def texts(value: Any) -> bool:
+def is_text_list(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(item, str) for item in value)
 
 
-def a_direction(value: Any) -> bool:
+def is_direction(value: Any) -> bool:
     return _numbers(value, 3)
 
 
-def numbers(value: Any) -> bool:
-    """Numbers by name."""
+def is_number_dict(value: Any) -> bool:
+    """Return True for a dict of numbers."""
     return isinstance(value, dict) and all(_numbers(item) for item in value.values())
 
 
-def sigmas(value: Any) -> bool:
+def is_sigmas(value: Any) -> bool:
     return _numbers(value, 7)
 
 
-def a_box(value: Any) -> bool:
+def is_box(value: Any) -> bool:
     return _numbers(value, 2, 3)
 
 
-def a_pose(value: Any) -> bool:
+def is_pose(value: Any) -> bool:
     return (
         isinstance(value, dict)
         and _numbers(value.get("rotation"), 3, 3)
@@ -276,43 +278,43 @@ def a_pose(value: Any) -> bool:
     )
 
 
-def ties(value: Any) -> bool:
-    """Where components lie in the world; `gsmap.store.ties` looks further."""
+def is_world_ties(value: Any) -> bool:
+    """Return True for a list of world ties; `gsmap.store.world_ties` validates the rest."""
     return isinstance(value, list) and all(
         isinstance(one, dict) and isinstance(one.get("component"), int) for one in value
     )
 
 
-def poses_by_scene(value: Any) -> bool:
-    return isinstance(value, dict) and all(is_digest(scene) and a_pose(pose) for scene, pose in value.items())
+def is_poses_by_scene(value: Any) -> bool:
+    return isinstance(value, dict) and all(is_digest(scene) and is_pose(pose) for scene, pose in value.items())
 
 
-def a_thinning(value: Any) -> bool:
-    """How a thinned scene is kept beside its arrays."""
+def is_thinning(value: Any) -> bool:
+    """Return True for the record of a thinned scene."""
     return (
         isinstance(value, dict)
         and isinstance(value.get("at"), str)
         and isinstance(value.get("num_gaussians"), int)
-        and (value.get("up") is None or a_direction(value["up"]))
+        and (value.get("up") is None or is_direction(value["up"]))
         and isinstance(value.get("row_map", False), bool)
     )
 
 
-def a_graph(value: Any) -> bool:
-    """What a graph is beside its arrays."""
+def is_graph(value: Any) -> bool:
+    """Return True for the metadata of a scene graph."""
     if not isinstance(value, dict) or not isinstance(value.get("layers"), dict):
         return False
     layers, things = value["layers"].values(), value.get("things", {"count": 0, "unit_m": 1.0})
     return (
-        (value.get("up") is None or a_direction(value["up"]))
+        (value.get("up") is None or is_direction(value["up"]))
         and _numbers(value.get("unit_m"))
         and _numbers(value.get("working_m", 1.0))
-        and texts(value.get("notes"))
+        and is_text_list(value.get("notes"))
         and isinstance(things, dict)
         and isinstance(things.get("count"), int)
         and _kept_arrays(value.get("arrays", {}))
         and _numbers(things.get("unit_m"))
-        and all(isinstance(x, dict) and isinstance(x.get("count"), int) and an_object(x.get("rest")) for x in layers)
+        and all(isinstance(x, dict) and isinstance(x.get("count"), int) and is_object(x.get("rest")) for x in layers)
     )
 
 
@@ -320,8 +322,8 @@ def _kept_arrays(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(how, dict) for how in value.values())
 
 
-def members(value: Any) -> bool:
-    """Of a segment of a retrieval index."""
+def is_member_list(value: Any) -> bool:
+    """Return True for the members of an index segment."""
     return isinstance(value, list) and all(
         isinstance(one, list)
         and len(one) == 5
@@ -333,8 +335,8 @@ def members(value: Any) -> bool:
     )
 
 
-def candidates(value: Any) -> bool:
-    """Of a scene that asked a retrieval index."""
+def is_candidate_list(value: Any) -> bool:
+    """Return True for the candidates of a lookup."""
     return isinstance(value, list) and all(
         isinstance(one, list)
         and len(one) == 3
@@ -351,8 +353,8 @@ def _numbers(value: Any, *shape: int) -> bool:
     return isinstance(value, list) and len(value) == shape[0] and all(_numbers(item, *shape[1:]) for item in value)
 
 
-def corrupt(where: str, value: Any, what: str) -> CorruptError:
-    """What to tell of a value that gsmap cannot have written."""
+def corrupt_value(where: str, value: Any, what: str) -> CorruptError:
+    """Return the error for a value that gsmap cannot have written."""
     return CorruptError(
         f"the catalog holds {_short(value)} in {where}, which is not {what}: gsmap did not write that; "
         "restore the catalog from a backup, and do not trust a map that was sent to you so",
@@ -361,6 +363,6 @@ def corrupt(where: str, value: Any, what: str) -> CorruptError:
 
 
 def _short(value: Any) -> str:
-    """A value as a message quotes it."""
-    said = repr(value)
-    return said if len(said) <= 60 else f"{said[:57]}..."
+    """Quote a value for a message, shortened."""
+    quoted = repr(value)
+    return quoted if len(quoted) <= 60 else f"{quoted[:57]}..."

@@ -1,4 +1,4 @@
-"""Boxes around chunks of Gaussians, for finding what touches a region without reading it."""
+"""Bounding boxes of chunks of Gaussians, to find the chunks that touch a region without reading them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from gsmap.types import Gaussians
 
 
 def chunk_boxes(gaussians: Gaussians, rows: int, *, sigmas: float = 3.0) -> np.ndarray:
-    """(C, 2, 3) float64 box of every ``rows`` Gaussians in a row, widened by ``sigmas`` standard deviations of each."""
+    """Compute (C, 2, 3) float64 boxes of every ``rows`` consecutive Gaussians, each widened by ``sigmas`` standard
+    deviations."""
     parts = (gaussians[start : start + rows] for start in range(0, len(gaussians), rows))
     return np.array([reached_box(part, sigmas) for part in parts]).reshape(-1, 2, 3)
 
 
 def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
-    """Keep the boxes (C, 2, 3) of a scene's chunks, in place of those that there are."""
+    """Store the boxes (C, 2, 3) of a scene's chunks, replacing the previous ones."""
     if number >= 1 << 24:
         raise StoreError(
             "a map holds at most 16 million scenes", code="too_many_scenes"
-        )  # the R*Tree's floats count no further
+        )  # float32 coordinates of the R*Tree represent integers exactly up to 2**24
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
     rows = [
         {"s": number, "chunk": i}
@@ -40,14 +41,14 @@ def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
 
 
 def get_boxes(connection: Connection, number: int) -> np.ndarray:
-    """The boxes (C, 2, 3) of a scene's chunks."""
+    """Return the boxes (C, 2, 3) of a scene's chunks."""
     query = text(f"SELECT x0, y0, z0, x1, y1, z1 FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s ORDER BY chunk")
     rows = [list(row) for row in connection.execute(query, {"s": number})]
     return np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
 
 
-def touching(connection: Connection, number: int, bounds: np.ndarray) -> list[int]:
-    """The chunks of a scene whose boxes meet one (2, 3) in its frame."""
+def chunks_touching(connection: Connection, number: int, bounds: np.ndarray) -> list[int]:
+    """Return the numbers of the chunks whose boxes intersect a (2, 3) box in the scene frame."""
     if bounds.shape != (2, 3):
         raise InputError(
             f"bounds must be (2, 3): lowest and highest corner, got shape {bounds.shape}", code="invalid_box"
@@ -61,7 +62,7 @@ def touching(connection: Connection, number: int, bounds: np.ndarray) -> list[in
 
 
 def row_ranges(chunks: list[int], count: int) -> list[tuple[int, int]]:
-    """Row ranges of chunks, neighbours joined."""
+    """Return the row ranges of chunks, merging adjacent ones."""
     out: list[tuple[int, int]] = []
     for chunk in chunks:
         start, stop = chunk * CHUNK_ROWS, min(count, (chunk + 1) * CHUNK_ROWS)

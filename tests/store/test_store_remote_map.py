@@ -13,12 +13,12 @@ from store_swift import BUCKET, ENVIRONMENT, Wire
 
 import gsmap.map
 from gsmap.errors import BusyError, ConfigError, CorruptError, NotFoundError, StoreError
-from gsmap.store import Store, advisory, cache, homes
+from gsmap.store import Store, advisory_locks, cache, remote_map
 from gsmap.store.backup import clone, restore, save
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.merging import merge
-from gsmap.store.object_arrays import joined
-from gsmap.store.places import place_of
+from gsmap.store.object_arrays import merge_ranges
+from gsmap.store.storage import open_storage
 from gsmap.types import Gaussians, NodeLayer, SceneGraph
 
 _numbers = itertools.count()
@@ -69,7 +69,7 @@ def test_a_map_is_made_once_and_needs_a_server(bucket, postgres_database):
     assert Store.exists(bucket)
     with raises(StoreError, code="already_exists"):
         Store.create(bucket, catalog_url=postgres_database)
-    place = place_of(f"{bucket} other")
+    place = open_storage(f"{bucket} other")
     place.put("x", [b"1"], 1)
     with raises(StoreError, code="folder_not_empty"):
         Store.create(place.url, catalog_url=postgres_database)
@@ -210,10 +210,10 @@ def test_a_box_takes_few_requests_and_few_bytes(server, home, bucket, monkeypatc
     box = np.array([[63.0, 63, -1], [79.1, 79.1, 9]])
     with Store.open(bucket, "r") as store:
         with store.catalog.read() as connection:
-            from gsmap.store.boxes import touching
+            from gsmap.store.chunk_boxes import chunks_touching
 
             number = connection.exec_driver_sql("SELECT number FROM scenes").scalar()
-            touched = len(touching(connection, number, box))
+            touched = len(chunks_touching(connection, number, box))
         before = wire.answers, wire.num_bytes
         found = store.scenes.gaussians("a", box)
         requests, num_bytes = wire.answers - before[0], wire.num_bytes - before[1]
@@ -226,9 +226,9 @@ def test_a_box_takes_few_requests_and_few_bytes(server, home, bucket, monkeypatc
 
 
 def test_ranges_that_are_near_are_one_request():
-    assert joined([(0, 5), (5, 9), (20, 30), (31, 40), (90, 95)], 2) == [(0, 40), (90, 95)]
-    assert joined([(7, 9), (0, 3), (2, 5)], 9) == [(0, 5), (7, 9)]
-    assert joined([], 3) == []
+    assert merge_ranges([(0, 5), (5, 9), (20, 30), (31, 40), (90, 95)], 2) == [(0, 40), (90, 95)]
+    assert merge_ranges([(7, 9), (0, 3), (2, 5)], 9) == [(0, 5), (7, 9)]
+    assert merge_ranges([], 3) == []
 
 
 def test_a_pair_is_fetched_once(server, home, bucket, monkeypatch):
@@ -275,8 +275,8 @@ def test_a_backup_a_clone_and_a_merge_leave_the_bucket(home, tmp_path):
     (tmp_path / "net.onnx").write_bytes(b"no network")
     home.models.add("net", tmp_path / "net.onnx", kind="clip")
     next((home.home / "models").iterdir()).unlink()  # as on another machine
-    save(home, place_of(tmp_path / "backup"))
-    restore(place_of(tmp_path / "backup"), tmp_path / "back")
+    save(home, open_storage(tmp_path / "backup"))
+    restore(open_storage(tmp_path / "backup"), tmp_path / "back")
     clone(home, tmp_path / "clone")
     with Store.create(tmp_path / "merged") as into:
         merge(into, home)
@@ -324,11 +324,11 @@ def test_a_bucket_named_with_a_password_is_refused(tmp_path):
 def test_nothing_is_brought_from_or_to_elsewhere(home):
     for name in ("../x", "models/../x", "/etc/passwd", "models/", "models"):
         with raises(CorruptError, code="invalid_stored_name"):
-            homes.Home(home.location).bring(name)
+            remote_map.RemoteMap(home.location).fetch(name)
 
 
 def test_a_home_that_names_no_database_is_refused(bucket):
-    place = place_of(bucket)
+    place = open_storage(bucket)
     for content in (b"x" * 2_000_000, b"mysql://h/db\n", b"\xff"):
         place.put("catalog.url", [content], len(content))
         with raises(CorruptError, code=("file_too_large", "catalog_invalid")):
@@ -352,7 +352,7 @@ def test_one_writes_at_a_time_and_no_folder_is_locked(home, bucket):
             pass
         with other.catalog.write():
             pass
-        with home.catalog.still(), pytest.raises(BusyError), other.catalog.write():
+        with home.catalog.pause_writers(), pytest.raises(BusyError), other.catalog.write():
             pass
     assert not (home.folder / "lock").exists()
 
@@ -361,7 +361,7 @@ def test_who_died_holds_no_lock(home, bucket):
     with Store.open(bucket) as other:
         connection = home.catalog.engine.connect()
         connection.begin()
-        advisory.take(connection, advisory.WRITER, 1.0, "x")
+        advisory_locks.acquire(connection, advisory_locks.WRITER, 1.0, "x")
         other.catalog.patience_s = 0.2
         with pytest.raises(BusyError), other.catalog.write():
             pass
@@ -395,4 +395,4 @@ def test_writers_wait_for_each_other(home, bucket):
         thread.join()
     with home.catalog.read() as connection:
         assert connection.execute(text("SELECT n FROM counter")).scalar_one() == 15
-    assert homes.is_remote(bucket)
+    assert remote_map.is_remote(bucket)

@@ -1,9 +1,9 @@
-"""Who is at work in a backup: those who save, and the one who deletes what is not needed.
+"""Leases in a backup: those of processes that save, and that of the one that deletes unneeded objects.
 
-Everybody first says that he is there and then looks who else is. So of a saver and a sweeper that come at the same time
-at least one sees the other: a saver waits for the sweeper to be done, and a sweeper goes away and leaves everything as
-it is. A lease that is not renewed in time is nobody's, and one of a process of this machine that has ended; ages are by
-the clock of the place, never by ours.
+Every process first writes its lease and then reads those of the others. So if a saver and a sweeper start at the same
+time, at least one sees the other: a saver waits for the sweeper to end, and a sweeper gives up without deleting
+anything. A lease expires if it is not renewed in time, or if its process on this machine has ended; ages are by the
+clock of the storage, never by the local one.
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ from dataclasses import asdict
 from types import TracebackType
 
 from gsmap.errors import MALFORMED, BusyError, GsmapError, NotFoundError, StoreError
-from gsmap.store.places import Place
+from gsmap.store.storage import Storage
 from gsmap.types.lock_owner import LockOwner, this_process
 
 LEASES = "leases/"
 SAVE = "save"
 SWEEP = "sweep"
 RENEW_S = 60.0
-EXPIRES_S = 900.0  # a writer whose place did not answer for so long has stopped, or stops when it notices
-PATIENCE_S = 1800.0  # a saver waits so long for a sweeper; longer than a dead one's lease lives
+EXPIRES_S = 900.0  # a writer that cannot renew for so long has stopped, or stops in `require`
+PATIENCE_S = 1800.0  # maximum wait of a saver for a sweeper, longer than a dead one's lease lasts
 _MAX_BYTES = 10_000  # of a lease
 
 
-class Lease:
-    """A sign in the place that somebody is at work; renewed by a thread until it is left.
+class BackupLease:
+    """A lease in the storage of a backup, renewed by a thread until the block is left.
 
     Args:
         task: `SAVE` or `SWEEP`.
     """
 
-    def __init__(self, place: Place, task: str) -> None:
+    def __init__(self, storage: Storage, task: str) -> None:
         self.name = f"{LEASES}{task}-{uuid.uuid4().hex}.json"
-        self._place = place
+        self._storage = storage
         self._holder = this_process(f"backup {task}")
         self._renewed = 0.0
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._keep, name=self.name, daemon=True)
 
-    def __enter__(self) -> Lease:
+    def __enter__(self) -> BackupLease:
         self._renew()
         self._thread.start()
         return self
@@ -54,25 +54,25 @@ class Lease:
     ) -> None:
         self._done.set()
         self._thread.join()
-        with contextlib.suppress(GsmapError):  # it expires
-            self._place.delete(self.name)
+        with contextlib.suppress(GsmapError):  # otherwise it expires
+            self._storage.delete(self.name)
 
     def require(self) -> None:
-        """Go on only while others can know that we are here.
+        """Raise unless the lease was renewed recently, so that other processes can rely on it.
 
         Raises:
-            StoreError: the lease could not be renewed, or this process stood still for long.
+            StoreError: the lease could not be renewed, or this process was suspended for long.
         """
         if time.monotonic() - self._renewed > EXPIRES_S / 2:
             raise StoreError(
-                f"{self._place.url} could not be reached for {EXPIRES_S / 2:g} s: run it again", code="place_failed"
+                f"{self._storage.url} could not be reached for {EXPIRES_S / 2:g} s: run it again", code="place_failed"
             )
 
     def others(self, task: str = "") -> list[str]:
-        """Names of the leases of others that still count, of one task or of all."""
-        listed = self._place.list(LEASES)
+        """Return the names of the valid leases of other processes, of one task or of all."""
+        listed = self._storage.list(LEASES)
         if self.name not in listed:
-            raise StoreError(f"{self._place.url}: our lease was taken away; run it again", code="lease_lost")
+            raise StoreError(f"{self._storage.url}: our lease was taken away; run it again", code="lease_lost")
         oldest = listed[self.name].modified_s - EXPIRES_S
         del listed[self.name]
         wanted = {name: about for name, about in listed.items() if name.startswith(LEASES + task)}
@@ -83,29 +83,29 @@ class Lease:
         ]
 
     def _is_gone(self, name: str) -> bool:
-        """Whether who wrote a lease has ended, as far as this machine can tell; the lease goes with it then."""
+        """Return True if the owner of a lease ran on this machine and has ended; then deletes the lease."""
         try:
-            told = json.loads(b"".join(self._place.get(name)))
-            gone = LockOwner(**{key: str(told[key]) for key in ("task", "host", "process", "since")}).is_gone
+            content = json.loads(b"".join(self._storage.get(name)))
+            gone = LockOwner(**{key: str(content[key]) for key in ("task", "host", "process", "since")}).is_gone
         except NotFoundError:
             return True
         except MALFORMED:
             return False
         if gone:
-            self._place.delete(name)
+            self._storage.delete(name)
         return gone
 
     def wait_for_sweepers(self) -> None:
-        """Return when nobody deletes.
+        """Wait until no process is deleting.
 
         Raises:
-            BusyError: somebody still does after a long time.
+            BusyError: a process is still deleting after a long time.
         """
         deadline, pause = time.monotonic() + PATIENCE_S, 0.05
         while self.others(SWEEP):
             if time.monotonic() > deadline:
                 raise BusyError(
-                    f"{self._place.url}: another gsmap is deleting old snapshots there; try again later",
+                    f"{self._storage.url}: another gsmap is deleting old snapshots there; try again later",
                     code="backup_busy",
                 )
             time.sleep(pause)
@@ -115,10 +115,10 @@ class Lease:
     def _renew(self) -> None:
         began = time.monotonic()
         text = json.dumps(asdict(self._holder)).encode()
-        self._place.put(self.name, [text], len(text))
+        self._storage.put(self.name, [text], len(text))
         self._renewed = began
 
     def _keep(self) -> None:
         while not self._done.wait(RENEW_S):
-            with contextlib.suppress(GsmapError):  # `require` tells
+            with contextlib.suppress(GsmapError):  # `require` raises
                 self._renew()

@@ -1,4 +1,4 @@
-"""Where backups lie: a folder, or a bucket of an object store. Objects appear there whole or not at all."""
+"""Storage of backups and remote maps: a folder, or a bucket of an object store; objects appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CHUNK_BYTES = 1 << 20  # read, hashed and written at a time
 
 
 def chunks_of(path: Path) -> Iterator[bytes]:
-    """The bytes of a file; a link is not followed."""
+    """Yield the bytes of a file; a link is not followed."""
     with open(open_file(path), "rb") as file:
         while chunk := file.read(CHUNK_BYTES):
             yield chunk
@@ -43,55 +43,55 @@ def chunks_of(path: Path) -> Iterator[bytes]:
 SINGLE_PUT_BYTES = 64 << 20  # up to this size an object is one request; above, its parts appear as one at the end
 _PART_BYTES = 16 << 20  # S3 allows 10,000 parts: objects of up to 160 GB
 _STAGING = "staging"
-_NAME = re.compile(r"[a-z0-9]+(/[0-9a-zA-Z._-]+){0,2}|gsmap-backup\.json")  # what we ourselves call things there
+_NAME = re.compile(r"[a-z0-9]+(/[0-9a-zA-Z._-]+){0,2}|gsmap-backup\.json")  # names that gsmap uses
 
 
 @dataclass(frozen=True)
-class Listed:
-    """An object: how long it is, and when it was last written (seconds, by the clock of the place)."""
+class ObjectInfo:
+    """Size of an object, and when it was last written (seconds, by the clock of the storage)."""
 
     size_bytes: int
     modified_s: float
 
 
-class Place(Protocol):
-    """Named objects under one root; names have slashes, and are checked by who reads them from outside."""
+class Storage(Protocol):
+    """Named objects under one root; names contain slashes, and must be validated if they come from outside."""
 
-    url: str  # for people and for the catalog; without secrets
+    url: str  # shown to users and stored in the catalog, without secrets
 
-    def list(self, prefix: str) -> dict[str, Listed]:
-        """All objects whose name begins with ``prefix`` (a folder with its slash, or nothing), by name."""
+    def list(self, prefix: str) -> dict[str, ObjectInfo]:
+        """Return all objects by name whose name begins with ``prefix`` (a folder with its slash, or empty)."""
 
-    def anything(self) -> str | None:
-        """The name of something that lies there; None where nothing does."""
+    def first_name(self) -> str | None:
+        """Return the name of any object; None if the storage is empty."""
 
     def size_bytes(self, name: str) -> int | None:
-        """How long an object is; None where there is none."""
+        """Return the size of an object; None if there is none."""
 
     def put(self, name: str, chunks: Iterable[bytes], size_bytes: int) -> None:
-        """Write an object, or replace it; durable when it returns, and as before where ``chunks`` raises."""
+        """Write or replace an object; durable when it returns, unchanged if ``chunks`` raises."""
 
     def get(self, name: str) -> Iterator[bytes]:
-        """The bytes of an object, in order; NotFoundError where there is none."""
+        """Yield the bytes of an object in order; raises NotFoundError if there is none."""
 
     def delete(self, name: str) -> None:
-        """Delete an object; nothing where there is none."""
+        """Delete an object if it exists."""
 
     def drop_leftovers(self) -> None:
-        """Delete what writers that died left; only while no other writes."""
+        """Delete what killed writers left; only while no other process writes."""
 
 
-def place_of(target: str | os.PathLike[str]) -> Place:
-    """The place that a user names: a folder, ``file:///folder`` or ``s3://bucket/prefix``.
+def open_storage(target: str | os.PathLike[str]) -> Storage:
+    """Open the storage that a user names: a folder, ``file:///folder`` or ``s3://bucket/prefix``.
 
     Raises:
-        ConfigError: another scheme, or a URL with a password or options in it.
+        ConfigError: another scheme, or a URL with a password or options.
         MissingDependencyError: S3 without the package ``obstore``.
     """
     text = os.fspath(target)
     scheme, found, _ = text.partition("://")
     if not found:
-        return FolderPlace(Path(text))
+        return FolderStorage(Path(text))
     parts = urllib.parse.urlsplit(text)
     if scheme not in ("file", "s3"):
         raise ConfigError(
@@ -108,24 +108,24 @@ def place_of(target: str | os.PathLike[str]) -> Place:
             raise ConfigError(
                 f"{text} is on another machine: write file:///FOLDER, with three slashes", code="invalid_location"
             )
-        return FolderPlace(Path(urllib.parse.unquote(parts.path)))
+        return FolderStorage(Path(urllib.parse.unquote(parts.path)))
     if not parts.netloc:
         raise ConfigError(f"{text} names no bucket: write s3://BUCKET/PREFIX", code="invalid_location")
-    return ObjectPlace(parts.netloc, parts.path.strip("/"))
+    return BucketStorage(parts.netloc, parts.path.strip("/"))
 
 
-class FolderPlace:
-    """A folder. Objects are written below ``staging`` and renamed; links in it are not followed."""
+class FolderStorage:
+    """Storage in a folder. Objects are written below ``staging`` and renamed; links are not followed."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
         self.url = str(self.root)
 
-    def list(self, prefix: str) -> dict[str, Listed]:
+    def list(self, prefix: str) -> dict[str, ObjectInfo]:
         if prefix and not prefix.endswith("/"):
             raise ValueError(f"a prefix ends with a slash, got {prefix!r}")
-        out: dict[str, Listed] = {}
-        with self._explained():
+        out: dict[str, ObjectInfo] = {}
+        with self._translate_errors():
             todo = [prefix] if prefix != f"{_STAGING}/" else []
             while todo:
                 folder = todo.pop()
@@ -134,26 +134,26 @@ class FolderPlace:
                         if entry.is_dir(follow_symlinks=False):
                             todo += [f"{folder}{entry.name}/"] if folder or entry.name != _STAGING else []
                         elif entry.is_file(follow_symlinks=False):
-                            with contextlib.suppress(FileNotFoundError):  # deleted by another meanwhile
+                            with contextlib.suppress(FileNotFoundError):  # deleted meanwhile
                                 about = entry.stat(follow_symlinks=False)
-                                out[f"{folder}{entry.name}"] = Listed(about.st_size, about.st_mtime)
+                                out[f"{folder}{entry.name}"] = ObjectInfo(about.st_size, about.st_mtime)
         return out
 
-    def anything(self) -> str | None:
-        with self._explained(), contextlib.suppress(FileNotFoundError), os.scandir(self.root) as entries:
+    def first_name(self) -> str | None:
+        with self._translate_errors(), contextlib.suppress(FileNotFoundError), os.scandir(self.root) as entries:
             return next((entry.name for entry in entries if entry.name != _STAGING), None)
         return None
 
     def size_bytes(self, name: str) -> int | None:
-        with self._explained(), contextlib.suppress(FileNotFoundError):
+        with self._translate_errors(), contextlib.suppress(FileNotFoundError):
             about = self._path(name).lstat()
             return about.st_size if stat.S_ISREG(about.st_mode) else None
         return None
 
     @contextlib.contextmanager
     def staging(self) -> Iterator[Path]:
-        """A folder to work in; gone afterwards."""
-        with self._explained():
+        """Yield a temporary folder in the storage."""
+        with self._translate_errors():
             make_folder(self.root / _STAGING)
             folder = Path(tempfile.mkdtemp(dir=self.root / _STAGING))
         try:
@@ -163,13 +163,13 @@ class FolderPlace:
 
     def put(self, name: str, chunks: Iterable[bytes], size_bytes: int) -> None:
         place = self._path(name)
-        with self._explained():
+        with self._translate_errors():
             try:
                 self._put(place, chunks)
             except FileNotFoundError:
                 if not isinstance(chunks, list):
                     raise
-                # Only leases are written by who has none yet: a sweeper took it for what a dead one left.
+                # Only leases are written without a lease, so a sweeper may have deleted the staged file.
                 self._put(place, chunks)
 
     def _put(self, place: Path, chunks: Iterable[bytes]) -> None:
@@ -188,7 +188,7 @@ class FolderPlace:
         sync_folder(place.parent)
 
     def get(self, name: str) -> Iterator[bytes]:
-        with self._explained():
+        with self._translate_errors():
             try:
                 handle = os.open(self._path(name), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
             except FileNotFoundError:
@@ -200,11 +200,15 @@ class FolderPlace:
                     yield chunk
 
     def delete(self, name: str) -> None:
-        with self._explained():
+        with self._translate_errors():
             self._path(name).unlink(missing_ok=True)
 
     def drop_leftovers(self) -> None:
-        with self._explained(), contextlib.suppress(FileNotFoundError), os.scandir(self.root / _STAGING) as entries:
+        with (
+            self._translate_errors(),
+            contextlib.suppress(FileNotFoundError),
+            os.scandir(self.root / _STAGING) as entries,
+        ):
             for entry in entries:
                 if entry.is_dir(follow_symlinks=False):
                     shutil.rmtree(entry.path, ignore_errors=True)
@@ -222,7 +226,7 @@ class FolderPlace:
         return self.root / name
 
     @contextlib.contextmanager
-    def _explained(self) -> Iterator[None]:
+    def _translate_errors(self) -> Iterator[None]:
         try:
             yield
         except GsmapError:
@@ -245,8 +249,9 @@ class FolderPlace:
             ) from error
 
 
-class ObjectPlace:
-    """A prefix of an S3 bucket, through ``obstore``; where it is and who we are says the environment (``AWS_*``)."""
+class BucketStorage:
+    """Storage below a prefix of an S3 bucket, through ``obstore``; endpoint and credentials come from the
+    environment (``AWS_*``)."""
 
     def __init__(self, bucket: str, prefix: str) -> None:
         try:
@@ -258,67 +263,68 @@ class ObjectPlace:
         endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
         options: dict[str, Any] = {"endpoint": endpoint} if endpoint else {}
         client: Any = {"timeout": timedelta(minutes=10), "connect_timeout": timedelta(seconds=20)}
-        if endpoint.startswith("http://"):  # the user named it so
+        if endpoint.startswith("http://"):  # the user chose plain HTTP
             client["allow_http"] = True
         self._api = obstore
-        with self._explained("open"):
+        with self._translate_errors("open"):
             self._store = S3Store(
                 bucket,
                 prefix=prefix or None,
                 client_options=client,
                 retry_config={"max_retries": 6, "retry_timeout": timedelta(minutes=2)},
-                checksum_algorithm="sha256",  # the server refuses bytes that changed on the way
+                checksum_algorithm="sha256",  # the server rejects corrupted uploads
                 **options,
             )
 
-    def list(self, prefix: str) -> dict[str, Listed]:
-        out: dict[str, Listed] = {}
-        with self._explained("list"):
+    def list(self, prefix: str) -> dict[str, ObjectInfo]:
+        out: dict[str, ObjectInfo] = {}
+        with self._translate_errors("list"):
             for batch in self._api.list(self._store, prefix=prefix or None, chunk_size=1000):
-                out |= {found["path"]: Listed(found["size"], found["last_modified"].timestamp()) for found in batch}
+                out |= {found["path"]: ObjectInfo(found["size"], found["last_modified"].timestamp()) for found in batch}
         return out
 
-    def anything(self) -> str | None:
-        with self._explained("list"):
+    def first_name(self) -> str | None:
+        with self._translate_errors("list"):
             for batch in self._api.list(self._store, chunk_size=1):
                 return str(batch[0]["path"]) if batch else None
         return None
 
     def size_bytes(self, name: str) -> int | None:
-        with self._explained("read"), contextlib.suppress(FileNotFoundError):
+        with self._translate_errors("read"), contextlib.suppress(FileNotFoundError):
             return int(self._api.head(self._store, name)["size"])
         return None
 
     def put(self, name: str, chunks: Iterable[bytes], size_bytes: int) -> None:
         try:
-            with self._explained("write"):
+            with self._translate_errors("write"):
                 if size_bytes <= SINGLE_PUT_BYTES:
                     self._api.put(self._store, name, b"".join(chunks), use_multipart=False)
                 else:
                     self._api.put(
                         self._store, name, iter(chunks), use_multipart=True, chunk_size=_PART_BYTES, max_concurrency=4
                     )
-        except _Refused:
-            # The answer may have been lost and not the object: an object under the name of its digest is what we sent.
+        except StorageRequestError:
+            # The response may have been lost, not the object: an object named by its digest is the one sent.
             if name.startswith("objects/") and self.size_bytes(name) == size_bytes:
                 return
             raise
 
-    def put_new(self, name: str, content: bytes) -> bool:
-        """Write an object unless there is one of that name; whether it was written."""
+    def put_if_absent(self, name: str, content: bytes) -> bool:
+        """Write an object unless one with this name exists; returns True if it was written."""
         from obstore.exceptions import AlreadyExistsError
 
-        with self._explained("write"):
+        with self._translate_errors("write"):
             try:
                 self._api.put(self._store, name, content, use_multipart=False, mode="create")
             except AlreadyExistsError:
                 return False
         return True
 
-    def ranges(self, name: str, ranges: Sequence[tuple[int, int]]) -> Sequence[bytes]:
-        """The bytes of ranges ``[start, stop)`` of an object, one request each; NotFoundError where there is none."""
+    def get_ranges(self, name: str, ranges: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        """Return the bytes of ranges ``[start, stop)`` of an object, one request each; raises NotFoundError if there
+        is none."""
         starts, ends = [start for start, _ in ranges], [stop for _, stop in ranges]
-        with self._explained("read"):
+        with self._translate_errors("read"):
             try:
                 found = self._api.get_ranges(self._store, name, starts=starts, ends=ends, coalesce=0)
             except FileNotFoundError:
@@ -326,7 +332,7 @@ class ObjectPlace:
         return [bytes(one) for one in found]
 
     def get(self, name: str) -> Iterator[bytes]:
-        with self._explained("read"):
+        with self._translate_errors("read"):
             try:
                 found = self._api.get(self._store, name)
             except FileNotFoundError:
@@ -335,35 +341,35 @@ class ObjectPlace:
                 yield bytes(chunk)
 
     def delete(self, name: str) -> None:
-        with self._explained("delete"), contextlib.suppress(FileNotFoundError):
+        with self._translate_errors("delete"), contextlib.suppress(FileNotFoundError):
             self._api.delete(self._store, name)
 
     def drop_leftovers(self) -> None:
-        """Parts of objects that were never finished are the bucket's to expire (a lifecycle rule)."""
+        """Do nothing: unfinished multipart uploads expire by a lifecycle rule of the bucket."""
 
     @contextlib.contextmanager
-    def _explained(self, what: str) -> Iterator[None]:
+    def _translate_errors(self, what: str) -> Iterator[None]:
         from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError
 
         try:
             yield
         except (PermissionDeniedError, UnauthenticatedError) as error:
-            raise _Refused(
+            raise StorageRequestError(
                 f"{self.url}: not allowed to {what} ({_first_line(error)}): see AWS_ACCESS_KEY_ID",
                 code="place_refused",
             ) from error
         except (BaseError, OSError) as error:
-            raise _Refused(
+            raise StorageRequestError(
                 f"{self.url}: cannot {what} ({_first_line(error)}): see AWS_ENDPOINT_URL, and try again",
                 code="place_failed",
             ) from error
 
 
-class _Refused(StoreError):
-    """An object store did not do what it was asked, or its answer was lost."""
+class StorageRequestError(StoreError):
+    """A request to an object store failed, or its response was lost."""
 
 
 def _first_line(error: BaseException) -> str:
-    """What an error says, without the XML that servers add to it."""
+    """Return an error message without the XML that servers append."""
     lines = re.split(r"\n|: <\?xml|\bDebug source", str(error).strip())
     return re.sub(r"\s+", " ", lines[0])[:300]

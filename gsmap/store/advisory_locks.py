@@ -1,6 +1,6 @@
-"""Locks of a PostgreSQL server, in the place of locks of a shared folder: one database holds one map.
+"""Locks of a PostgreSQL server, used instead of file locks; one database holds one map.
 
-They are of a transaction: the server frees them when it ends, however it does, and when its connection is gone.
+Each lock belongs to a transaction: the server frees it when the transaction or its connection ends.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from sqlalchemy.exc import OperationalError
 from gsmap.errors import BusyError
 
 WRITER, ARRAYS = 1, 2
-_OURS = 0x67736D70  # "gsmp": other programs in the same database number theirs otherwise
+_NAMESPACE = 0x67736D70  # "gsmp": the namespace of gsmap's locks, apart from those of other programs
 _NOT_AVAILABLE = "55P03"
 
 
-def take(connection: Connection, lock: int, patience_s: float, busy: str, *, shared: bool = False) -> None:
+def acquire(connection: Connection, lock: int, patience_s: float, busy: str, *, shared: bool = False) -> None:
     """Take a lock until the end of the connection's transaction.
 
     Args:
         lock: `WRITER` or `ARRAYS`.
-        busy: what the others have been doing, for the error.
-        shared: together with others who share it.
+        busy: description of what other processes are doing, for the error message.
+        shared: take a shared lock.
 
     Raises:
-        BusyError: others kept it for ``patience_s``.
+        BusyError: another process kept the lock for ``patience_s``.
     """
-    kind, number = "_shared" if shared else "", {"a": _OURS, "b": lock}
+    kind, number = "_shared" if shared else "", {"a": _NAMESPACE, "b": lock}
     later = f"{busy} for {patience_s:g} s; try again later"
     if patience_s <= 0:
         if not connection.execute(text(f"SELECT pg_try_advisory_xact_lock{kind}(:a, :b)"), number).scalar_one():

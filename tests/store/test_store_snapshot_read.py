@@ -45,7 +45,7 @@ def test_reports_read_inside_one(store, report, monkeypatch):
     read = type(store.catalog).read
 
     def watched(catalog):
-        depth.append(getattr(catalog._held, "reading", None))
+        depth.append(getattr(catalog._thread, "reading", None))
         return read(catalog)
 
     monkeypatch.setattr(type(store.catalog), "read", watched)

@@ -1,8 +1,8 @@
-"""Arrays in as few bytes as hold every value without loss, in an order that packs well.
+"""Lossless encoding of arrays in few bytes, in an order that compresses well.
 
-Numbers that are multiples of a power of two are kept as small integers, others in the narrowest type that has them all.
-Types of several bytes are kept byte by byte (all high bytes of a column, then all low ones): neighbours are alike in
-their high bytes, which then pack to little.
+Numbers that are multiples of a power of two are stored as small integers, others in the narrowest exact type. Types of
+several bytes are stored byte plane by byte plane (all high bytes of a column first), because neighbouring values share
+high bytes, which then compress well.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ _FLOATS = (np.dtype("f2"), np.dtype("f4"))
 _TYPES = {t.str[1:]: t for t in (*_WHOLE, *_FLOATS, np.dtype("i8"), np.dtype("u8"), np.dtype("f8"))}
 
 
-def narrow(values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-    """What to store of an array, and how it is to be read again (plain, for JSON): `widen` is the inverse."""
+def encode_array(values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the encoded array and a JSON description of the encoding; `decode_array` is the inverse."""
     step = _step(values) if values.dtype.kind == "f" else 1.0
     found = values
     candidates = (*_WHOLE, *_FLOATS) if values.dtype.kind == "f" else _WHOLE
@@ -34,40 +34,45 @@ def narrow(values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
             found = kept
             break
     scale = step if found.dtype.kind in "ui" and found is not values else 1.0
-    how = {"is": values.dtype.str[1:], "as": found.dtype.str[1:], "step": scale, "shape": list(values.shape)}
-    return (found if found.dtype.itemsize == 1 else _bytes_apart(found)), how
+    encoding = {"is": values.dtype.str[1:], "as": found.dtype.str[1:], "step": scale, "shape": list(values.shape)}
+    return (found if found.dtype.itemsize == 1 else _split_bytes(found)), encoding
 
 
-def widen(stored: np.ndarray, how: Mapping[str, Any]) -> np.ndarray:
-    """The array again, from what `narrow` gave for it; its shape is that of `shape_of`.
+def decode_array(stored: np.ndarray, encoding: Mapping[str, Any]) -> np.ndarray:
+    """Decode an array of `encode_array`; the stored array has the shape `encoded_shape`.
 
     Raises:
-        ValueError: it is of another type.
+        ValueError: the array has another type.
     """
-    kept, dtype = _TYPES[how["as"]], _TYPES[how["is"]]
+    kept, dtype = _TYPES[encoding["as"]], _TYPES[encoding["is"]]
     if stored.dtype != (kept if kept.itemsize == 1 else np.uint8):
         raise ValueError(f"its values are {stored.dtype}, but the catalog says {kept}")
-    values = stored if kept.itemsize == 1 else _bytes_together(stored, kept)
-    values = values.reshape(how["shape"])
+    values = stored if kept.itemsize == 1 else _join_bytes(stored, kept)
+    values = values.reshape(encoding["shape"])
     if kept == dtype:
         return values
-    step = how["step"]
+    step = encoding["step"]
     out: np.ndarray = values.astype(dtype) if step == 1.0 else np.multiply(values, dtype.type(step), dtype=dtype)
     return out
 
 
-def shape_of(how: Mapping[str, Any]) -> Shape:
-    """The shape that what is stored has.
+def encoded_shape(encoding: Mapping[str, Any]) -> Shape:
+    """Return the shape of the stored array.
 
     Raises:
-        CorruptError: `narrow` does not say that of any array.
+        CorruptError: not an encoding of `encode_array`.
     """
-    shape, step, known = how.get("shape"), how.get("step"), {how.get("is"), how.get("as")} <= set(_TYPES)
+    shape, step, known = (
+        encoding.get("shape"),
+        encoding.get("step"),
+        {encoding.get("is"), encoding.get("as")} <= set(_TYPES),
+    )
     if not (_is_shape(shape) and known and type(step) is float and math.isfinite(step) and step > 0):
         raise CorruptError(
-            f"the catalog has an array that is kept as {how!r:.100}: gsmap did not write that", code="catalog_invalid"
+            f"the catalog has an array that is kept as {encoding!r:.100}: gsmap did not write that",
+            code="catalog_invalid",
         )
-    width = _TYPES[how["as"]].itemsize
+    width = _TYPES[encoding["as"]].itemsize
     return tuple(shape) if width == 1 else (width * math.prod(shape[1:]), shape[0])
 
 
@@ -76,7 +81,7 @@ def _is_shape(value: object) -> TypeGuard[list[int]]:
 
 
 def _as(values: np.ndarray, dtype: np.dtype, step: float) -> np.ndarray | None:
-    """The values over ``step`` as another type; None where that loses anything."""
+    """Convert values divided by ``step`` to another type; None if that loses anything."""
     if dtype.kind in "ui":
         limits = np.iinfo(dtype)
         over = values / step if step != 1.0 else values
@@ -91,7 +96,7 @@ def _as(values: np.ndarray, dtype: np.dtype, step: float) -> np.ndarray | None:
 
 
 def _step(values: np.ndarray) -> float:
-    """The largest power of two that all values are multiples of; 1 where that makes no sense."""
+    """Return the largest power of two that divides all values; 1 if there is none."""
     some = values[values != 0].astype(np.float64)
     if not some.size or not np.isfinite(some).all():
         return 1.0
@@ -101,15 +106,15 @@ def _step(values: np.ndarray) -> float:
     return float(2.0 ** np.clip(lowest.min(), -1000, 1000))
 
 
-def _bytes_apart(values: np.ndarray) -> np.ndarray:
-    """(N, ...) of a type of B bytes as (B * columns, N) uint8."""
+def _split_bytes(values: np.ndarray) -> np.ndarray:
+    """Convert (N, ...) of a type of B bytes to (B * columns, N) uint8."""
     n, width = len(values), values.dtype.itemsize
     columns = math.prod(values.shape[1:])
     apart = np.ascontiguousarray(values).view(np.uint8).reshape(n, columns, width)[:, :, ::-1]
     return np.ascontiguousarray(apart.transpose(2, 1, 0)).reshape(width * columns, n)
 
 
-def _bytes_together(stored: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def _join_bytes(stored: np.ndarray, dtype: np.dtype) -> np.ndarray:
     width, n = dtype.itemsize, stored.shape[1]
     apart = stored.reshape(width, -1, n) if stored.size else np.zeros((width, 0, n), np.uint8)
     return np.ascontiguousarray(apart.transpose(2, 1, 0)[:, :, ::-1]).view(dtype)

@@ -22,7 +22,7 @@ from gsmap.errors import StoreError
 from gsmap.store import Store, schema
 from gsmap.store.arrays import CHUNK_ROWS
 from gsmap.store.catalog import now
-from gsmap.store.copying import copy_catalog, copy_rows, empty_catalog, one_state, tables
+from gsmap.store.catalog_copy import copy_catalog, copy_rows, empty_catalog, snapshot_read, tables
 from gsmap.store.indexes import Lookup
 from gsmap.types import Prior, SceneGraph, Sim3
 from gsmap.types.localization import SceneFeatures
@@ -45,8 +45,8 @@ def fill(store):
     store.world.add([ControlPoint("G1", "EPSG:25832", np.array([691234.5, 5334567.125, 519.3]))])
     store.exports.add_tile(store.exports.begin("/tmp/out", revision=1), tile("a.ply", [a, b]))
     nodes = IndexArrays(np.zeros(1, np.int64), np.arange(2, dtype=np.int64), np.zeros((1, 58), np.uint8))
-    store.indexes.put("0" * 32, [IndexedScene(a.id, "1" * 32, True, False, 1.5)], nodes, ())
-    store.indexes.note([Lookup(a.id, "0" * 32, (Candidate(b.id, 1.0, 2.0),))])
+    store.indexes.save_segment("0" * 32, [IndexedScene(a.id, "1" * 32, True, False, 1.5)], nodes, ())
+    store.indexes.save_lookups([Lookup(a.id, "0" * 32, (Candidate(b.id, 1.0, 2.0),))])
     cameras = make_cameras()
     starts = np.zeros(len(cameras) + 1, np.int64)
     shown, angles = np.zeros((0, 128), np.int8), np.zeros(0, np.uint8)
@@ -67,7 +67,7 @@ def fill(store):
 
 
 def rows_of(catalog):
-    with one_state(catalog) as connection:
+    with snapshot_read(catalog) as connection:
         return {t.name: [tuple(r) for r in connection.execute(select(t).order_by(*t.primary_key))] for t in tables()}
 
 
@@ -133,7 +133,7 @@ def test_a_copy_is_one_state_while_others_write(kind, tmp_path, request):
 
         (tmp_path / "copy").mkdir()
         made = empty_catalog(tmp_path / "copy")
-        with one_state(store.catalog) as reading, made.write() as writing:
+        with snapshot_read(store.catalog) as reading, made.write() as writing:
             reading.execute(text("SELECT count(*) FROM about")).scalar()  # from here on it sees this state
             thread = threading.Thread(target=write)
             thread.start()

@@ -1,11 +1,11 @@
-"""A group of arrays in one file: a zip archive whose members are the keys of a zarr v3 group, none of them compressed.
+"""One file per array group: an uncompressed zip archive with the keys of a zarr v3 group.
 
-`zarr.storage.ZipStore` opens it, and so does any unzip. gsmap writes it in one go and in an order that suits reads of a
-part: the chunks of all long arrays row block after row block, so that what a box of a scene needs lies together; then
-arrays of a single chunk; then the metadata; then the archive's table of contents. Its tail tells where everything is.
+`zarr.storage.ZipStore` and any unzip tool open it. gsmap writes it sequentially in an order that suits partial reads:
+the chunks of all long arrays row block by row block, so that the data of a region of a scene is contiguous; then arrays
+of a single chunk; then the metadata; then the table of contents, which locates everything.
 
-The table is checked where it is read, since a map may come from a stranger: members lie one after the other, stored as
-they are, within the file.
+The table is validated when it is read, since a map may come from an untrusted source: members must be stored
+uncompressed, one after the other, within the file.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ import numpy as np
 
 FILE = "arrays.zip"
 TAIL_BYTES = 64 << 10
-"""What is read of the end at first: it holds the table and the metadata of a scene of some two million Gaussians."""
+"""Bytes read from the end first: enough for the table and metadata of a scene with two million Gaussians."""
 
 _ZSTD_LEVEL = 1
-_NEVER = (1980, 1, 1, 0, 0, 0)  # the same arrays are the same bytes, whenever they are written
+_FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # equal arrays give equal bytes, whenever they are written
 _END, _END_64, _LOCATOR = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), struct.Struct("<4sLQL")
 _ENTRY, _LOCAL = struct.Struct("<4s6H3L5H2L"), struct.Struct("<4s5H3L2H")
-_MAX_TABLE_BYTES = 64 << 20  # of half a million chunks: 1.6 billion Gaussians
+_MAX_TABLE_BYTES = 64 << 20  # half a million chunks: 1.6 billion Gaussians
 _UTF8 = 0x800
 
 Read = Callable[[int, int], bytes]
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class ByteRange:
     """A range of bytes of one file of a group; a whole member of an archive has a CRC-32."""
 
     file: str
@@ -47,12 +47,12 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Column:
-    """An array that is written block after block, and is never in memory as a whole.
+class StreamedArray:
+    """An array that is written block by block and is never in memory as a whole.
 
     Args:
-        shape, dtype: of the whole.
-        block: gives the block that begins at a row; blocks are as long as a chunk, and asked for in order.
+        shape, dtype: of the whole array.
+        block: returns the block that begins at a row; called in order, with blocks as long as a chunk.
     """
 
     shape: tuple[int, ...]
@@ -70,9 +70,9 @@ class Column:
         return self.block(rows.start)
 
 
-def write(path: Path, arrays: Mapping[str, np.ndarray | Column], *, chunk_rows: int) -> None:
-    """Write arrays in chunks of ``chunk_rows`` rows, whose blocks are asked for in the order of their rows, those of
-    all arrays before the next; memory beyond theirs is that of a row block."""
+def write(path: Path, arrays: Mapping[str, np.ndarray | StreamedArray], *, chunk_rows: int) -> None:
+    """Write arrays in chunks of ``chunk_rows`` rows; streamed blocks are requested in row order across all arrays, so
+    that memory is bounded by one row block."""
     import zarr
     from numcodecs import zstd
     from zarr.codecs import ZstdCodec
@@ -97,28 +97,28 @@ def write(path: Path, arrays: Mapping[str, np.ndarray | Column], *, chunk_rows: 
                     if i * chunk_rows < len(array):
                         chunk = _chunk(array, i, min(chunk_rows, len(array)))
                         key = "/".join([name, "c", str(i), *("0" for _ in array.shape[1:])])
-                        archive.writestr(zipfile.ZipInfo(key, _NEVER), zstd.compress(chunk, _ZSTD_LEVEL, True))
+                        archive.writestr(zipfile.ZipInfo(key, _FIXED_DATE), zstd.compress(chunk, _ZSTD_LEVEL, True))
         for key, described in keys.items():
-            archive.writestr(zipfile.ZipInfo(key, _NEVER), described.to_bytes())
+            archive.writestr(zipfile.ZipInfo(key, _FIXED_DATE), described.to_bytes())
 
 
-def _chunk(array: np.ndarray | Column, i: int, rows: int) -> np.ndarray:
-    """The bytes of a chunk of so many rows; the last one is filled with zeros, as zarr does."""
+def _chunk(array: np.ndarray | StreamedArray, i: int, rows: int) -> np.ndarray:
+    """Return the bytes of one chunk; the last one is padded with zeros, as zarr does."""
     part = np.ascontiguousarray(array[i * rows : (i + 1) * rows], array.dtype.newbyteorder("<"))
     if len(part) < rows:
         part = np.concatenate([part, np.zeros((rows - len(part), *part.shape[1:]), part.dtype)])
     return part.reshape(-1).view(np.uint8)
 
 
-def members(size: int, read: Read) -> Mapping[str, Span]:
-    """The members of an archive by name.
+def read_members(size: int, read: Read) -> Mapping[str, ByteRange]:
+    """Return the byte ranges of the members of an archive, by name.
 
     Args:
-        size: of the file.
-        read: ``read(start, stop)`` gives that range of it.
+        size: of the file in bytes.
+        read: ``read(start, stop)`` returns that range of the file.
 
     Raises:
-        ValueError: gsmap did not write it so.
+        ValueError: gsmap did not write the archive.
     """
     end = size - _END.size
     if end < 0:
@@ -140,10 +140,10 @@ def members(size: int, read: Read) -> Mapping[str, Span]:
     return _entries(read(table, end), count, table)
 
 
-@lru_cache(maxsize=4)  # every tile asks the same scenes, and the table grows with the scene
-def _entries(table: bytes, count: int, end: int) -> Mapping[str, Span]:
-    """The members that a table of contents lists; they end where it begins."""
-    out: dict[str, Span] = {}
+@lru_cache(maxsize=4)  # every tile reads the same scenes, and the table grows with the scene
+def _entries(table: bytes, count: int, end: int) -> Mapping[str, ByteRange]:
+    """Parse and validate a table of contents; the members must end where the table begins."""
+    out: dict[str, ByteRange] = {}
     at = lies = 0
     for _ in range(count):
         if at + _ENTRY.size > len(table):
@@ -163,7 +163,7 @@ def _entries(table: bytes, count: int, end: int) -> Mapping[str, Span]:
         if start != lies:
             raise ValueError("its members do not lie one after the other")
         body = start + _LOCAL.size + named
-        out[name] = Span(FILE, body, size, crc)
+        out[name] = ByteRange(FILE, body, size, crc)
         lies = body + size
     if at != len(table) or lies != end:
         raise ValueError("its table of contents does not tell all that is in it")

@@ -1,4 +1,4 @@
-"""Copying a catalog from one database to another, whatever the two are: SQLite's file, a PostgreSQL server."""
+"""Copy a catalog between databases: SQLite files and PostgreSQL servers."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from gsmap.errors import StoreError
 from gsmap.store import catalog as _catalog
 from gsmap.store import migrate, schema, sqlite, trust
 from gsmap.store.catalog import Catalog
-from gsmap.store.explained import explained
+from gsmap.store.error_translation import translate_errors
 from gsmap.store.schema import CHUNK_BOXES
 
-BATCH_ROWS = 2000  # rows in memory at a time; poses with covariances are some kilobytes each
+BATCH_ROWS = 2000  # rows in memory at a time; a pose with covariance takes some kilobytes
 
 # The R*Tree of SQLite and the plain table elsewhere, by the columns that both have.
 _BOXES = Table(
@@ -31,17 +31,17 @@ _BOXES = Table(
 
 
 def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Catalog:
-    """All tables and no row, in a new ``map.sqlite``, or in an empty database; ``catalog.url`` remembers which.
+    """Create all tables, empty, in a new ``map.sqlite`` or in an empty database named in ``catalog.url``.
 
     Args:
-        map_id: the id of the map that a database is for.
+        map_id: id of the map that a database is for.
 
     Raises:
-        StoreError: the database holds a map already.
+        StoreError: the database already holds a map.
     """
     if url is None:
         sqlite.create_file(folder / sqlite.FILE)
-        made = own_catalog(folder)
+        made = open_sqlite_catalog(folder)
     else:
         engine = _catalog.url_engine(url)
         if migrate.version(engine, folder) is not None:
@@ -55,20 +55,20 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
     return made
 
 
-def own_catalog(folder: Path) -> Catalog:
-    """The ``map.sqlite`` in a folder that is being made, to change it."""
+def open_sqlite_catalog(folder: Path) -> Catalog:
+    """Open the ``map.sqlite`` of a map under construction for writing."""
     return Catalog(folder, sqlite.engine(folder / sqlite.FILE, writable=True), writable=True)
 
 
-def make_own(folder: Path, empty: Collection[Table], **about: Any) -> None:
-    """Let a copied ``map.sqlite`` be of another map: its revisions are those of the map that it was copied from.
+def make_independent(folder: Path, empty: Collection[Table], **about: Any) -> None:
+    """Turn a copied ``map.sqlite`` into that of another map: its revisions name the original map as origin.
 
     Args:
-        empty: tables that are of that map alone.
-        about: what is other in the row about the map: its ``id``.
+        empty: tables that belong to the original map alone.
+        about: changed columns of the row about the map, such as ``id``.
     """
     revisions = schema.revisions
-    with contextlib.closing(own_catalog(folder)) as catalog, catalog.write() as connection:
+    with contextlib.closing(open_sqlite_catalog(folder)) as catalog, catalog.write() as connection:
         before = connection.execute(select(schema.about.c.id)).scalar_one()
         connection.execute(update(schema.about).values(**about))
         solved = select(revisions.c.number).where(revisions.c.origin.is_(None))
@@ -80,19 +80,19 @@ def make_own(folder: Path, empty: Collection[Table], **about: Any) -> None:
 
 
 def copy_catalog(source: Catalog, target: Catalog, *, leave_out: Collection[str] = ()) -> dict[str, int]:
-    """Copy all rows of all tables into a catalog that was just made (`empty_catalog`), in one transaction of each.
+    """Copy all rows of all tables into a new catalog (`empty_catalog`), in one transaction of each.
 
-    What arrives is one committed state of the source, whatever others write meanwhile; nobody waits for it. Boxes of
-    chunks have 32 bits in SQLite's R*Tree and 64 elsewhere: they widen by a rounding on the way into the tree.
+    The copy is a snapshot of the source and blocks no other process. Chunk boxes have 32 bits in SQLite's R*Tree and 64
+    elsewhere: they widen by rounding on the way into the tree.
 
     Args:
-        leave_out: names of tables whose rows stay behind.
+        leave_out: names of tables whose rows are not copied.
 
     Returns:
-        How many rows of each table were copied.
+        Number of rows copied, by table.
 
     Raises:
-        StoreError: the two have different schemas, or the target holds rows already.
+        StoreError: the schemas differ, or the target already holds rows.
     """
     versions = [migrate.version(one.engine, one.folder) for one in (source, target)]
     if versions[0] != versions[1]:
@@ -100,12 +100,12 @@ def copy_catalog(source: Catalog, target: Catalog, *, leave_out: Collection[str]
             f"{source.folder} has schema {versions[0]}, the catalog to copy it to {versions[1]}: run gsmap migrate",
             code="schema_mismatch",
         )
-    with one_state(source) as reading, target.write() as writing:
+    with snapshot_read(source) as reading, target.write() as writing:
         return copy_rows(reading, writing, leave_out=leave_out)
 
 
 def copy_rows(source: Connection, target: Connection, *, leave_out: Collection[str] = ()) -> dict[str, int]:
-    """`copy_catalog` inside transactions of the caller's; that of the source must see one state (`one_state`)."""
+    """Copy rows as `copy_catalog` does inside the caller's transactions; the source must be a `snapshot_read`."""
     counts = {}
     for table in tables():
         if target.execute(select(text("1")).select_from(table).limit(1)).first() is not None:
@@ -119,15 +119,15 @@ def copy_rows(source: Connection, target: Connection, *, leave_out: Collection[s
 
 
 @contextlib.contextmanager
-def one_state(catalog: Catalog) -> Iterator[Connection]:
-    """A reading transaction that sees one committed state from its first statement to its last."""
+def snapshot_read(catalog: Catalog) -> Iterator[Connection]:
+    """Open a reading transaction that sees one committed state from its first statement to its last."""
     options = {} if catalog.is_sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
-    with explained(catalog.folder), catalog.engine.execution_options(**options).begin() as connection:
+    with translate_errors(catalog.folder), catalog.engine.execution_options(**options).begin() as connection:
         yield connection
 
 
 def tables() -> list[Table]:
-    """Every table but ``alembic_version``, those that others refer to first; texts are as they lie, not decoded."""
+    """Return every table but ``alembic_version`` in order of references, with texts that are not decoded."""
     return [_plain(table) for table in schema.metadata.sorted_tables] + [_BOXES]
 
 
@@ -150,7 +150,7 @@ def _copy_table(source: Connection, target: Connection, table: Table) -> int:
 
 
 def _set_counters(connection: Connection) -> None:
-    """Let numbers go on after those that were copied: PostgreSQL keeps a counter beside each table."""
+    """Advance the key counters of PostgreSQL past the copied rows."""
     if connection.dialect.name != "postgresql":
         return
     for table in tables():

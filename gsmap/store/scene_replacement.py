@@ -1,4 +1,4 @@
-"""A scene in the place of another: what is known of the one and holds for the other."""
+"""Transfer of data from a superseded scene to the one that replaces it."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from gsmap.store import facts, objects, photos, world
 from gsmap.store.change_rows import pair_of
 from gsmap.store.schema import comparisons, priors, scene_facts
 from gsmap.store.store import Store
-from gsmap.store.transfer import in_order
+from gsmap.store.transfer import merge_by_time
 from gsmap.types import PoseGraph
 
 
 def inherit(store: Store, old: str, new: str) -> None:
-    """Let a scene have what was said of another, its prior, its place in the newest poses, and its comparisons.
+    """Copy the facts, prior, newest pose, observations, photos, objects and comparisons of a scene to its replacement.
 
-    Of the comparisons it has the numbers of the changes and the words on them; their arrays are of the other scene's
-    Gaussians, so that they count as made by another recipe.
+    Comparisons bring the numbers of changes and their reviews; their arrays refer to the old scene's Gaussians, so that
+    they are stale.
 
     Args:
-        old, new: ids of scenes that share a frame; both are in the map.
+        old, new: ids of scenes in the map that share a frame.
     """
     with store.catalog.write() as connection:
         _inherit_facts(connection, old, new)
-        standing = (priors.c.scene == old) & priors.c.removed_at.is_(None)
-        for row in connection.execute(select(priors).where(standing)).mappings().all():
+        current = (priors.c.scene == old) & priors.c.removed_at.is_(None)
+        for row in connection.execute(select(priors).where(current)).mappings().all():
             content = {column: value for column, value in row.items() if column != "number"}
             connection.execute(insert(priors), content | {"scene": new})
         _inherit_comparisons(connection, old, new)
@@ -40,11 +40,11 @@ def inherit(store: Store, old: str, new: str) -> None:
 
 
 def _inherit_facts(connection: Connection, old: str, new: str) -> None:
-    """All that was said of either, in the order of time."""
-    said = facts.said(connection, old), facts.said(connection, new)
+    """Merge the facts of both scenes in the order of time."""
+    both = facts.list_facts(connection, old), facts.list_facts(connection, new)
     rows = [
         {"scene": new, "kind": one.kind, "value": one.value, "author": one.author, "created_at": one.created_at}
-        for one in in_order(*said, time=lambda fact: fact.created_at)
+        for one in merge_by_time(*both, time=lambda fact: fact.created_at)
     ]
     connection.execute(delete(scene_facts).where(scene_facts.c.scene == new))
     if rows:
@@ -55,14 +55,14 @@ def _inherit_comparisons(connection: Connection, old: str, new: str) -> None:
     of_old = (comparisons.c.older == old) | (comparisons.c.newer == old)
     for row in connection.execute(select(comparisons).where(of_old)).all():
         if new in (row.older, row.newer):
-            continue  # of the two with each other, when both were in the map: it stays theirs
+            continue  # a comparison of the two scenes with each other stays
         older, newer = (new if scene == old else scene for scene in (row.older, row.newer))
         values = {"older": older, "newer": newer, "pair": pair_of(older, newer), "group_id": None}
         connection.execute(update(comparisons).where(comparisons.c.number == row.number).values(**values))
 
 
 def _in_place_of(graph: PoseGraph, old: str, new: str) -> PoseGraph:
-    """The poses with the one scene where the other was; what became of the other's edges is not known of the new."""
+    """Replace a scene in a pose graph; edges of the old scene are dropped, since they are unknown for the new one."""
     poses = {scene: pose for scene, pose in graph.poses.items() if scene != old}
     poses[new] = replace(graph.poses[old], scene=new)
     outcomes = {pair: outcome for pair, outcome in graph.outcomes.items() if old not in pair}

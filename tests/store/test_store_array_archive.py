@@ -9,7 +9,7 @@ from store_samples import key, make_cameras, make_gaussians
 from zarr.storage import ZipStore
 
 from gsmap.errors import CorruptError
-from gsmap.store import Store, packed
+from gsmap.store import Store, array_archive
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.types import NodeLayer, SceneGraph
 
@@ -23,9 +23,9 @@ ARRAYS = {
 
 
 def written(path, **arrays):
-    packed.write(path, arrays or ARRAYS, chunk_rows=16)
+    array_archive.write(path, arrays or ARRAYS, chunk_rows=16)
     data = path.read_bytes()
-    return data, packed.members(len(data), lambda start, stop: data[start:stop])
+    return data, array_archive.read_members(len(data), lambda start, stop: data[start:stop])
 
 
 def test_zarr_opens_an_archive_by_itself(tmp_path):
@@ -68,7 +68,7 @@ def test_an_archive_of_more_members_than_a_short_one_counts(tmp_path):
         for i in range(65_600):
             archive.writestr(zipfile.ZipInfo(f"x/c/{i}"), b"1")
     data = path.read_bytes()
-    members = packed.members(len(data), lambda start, stop: data[start:stop])
+    members = array_archive.read_members(len(data), lambda start, stop: data[start:stop])
     assert len(members) == 65_600
     last = members["x/c/65599"]
     assert data[last.start : last.start + last.size] == b"1"
@@ -79,7 +79,7 @@ def test_every_cut_is_told(tmp_path, at):
     data, _ = written(tmp_path / "a.zip")
     short = data[: len(data) - 1 - at]
     with pytest.raises(ValueError, match=r"archive|table"):
-        packed.members(len(short), lambda start, stop: short[start:stop])
+        array_archive.read_members(len(short), lambda start, stop: short[start:stop])
 
 
 def test_no_flip_of_a_bit_changes_what_is_read(tmp_path):

@@ -1,8 +1,7 @@
-"""Row maps: the rows of a capture's Gaussians as it was ingested, and as they are kept now.
+"""Mapping between rows of a capture's Gaussians as ingested and as stored now.
 
-Row sets that the map keeps (of changes, of things) count the Gaussians of the capture as it was ingested: thinning
-does not renumber them, and ingesting the capture again does not. Each reader and writer of kept row sets goes through
-`RowMap`.
+Row sets that a map stores (of changes, of segments) refer to the Gaussians of the capture as ingested, so that neither
+thinning nor another ingest renumbers them. All readers and writers of stored row sets use `RowIndexMap`.
 """
 
 from __future__ import annotations
@@ -13,9 +12,9 @@ import numpy as np
 
 from gsmap.errors import CorruptError, InputError
 from gsmap.store import compact
+from gsmap.store.array_groups import manifest, unless_pruned
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
-from gsmap.store.groups import manifest, unless_pruned
 from gsmap.store.scene_content import thinning_of
 from gsmap.store.scene_refs import find
 from gsmap.store.scenes import KIND
@@ -24,14 +23,14 @@ _GONE = -1
 
 
 @dataclass(frozen=True, eq=False)
-class RowMap:
-    """Rows of a capture as it was ingested (``whole``) and as it is kept now (``kept``).
+class RowIndexMap:
+    """Mapping between rows of a capture as ingested (``whole``) and as stored now (``kept``).
 
     Args:
-        num_whole: Gaussians that it was ingested with.
-        num_kept: Gaussians that are kept now.
-        rows: (num_kept,) whole row of each kept one, rising; None where all are kept, and where they are not known:
-            an older gsmap thinned the capture and kept no row map.
+        num_whole: number of Gaussians as ingested.
+        num_kept: number of Gaussians stored now.
+        rows: (num_kept,) whole row of each kept one, ascending; None if all are kept, or if an older gsmap thinned the
+            capture without storing the mapping.
     """
 
     num_whole: int
@@ -40,16 +39,16 @@ class RowMap:
 
     @property
     def is_known(self) -> bool:
-        """Whether a whole row can be told from a kept one."""
+        """Return True if rows can be converted."""
         return self.rows is not None or self.num_whole == self.num_kept
 
     def kept(self, whole: np.ndarray) -> np.ndarray:
-        """Kept rows of some whole rows, in their order; rows that are kept no longer are left out.
+        """Convert whole rows to kept rows, in order; rows that are no longer stored are left out.
 
-        None at all where the row map is not known.
+        Empty if the mapping is unknown.
         """
         if self.rows is None:
-            return whole if self.is_known else _none(whole)
+            return whole if self.is_known else _empty(whole)
         place = np.full(self.num_whole, _GONE, whole.dtype)
         place[self.rows] = np.arange(self.num_kept, dtype=whole.dtype)
         found: np.ndarray = place[whole]
@@ -57,13 +56,13 @@ class RowMap:
         return found
 
     def whole(self, rows: np.ndarray, counted: int | None = None) -> np.ndarray:
-        """Whole rows of some rows; none at all where the row map is not known.
+        """Convert rows to whole rows; empty if the mapping is unknown.
 
         Args:
-            counted: how many Gaussians the capture had when the rows were counted; default: as many as are kept.
+            counted: number of Gaussians of the capture that the rows refer to; default: as many as are kept.
 
         Raises:
-            InputError: it was thinned, or ingested again, since they were counted.
+            InputError: the capture was thinned or ingested again since.
         """
         counted = self.num_kept if counted is None else counted
         if counted == self.num_whole:
@@ -73,12 +72,12 @@ class RowMap:
                 "the capture was thinned or ingested again meanwhile: run the same again", code="changed_meanwhile"
             )
         if self.rows is None:
-            return _none(rows)
+            return _empty(rows)
         out: np.ndarray = self.rows[rows].astype(rows.dtype)
         return out
 
     def values_of_kept(self, values: np.ndarray) -> np.ndarray | None:
-        """Values of the kept Gaussians, of values of the whole or of the kept ones; None of any other capture."""
+        """Select the values of the kept Gaussians from per-row values of either; None if the length matches neither."""
         if len(values) == self.num_kept:
             return values
         if len(values) != self.num_whole or self.rows is None:
@@ -87,7 +86,8 @@ class RowMap:
         return found
 
     def values_of_whole(self, values: np.ndarray, missing: int) -> np.ndarray:
-        """Values of the whole capture, ``missing`` where a Gaussian is kept no longer; as they are where not known."""
+        """Expand per-row values to the whole capture, ``missing`` for rows that are not kept; unchanged if the
+        mapping is unknown."""
         if self.rows is None or len(values) != self.num_kept:
             return values
         out = np.full(self.num_whole, missing, values.dtype)
@@ -95,32 +95,32 @@ class RowMap:
         return out
 
 
-def _none(rows: np.ndarray) -> np.ndarray:
+def _empty(rows: np.ndarray) -> np.ndarray:
     return np.zeros(0, rows.dtype)
 
 
-class RowMaps:
-    """The row maps of a map's scenes."""
+class RowIndexMaps:
+    """The row mappings of a map's scenes."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
 
-    def of(self, scene: str) -> RowMap:
-        """The row map of a scene by its id; arrays are read of a thinned one alone.
+    def of(self, scene: str) -> RowIndexMap:
+        """Return the row mapping of a scene by its id; reads arrays only for a thinned scene.
 
         Raises:
             NotFoundError: no such scene.
-            CorruptError: its bytes on disk are missing or differ.
+            CorruptError: bytes on disk are missing or differ.
         """
         with self._catalog.read() as connection:
             row = find(connection, scene)
             files = manifest(connection, row.group_id or "")
         thinning = thinning_of(row.thinned)
         if thinning is None:
-            return RowMap(row.num_gaussians, row.num_gaussians)
+            return RowIndexMap(row.num_gaussians, row.num_gaussians)
         if not thinning.has_row_map or not files:
-            return RowMap(thinning.num_gaussians, row.num_gaussians)
+            return RowIndexMap(thinning.num_gaussians, row.num_gaussians)
         shapes = {compact.KEPT: compact.kept_shape(thinning.num_gaussians)}
         with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
             read = self._arrays.read(KIND, row.group_id, files, only=(compact.KEPT,), shapes=shapes)
@@ -131,4 +131,4 @@ class RowMaps:
                 "its capture again",
                 code="catalog_invalid",
             )
-        return RowMap(thinning.num_gaussians, row.num_gaussians, rows)
+        return RowIndexMap(thinning.num_gaussians, row.num_gaussians, rows)
