@@ -47,7 +47,6 @@ ERRORS: Final[Mapping[str, str]] = {
     "nothing_requested": "No option states what to do.",
     "option_not_applicable": "An option does not apply to this kind of data or to this method.",
     "out_of_range": "A number lies outside the range allowed.",
-    "setting_mismatch": "Settings do not fit each other.",
     "setting_not_a_leaf": "The name stands for a group of settings, not for one.",
     "setting_not_changed": "The setting has its default, so that there is nothing to reset.",
     "setting_of_run": "The setting holds for one run and is not stored with a map.",
