@@ -90,7 +90,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "not_a_folder": "A file lies where a folder belongs.",
     "not_a_plain_file": "A link, pipe, device or folder lies where a file belongs.",
     "not_json": "A file is not valid JSON, or not of the structure expected.",
-    "not_writable": "The file or folder cannot be written.",
+    "not_writable": "The file, folder, tag or map opened for reading cannot be written.",
     "target_is_a_folder": "The output is a folder where a file belongs.",
     "too_many_open_files": "The process has too many files open.",
     # Captures, and files of Gaussians, cameras and poses.

@@ -133,7 +133,7 @@ class Catalog:
             yield self._writing
             return
         if not self.writable:
-            raise StoreError(self._read_only_message, code="catalog_refused")
+            raise StoreError(self._read_only_message, code="not_writable")
         with self.lock() if self.is_sqlite else contextlib.nullcontext():
             with translate_errors(self.folder, NOT_KEPT), self.engine.connect() as connection:
                 try:
@@ -167,7 +167,7 @@ class Catalog:
             BusyError: another process kept the lock for ``patience_s``.
         """
         if not self.writable:
-            raise StoreError(self._read_only_message, code="catalog_refused")
+            raise StoreError(self._read_only_message, code="not_writable")
         if self._has_lock:
             yield
             return

@@ -245,7 +245,7 @@ class Store:
         _refuse_unexpected_entries(folder)
         read_only_message = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
         if mode == "w" and place.is_tag and not allow_tags:
-            raise StoreError(read_only_message, code="catalog_refused")
+            raise StoreError(read_only_message, code="not_writable")
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(
                 f"{path} cannot be written (read-only disk or missing permission): open it for reading",

@@ -221,5 +221,5 @@ def test_bad_options_are_refused_before_anything_is_written(street):
         street.export(params=Params(max_shift_m=-1))
     assert not street.out.exists()
     (street.out.parent / "file").write_text("mine")
-    with raises(StoreError, code="not_writable"):
+    with raises(StoreError, code="store"):
         Street(street.out.parent / "file" / "out").export()

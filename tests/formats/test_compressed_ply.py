@@ -105,7 +105,7 @@ def test_damage_is_named(tmp_path):
         (b"property uint packed_scale", b"property int packed_scale", "wrong_file_type"),
         (b"property float max_z", b"property double max_z", "wrong_file_type"),
         (b"property uchar f_rest_0\n", b"", "file_truncated"),
-        (b"property uchar f_rest_0\n", b"property uchar f_rest_9\n", "duplicate"),
+        (b"property uchar f_rest_0\n", b"property uchar f_rest_9\n", "wrong_file_type"),
     ):
         path.write_bytes(data.replace(old, new, 1))
         with raises(InputError, code=code):

@@ -133,7 +133,7 @@ def test_what_is_no_capture(tmp_path):
     with raises(InputError, code="no_captures"):
         read_captures(tmp_path)
     (tmp_path / "a.xyz").touch()
-    with raises(InputError, code="unsupported_format"):
+    with raises(InputError, code="no_captures"):
         read_captures(tmp_path / "a.xyz")
     (tmp_path / "ckpt_29999_rank0.pt").touch()
     for given, code in ((tmp_path / "ckpt_29999_rank0.pt", "wrong_file_type"), (tmp_path, "no_captures")):

@@ -498,7 +498,7 @@ def test_branches_and_tags_go_with_their_map(filled, place, tmp_path):
             assert sorted(scene.name for scene in store.scenes.list()) == scenes
             check = store.check()
             assert (check.ok, check.unverified) == (True, ())
-    with raises(StoreError, code="place_failed"):
+    with raises(StoreError, code="not_writable"):
         Store.open(tmp_path / "r@v1")
 
 

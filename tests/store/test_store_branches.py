@@ -74,11 +74,11 @@ def test_a_tag_cannot_be_written(store):
     store.branches.make("v1", tag=True)
     add(store, 1)
     before = bytes_of(store.home / "branches" / "v1")
-    with raises(StoreError, code="place_failed"):
+    with raises(StoreError, code="not_writable"):
         Store.open(at(store, "v1"))
     with Store.open(at(store, "v1"), "r") as tag:
         assert [s.name for s in tag.scenes.list()] == ["scene0"]
-        with raises(StoreError, code="place_failed"):
+        with raises(StoreError, code="not_writable"):
             tag.scenes.edit("scene0", name="x")
         tag.branches.make("of-v1")
     with Store.open(at(store, "of-v1")) as branch:
