@@ -1,11 +1,13 @@
-"""Stable codes of errors, by which programs tell them apart.
+"""Stable codes of errors and of reasons, by which programs tell them apart.
 
 Messages are worded for people and change from version to version; the meaning of a code does not. `GsmapError.code` is
-a key of `ERRORS`; ``--json`` and the page's server print it beside the message.
+a key of `ERRORS`; ``--json`` and the page's server print it beside the message. A result that is a refusal, such as a
+rejected edge or a photo without a pose, has a reason in words and a ``reason_code``, a key of `REASONS`.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Final
 
@@ -334,3 +336,86 @@ ERRORS: Final[Mapping[str, str]] = {
     "wrong_reference_kind": "The name is that of a tag, not of a branch, or the reverse.",
 }
 """By code: the cause, in one sentence."""
+
+REASONS: Final[Mapping[str, tuple[str, str]]] = {
+    # Pairs of scenes that are not accepted.
+    "collinear_correspondences": ("The correspondences lie along a line.", r"correspondences lie along a line"),
+    "colours_disagree": ("Colours disagree where surfaces coincide.", r"colours disagree"),
+    "correspondences_lost": (
+        "Refinement moves the pose away from its correspondences.",
+        r"surfaces pull the pose away",
+    ),
+    "free_space_violation": ("A scene has surface where the other scene saw free space.", r"free-space violation"),
+    "inconsistent_correspondences": ("The correspondences fit no single pose.", r"correspondences do not fit one pose"),
+    "mirrored_correspondences": ("The correspondences fit a mirrored pose only.", r"correspondences are mirrored"),
+    "no_pose_proposed": ("No proposer found a pose.", r"no pose proposed|no pose under which"),
+    "not_significant": ("The correspondences may have arisen by chance.", r"not significant"),
+    "package_missing": (
+        "A package that the comparison needs is not installed.",
+        r"comparing shapes needs an|shapes are compared by a package",
+    ),
+    "rejected_by_person": ("A person rejected the edge.", r"rejected by a person"),
+    "too_little_overlap": ("Too little surface coincides.", r"too little surface coincides"),
+    "unit_unknown": (
+        "The metric scale of a scene is unknown.",
+        r"comparing shapes needs scenes|shapes are compared in metres",
+    ),
+    # Of pairs, photos and scans.
+    "ambiguous": ("Another pose or place fits about as well.", r"ambiguous: |it fits two places"),
+    "not_probable": ("All evidence together is not strong enough.", r"not probable enough"),
+    "pose_uncertain": ("The pose is known too imprecisely.", r"(the overlap|what it shows) fixes (the|its) pose only"),
+    # Photos and scans that are refused.
+    "no_match": ("Nothing in the map resembles it.", r"nothing in the map looks like it|no scene of the map has any"),
+    "no_scene_matches": ("No scene that was compared shows it.", r"\d+ scenes were compared and none"),
+    "not_confirmed": ("Too few patches of the map are found again in the photo.", r"what the map shows there is not"),
+    "too_far": ("The pose lies outside the area given.", r"it was taken .* from there"),
+    # Edges that are accepted, and that optimize does not use or does not rely on.
+    "aliased_places": ("Places that look alike cannot be told apart.", r"places that look alike\?"),
+    "confirmed_by_person": ("A person confirmed the edge.", r"confirmed by a person"),
+    "contradicting_groups": ("Two groups of edges contradict each other.", r"edges that agree among themselves"),
+    "contradicts_component": (
+        "The edge contradicts other evidence of two components.",
+        r"contradicts what else",
+    ),
+    "contradicts_edge": (
+        "The edge contradicts one of similar evidence.",
+        r"contradicts an edge whose evidence",
+    ),
+    "contradicts_edges": ("The edge contradicts the other edges.", r"contradicts the other edges"),
+    "outvoted": ("Too few edges agree against those that contradict them.", r"\d+ edges agree and \d+ others"),
+    "surfaces_differ": ("Both scenes saw different surfaces at the place.", r"\S+% of what both saw is not the same"),
+    "too_few_edges": ("Too few agreeing edges join two large components.", r"would join two components"),
+    "unconfirmed": ("No cycle of edges confirms the edge.", r"in no agreeing cycle"),
+    # World observations.
+    "contradicts_observations": (
+        "The observation contradicts the others.",
+        r"it contradicts the other observations|the other bars contradict it",
+    ),
+    "no_ray": ("No two photos show the control point.", r"no two photos show it"),
+    # Captures that are not thinned.
+    "fidelity_too_low": ("Thinning would change the capture's pictures too much.", r"compact, its pictures would"),
+    "seen_too_little": ("Newer captures saw too little of it.", r"newer captures that stay whole saw"),
+    # Anything else.
+    "other": ("Another reason.", r""),
+}
+"""By code: the reason in one sentence, and the pattern that a text of it begins with, those of earlier versions of
+gsmap included: stored reasons are texts."""
+
+
+_PATTERN = re.compile("|".join(f"(?P<{code}>{pattern})" for code, (_, pattern) in REASONS.items()))
+
+
+def reason(code: str, text: str) -> str:
+    """Return the text of a reason; its code must be that of its wording, now and whenever it is read back."""
+    assert reason_code(text) == code, f"give {code!r} in REASONS a pattern for {text!r}"
+    return text
+
+
+def reason_code(text: str) -> str:
+    """Return the code of the text of a reason; empty where the text is."""
+    if not text:
+        return ""
+    found = _PATTERN.match(text)
+    assert found is not None  # "other" matches any text
+    assert found.lastgroup is not None
+    return found.lastgroup

@@ -18,6 +18,7 @@ from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.retrieval import ViewIndex, most_alike
 from gsmap.localize.settling import Picture, Settled, inliers, settle
 from gsmap.methods.extractor import Extractor
+from gsmap.reason_codes import reason
 from gsmap.types.localization import Keypoints, LocalizationResult, Photo
 
 
@@ -84,12 +85,12 @@ def placement(
         rival: probability of the best pose at another place.
         scale: of `prepared`.
     """
-    reason = refusal(best, rival, params)
+    why = refusal(best, rival, params)
     component = best.candidate.component
     metres = (metres_per_unit or {}).get(component, 1.0)
     told = {**best.evidence, "rival": rival}
-    if reason:
-        return LocalizationResult(name, reason, component=component, probability=best.probability, evidence=told)
+    if why:
+        return LocalizationResult(name, why, component=component, probability=best.probability, evidence=told)
     support, seen = _support(best, scenes, params, picture)
     pose = best.settled.T_metric_camera.copy()
     pose[:3, 3] /= metres
@@ -154,7 +155,9 @@ def judged_poses(
         if len(found) < fewest:
             return [], f"it shows too little: {len(found)} features"
         rough, most = _rough_poses(picture, found, index, scenes, replace(params.matching, views=views), params)
-        why = f"nothing in the map looks like it: {most} features match, no {fewest} agree on a pose"
+        why = reason(
+            "no_match", f"nothing in the map looks like it: {most} features match, no {fewest} agree on a pose"
+        )
         new = [one for one in rough if not any(near_to(one, other.candidate, params.resection) for other in out)]
         for candidate in new[: params.max_candidates]:
             sure = max((one.probability for one in out), default=0.0) >= params.sure

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsmap.geometry.rotations import angle_between
 from gsmap.geometry.similarities import Similarities, exp, without_scale
+from gsmap.reason_codes import reason
 from gsmap.types import ScenePose, Sim3
 from gsmap.types.registration import Registration
 
@@ -115,7 +116,7 @@ def join(supports: Sequence[Support], middle: np.ndarray, one_place: OnePlace, n
 
 def _contradiction(a: Support, b: Support, names: dict[str, str], how: str) -> Joined:
     places = " and ".join(f"where {names[s.scene]} shows it (component {s.component})" for s in (a, b))
-    return Joined(None, None, f"it fits two places, {how}: {places}", 0.5)
+    return Joined(None, None, reason("ambiguous", f"it fits two places, {how}: {places}"), 0.5)
 
 
 def _agree(a: Support, b: Support, middle: np.ndarray, one: OnePlace) -> bool:

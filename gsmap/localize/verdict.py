@@ -9,6 +9,7 @@ import numpy as np
 
 from gsmap.errors import ConfigError
 from gsmap.localize.probability import model
+from gsmap.reason_codes import reason
 
 
 @dataclass(frozen=True)
@@ -55,14 +56,22 @@ def judge(
     """
     inliers = round(10 ** evidence["inliers"] - 1)
     if inliers < params.min_inliers or not np.isfinite(sigmas).all():
-        return f"what the map shows there is not in the picture: {inliers} patches found, needs {params.min_inliers}"
+        return reason(
+            "not_confirmed",
+            f"what the map shows there is not in the picture: {inliers} patches found, needs {params.min_inliers}",
+        )
     if probability < params.min_probability:
-        return f"not probable enough: {probability:.1%}, needs {params.min_probability:.0%}: {_weakest(evidence)}"
+        return reason(
+            "not_probable",
+            f"not probable enough: {probability:.1%}, needs {params.min_probability:.0%}: {_weakest(evidence)}",
+        )
     if rival > params.max_rival:
-        return f"ambiguous: another place of the map shows the same ({rival:.0%} probable)"
+        return reason("ambiguous", f"ambiguous: another place of the map shows the same ({rival:.0%} probable)")
     degrees = np.degrees(sigmas[0])
     if degrees > params.max_rotation_sigma_deg or sigmas[1] > params.max_translation_sigma_m:
-        return f"what it shows fixes its pose only to {degrees:.1f} deg and {100 * sigmas[1]:.0f} cm"
+        return reason(
+            "pose_uncertain", f"what it shows fixes its pose only to {degrees:.1f} deg and {100 * sigmas[1]:.0f} cm"
+        )
     return ""
 
 

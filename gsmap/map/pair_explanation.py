@@ -32,7 +32,9 @@ def explain_pair(store: Store, settings: Settings, a: Scene, b: Scene) -> PairEx
     steps = [retrieval, *_steps(pair, settings)]
     advice = _advice(pair, settings, {step.name: step for step in steps}, untried)
     ends = {name: getattr(pair, name) for name in ("target", "target_name", "source", "source_name")}
-    return PairExplanation(**ends, status=pair.status, reason=pair.reason, steps=tuple(steps), advice=advice)
+    return PairExplanation(
+        **ends, status=pair.status, reason=pair.reason, reason_code=pair.reason_code, steps=tuple(steps), advice=advice
+    )
 
 
 def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[str, str]:

@@ -266,6 +266,7 @@ def row_of(names: Mapping[str, str], file: str, found: LocalizationResult, secon
         file=file,
         status="placed" if found.is_placed else "refused",
         reason=found.reason,
+        reason_code=found.reason_code,
         T_map_camera=found.T_map_camera,
         covariance=found.covariance,
         component=found.component,

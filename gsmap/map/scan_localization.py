@@ -60,6 +60,7 @@ def _row(file: str, row: ScanRow) -> LocalizeRow:
         file=file,
         status=row.status,
         reason=row.reason,
+        reason_code=row.reason_code,
         T_map_camera=row.T_map_camera,
         S_map_scan=row.S_map_scan,
         origin=row.origin,

@@ -29,6 +29,7 @@ from gsmap.optimize.params import Params
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.state import State, refine
 from gsmap.optimize.structure import component_labels
+from gsmap.reason_codes import reason
 
 _MAX_ALIASING_PROBABILITY = 0.5  # doubtful edges join nothing where more of the map's decided ones were of two places
 _COST = 10.0  # a wrong edge that is accepted costs as much as so many right ones that are doubtful
@@ -161,7 +162,7 @@ def accept_doubtful_edges(m: Measurements, state: State, doubtful: np.ndarray, g
     state.undecided |= apart
     for row in np.flatnonzero(apart).tolist():
         others = "captured in one visit" if one_visit[row] else "so are others of this map, or they contradict it"
-        state.pending[row] = f"places that look alike? ({others})"
+        state.pending[row] = reason("aliased_places", f"places that look alike? ({others})")
 
 
 def _within(m: Measurements, accepted: np.ndarray) -> np.ndarray:

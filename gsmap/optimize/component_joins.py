@@ -15,6 +15,7 @@ from gsmap.optimize.consistency import agreeing_pairs
 from gsmap.optimize.drift import DriftModel
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
+from gsmap.reason_codes import reason
 
 _MIN_RIVAL_EDGES = 2  # contradicting edges that agree among themselves count as a place that looks alike from so many
 _RIVAL_FACTOR = 3  # such a rival must be outnumbered so many times before large components join
@@ -100,17 +101,18 @@ def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Pa
     sure = params.min_wrong_probability
     outweighed = len(rows) <= join.rival - int(join.log_odds >= np.log(sure / (1 - sure)))
     if outweighed or (large and aliased):
-        return f"{len(rows)} edges agree and {join.rival} others contradict them: undecided"
+        return reason("outvoted", f"{len(rows)} edges agree and {join.rival} others contradict them: undecided")
     low = np.minimum(edges.targets[rows], edges.sources[rows])
     high = np.maximum(edges.targets[rows], edges.sources[rows])
     pairs = len(np.unique(low * edges.num_scenes + high))
     if large:
         if pairs >= params.min_bridge_edges:
             return "agreed"
-        return (
+        return reason(
+            "too_few_edges",
             f"would join two components of {params.min_large_component} or more scenes: needs "
             f"{params.min_bridge_edges} agreeing edges over {params.min_bridge_edges} scene pairs, or one that is "
-            f"confirmed, has {pairs}"
+            f"confirmed, has {pairs}",
         )
     return "agreed" if pairs >= 2 else "single"
 

@@ -12,6 +12,7 @@ from gsmap.optimize.params import Params
 from gsmap.optimize.robust import chi_squares
 from gsmap.optimize.state import State
 from gsmap.optimize.structure import bridges, component_labels
+from gsmap.reason_codes import reason
 from gsmap.types import EdgeOutcome, PoseGraph, ScenePose
 from gsmap.types.plain import plain
 
@@ -71,28 +72,37 @@ def _outcomes(
         if firm[k]:
             out[key] = EdgeOutcome("used", residual)
         elif state.accepted[k] and state.doubtful[k]:
-            reason = f"{_disagreement_text(m, k)}: the place changed, or it is another"
-            out[key] = EdgeOutcome("tentative", residual, reason)
+            why = reason("surfaces_differ", f"{_disagreement_text(m, k)}: the place changed, or it is another")
+            out[key] = EdgeOutcome("tentative", residual, why)
         elif state.accepted[k]:
-            out[key] = EdgeOutcome("tentative", residual, "in no agreeing cycle: rests on its own verdict alone")
+            why = reason("unconfirmed", "in no agreeing cycle: rests on its own verdict alone")
+            out[key] = EdgeOutcome("tentative", residual, why)
         elif not together[k]:
-            reason = state.pending.get(k, "contradicts what else is known of the two components")
+            why = state.pending.get(k) or reason(
+                "contradicts_component", "contradicts what else is known of the two components"
+            )
             if state.doubtful[k]:
-                reason = f"{_disagreement_text(m, k)}; {reason}"
+                why = reason("surfaces_differ", f"{_disagreement_text(m, k)}; {why}")
             elif state.ambiguous[k]:
-                reason = "contradicts an edge whose evidence is about as good: one is of another place that looks alike"
+                why = reason(
+                    "contradicts_edge",
+                    "contradicts an edge whose evidence is about as good: one is of another place that looks alike",
+                )
             elif state.undecided[k]:
-                reason = "edges that agree among themselves contradict each other here: places that look alike?"
-            out[key] = EdgeOutcome("unused", None, reason, undecided=True)
+                why = reason(
+                    "contradicting_groups",
+                    "edges that agree among themselves contradict each other here: places that look alike?",
+                )
+            out[key] = EdgeOutcome("unused", None, why, undecided=True)
         else:
-            reason = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
+            why = reason("contradicts_edges", f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}")
             if cycles.agree[k] > 0:
-                reason += "; it agrees with others that do too (a place that looks alike?)"
+                why += "; it agrees with others that do too (a place that looks alike?)"
             if state.doubtful[k]:
-                reason += f"; {_disagreement_text(m, k)}: another place that looks alike"
+                why += f"; {_disagreement_text(m, k)}: another place that looks alike"
             doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
             undecided = bool(cycles.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
-            out[key] = EdgeOutcome("unused", residual, reason, undecided)
+            out[key] = EdgeOutcome("unused", residual, why, undecided)
     return out
 
 

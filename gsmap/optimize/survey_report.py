@@ -9,10 +9,13 @@ import numpy as np
 from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, ObservationTests, System
 from gsmap.optimize.survey_terms import Terms, Unknowns
+from gsmap.reason_codes import reason
 from gsmap.types.world import Contradiction, Georeference, Residual, Survey, WorldFrame
 
 _MIN_CHECKS = 2.5  # redundancy of points, fixes and bars below which a note warns of unchecked observations
-_CONTRADICTS = "it contradicts the other observations"
+_CONTRADICTS = reason("contradicts_observations", "it contradicts the other observations")
+_BARS_CONTRADICT = reason("contradicts_observations", "the other bars contradict it")
+_NO_RAY = reason("no_ray", "no two photos show it, and no surface was rendered where one does")
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +126,7 @@ def tie_by_bars(system: System, index: int, survey: Survey, refusal: SurveyFailu
         rows.append(
             Residual(
                 "bar", bar.name, bar.scenes[0], "used" if used else "outlier", (float(error),),
-                (float(bar.length_m * np.sqrt(variance)),), reason="" if used else "the other bars contradict it",
+                (float(bar.length_m * np.sqrt(variance)),), reason="" if used else _BARS_CONTRADICT,
             )
         )  # fmt: skip
     return replace(nothing, metres_per_unit=float(np.exp(log)), scale_sigma=sigma, residuals=tuple(rows))
@@ -166,7 +169,7 @@ def _point_rows(system: System, solved: Solution, tests: ObservationTests) -> li
         use = "check" if point.check else "used" if active[0][k] else "outlier"
         error: tuple[float, ...] = ()
         sigma: tuple[float, ...] = ()
-        statistic, dof, reason = _given(tests.statistics[0][k], tests.dofs[0][k]), int(tests.dofs[0][k]), ""
+        statistic, dof, why = _given(tests.statistics[0][k], tests.dofs[0][k]), int(tests.dofs[0][k]), ""
         if determined[k]:
             off = met[k] - point.position
             covariance = picking[k] + _carried(system, k, images, picking[k], factor, show)
@@ -177,10 +180,10 @@ def _point_rows(system: System, solved: Solution, tests: ObservationTests) -> li
                 h, v = point.sigma_m
                 statistic, dof = float(off @ np.linalg.solve(covariance + np.diag([h, h, v]) ** 2, off)), 3
         elif point.check or not active[0][k]:
-            reason = "no two photos show it, and no surface was rendered where one does"
-        if use == "outlier" and not reason:
-            reason = solved.reasons.get(("point", k), _CONTRADICTS)
-        rows.append(Residual("point", point.name, "", use, error, sigma, (), statistic, dof, reason))
+            why = _NO_RAY
+        if use == "outlier" and not why:
+            why = solved.reasons.get(("point", k), _CONTRADICTS)
+        rows.append(Residual("point", point.name, "", use, error, sigma, (), statistic, dof, why))
     return rows
 
 
@@ -209,13 +212,13 @@ def _image_rows(system: System, x: Unknowns, active: Active, tests: ObservationT
     rows = []
     for k, image in enumerate(system.terms.images):
         use = "check" if checked[k] else "used" if active[1][k] else "outlier"
-        reason = _CONTRADICTS if use == "outlier" else ""
+        why = _CONTRADICTS if use == "outlier" else ""
         statistic = None if checked[k] or system.lone[k] else _given(tests.statistics[1][k], tests.dofs[1][k])
         error = (float(errors[k, 0]), float(errors[k, 1])) if abs(errors[k]).max() < 1e6 else ()
         rows.append(
             Residual(
                 "image", f"{image.point} in {image.image}", image.scene, use, (), (), error, statistic,
-                int(tests.dofs[1][k]), reason,
+                int(tests.dofs[1][k]), why,
             )
         )  # fmt: skip
     return rows

@@ -17,6 +17,7 @@ from importlib.resources import files
 import numpy as np
 
 from gsmap.errors import MissingDependencyError
+from gsmap.reason_codes import reason
 from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.metric_scene import MetricScene, own_working_m, working_unit_m
@@ -47,30 +48,27 @@ def register_by_shape(target: SceneView, source: SceneView, params: Params | Non
     """
     params, watch = params or Params(), Stopwatch()
     if not all(view.scale_policy == "known" or "landmarks" in view.graph.layers for view in (target, source)):
-        return Registration(
-            target.id,
-            source.id,
-            "no_match",
-            "comparing shapes needs scenes in metres, and the unit of one is not known",
-        )
+        why = reason("unit_unknown", "comparing shapes needs scenes in metres, and the unit of one is not known")
+        return Registration(target.id, source.id, "no_match", why)
     try:
         evaluated = evaluate_by_shape(target, source, params, watch)
     except MissingDependencyError as error:
-        return Registration(target.id, source.id, "no_match", f"comparing shapes needs an optional package: {error}")
+        why = reason("package_missing", f"comparing shapes needs an optional package: {error}")
+        return Registration(target.id, source.id, "no_match", why)
     if not evaluated:
-        reason = "no pose under which features of both surfaces agree"
-        return Registration(target.id, source.id, "no_match", reason, seconds=watch.seconds)
+        why = reason("no_pose_proposed", "no pose under which features of both surfaces agree")
+        return Registration(target.id, source.id, "no_match", why, seconds=watch.seconds)
     scored = sorted(((probability(j.proposal, j.evidence, PRIOR), j) for j in evaluated), key=lambda s: -s[0])
-    best, reason = scored[0][1], _reason(scored, source, params.verdict)
+    best, why = scored[0][1], _reason(scored, source, params.verdict)
     information = None
-    if not reason and best.covariance is not None:
+    if not why and best.covariance is not None:
         information = np.linalg.inv(best.covariance)
     seen = best.evidence
     return Registration(
         target.id,
         source.id,
-        "rejected" if reason else "accepted",
-        reason,
+        "rejected" if why else "accepted",
+        why,
         best.proposal.S_target_source,
         None if information is None else 0.5 * (information + information.T),
         num_inliers=best.proposal.num_inliers,
@@ -129,21 +127,22 @@ def _reason(scored: Sequence[tuple[float, EvaluatedPose]], source: SceneView, pa
     probable, best = scored[0]
     seen = best.evidence
     if probable < params.min_probability:
-        return (
+        return reason(
+            "not_probable",
             f"not probable enough by shape alone: {probable:.1%}, needs {params.min_probability:.0%}: overlap "
             f"{seen.overlap:.0%}, {best.proposal.num_inliers} features agree, {seen.disagreement:.0%} of the "
-            "surface seen in both differs"
+            "surface seen in both differs",
         )
     if len(scored) > 1 and scored[1][0] >= _RIVAL_PROBABILITY:
-        return f"ambiguous: its shape fits in two ways, the other with {scored[1][0]:.1%}"
+        return reason("ambiguous", f"ambiguous: its shape fits in two ways, the other with {scored[1][0]:.1%}")
     if best.covariance is None:
-        return "too little surface coincides to estimate the uncertainty"
+        return reason("too_little_overlap", "too little surface coincides to estimate the uncertainty")
     degrees = float(np.degrees(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1])))
     x, y, z = source.centre
     lever = np.hstack([-np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.eye(3)])
     metres = float(np.sqrt(np.linalg.eigvalsh(lever @ best.covariance[:6, :6] @ lever.T)[-1]))
     if degrees > params.max_rotation_sigma_deg or metres > params.max_translation_sigma_m:
-        return f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * metres:.0f} cm"
+        return reason("pose_uncertain", f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * metres:.0f} cm")
     return ""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from gsmap.reason_codes import reason
 from gsmap.register import covariance, refinement, verdict
 from gsmap.register.duplicate import find_duplicate
 from gsmap.register.evidence import PoseEvidence, measure
@@ -173,7 +174,9 @@ def _evaluate(
             seen = measure(*surfaces, pose, views, num_cameras=params.num_cameras)
         refined = proposal
     if not flaw and refined is proposal and not verdict.has_low_nfa(proposal, params.verdict):
-        flaw = "surfaces pull the pose away from its correspondences, which chance explains"
+        flaw = reason(
+            "correspondences_lost", "surfaces pull the pose away from its correspondences, which chance explains"
+        )
     proposal = refined
     flaw = flaw or verdict.decide(proposal, seen, None if uncertainty is None else uncertainty.sigmas, params.verdict)
     in_units = None if uncertainty is None else covariance.in_scene_units(uncertainty.covariance, pair.source.unit_m)

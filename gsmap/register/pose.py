@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.geometry.umeyama import umeyama
+from gsmap.reason_codes import reason
 from gsmap.types import Sim3
 
 _MAX_ROTATION_SIGMA_DEG = 3.0  # about any axis; correspondences that fix it less well lie along a line
@@ -58,11 +59,11 @@ def fit_pose(
     if rms > sigma_m:
         mirrored = source * [1.0, 1.0, -1.0]
         if _rms(target, umeyama(target, mirrored, with_scale=with_scale).apply(mirrored)) < 0.5 * rms:
-            flaw = "correspondences are mirrored"
+            flaw = reason("mirrored_correspondences", "correspondences are mirrored")
     if not flaw and rotation_sigma > np.radians(_MAX_ROTATION_SIGMA_DEG):
-        flaw = "correspondences lie along a line"
+        flaw = reason("collinear_correspondences", "correspondences lie along a line")
     if not flaw and rms > _MAX_RMS_SIGMAS * sigma_m:
-        flaw = "correspondences do not fit one pose"
+        flaw = reason("inconsistent_correspondences", "correspondences do not fit one pose")
     return PoseFit(pose, rms, rotation_sigma, flaw)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.geometry.rotations import angle_between
+from gsmap.reason_codes import reason
 from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.metric_scene import own_working_m
@@ -58,11 +59,14 @@ def select_pose(
     common: dict[str, Any] = {"target": target.id, "source": source.id, "seconds": seconds}
     if not evaluated:
         fewest = num_nodes(target, source)
-        reason = f"no pose proposed that chance does not explain (the smaller scene graph has {fewest} nodes)"
-        return Registration(status="no_match", reason=reason, notes=tuple(notes), **common)
+        why = reason(
+            "no_pose_proposed",
+            f"no pose proposed that chance does not explain (the smaller scene graph has {fewest} nodes)",
+        )
+        return Registration(status="no_match", reason=why, notes=tuple(notes), **common)
     accepted = [j for j in evaluated if not j.flaw]
     best = accepted[0] if accepted else min(evaluated, key=_sort_key)
-    status, reason = ("accepted", "") if accepted else ("rejected", best.flaw)
+    status, why = ("accepted", "") if accepted else ("rejected", best.flaw)
     # A pose that is too uncertain to be an edge is a rival all the same.
     others = [j for j in evaluated if not verdict.contradiction(j.proposal, j.evidence, params.verdict)]
     others = [j for j in others if not _same(best, j, target, source)]
@@ -72,9 +76,10 @@ def select_pose(
         rivals = rivals or sorted(others, key=lambda j: -_odds_of(j))
     if accepted and rivals:
         apart = _describe_distance(best, rivals[0], target, source)
-        status, reason = "no_match", f"ambiguous: {apart}, and the first is right with a probability of {probable:.0%}"
+        status = "no_match"
+        why = reason("ambiguous", f"ambiguous: {apart}, and the first is right with a probability of {probable:.0%}")
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
-        status, reason = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
+        status, why = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
     information = None
     if status == "accepted" and best.covariance is not None:
         information = np.linalg.inv(best.covariance)
@@ -83,7 +88,7 @@ def select_pose(
             notes = (*notes, best.decision.note)
     return Registration(
         status=status,
-        reason=reason,
+        reason=why,
         S_target_source=best.proposal.S_target_source if status != "no_match" else None,
         information=information,
         num_inliers=best.proposal.num_inliers,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.reason_codes import reason
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.probability import probability, shortfalls
 from gsmap.types.registration import Proposal
@@ -79,7 +80,7 @@ def not_significant(proposal: Proposal, params: Params, besides: str = "") -> st
         why = f"a rival clique has {proposal.runner_up:.0%} of its size, allowed {MAX_RUNNER_UP:.0%}"
     if besides.startswith(_NOT_SIGNIFICANT):
         return besides
-    return f"{_NOT_SIGNIFICANT}: {why}" + (f" ({besides})" if besides else "")
+    return reason("not_significant", f"{_NOT_SIGNIFICANT}: {why}" + (f" ({besides})" if besides else ""))
 
 
 def fails_prescreen(evidence: PoseEvidence) -> str:
@@ -117,8 +118,9 @@ def decide(
         or sigmas[1] > params.max_translation_sigma_m
         or sigmas[2] > params.max_scale_sigma
     ):
-        return (
-            f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * sigmas[1]:.0f} cm, {sigmas[2]:.1%} in scale"
+        return reason(
+            "pose_uncertain",
+            f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * sigmas[1]:.0f} cm, {sigmas[2]:.1%} in scale",
         )
     return improbable(proposal, evidence, params)
 
@@ -161,7 +163,8 @@ def improbable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> st
     # A significant clique is enough where the cameras of one scene observed too little to verify it.
     if probable >= params.min_probability or (not evidence.num_seen and is_significant(proposal, params)):
         return ""
-    return f"not probable enough: {probable:.1%}, needs {params.min_probability:.0%}: {_weakest(proposal, evidence)}"
+    weakest = _weakest(proposal, evidence)
+    return reason("not_probable", f"not probable enough: {probable:.1%}, needs {params.min_probability:.0%}: {weakest}")
 
 
 def _weakest(proposal: Proposal, evidence: PoseEvidence) -> str:
@@ -183,13 +186,18 @@ _NOT_SIGNIFICANT = "not significant"
 
 
 def _too_little(evidence: PoseEvidence, needs: int) -> str:
-    return f"too little surface coincides: {evidence.num_coinciding} cells, needs {needs}"
+    return reason("too_little_overlap", f"too little surface coincides: {evidence.num_coinciding} cells, needs {needs}")
 
 
 def _colours_disagree(evidence: PoseEvidence, needs: float) -> str:
     correlation = f"{evidence.colour_correlation:.2f}"
-    return f"colours disagree where surfaces coincide: correlation {correlation}, needs {needs:.2f}"
+    return reason(
+        "colours_disagree",
+        f"colours disagree where surfaces coincide: correlation {correlation}, needs {needs:.2f}",
+    )
 
 
 def _violates(evidence: PoseEvidence, allowed: float) -> str:
-    return f"free-space violation {evidence.free_space_violation:.0%}, allowed {allowed:.0%}"
+    return reason(
+        "free_space_violation", f"free-space violation {evidence.free_space_violation:.0%}, allowed {allowed:.0%}"
+    )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.reason_codes import reason_code
 from gsmap.types.cameras import Cameras
 
 
@@ -132,6 +133,11 @@ class LocalizationResult:
     probability: float = 0.0
     evidence: Mapping[str, float] = field(default_factory=dict)
     num_gaussians: int = 0
+
+    @property
+    def reason_code(self) -> str:
+        """The code of the reason, a key of `gsmap.reason_codes.REASONS`; empty where the reason is."""
+        return reason_code(self.reason)
 
     @property
     def is_placed(self) -> bool:

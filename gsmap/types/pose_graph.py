@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.reason_codes import reason_code
 from gsmap.types.sim3 import Sim3
 from gsmap.types.world import Georeference
 
@@ -100,6 +101,11 @@ class EdgeOutcome:
     residual_chi2: float | None = None
     reason: str = ""
     undecided: bool = False
+
+    @property
+    def reason_code(self) -> str:
+        """The code of the reason, a key of `gsmap.reason_codes.REASONS`; empty where the reason is."""
+        return reason_code(self.reason)
 
     def __post_init__(self) -> None:
         if self.use not in EDGE_USES:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.reason_codes import reason_code
 from gsmap.types.sim3 import Sim3
 
 STATUSES = ("accepted", "rejected", "no_match")
@@ -128,6 +129,11 @@ class Registration:
             raise InputError(
                 "an accepted registration needs a pose and an information matrix", code="invalid_registration"
             )
+
+    @property
+    def reason_code(self) -> str:
+        """The code of the reason, a key of `gsmap.reason_codes.REASONS`; empty where the reason is."""
+        return reason_code(self.reason)
 
     @property
     def scale(self) -> float | None:

@@ -82,7 +82,9 @@ def test_pose(tmp_path: Path, text: str) -> None:
 )
 def test_settings(tmp_path: Path, text: str) -> None:
     (tmp_path / "settings.toml").write_text(text)
-    with raises(ConfigError, code=("invalid_settings_file", "invalid_setting_value", "unknown_setting"), match=r"settings\.toml"):
+    with raises(
+        ConfigError, code=("invalid_settings_file", "invalid_setting_value", "unknown_setting"), match=r"settings\.toml"
+    ):
         map_settings(tmp_path, None, {})
     name, _, value = text.partition(" = ")
     assert parse(f"{name}={value}")[0] == name

@@ -1,4 +1,4 @@
-"""Contract: every code of an error is registered once, and every registered code is used."""
+"""Contract: every code of an error or a reason is registered once, and every registered code is used."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 import gsmap
 from gsmap import errors
 from gsmap.errors import ConfigError, GsmapError, InputError, MissingDependencyError
-from gsmap.reason_codes import ERRORS
+from gsmap.reason_codes import ERRORS, REASONS, reason, reason_code
 
 PACKAGE = Path(gsmap.__file__).parent
 CLASSES = {name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, GsmapError)}
@@ -66,7 +66,7 @@ def test_codes_are_registered_and_used() -> None:
 
 
 def test_codes_are_words_and_meanings_are_sentences() -> None:
-    for code, meaning in ERRORS.items():
+    for code, meaning in [*ERRORS.items(), *((code, meaning) for code, (meaning, _) in REASONS.items())]:
         assert re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", code)
         assert meaning[0].isupper() or meaning.startswith("gsmap")
         assert meaning.endswith(".")
@@ -86,3 +86,24 @@ def test_without_a_code_an_error_has_that_of_its_class() -> None:
     assert ConfigError("text").code == "config"
     assert MissingDependencyError("text").code == "missing_dependency"
     assert InputError("text", code="not_finite").code == "not_finite"
+
+
+def test_reasons_are_registered_and_used() -> None:
+    used = {
+        node.args[0].value
+        for _, tree in _trees()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "id", "") == "reason"
+        and isinstance(node.args[0], ast.Constant)
+    }
+    assert used == set(REASONS) - {"other"}
+
+
+def test_the_code_of_a_reason_is_that_of_its_text() -> None:
+    assert reason_code("") == ""
+    assert reason_code("something else") == "other"
+    assert reason_code("12% of what both saw is not the same in both; places that look alike?") == "surfaces_differ"
+    assert reason_code(reason("ambiguous", "ambiguous: two poses")) == "ambiguous"
+    with pytest.raises(AssertionError, match="give 'ambiguous' in REASONS a pattern"):
+        reason("ambiguous", "two poses fit")

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # the rows of this checkout, whichever one is installed
 
 from gsmap.cli.objects import OBJECTS, Many, Maybe, Object
-from gsmap.reason_codes import ERRORS
+from gsmap.reason_codes import ERRORS, REASONS
 from gsmap.settings import field_docs
 from gsmap.types.rows import SCHEMA, Row
 from gsmap.types.sim3 import Sim3
@@ -42,7 +42,9 @@ def page() -> str:
     lines += ["", "## Rows\n"]
     for row in row_types():
         lines += section(row)
-    lines += ["## Codes of errors\n", "| code | cause |", "| --- | --- |"]
+    lines += ["## Codes of reasons\n", "| code | reason |", "| --- | --- |"]
+    lines += [f"| `{code}` | {meaning} |" for code, (meaning, _) in sorted(REASONS.items())]
+    lines += ["", "## Codes of errors\n", "| code | cause |", "| --- | --- |"]
     lines += [f"| `{code}` | {meaning} |" for code, meaning in sorted(ERRORS.items())]
     return "\n".join(lines).rstrip() + "\n"
 

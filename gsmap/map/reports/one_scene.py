@@ -104,6 +104,7 @@ def _edges_of(store: Store, scene: Scene) -> tuple[SceneEdgeRow, ...]:
                 overlap=row.overlap,
                 num_inliers=row.num_inliers,
                 reason=row.reason,
+                reason_code=row.reason_code,
             )
         )
     return tuple(out)

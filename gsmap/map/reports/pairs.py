@@ -9,6 +9,7 @@ from gsmap.map.date_filter import is_after, parse_moment
 from gsmap.map.reports.common import names, one_of
 from gsmap.map.reports.scenes import scene_rows
 from gsmap.map.snapshot_read import snapshot_read
+from gsmap.reason_codes import reason, reason_code
 from gsmap.store import Store
 from gsmap.store.registrations import StoredRegistration
 from gsmap.types import EdgeOutcome, Registration, Scene
@@ -103,20 +104,21 @@ def _edge_rows(store: Store, edges: Iterable[StoredRegistration], *scenes: str) 
 def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[str, str]) -> EdgeRow:
     edge = stored.registration
     outcome = outcomes.get((edge.target, edge.source))
-    status, reason = edge.status, edge.reason or (outcome.reason if outcome else "")
+    status, why = edge.status, edge.reason or (outcome.reason if outcome else "")
     used = _USED[outcome.use] if outcome else False
     if stored.review == "confirm":
-        status, reason = "accepted", "confirmed by a person"
+        status, why = "accepted", reason("confirmed_by_person", "confirmed by a person")
         used = bool(used)  # a tentative edge holds its scenes; the person now confirms it in place of a cycle
     elif stored.review == "reject":
-        status, reason = "rejected", "rejected by a person"
+        status, why = "rejected", reason("rejected_by_person", "rejected by a person")
     return EdgeRow(
         target=edge.target,
         target_name=name_of[edge.target],
         source=edge.source,
         source_name=name_of[edge.source],
         status=status,
-        reason=reason,
+        reason=why,
+        reason_code=reason_code(why),
         S_target_source=edge.S_target_source,
         scale=edge.scale,
         information=edge.information,
@@ -140,7 +142,12 @@ def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
     """Report a pair: its current edge, evidence, and history of registrations and reviews."""
     current = store.registrations.get(a.id, b.id)
     events = [
-        PairEventRow(at=old.created_at, what=old.registration.status, reason=old.registration.reason)
+        PairEventRow(
+            at=old.created_at,
+            what=old.registration.status,
+            reason=old.registration.reason,
+            reason_code=old.registration.reason_code,
+        )
         for old in store.registrations.history(a.id, b.id)
     ]
     events += [

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsmap.map.reports.common import names
 from gsmap.map.snapshot_read import snapshot_read
+from gsmap.reason_codes import reason_code
 from gsmap.store import Store
 from gsmap.types import ScenePose
 from gsmap.types.rows.world import ContradictionRow, GeoreferenceRow, ResidualRow, WorldReport
@@ -100,6 +101,7 @@ def residual_row(row: Residual, name_of: Mapping[str, str]) -> ResidualRow:
         statistic=row.statistic,
         dof=row.dof,
         reason=row.reason,
+        reason_code=reason_code(row.reason),
     )
 
 

@@ -25,6 +25,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import SharedJobs, note_interruption
 from gsmap.methods import RecipeKey, family
 from gsmap.methods.extractor import Extractor
+from gsmap.reason_codes import reason
 from gsmap.store import Store
 from gsmap.types import Gaussians, PoseGraph, Scene
 from gsmap.types.localization import LocalizationResult, Photo, SceneFeatures
@@ -227,8 +228,8 @@ def _within(found: LocalizationResult, near: SearchRegion | None) -> Localizatio
     far = float(np.linalg.norm(found.T_map_camera[:3, 3] - near.point))
     if far <= near.radius:
         return found
-    reason = f"it was taken {far:.3g} from there, farther than {near.radius:g}"
-    return replace(found, reason=reason, T_map_camera=None, covariance=None)
+    why = reason("too_far", f"it was taken {far:.3g} from there, farther than {near.radius:g}")
+    return replace(found, reason=why, T_map_camera=None, covariance=None)
 
 
 def localizing_near(localizer: Localizer, near: SearchRegion) -> ViewIndex:

@@ -26,6 +26,7 @@ from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.map.stages.localize import parse_near
 from gsmap.map.stages.register import placed_scenes
 from gsmap.methods import RecipeKey
+from gsmap.reason_codes import reason, reason_code
 from gsmap.register import SceneView
 from gsmap.register.pose_selection import SAME_DISTANCE_M, SAME_LOG_SCALE, SAME_ROTATION_DEG
 from gsmap.store import Store
@@ -254,11 +255,13 @@ def _row(
         camera = np.eye(4)
         camera[:3, :3], camera[:3, 3] = S.rotation, S.translation
     sigma_deg, sigma = (None, None) if S is None or joined is None else _sigmas(joined.covariance, middle)
+    why = "" if S is not None else _why_not(found, joined, scenes)
     return ScanRow(
         file=str(request.file),
         kind=sought.kind,
         status="refused" if S is None else "placed",
-        reason="" if S is not None else _why_not(found, joined, scenes),
+        reason=why,
+        reason_code=reason_code(why),
         S_map_scan=S,
         T_map_camera=camera,
         origin=sought.origin,
@@ -276,6 +279,7 @@ def _row(
                 scene_name=scenes[one.target].name,
                 status=one.status,
                 reason=one.reason,
+                reason_code=one.reason_code,
                 probability=one.evidence.get("probability", float("nan")),
                 overlap=one.overlap,
                 component=poses.poses[one.target].component,
@@ -294,9 +298,10 @@ def _why_not(found: Sequence[Registration], joined: Joined | None, scenes: dict[
     if joined is not None:
         return joined.reason
     if not found:
-        return "no scene of the map has anything in common with it"
+        return reason("no_match", "no scene of the map has anything in common with it")
     best = max(found, key=lambda one: (one.evidence.get("probability", 0.0) or 0.0, one.overlap))
-    return f"{len(found)} scenes were compared and none shows it; nearest {scenes[best.target].name}: {best.reason}"
+    nearest = f"nearest {scenes[best.target].name}: {best.reason}"
+    return reason("no_scene_matches", f"{len(found)} scenes were compared and none shows it; {nearest}")
 
 
 def _sigmas(covariance: np.ndarray | None, middle: np.ndarray) -> tuple[float | None, float | None]:

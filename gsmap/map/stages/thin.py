@@ -14,6 +14,7 @@ from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import note_interruption
 from gsmap.methods import RecipeKey
+from gsmap.reason_codes import reason, reason_code
 from gsmap.store import Store, compact
 from gsmap.thin import find_visible, measure_fidelity_db, observed_fraction, render_views
 from gsmap.types import PosedScene, PoseGraph, Scene, SceneGraph
@@ -79,7 +80,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
             progress("thin", 0.5 + 0.5 * done / len(shares), scene.name)
             share = shares[scene.id]
             if share < settings.thin.min_seen_again:
-                why = f"newer captures that stay whole saw {share:.0%} of it"
+                why = reason("seen_too_little", f"newer captures that stay whole saw {share:.0%} of it")
                 rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why))
                 continue
             own = PosedScene(store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id), scene.id)
@@ -87,7 +88,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
             kept = compact.round_trip(own.gaussians[stays])
             fidelity = measure_fidelity_db(own, kept, settings.thin)
             if fidelity < settings.thin.min_fidelity_db:
-                why = f"compact, its pictures would keep {fidelity:.1f} dB"
+                why = reason("fidelity_too_low", f"compact, its pictures would keep {fidelity:.1f} dB")
                 rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why, fidelity))
                 continue
             after = compact.num_bytes(own.gaussians[stays])
@@ -177,17 +178,18 @@ def _superseded(
     return shares
 
 
-def _row(scene: Scene, before: int, after: int, seen: float, reason: str, fidelity: float | None = None) -> ThinRow:
+def _row(scene: Scene, before: int, after: int, seen: float, why: str, fidelity: float | None = None) -> ThinRow:
     return ThinRow(
         scene=scene.id,
         scene_name=scene.name,
         captured_at=scene.captured_at or "",
-        thinned=not reason,
+        thinned=not why,
         num_bytes_before=before,
         num_bytes_after=after,
         seen_again=seen,
         fidelity_db=fidelity,
-        reason=reason,
+        reason=why,
+        reason_code=reason_code(why),
     )
 
 

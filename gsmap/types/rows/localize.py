@@ -56,6 +56,7 @@ class LocalizeRow(Row):
         file: file as given; ``FILE#SECONDS`` for a video frame.
         status: ``placed`` or ``refused``.
         reason: reason for the refusal; empty if it is placed.
+        reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
         T_map_camera: (4, 4) camera-to-map of a photo (OpenCV axes), in the frame and unit of its component; else null.
         S_map_scan: scan coordinates, less ``origin``, to the map, frame and unit of its component; null for photos and
             refused scans.
@@ -89,6 +90,7 @@ class LocalizeRow(Row):
     file: str
     status: str
     reason: str
+    reason_code: str = ""
     T_map_camera: np.ndarray | None = None
     S_map_scan: Sim3 | None = None
     origin: np.ndarray | None = None

@@ -21,6 +21,7 @@ class ScanSupport(Row):
         scene_name: name.
         status: ``accepted`` (it shows the scan), ``rejected`` or ``no_match``.
         reason: reason of a rejection, or empty.
+        reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
         probability: probability that the match is right; null without evidence.
         overlap: fraction of the smaller surface that coincides.
         component: component of the scene.
@@ -39,6 +40,7 @@ class ScanSupport(Row):
     scene_name: str
     status: str
     reason: str
+    reason_code: str = ""
     probability: float
     overlap: float
     component: int
@@ -54,6 +56,7 @@ class ScanRow(Row):
         kind: ``points``, ``mesh``, ``depth`` or ``splat``.
         status: ``placed`` or ``refused``.
         reason: reason for the refusal; empty if it is placed.
+        reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
         S_map_scan: scan coordinates, less ``origin``, to the component's frame; null if refused.
         T_map_camera: camera pose of a depth image (OpenCV axes), translation in map units; else null.
         origin: offset subtracted from the file's coordinates; zeros unless they are large.
@@ -85,6 +88,7 @@ class ScanRow(Row):
     kind: str
     status: str
     reason: str
+    reason_code: str = ""
     S_map_scan: Sim3 | None
     T_map_camera: np.ndarray | None
     origin: np.ndarray

@@ -44,6 +44,7 @@ class EdgeRow(PairRef):
         status: ``accepted``, ``rejected`` (a contradicted pose), ``no_match``, or ``never registered`` without an edge;
             a review takes precedence.
         reason: reason why it is not accepted or not used, or empty.
+        reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
         S_target_source: pose of the source in the target; null if none was found.
         scale: scale of that pose; null if none was found.
         information: (7, 7) over [rotation (3, rad), translation (3), log scale] applied on the source side,
@@ -72,6 +73,7 @@ class EdgeRow(PairRef):
 
     status: str
     reason: str
+    reason_code: str = ""
     S_target_source: Sim3 | None
     scale: float | None
     information: np.ndarray | None
@@ -94,6 +96,7 @@ class PairEventRow(Row):
         at: time, ISO 8601 with zone.
         what: status of a registration, or a review: ``confirm``, ``reject`` or ``withdraw``.
         reason: reason.
+        reason_code: as in `EdgeRow`; empty for a review.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"at": "at", "what": "what", "reason": "reason"}
@@ -101,6 +104,7 @@ class PairEventRow(Row):
     at: str
     what: str
     reason: str
+    reason_code: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -150,6 +154,7 @@ class PairExplanation(PairRef):
     Args:
         status: as in `EdgeRow`.
         reason: as in `EdgeRow`.
+        reason_code: as in `EdgeRow`.
         steps: steps from retrieval to the pose graph.
         advice: advice for the first open step, or empty.
         picture: image file with both captures seen from the same cameras; null if not requested or without a pose.
@@ -157,6 +162,7 @@ class PairExplanation(PairRef):
 
     status: str
     reason: str
+    reason_code: str = ""
     steps: tuple[ExplanationStep, ...]
     advice: str
     picture: str | None = None

@@ -163,6 +163,7 @@ class SceneEdgeRow(Row):
         overlap: as in `EdgeRow`.
         num_inliers: as in `EdgeRow`.
         reason: as in `EdgeRow`.
+        reason_code: as in `EdgeRow`.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -181,6 +182,7 @@ class SceneEdgeRow(Row):
     overlap: float
     num_inliers: int
     reason: str
+    reason_code: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -23,6 +23,7 @@ class ThinRow(SceneRef):
         fidelity_db: PSNR of the thinned against the whole capture in its own images; null if it was not measured or
             nothing differs.
         reason: reason why it is not thinned, or empty.
+        reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -43,6 +44,7 @@ class ThinRow(SceneRef):
     seen_again: float
     fidelity_db: float | None
     reason: str
+    reason_code: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -31,6 +31,7 @@ class ResidualRow(Row):
         statistic: chi-square against all other observations; null without redundancy.
         dof: degrees of freedom of ``statistic``.
         reason: reason why it is an outlier or unused, or empty.
+        reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -58,6 +59,7 @@ class ResidualRow(Row):
     statistic: float | None
     dof: int
     reason: str
+    reason_code: str = ""
 
     @property
     def error_mm(self) -> str:
