@@ -33,6 +33,7 @@ def test_the_same_room_again_and_at_another_exposure_has_not_changed():
 
 
 @pytest.mark.parametrize("appears", [False, True])
+@pytest.mark.guards("answers")
 def test_a_box_that_went_or_came(appears):
     room = [*shell(), *STAYS]
     scenes = [capture([*room, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6)], 1), capture(room, 2)]
@@ -53,6 +54,7 @@ def test_a_box_that_went_or_came(appears):
 
 
 @pytest.mark.parametrize(("yaw", "to"), [(0.0, (1.25, 1.2)), (1.2, (2.0, 1.0))])
+@pytest.mark.guards("answers")
 def test_a_box_that_moved_is_one_change_with_its_pose(yaw, to):
     room = [*shell(), *STAYS]
     report = change.compare(
@@ -103,6 +105,7 @@ def test_paint_is_no_move_and_its_cells_are_the_wall_or_the_box():
     assert share_near(repainted.voxels, (0.9, 1.2, 0.3), (0.25, 0.2, 0.3)) > 0.95
 
 
+@pytest.mark.guards("answers")
 def test_what_one_capture_did_not_see_has_not_changed():
     # The newer capture looks away from the box that is gone.
     room = [*shell(), *STAYS]

@@ -16,6 +16,7 @@ SEEN = {"cells": 30.0, "looked_through": 20.0, "views_through": 3.0, "views_on":
 PAINTED = {"cells": 60.0, "looked_through": 0.0, "views_through": 0.0, "views_on": 0.0, "strength": 4.0, "slender": 0.0}
 
 
+@pytest.mark.guards("answers")
 def test_more_that_speaks_for_a_change_makes_it_surer():
     sure = confidence(SEEN)
     assert 0.5 < sure < 1

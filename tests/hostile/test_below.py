@@ -35,6 +35,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "root"
 
 
+@pytest.mark.guards("security")
 def test_deleting_follows_no_link(home, root):
     before = everything_in(home)
     (root / "a" / "inner").symlink_to(home / "photos")
@@ -59,6 +60,7 @@ def test_a_root_that_is_a_link_is_the_persons_own_doing(root, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", "a/b", "/etc", "a\0b"])
+@pytest.mark.guards("security")
 def test_a_name_is_one_part_of_a_path(root, name):
     for function in (durable.remove_tree, durable.remove_file, durable.refuse_links):
         with raises(CorruptError, code="invalid_stored_name"):
@@ -75,6 +77,7 @@ def test_what_is_missing_is_no_error(root):
     assert list(durable.files_below(root)) == ["a/b/c"]
 
 
+@pytest.mark.guards("security")
 def test_only_plain_files_are_opened(home, root):
     (root / "link").symlink_to(home / "photos" / "1.jpg")
     os.mkfifo(root / "pipe")
@@ -86,6 +89,7 @@ def test_only_plain_files_are_opened(home, root):
 
 
 @pytest.mark.parametrize(("kind", "name"), [("..", "0" * 32), ("scenes", ".."), ("staging", "0" * 32), ("scenes", "x")])
+@pytest.mark.guards("security")
 def test_a_group_has_a_kind_and_a_digest(tmp_path, kind, name):
     arrays = Arrays(tmp_path / "arrays")
     for call in (
@@ -177,6 +181,7 @@ def test_whom_the_user_trusts_is_the_users_own_file(tmp_path, monkeypatch):
             trust.trusted_urls()
 
 
+@pytest.mark.guards("security")
 def test_a_map_that_was_restored_to_another_database_leaves_the_first_one_trusted(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     trust.config_file().parent.mkdir()

@@ -115,6 +115,7 @@ def hostile_case(request: pytest.FixtureRequest) -> Case:
     return request.param
 
 
+@pytest.mark.guards("security")
 def test_nothing_outside_is_touched(
     hostile_case: Case,
     good_world: Path,

@@ -126,6 +126,7 @@ def test_one_photo_finds_nobody_and_neither_do_few_points() -> None:
     assert 5 not in _adjusted(clip.photos, only, PARAMS, POSES), "what repeats itself fools one"
 
 
+@pytest.mark.guards("answers")
 def test_a_photo_that_the_map_places_wrongly_takes_no_part() -> None:
     clip = Clip(range(8))
     wrong = moved(clip.truth[4], np.array([0, 0.5, 0, 0.8, 0, 0]))

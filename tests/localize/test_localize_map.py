@@ -258,6 +258,7 @@ def test_too_small_a_budget_is_refused_with_one_that_would_do(made, tmp_path) ->
 
 
 @pytest.mark.parametrize("what", ["bytes", "json", "version", "missing"])
+@pytest.mark.guards("data")
 def test_a_damaged_small_map_is_told(made, small, tmp_path, what) -> None:
     folder, lens, _ = made
     out = tmp_path / "small"

@@ -48,6 +48,7 @@ def test_photos_of_another_place_are_refused(world, elsewhere) -> None:
         assert one.T_map_camera is None
 
 
+@pytest.mark.guards("answers")
 def test_poses_are_in_the_unit_of_the_map(world) -> None:
     """A frame whose unit is half a metre has twice the numbers, and four times the variances."""
     metric, other = found(world, world.photos[0]), found(world, world.photos[0], metres=0.5)

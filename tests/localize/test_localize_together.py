@@ -226,6 +226,7 @@ def shots_of(*told: dict[str, float]) -> list[SimpleNamespace]:
     ]
 
 
+@pytest.mark.guards("answers")
 def test_frames_of_a_room_that_looks_alike_do_not_make_each_other_sure() -> None:
     """Each may be of the room or of one that looks like it, and all are of the same one: furniture that stands
     elsewhere in some of them tells against all."""

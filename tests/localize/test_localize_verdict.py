@@ -49,12 +49,14 @@ def probability(told: dict[str, float], **settings: float) -> float:
     return model().probability(told, params.prior, params.alike)
 
 
+@pytest.mark.guards("answers")
 def test_good_evidence_is_probable_and_bad_is_not() -> None:
     assert probability(GOOD) > 0.97
     assert probability(BAD) < 0.05
     assert 0 < probability(GOOD | {"colour": float("nan"), "matches": float("nan")}) < 1
 
 
+@pytest.mark.guards("answers")
 def test_a_room_that_looks_alike_is_as_improbable_as_it_is_rare() -> None:
     """Furniture that stands elsewhere tells against a place, the more the more rooms look alike; somebody in the
     picture, by far less."""
@@ -92,6 +94,7 @@ def test_every_piece_counts_in_one_direction(name: str, odds: str) -> None:
     assert (worth <= 1e-9).all() if falls else (worth >= -1e-9).all()
 
 
+@pytest.mark.guards("answers")
 def test_what_is_not_probable_is_refused_with_its_weakest_evidence() -> None:
     params = verdict.Params()
     assert verdict.judge(GOOD, 0.99, SURE, 0.0, params) == ""
@@ -100,6 +103,7 @@ def test_what_is_not_probable_is_refused_with_its_weakest_evidence() -> None:
     assert "explains 20%" in refused
 
 
+@pytest.mark.guards("answers")
 def test_a_twin_is_told_as_ambiguous() -> None:
     assert "ambiguous" in verdict.judge(GOOD, 0.99, SURE, 0.6, verdict.Params())
 
@@ -112,6 +116,7 @@ def test_a_pose_that_is_hardly_known_is_not_said() -> None:
     assert "3 patches" in verdict.judge(GOOD | {"inliers": np.log10(4)}, 0.99, SURE, 0.0, strict)
 
 
+@pytest.mark.guards("answers")
 def test_what_scenes_err_is_carried_to_the_camera() -> None:
     """The covariance of a camera fixed to a scene is that of random poses of the scene."""
     rng = np.random.default_rng(0)

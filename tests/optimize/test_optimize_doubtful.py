@@ -53,6 +53,7 @@ def components(answer):
     return sorted(found.values())
 
 
+@pytest.mark.guards("answers")
 def test_a_street_of_look_alikes_is_laid_out_as_it_is():
     street = Street()
     blind = [replace(e, disagreement=float("nan")) for e in street.right + street.wrong]
@@ -83,6 +84,7 @@ def test_look_alikes_that_contradict_each_other_tie_no_parts(gone, parts):
     assert all("look alike" in answer.outcomes[e.target, e.source].reason for e in between)
 
 
+@pytest.mark.guards("answers")
 def test_a_place_that_changed_is_tied_tentatively():
     """Two visits of one place: nothing but doubtful edges between them, and none contradicts another."""
     rng = np.random.default_rng(0)
@@ -136,6 +138,7 @@ def test_what_is_borne_out_confirms_unless_the_map_has_look_alikes(contradicted)
     assert triangle == ({"tentative"} if contradicted else {"used"})
 
 
+@pytest.mark.guards("answers")
 def test_a_confirmed_edge_is_in_no_doubt():
     street = Street(4, period=2)
     word = replace(street.right[1], disagreement=0.5, confirmed=True)
@@ -164,6 +167,7 @@ def test_where_doubt_begins_is_told_by_the_map():
     assert "not the same" not in optimize(street.ids, alone, params=QUICK).outcomes["s00", "s01"].reason
 
 
+@pytest.mark.guards("answers")
 def test_the_bar_divides_what_agrees_from_what_is_contradicted():
     rng = np.random.default_rng(0)
     low, high = (middle * np.exp(rng.normal(0, 0.2, 4000)) for middle in (0.05, 0.15))

@@ -25,6 +25,7 @@ def error_m(answer, ids, truth):
     return np.linalg.norm(found - truth.translations, axis=1)
 
 
+@pytest.mark.guards("answers")
 def test_an_anchor_sets_the_frame(world):
     ids, truth, edges = world
     anchor = Prior("s7", truth.item(7), np.r_[[1e-4] * 3, [1e-3] * 3, 1e-6])

@@ -30,6 +30,7 @@ def with_one_wrong(confirmed=False):
     return m, State.fresh(m, world.truth, np.ones(len(m), dtype=bool), nothing)
 
 
+@pytest.mark.guards("answers")
 def test_refining_lets_go_of_what_lies_beyond_the_gate():
     m, state = with_one_wrong()
     refine(m, state, GATE, 16.0)
@@ -39,6 +40,7 @@ def test_refining_lets_go_of_what_lies_beyond_the_gate():
     assert chi_squares(m, state.poses)[state.accepted].max() <= GATE
 
 
+@pytest.mark.guards("answers")
 def test_refining_keeps_what_is_confirmed():
     m, state = with_one_wrong(confirmed=True)
     refine(m, state, GATE, 16.0)
@@ -86,6 +88,7 @@ def test_when_components_join(agreeing, rival, sizes, confirmed, decision):
     assert decision in join_decision(join, m, np.array(sizes), Params())
 
 
+@pytest.mark.guards("answers")
 def test_the_same_pair_of_scenes_counts_once_towards_a_bridge():
     ids = [f"s{k}" for k in range(12)]
     pose = Sim3.identity()

@@ -71,6 +71,7 @@ def test_two_captures_of_one_wall_agree():
     assert found.num_seen > 2000
 
 
+@pytest.mark.guards("answers")
 def test_what_stands_in_front_contradicts_and_what_lies_behind_does_not():
     bare, screened = _wall(3.0), Gaussians.concatenate([_wall(3.0), _wall(1.5, width=0.8, height=2.0)])
     # To the cameras of the bare wall the screen stands in the way; to the others the wall behind it is hidden.
@@ -230,6 +231,7 @@ _SIGMAS = (0.003, 0.011, 1e-6)
         ({"num_coinciding": 100}, _SURE, False),
     ],
 )
+@pytest.mark.guards("answers")
 def test_verdict(change, proposal, accepted):
     reason = verdict.decide(proposal, replace(_GOOD, **change), _SIGMAS)
     assert (reason == "") == accepted
@@ -267,6 +269,7 @@ def test_the_direction_that_is_violated_says_of_how_many_gaussians():
     assert whole.num_judged > 0
 
 
+@pytest.mark.guards("answers")
 def test_verdict_refuses_what_is_known_too_loosely():
     assert "fixes the pose only" in verdict.decide(_SURE, _GOOD, (0.05, 0.011, 1e-6))
     assert "too little surface" in verdict.decide(_SURE, _GOOD, None)

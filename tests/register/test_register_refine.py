@@ -475,6 +475,7 @@ def test_what_a_known_scale_reveals_of_the_sensors_widens_the_pose(world, surfac
     assert np.allclose(hidden[1][3:6, 3:6], hidden[0][3:6, 3:6] / 16)
 
 
+@pytest.mark.guards("answers")
 def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     """Refined under a scale that is 0.3 percent wrong, a pose moves as its covariance says of that much scale."""
     target, source = surfaces

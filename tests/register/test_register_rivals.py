@@ -17,6 +17,7 @@ def _close(found, true) -> bool:
     return bool(error.rre_deg < 2 and error.centroid_m < 0.3)
 
 
+@pytest.mark.guards("answers")
 def test_a_smaller_set_that_moved_on_its_own_is_the_runner_up():
     world, S_second = two_pose_world(first=40, second=30)
     target, source = world.graphs()
@@ -90,6 +91,7 @@ def symmetric():
     return splat_world(3, symmetric=True, cut_m=(6.5, -0.5), points=20_000, policy="known")
 
 
+@pytest.mark.guards("answers")
 def test_a_room_that_looks_the_same_after_half_a_turn_is_ambiguous(symmetric):
     found = register_pair(symmetric.target, symmetric.source, Params(fallback="never"))
     assert found.status == "no_match"

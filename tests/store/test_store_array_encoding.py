@@ -36,6 +36,7 @@ RNG = np.random.default_rng(0)
         (np.array([7], np.uint8), "u1"),
     ],
 )
+@pytest.mark.guards("data")
 def test_every_value_comes_back_to_the_bit(values, kept):
     stored, how = encode_array(values)
     assert how["as"] == kept
@@ -96,6 +97,7 @@ def bits(graph):
 
 
 @pytest.mark.parametrize("round_it", [False, True])
+@pytest.mark.guards("data")
 def test_a_graph_comes_back_to_the_bit(round_it):
     made = round_graph(graph()) if round_it else graph()
     arrays, about = to_arrays(made)

@@ -94,6 +94,7 @@ def test_only_what_is_new_is_sent(filled, place):
     assert third.snapshot.num_bytes_new < third.snapshot.num_bytes
 
 
+@pytest.mark.guards("data")
 def test_a_damaged_map_is_not_backed_up(filled, place):
     broken = array_of(filled, "b")
     flip(broken)
@@ -287,6 +288,7 @@ def test_a_backup_that_is_interrupted_goes_on(filled, tmp_path):
     assert list((place.root / "leases").iterdir()) == []
 
 
+@pytest.mark.guards("data")
 def test_verify_mends_what_the_map_has_and_tells_the_rest(filled, place, tmp_path):
     filled.scenes.add(make_gaussians(seed=7), make_cameras(), name="old")
     gone = array_of(filled, "old")
@@ -313,6 +315,7 @@ def test_verify_mends_what_the_map_has_and_tells_the_rest(filled, place, tmp_pat
     assert [sha in problem for problem in save(filled, place, verify=True).problems] == [True]
 
 
+@pytest.mark.guards("data")
 def test_keep_deletes_old_snapshots_and_what_only_they_needed(filled, place, tmp_path):
     filled.scenes.add(make_gaussians(seed=7), make_cameras(), name="old")
     old = saving_module.hashlib.sha256(array_of(filled, "old").read_bytes()).hexdigest()
@@ -361,6 +364,7 @@ def test_a_snapshot_that_another_dates_later_meanwhile_does_not_end_the_one_just
     assert Backup.at(place).names() == [made.name, name]
 
 
+@pytest.mark.guards("data")
 def test_keep_deletes_nothing_when_a_snapshot_cannot_be_read(filled, place):
     save(filled, place)
     second = save(filled, place).snapshot

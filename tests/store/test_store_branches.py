@@ -128,6 +128,7 @@ def test_links_are_no_branches(store, tmp_path):
         Store.open(at(store, "b"))
 
 
+@pytest.mark.guards("data")
 def test_prune_keeps_what_any_branch_names(store):
     kept, gone = add(store, 0), add(store, 1)
     store.graphs.save(SceneGraph(kept), key("describe", kept))

@@ -161,12 +161,14 @@ def test_damage_is_found_and_mended(store, ids):
     np.testing.assert_array_equal(store.changes.load(kept.number).changes[0].voxels, found.voxels)
 
 
+@pytest.mark.guards("data")
 def test_rows_of_gaussians_that_a_scene_lacks_are_refused(store, ids):
     kept = save_comparison(store, *ids, made_change(CHAIR, after=np.array([500], np.int32)))
     with raises(CorruptError, code="catalog_invalid"):
         store.changes.load(kept.number)
 
 
+@pytest.mark.guards("data")
 def test_prune_takes_what_was_superseded_and_what_lost_a_scene(store, ids):
     first = save_comparison(store, *ids, made_change(CHAIR))
     (old,) = groups(store)

@@ -25,6 +25,7 @@ def sorted_gaussians(n=500, degree=1, seed=0) -> Gaussians:
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("n", [1, 700, CHUNK_ROWS + 9])
+@pytest.mark.guards("data")
 def test_compact_gaussians_differ_by_less_than_a_step(n, degree):
     g = sorted_gaussians(n, degree)
     back = compact.round_trip(g)

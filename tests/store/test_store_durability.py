@@ -92,6 +92,7 @@ def recorder(store, monkeypatch):
     return Recorder(monkeypatch, store)
 
 
+@pytest.mark.guards("data")
 def test_a_scene_is_on_the_disk_before_its_row(store, recorder):
     scene, _ = store.scenes.add(make_gaussians(), make_cameras(), name="a")
     check_published(recorder, store.folder / "arrays" / "scenes" / scene.id)
@@ -99,6 +100,7 @@ def test_a_scene_is_on_the_disk_before_its_row(store, recorder):
     assert not is_locked(store.folder / "lock")
 
 
+@pytest.mark.guards("data")
 def test_a_graph_is_on_the_disk_before_its_row(store, recorder):
     scene, _ = store.scenes.add(make_gaussians(), make_cameras(), name="a")
     recorder.events.clear()
@@ -116,6 +118,7 @@ def test_a_model_is_on_the_disk_before_its_row(store, recorder, tmp_path):
     assert renamed < recorder.index("fsync", model.path.parent) < recorder.index("commit")
 
 
+@pytest.mark.guards("data")
 def test_a_new_map_appears_whole(tmp_path, monkeypatch, store):
     recorder = Recorder(monkeypatch, store)
     Store.create(tmp_path / "new").close()
@@ -141,6 +144,7 @@ def test_writing_holds_the_lock_and_reading_does_not(store):
     assert not is_locked(lock)
 
 
+@pytest.mark.guards("data")
 def test_the_log_is_folded_in_under_the_lock(store, monkeypatch):
     """In SQLite before 3.51.3 a commit at the same time could corrupt the file."""
     real, held = sqlite.checkpoint, []
@@ -156,6 +160,7 @@ def test_the_log_is_folded_in_under_the_lock(store, monkeypatch):
     assert held == [True, True, True]  # two transactions and a closing
 
 
+@pytest.mark.guards("data")
 def test_what_is_being_staged_is_not_swept_away(store):
     others = Arrays(store.arrays.root)
     with store.arrays.stage({"a": np.zeros(3)}, "scenes", "0" * 32) as staged:

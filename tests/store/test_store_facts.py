@@ -41,7 +41,7 @@ def test_edit_and_its_history(store, two_scenes):
     with Store.open(store.folder, "r") as reader:
         assert [(s.name, s.tags) for s in reader.scenes.list()] == [("kitchen", ("day", "winter")), ("scene1", ())]
         assert reader.scenes.get(scene.id).tags == ("day", "winter")
-        with raises(StoreError, code="catalog_refused"):
+        with raises(StoreError, code="not_writable"):
             reader.scenes.edit("kitchen", name="x")
 
 

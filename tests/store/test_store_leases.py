@@ -127,6 +127,7 @@ def test_a_lease_longer_than_any_is_none(store: Store) -> None:
     assert store.leases.try_hold("poses", "update")
 
 
+@pytest.mark.guards("data")
 def test_all_that_a_process_holds_is_renewed_while_it_holds_it(store: Store) -> None:
     mine = Leases(store.catalog, lease_s=1.0, heartbeat_s=0.2)
     assert mine.take(["a", "b", "c"], "update").ours == ("a", "b", "c")
@@ -143,6 +144,7 @@ def test_all_that_a_process_holds_is_renewed_while_it_holds_it(store: Store) -> 
     assert "gsmap-leases" not in [t.name for t in threading.enumerate()]
 
 
+@pytest.mark.guards("data")
 def test_what_was_lost_is_not_taken_back(store: Store) -> None:
     """A machine slept, another one took over: neither a heartbeat nor giving back touches the other's lease."""
     mine = Leases(store.catalog, lease_s=1.0, heartbeat_s=0.1)
@@ -220,6 +222,7 @@ def compete(openers: Sequence[Callable[[], Store]]) -> None:
     assert sorted(won, key=int) == [str(i) for i in range(12)]
 
 
+@pytest.mark.guards("data")
 def test_of_many_one_gets_each(store: Store) -> None:
     compete([lambda: Store.open(store.folder)] * 4)
 

@@ -131,6 +131,7 @@ def test_again_it_adds_nothing(store, other):
     assert {s.name for s in other.scenes.list()} == {"scene1", "scene2", "scene1-2"}
 
 
+@pytest.mark.guards("data")
 def test_arrays_are_linked_and_their_bytes_compared(store, other):
     scene = add(other, 1)
     victim = next(p for p in (other.home / "arrays/scenes" / scene).rglob("*.zip") if p.is_file())
@@ -226,6 +227,7 @@ def test_what_people_said_of_a_pair_holds_in_the_order_of_time(store, other):
     assert store.registrations.get(b, a).number == max(r.number for r in store.registrations.history(a, b))
 
 
+@pytest.mark.guards("data")
 def test_life_and_death_by_the_later_word(store, other):
     a, b, c = (add(store, i) for i in (1, 2, 3))
     store.scenes.remove(a)
@@ -264,6 +266,7 @@ def test_scenes_in_both_tie_the_frames(store, other):
     np.testing.assert_allclose(poses[b].S_map_scene.translation, [3, 0, 0], atol=1e-12)
 
 
+@pytest.mark.guards("data")
 def test_where_they_disagree_the_other_stays_apart(store, other):
     a, b = add(store, 1), add(store, 2)
     for i in (1, 2, 4):

@@ -90,6 +90,7 @@ def test_graph_round_trip(store, two_scenes):
             np.testing.assert_array_equal(a, b, part.name)
 
 
+@pytest.mark.guards("data")
 def test_a_damaged_graph_is_mended_by_saving_it_again(store, two_scenes):
     scene, made = two_scenes[0].id, key("describe", two_scenes[0].id)
     graph = SceneGraph(scene, {"objects": layer()})
@@ -294,6 +295,7 @@ def current(store, a: str, b: str) -> tuple[int, str | None] | None:
     return None if found is None else (found.number, found.review)
 
 
+@pytest.mark.guards("data")
 def test_a_measurement_stands_until_it_is_withdrawn(store, two_scenes):
     a, b = (s.id for s in two_scenes)
     save, review = store.registrations.save, store.registrations.review
@@ -332,6 +334,7 @@ def test_the_newest_word_of_a_person_counts(store, two_scenes):
         assert current(store, a, b) == (computed, word)
 
 
+@pytest.mark.guards("data")
 def test_a_measurement_alone(store, two_scenes):
     a, b = (s.id for s in two_scenes)
     mine = store.registrations.save(measured(a, b)).number

@@ -1,5 +1,6 @@
 import shutil
 
+import pytest
 import store_older
 from raising import raises
 
@@ -8,6 +9,7 @@ from gsmap.errors import SchemaVersionError
 from gsmap.store import Store, migrate, schema, sqlite
 
 
+@pytest.mark.guards("data")
 def test_a_map_of_schema_0001(tmp_path):
     path = store_older.unpack(tmp_path)
     with raises(SchemaVersionError, code="map_too_old"):
@@ -20,6 +22,7 @@ def test_a_map_of_schema_0001(tmp_path):
         store_older.use(store)
 
 
+@pytest.mark.guards("data")
 def test_its_backup_is_the_older_map(tmp_path):
     path = store_older.unpack(tmp_path)
     Store.migrate(path)
@@ -31,6 +34,7 @@ def test_its_backup_is_the_older_map(tmp_path):
         store_older.check_all(store)
 
 
+@pytest.mark.guards("data")
 def test_down_and_up_again_loses_nothing_that_schema_0001_knew(tmp_path):
     path = store_older.unpack(tmp_path)
     Store.migrate(path)

@@ -82,7 +82,7 @@ def test_reading_store_refuses_to_write(store, two_scenes):
             lambda: reader.scenes.remove("scene0"),
             lambda: reader.prune(),
         ):
-            with raises(StoreError, code="catalog_refused"):
+            with raises(StoreError, code="not_writable"):
                 change()
     assert {p: p.read_bytes() for p in store.folder.rglob("*") if p.is_file() and "sqlite-" not in p.name} == before
 

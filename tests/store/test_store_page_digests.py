@@ -25,6 +25,7 @@ def test_every_flip_is_found(closed, count):
     assert check_flips.checks(closed)
 
 
+@pytest.mark.guards("data")
 def test_a_flip_in_each_page_and_in_its_digest_is_named(closed):
     file = closed / sqlite.FILE
     noted = page_digests.load(file)
@@ -55,6 +56,7 @@ def test_a_longer_and_a_shorter_file_are_found(closed):
     Store.open(closed, "r").close()
 
 
+@pytest.mark.guards("data")
 def test_damage_that_comes_while_a_map_is_open_is_not_blessed(closed):
     """The next fold looks first: what was written stays in the log, and the damage stays to be seen."""
     store = Store.open(closed)
@@ -107,6 +109,7 @@ def stages_of_a_fold(path: Path, copies: Path, monkeypatch) -> list[Path]:
     return out
 
 
+@pytest.mark.guards("data")
 def test_killed_anywhere_in_a_fold(closed, tmp_path, monkeypatch):
     stages = stages_of_a_fold(closed, tmp_path / "stages", monkeypatch)
     before, under_way, after = (stages[i] / sqlite.FILE for i in (1, 1, 2))
@@ -185,6 +188,7 @@ def test_a_page_that_was_folded_in_is_verified_without_the_log(closed, tmp_path,
         flip(stage / sqlite.FILE, number * PAGE - 9)
 
 
+@pytest.mark.guards("data")
 def test_a_reader_that_keeps_the_log_from_being_folded_in(closed, monkeypatch):
     monkeypatch.setattr(sqlite, "_READERS_S", 0.05)
     file = closed / sqlite.FILE
@@ -225,6 +229,7 @@ def test_many_open_it_while_others_fold(tmp_path, start, context):
         assert store.check().problems == ()
 
 
+@pytest.mark.guards("data")
 def test_reading_the_file_drops_no_lock_of_sqlite(tmp_path, start):
     """Closing a handle on a file drops the process's locks on it; then another one that closes the map would take
     itself for the last, remove the log, and what this one writes from then on would be lost."""
@@ -248,6 +253,7 @@ def test_reading_the_file_drops_no_lock_of_sqlite(tmp_path, start):
     assert seen == [names[:1], names[:2], names[:3], names]
 
 
+@pytest.mark.guards("data")
 def test_handles_are_shared_and_closed_with_the_last(tmp_path):
     (tmp_path / "a").write_bytes(b"x")
     one, two = FileHandle(tmp_path / "a"), FileHandle(tmp_path / "a")

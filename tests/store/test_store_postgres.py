@@ -83,6 +83,7 @@ def test_the_password_stays_out_of_the_map(tmp_path, guarded_database, monkeypat
         assert store.id == made
 
 
+@pytest.mark.guards("security")
 def test_a_remembered_server_is_connected_to_only_once_it_is_trusted(tmp_path, postgres_database, monkeypatch):
     folder = tmp_path / "m"
     with Store.create(folder, catalog_url=postgres_database) as store:

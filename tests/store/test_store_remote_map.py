@@ -169,6 +169,7 @@ def test_prune_and_purge_reclaim_objects(home, tmp_path):
     assert home.check().ok
 
 
+@pytest.mark.guards("data")
 def test_a_group_that_a_prune_took_for_an_orphan_is_sent_again(home, monkeypatch):
     """Between sending and naming nobody knows of it."""
     from gsmap.store import scenes

@@ -71,6 +71,7 @@ def test_nothing_that_exists_is_overwritten(site, place, tmp_path):
     assert holdings(tmp_path / "empty") == before == holdings(site)
 
 
+@pytest.mark.guards("security")
 def test_nobody_is_at_work_on_a_restored_map(site, place, tmp_path):
     lease = "INSERT INTO leases VALUES ('map', 't', 'h', '1', 'update', '2026-01-01', '2999-01-01')"
     with Store.open(site) as store:
@@ -83,6 +84,7 @@ def test_nobody_is_at_work_on_a_restored_map(site, place, tmp_path):
 
 
 @pytest.mark.parametrize("harm", ["flip", "cut", "grow", "lose", "link"])
+@pytest.mark.guards("data")
 def test_a_damaged_object_is_never_restored(site, place, tmp_path, harm):
     with Store.open(site) as store:
         made = save(store, place).snapshot
@@ -134,6 +136,7 @@ HOSTILE_PATHS = [
 
 
 @pytest.mark.parametrize("path", HOSTILE_PATHS)
+@pytest.mark.guards("security")
 def test_a_path_outside_the_map_is_refused(site, place, tmp_path, path):
     with Store.open(site, "r") as store:
         map_id = store.id
@@ -172,6 +175,7 @@ def test_lists_that_are_none(site, place, tmp_path):
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.guards("data")
 def test_snapshots_that_say_what_is_not_so(site, place, tmp_path):
     with Store.open(site, "r") as store:
         map_id = store.id
@@ -214,6 +218,7 @@ def test_a_newer_format_is_refused(site, place, tmp_path):
         restore(place, tmp_path / "r")
 
 
+@pytest.mark.guards("security")
 def test_links_in_a_backup_are_not_followed(site, place, tmp_path):
     with Store.open(site) as store:
         save(store, place)
@@ -269,6 +274,7 @@ def test_an_older_schema_into_postgres(tmp_path, place, postgres_database):
         check_all(store)
 
 
+@pytest.mark.guards("data")
 def test_a_database_is_empty_again_where_the_map_did_not_come_to_be(
     site, place, tmp_path, postgres_database, monkeypatch
 ):
@@ -289,6 +295,7 @@ def test_a_database_is_empty_again_where_the_map_did_not_come_to_be(
     assert holdings(tmp_path / "r") == holdings(site)
 
 
+@pytest.mark.guards("data")
 def test_a_clone_is_another_map(site, tmp_path):
     with Store.open(site) as store:
         before = holdings(site)

@@ -77,6 +77,7 @@ def count(store, table):
         return connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar()
 
 
+@pytest.mark.guards("data")
 def test_every_revision_is_read_as_it_was_saved(store):
     made = list(histories(store, np.random.default_rng(0)))
     for graph in made:
@@ -272,6 +273,7 @@ def test_registrations_are_kept_together_as_one_by_one(store):
     store.registrations.save_all([])
 
 
+@pytest.mark.guards("data")
 def test_a_revision_made_from_the_newest_writes_the_rows_of_one_that_is_compared(tmp_path, store):
     """What is the very same object in both answers need not be looked at; unless another was saved meanwhile."""
     rows = []

@@ -56,6 +56,7 @@ def test_reports_read_inside_one(store, report, monkeypatch):
 
 
 @pytest.mark.parametrize("read", ["gaussians", "cameras"])
+@pytest.mark.guards("data")
 def test_arrays_that_are_pruned_while_they_are_read_are_not_called_damaged(store, monkeypatch, read):
     add(store, 1)
     prune_when_read(store, monkeypatch)
@@ -63,6 +64,7 @@ def test_arrays_that_are_pruned_while_they_are_read_are_not_called_damaged(store
         getattr(store.scenes, read)("scene1")
 
 
+@pytest.mark.guards("data")
 def test_a_graph_that_is_pruned_while_it_is_read_is_not_called_damaged(store, monkeypatch):
     scene = add(store, 1).id
     store.graphs.save(SceneGraph(scene), key("describe", scene))
@@ -71,6 +73,7 @@ def test_a_graph_that_is_pruned_while_it_is_read_is_not_called_damaged(store, mo
         store.graphs.load(scene)
 
 
+@pytest.mark.guards("data")
 def test_a_comparison_that_is_pruned_while_it_is_read_is_not_called_damaged(store, monkeypatch):
     older, newer = (add(store, seed).id for seed in (1, 2))
     kept = save_comparison(store, older, newer, made_change(np.array([[0.0, 0, 0], [1, 1, 1]])))

@@ -27,6 +27,7 @@ def killed(tmp_path):
 
 
 @pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.guards("data")
 def test_a_flip_in_the_log_is_found(killed, count):
     log = wal_path(killed / sqlite.FILE)
     rng = random.Random(1)
