@@ -1,0 +1,129 @@
+"""Which of several evaluated poses is the result, and what status it has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsmap.register import pose_selection
+from gsmap.register.evidence import PoseEvidence
+from gsmap.register.params import Params
+from gsmap.register.pose_selection import EvaluatedPose, is_same_pose, select_pose
+from gsmap.types import Sim3
+from gsmap.types.registration import Proposal
+
+SURE = PoseEvidence(
+    overlap=0.6,
+    free_space_violation=0.0,
+    num_seen=5000,
+    num_judged=5000,
+    num_coinciding=5000,
+    colour_correlation=0.9,
+    colour_t=40.0,
+    disagreement=0.0,
+    seen_m2=30.0,
+)
+COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 6e-6, 7e-6])
+SCENE = SimpleNamespace(id="a", centre=np.array([1.0, 0, 0]), graph=SimpleNamespace(unit_m=1.0, layers={}))
+
+
+@pytest.fixture(autouse=True)
+def metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_selection, "own_working_m", lambda view: view.graph.unit_m)
+    monkeypatch.setattr(pose_selection, "num_nodes", lambda target, source: 7)
+
+
+def shifted(metres: float) -> Sim3:
+    return Sim3(np.eye(3), np.array([metres, 0, 0]), 1.0)
+
+
+def evaluated(S: Sim3, flaw: str = "", log_nfa: float = -60.0, evidence: PoseEvidence = SURE) -> EvaluatedPose:
+    proposal = Proposal("graph:landmarks", S, False, 80, 100, log_nfa=log_nfa, runner_up=0.0)
+    return EvaluatedPose(proposal, evidence, COVARIANCE, flaw)
+
+
+def select(*poses: EvaluatedPose):
+    return select_pose(SCENE, SimpleNamespace(**vars(SCENE) | {"id": "b"}), poses, Params(), seconds={})
+
+
+@pytest.mark.guards("answers")
+@pytest.mark.parametrize(
+    ("other", "same"),
+    [
+        (Sim3.identity(), True),
+        (shifted(0.29), True),
+        (shifted(0.31), False),
+        (shifted(-0.31), False),
+        (Sim3(np.eye(3), np.array([-0.019, 0, 0]), 1.019), True),
+        (Sim3(np.eye(3), np.array([-0.021, 0, 0]), 1.021), False),
+        (Sim3(np.eye(3), np.array([0.021, 0, 0]), 1 / 1.021), False),
+        (Sim3(Rotation.from_rotvec(np.radians([2.9, 0, 0])).as_matrix(), np.zeros(3), 1.0), True),
+        (Sim3(Rotation.from_rotvec(np.radians([3.1, 0, 0])).as_matrix(), np.zeros(3), 1.0), False),
+    ],
+)
+def test_poses_are_the_same_only_where_turn_shift_and_scale_are(other: Sim3, same: bool) -> None:
+    assert is_same_pose(Sim3.identity(), other, SCENE.centre, 1.0) is same
+    assert is_same_pose(other, Sim3.identity(), SCENE.centre, 1.0) is same
+
+
+@pytest.mark.guards("answers")
+def test_the_shift_is_that_of_the_centre_in_metres() -> None:
+    assert is_same_pose(Sim3.identity(), shifted(0.5), np.zeros(3), 0.5)
+    assert not is_same_pose(Sim3.identity(), shifted(0.2), np.zeros(3), 2.0)
+    turned = Sim3(Rotation.from_rotvec(np.radians([0, 0, 2.0])).as_matrix(), np.zeros(3), 1.0)
+    assert is_same_pose(Sim3.identity(), turned, np.array([5.0, 0, 0]), 1.0)
+    assert not is_same_pose(Sim3.identity(), turned, np.array([50.0, 0, 0]), 1.0)
+
+
+@pytest.mark.guards("answers")
+def test_without_a_pose_there_is_no_match() -> None:
+    found = select()
+    assert (found.status, found.reason_code) == ("no_match", "no_pose_proposed")
+    assert found.S_target_source is None
+    assert found.information is None
+
+
+@pytest.mark.guards("answers")
+def test_an_accepted_pose_has_its_information() -> None:
+    found = select(evaluated(shifted(1.0)))
+    assert (found.status, found.reason) == ("accepted", "")
+    np.testing.assert_array_equal(found.S_target_source.matrix(), shifted(1.0).matrix())
+    np.testing.assert_allclose(found.information @ COVARIANCE, np.eye(7), atol=1e-9)
+    np.testing.assert_array_equal(found.information, found.information.T)
+
+
+@pytest.mark.guards("answers")
+def test_an_accepted_pose_counts_before_a_rejected_one() -> None:
+    weak = replace(SURE, num_coinciding=20, colour_correlation=0.0)
+    rejected = evaluated(shifted(9.0), flaw="too little surface coincides", log_nfa=-200.0, evidence=weak)
+    found = select(rejected, evaluated(shifted(1.0)))
+    assert found.status == "accepted"
+    assert found.S_target_source.translation[0] == 1.0
+
+
+@pytest.mark.guards("answers")
+def test_two_accepted_poses_apart_are_ambiguous_and_have_no_pose() -> None:
+    found = select(evaluated(shifted(1.0)), evaluated(shifted(5.0)))
+    assert (found.status, found.reason_code) == ("no_match", "ambiguous")
+    assert found.S_target_source is None
+    assert found.information is None
+    assert found.evidence["probability"] < 0.9
+
+
+@pytest.mark.guards("answers")
+def test_two_accepted_poses_that_are_one_are_accepted() -> None:
+    assert select(evaluated(shifted(1.0)), evaluated(shifted(1.1))).status == "accepted"
+
+
+@pytest.mark.guards("answers")
+@pytest.mark.parametrize(("log_nfa", "status"), [(-60.0, "rejected"), (-1.0, "no_match")])
+def test_a_rejected_pose_is_shown_only_where_chance_does_not_explain_it(log_nfa: float, status: str) -> None:
+    found = select(evaluated(shifted(1.0), flaw="free-space violation 40%, allowed 18%", log_nfa=log_nfa))
+    assert found.status == status
+    assert (found.S_target_source is not None) == (status == "rejected")
+    assert found.information is None
+    assert found.reason_code == {"rejected": "free_space_violation", "no_match": "not_significant"}[status]
