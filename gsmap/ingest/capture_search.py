@@ -15,7 +15,7 @@ from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import colmap, scans
 
 MAX_DEPTH = 5
-# What a trainer calls every one of its files, so the folder tells more.
+# Generic file names of trainers; the folder has a better name.
 _GENERIC = re.compile(
     r"(point_cloud|splat|scene|gaussians|model|output|export|meta|ckpt|step|chkpnt)([_-]?\d+)?(_rank\d+)?",
     re.IGNORECASE,

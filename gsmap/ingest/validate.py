@@ -79,7 +79,7 @@ def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) ->
     """Validate the cameras of valid Gaussians."""
     if not len(cameras):
         raise InputError(
-            f"{where} has an empty list of cameras: leave them out, and gsmap makes some", code="no_cameras"
+            f"{where} has an empty list of cameras: omit it, and gsmap synthesizes cameras", code="no_cameras"
         )
     large = cameras.sizes_px.max(1) > MAX_SIDE_PX
     if large.any():

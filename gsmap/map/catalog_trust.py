@@ -40,7 +40,7 @@ def trust(path: str | os.PathLike[str]) -> TrustReport:
     folder = _folder(path)
     found = _remembered(folder)
     map_id = found.map_id
-    if map_id is None:  # an older gsmap made it: the database knows
+    if map_id is None:  # made by an older gsmap: read the id from the database
         map_id = Store.id_at(path, found.url)
         trusting.write(folder, found.url, map_id)
     trusting.trust(map_id, found.url)
@@ -61,7 +61,7 @@ def _remembered(folder: Path) -> trusting.CatalogAddress:
         raise NotFoundError(f"no map at {display_name(folder)}", code="map_not_found")
     if not (folder / trusting.URL_FILE).exists():
         raise ConfigError(
-            f"{folder} keeps its catalog in its own folder, if it is a map: there is nothing to trust",
+            f"{folder} has no catalog.url: its catalog is in the folder, and there is nothing to trust",
             code="nothing_to_trust",
         )
     return trusting.read_address(folder)

@@ -44,7 +44,7 @@ def parse_change_id(text: str) -> int:
     number = change_number(text)
     if number is None:
         raise NotFoundError(
-            f"no change is called {text!r}: they are called c1, c2, ... (gsmap changes MAP)", code="change_not_found"
+            f"no change {text!r}: change ids are c1, c2, ... (gsmap changes MAP)", code="change_not_found"
         )
     return number
 
@@ -59,13 +59,13 @@ def filter_by_date(
         ConfigError: a date that is none, two ways of saying since when, or an end before its beginning.
     """
     if since is not None and between is not None:
-        raise ConfigError("say since when, or between which dates: not both", code="conflicting_options")
+        raise ConfigError("give --since or --between, not both", code="conflicting_options")
     first = between[0] if between is not None else since
     start = None if first is None else parse_moment(first)
     ends = [end_of_date(text) for text in (between[1] if between is not None else None, as_of) if text is not None]
     if start is not None and any(end < start for end in ends):
         raise ConfigError(
-            f"no date lies after {first} and before a date that is earlier: give the earlier one first",
+            f"the period ends before it begins ({first}): give the earlier date first",
             code="date_out_of_range",
         )
 
@@ -111,7 +111,7 @@ def changes_report(
     )
 
 
-_WRITE = "gsmap changes does where the map can be written"
+_WRITE = "run gsmap changes with write access to the map"
 
 
 @snapshot_read
@@ -132,7 +132,7 @@ def change_arrays(store: Store, number: int) -> Change:
     graph = store.revisions.get()
     if graph is None or comparison.newer not in graph.poses:
         raise NotFoundError(
-            f"c{number} has no place now: its newer capture has none (gsmap update)", code="change_unplaced"
+            f"c{number} has no position: its newer capture has no pose; run gsmap update", code="change_unplaced"
         )
     S = graph.poses[comparison.newer].S_map_scene @ comparison.S_frame_newer.inverse()
     found = store.changes.load(comparison.number).changes[change.place]

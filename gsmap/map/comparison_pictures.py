@@ -55,7 +55,7 @@ class PictureFolder:
         if not os.path.lexists(path):
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
                 raise ConfigError(
-                    f"{folder} holds other things: give an empty or a new folder for pictures", code="folder_not_empty"
+                    f"{folder} holds other files: give an empty or a new folder for images", code="folder_not_empty"
                 )
             return cls(map_id)
         try:
@@ -276,7 +276,7 @@ def _placed(store: Store, scene: str, S: Sim3) -> PosedScene:
 def _note(store: Store, folder: Path) -> None:
     """Record the folder in the catalog, as exports are."""
     if (refused := note_target(store, folder, {"pictures": True})) is not None:
-        _log.warning("%s: the map does not know of these pictures, so a purge will not find them", refused)
+        _log.warning("%s: the folder is not recorded in the map, so a purge will not find these images", refused)
 
 
 def note_target(store: Store, path: Path, settings: Mapping[str, Any]) -> str | None:

@@ -9,7 +9,7 @@ from gsmap.errors import ConfigError
 from gsmap.types import Scene
 
 _DAY = len("2024-05-31")
-NO_DATE = "gsmap edit MAP SCENE --captured-at DATE tells"
+NO_DATE = "set it with gsmap edit MAP SCENE --captured-at DATE"
 
 
 def parse_moment(text: str) -> datetime:

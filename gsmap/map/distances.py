@@ -64,7 +64,7 @@ def measure(
     frame = next((tie.frame for tie in graph.world if tie.S_world_map is not None), None)
     notes = []
     if any(one.scene is None for one in said):
-        notes.append("points given in the map or the world count as exact: sigma is of the map alone")
+        notes.append("points of the map or world are taken as exact: sigma covers the map only")
     one, two = placed
     in_world = any(end.place.crs is not None for end in placed)
     if one.component is not None and one.component == two.component and not in_world:
@@ -74,7 +74,9 @@ def measure(
         variance = _pose_variance(solved, placed) * metres**2 + (span * metres * sigma_log) ** 2
         distance = span * metres
         if known_by in ("assumed", "guessed", "unknown"):
-            notes.append(f"its metre is {known_by}: gsmap georeference MAP --scale-bar A B METRES measures it")
+            notes.append(
+                f"the metric scale is {known_by}: measure it with gsmap georeference MAP --scale-bar A B METRES"
+            )
     elif one.metric is not None and two.metric is not None:
         distance, known_by = _apart(one.metric, two.metric), "world"
         variance = _world_variance(solved, placed)

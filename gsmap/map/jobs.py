@@ -31,7 +31,7 @@ from gsmap.types.localization import SceneFeatures
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress
 
-# A job imports its room when it runs: who only names what is missing does without.
+# A job imports its room when it runs, since listing missing results does not need it.
 if TYPE_CHECKING:
     from gsmap import change as changing
     from gsmap import describe as describing
@@ -172,7 +172,7 @@ def _picture(path: str, number: int) -> np.ndarray:
             return np.asarray(picture.convert("RGB"))
     except InputError as error:
         raise CorruptError(
-            f"what the map keeps of photo p{number} is no picture ({error}): take it back (gsmap remove MAP p{number} "
+            f"the stored image of photo p{number} is damaged ({error}): remove it (gsmap remove MAP p{number} "
             "--photo) and add it again",
             code="photo_damaged",
         ) from error

@@ -256,7 +256,7 @@ class Map(AbstractContextManager["Map"]):
             found, _ = readers(captures, **options)
             if len(found) != 1:
                 raise ConfigError(
-                    f"one capture takes the place of {supersedes}, {len(found)} were found: name one",
+                    f"--supersedes takes one capture, {len(found)} were found: name one",
                     code="many_captures",
                 )
             with announce_work(self.store, "ingest"):
@@ -350,7 +350,7 @@ class Map(AbstractContextManager["Map"]):
 
         if captured_at is not None and not captures:
             raise ConfigError(
-                "captured-at is of captures: name their files, or correct a scene with gsmap edit",
+                "--captured-at needs captures: name their files, or correct a scene with gsmap edit",
                 code="option_not_applicable",
             )
         before = reports.history_position(self.store)
@@ -411,7 +411,7 @@ class Map(AbstractContextManager["Map"]):
 
         Raises:
             NotFoundError: the map has no poses yet, or no such scene.
-            InputError: of the two captures that are named, nobody knows which is newer.
+            InputError: the dates do not order the two given captures.
         """
         from gsmap.map.changes import changes_report, filter_by_date
         from gsmap.map.stages.change import compare, plan_comparisons
@@ -910,7 +910,7 @@ class Map(AbstractContextManager["Map"]):
 
         if images is None and (tiles is not None or lpips is not None):
             raise ConfigError(
-                "tiles and LPIPS are of photographs: give the folder of images, too", code="missing_option"
+                "--tiles and --lpips compare with photos: give the folder of images, too", code="missing_option"
             )
         params = self.settings.evaluate
         if max_rre_deg is not None:
@@ -1016,7 +1016,7 @@ class Map(AbstractContextManager["Map"]):
         a, b = self._pair(pair)
         if (picture := picture_of_pair(self.store, a.id, b.id)) is None:
             raise NotFoundError(
-                f"{a.name}:{b.name} has no pose to draw both captures in: gsmap why MAP A:B says why",
+                f"{a.name}:{b.name} has no pose to draw both captures in: gsmap why MAP A:B explains it",
                 code="no_pose_of_pair",
             )
         save_picture(picture, path)
@@ -1032,7 +1032,7 @@ class Map(AbstractContextManager["Map"]):
         row = self.show_change(name)
         if (picture := picture_of_change(self.store, self._settings_to_look_by(), row)) is None:
             raise NotFoundError(
-                f"{name} has no place now: its newer capture has none (gsmap update)", code="change_unplaced"
+                f"{name} has no position: its newer capture has no pose; run gsmap update", code="change_unplaced"
             )
         save_picture(picture, path)
 

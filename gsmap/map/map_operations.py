@@ -68,7 +68,7 @@ def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> S
     """Make a map of some scenes (ids), whole or not at all; see `gsmap.store.merging.split`."""
     folder = Path(out).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise StoreError(f"{out} exists already: choose another name", code="already_exists")
+        raise StoreError(f"{out} exists: choose another name", code="already_exists")
     with staging.beside(folder) as staged:
         with Store.create(staged) as part:
             merged = merging.split(store, part, chosen)
@@ -97,9 +97,7 @@ def chosen(store: Store, island: int | None, box: Sequence[float] | None, scenes
         NotFoundError: there are none.
     """
     if (scenes is None) == (island is None and box is None) or (scenes is not None and not scenes):
-        raise ConfigError(
-            "say which scenes: those of a component, those in a box, or their names", code="nothing_requested"
-        )
+        raise ConfigError("choose scenes by component, by box, or by name", code="nothing_requested")
     if scenes is not None:
         return list(dict.fromkeys(store.scenes.get(ref).id for ref in scenes))
     graph, living = store.revisions.get(), {scene.id: scene for scene in store.scenes.list()}

@@ -42,6 +42,6 @@ def _spec(options: dict[str, Any], path: str) -> ModelSpec:
         )
     except (KeyError, TypeError) as error:
         raise CorruptError(
-            f"what the catalog says of the model {path} makes no sense ({error!r}): add it again",
+            f"the catalog entry of the model {path} is invalid ({error!r}): add it again",
             code="catalog_invalid",
         ) from error

@@ -36,7 +36,7 @@ def apply_annotations(
         if not target or target == thing.id:
             continue
         if why := why_distinct(of[thing.id], of[target], scenes):
-            notes.append(f"{thing.id} is not told as one with {target}, as it was said to be: {why}")
+            notes.append(f"{thing.id} is not joined with {target}, although annotated as the same: {why}")
             continue
         of[target] = _as_one(of[target], of.pop(thing.id))
         joined = {one: target if to == thing.id else to for one, to in joined.items()} | {thing.id: target}
@@ -45,7 +45,7 @@ def apply_annotations(
             places = [scenes[scene].name for scene in store.objects.places(number) if scene in scenes]
             if places:
                 called = f" ({said.name or said.label})" if said.name or said.label else ""
-                notes.append(f"{name}{called} is not found any more; it was a thing of {few(places)}")
+                notes.append(f"{name}{called} is not found any more; it was segmented in {few(places)}")
     return [of[thing.id] for thing in objects if thing.id in of], joined, notes
 
 

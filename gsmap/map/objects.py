@@ -250,7 +250,7 @@ def edit_object(
     if number is None:
         number = number_of(known.named(ref).id)
     if number is None:
-        raise NotFoundError(f"{ref} has no number yet: the map is open for reading only", code="object_without_number")
+        raise NotFoundError(f"{ref} has no number yet: the map is open read-only", code="object_without_number")
     other = None if same_as is None else 0
     if same_as is not None and not _none(same_as):
         target, mine = known.named(same_as), known.named(f"o{number}")
@@ -298,7 +298,7 @@ def history_report(known: MapObjects, place: str | None, box: Sequence[float] | 
     """
     if (place is None) == (box is None):
         raise ConfigError(
-            "say which place: an object's id, a point X,Y,Z, or --box with six numbers", code="nothing_requested"
+            "give one place: an object's id, a point X,Y,Z, or --box with six numbers", code="nothing_requested"
         )
     if place is not None and not ("," in place and _POINT.fullmatch(place)):
         chosen = [known.named(place)]
@@ -348,12 +348,10 @@ def _area(place: str | None, box: Sequence[float] | None) -> np.ndarray:
     except ValueError as error:
         raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {place!r}", code="invalid_point") from error
     if len(numbers) != (3 if place is not None else 6) or not np.isfinite(numbers).all():
-        raise ConfigError(
-            "a point is three numbers X,Y,Z, a box six: its lowest and its highest corner", code="invalid_point"
-        )
+        raise ConfigError("a point is X,Y,Z; a box is six numbers, its lowest and highest corner", code="invalid_point")
     corners = np.array(numbers).reshape(-1, 3)
     if (corners[0] > corners[-1]).any():
-        raise ConfigError("a box is its lowest corner, then its highest", code="invalid_box")
+        raise ConfigError("the lowest corner of a box comes before the highest", code="invalid_box")
     return np.array([corners[0], corners[-1]])
 
 

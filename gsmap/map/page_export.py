@@ -89,7 +89,7 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
         raise NotFoundError(f"cannot write {path}: {path.parent} does not exist", code="folder_not_found")
     if path.exists() and not is_stream(path) and owner_of(path) != store.id:
         raise ConfigError(
-            f"{path} is there and is no page of this map: choose another name, or delete it", code="foreign_export"
+            f"{path} exists and is not a page of this map: choose another name, or delete it", code="foreign_export"
         )
     page, doors = built_page(), MapPageSource(store, settings)
     made: list[site.SiteContents] = []
@@ -183,10 +183,10 @@ def _mark(map_id: str, files: Sequence[str]) -> bytes:
 def _check_folder(store: Store, folder: Path) -> None:
     """Refuse a folder with anything but this map's page."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise ConfigError(f"{folder} is no folder: give an empty or a new one", code="not_a_folder")
+        raise ConfigError(f"{folder} is not a folder: give an empty or a new one", code="not_a_folder")
     if folder.is_dir() and any(folder.iterdir()) and site_owner(folder) != store.id:
         raise ConfigError(
-            f"{folder} holds other things than a page of this map: give an empty or a new folder",
+            f"{folder} holds other files than a page of this map: give an empty or a new folder",
             code="folder_not_empty",
         )
     site_files(folder)

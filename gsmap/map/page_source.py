@@ -163,7 +163,7 @@ class MapPageSource:
         picture = picture_of_change(self._store, self._settings, row, _PICTURE_PX)
         if picture is None:
             raise NotFoundError(
-                f"{change} has no place now: its newer capture has none (gsmap update)", code="change_unplaced"
+                f"{change} has no position: its newer capture has no pose; run gsmap update", code="change_unplaced"
             )
         return picture
 

@@ -75,7 +75,8 @@ class PhotoReporter:
         notes = []
         if found.judged < _LITTLE:
             notes.append(
-                f"{photo.name}: only {found.judged:.0%} of it could be compared: elsewhere no capture looked from there"
+                f"{photo.name}: only {found.judged:.0%} of it could be compared: no capture observed the rest from a "
+                "similar direction"
             )
         return PhotoObservation(found, rows, tuple(notes))
 

@@ -48,12 +48,10 @@ class PhotoOptions:
 
     def __post_init__(self) -> None:
         if self.pictures is not None and not self.changes:
-            raise ConfigError("--pictures are of what differs: ask for it by --changes", code="missing_option")
+            raise ConfigError("--pictures draws changes: add --changes", code="missing_option")
         if self.captured_at is not None:
             if not self.add:
-                raise ConfigError(
-                    "--captured-at dates photographs that are kept: add them by --add", code="missing_option"
-                )
+                raise ConfigError("--captured-at dates stored photos: add --add", code="missing_option")
             given_date(self.captured_at)
 
 
@@ -85,11 +83,11 @@ def localize_files(
     """
     options = options or PhotoOptions()
     if options.add and not store.catalog.writable:
-        raise ReadOnlyError(f"{store.location} is open to be read only: photographs can be placed in it, but not kept")
+        raise ReadOnlyError(f"{store.location} is open read-only: photos can be localized, but not stored")
     check_named(files, video, masks)
     if depth is not None and masks is not None:
         raise ConfigError(
-            "--masks are of photographs: of a depth picture, set what does not count to 0", code="option_not_applicable"
+            "--masks apply to photos: in a depth image, set pixels to ignore to 0", code="option_not_applicable"
         )
     lens = parse_lens(intrinsics, focal)
     if video is not None:
@@ -112,10 +110,10 @@ def check_named(
     """Refuse photos together with a video, neither of them, and masks for a video."""
     if video is not None and masks is not None:
         raise ConfigError(
-            "--masks are of photographs, by their names: a clip's frames have none", code="option_not_applicable"
+            "--masks apply to photos by name: frames of a video have no names", code="option_not_applicable"
         )
     if bool(files) == (video is not None):
-        raise ConfigError("name the photographs to localise, or one clip by --video", code="nothing_requested")
+        raise ConfigError("name the photos to localize, or one video with --video", code="nothing_requested")
 
 
 def photos_of(
@@ -219,12 +217,12 @@ def _add(
         date = photo_date(row.file) if os.path.isfile(row.file) else CaptureDate()
     sighting = localized_photo_of(store, row, photo, reporter.observed_objects(row, observation), date.when)
     if sighting is None:
-        return False, [f"{row.file} was not kept: the scene that it was found by is gone"]
+        return False, [f"{row.file} was not stored: its supporting scene was removed"]
     notes = [date.note] if date.note else []
     if date.when is None:
-        notes.append(f"{row.file} has no date: what it shows comes last in histories (--captured-at DATE says it)")
+        notes.append(f"{row.file} has no date: its observations come last in histories; set --captured-at DATE")
     added = store.photos.add(sighting, small_jpeg(photo))
-    return added, notes if added else [f"{row.file} is kept already"]
+    return added, notes if added else [f"{row.file} is stored already"]
 
 
 def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
@@ -235,7 +233,7 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
     """
     if intrinsics is not None and focal is not None:
         raise ConfigError(
-            "intrinsics hold the focal length: give one of --intrinsics and --focal", code="conflicting_options"
+            "give one of --intrinsics and --focal: intrinsics include the focal length", code="conflicting_options"
         )
     if intrinsics is not None:
         parts = intrinsics.split(",") if isinstance(intrinsics, str) else intrinsics

@@ -49,15 +49,15 @@ class Request:
         given = [value for value in (self.text, self.picture, self.like, self.at) if value is not None]
         if len(given) != 1:
             raise ConfigError(
-                "say one thing to look for: words, --picture FILE, --like SCENE:NODE or --at X,Y,Z",
+                "give one query: text, --picture FILE, --like SCENE:NODE or --at X,Y,Z",
                 code="nothing_requested",
             )
         if self.text is not None and not self.text.strip():
-            raise ConfigError("the words to look for are empty", code="nothing_requested")
+            raise ConfigError("the query text is empty", code="nothing_requested")
         if self.at is not None and (len(self.at) != 3 or not np.isfinite(self.at).all()):
             raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {list(self.at)}", code="invalid_point")
         if self.top < 1:
-            raise ConfigError(f"at least one hit is shown, got {self.top}", code="out_of_range")
+            raise ConfigError(f"--top must be at least 1, got {self.top}", code="out_of_range")
 
     @property
     def words(self) -> str:
@@ -133,7 +133,7 @@ def find_places(
     )
     notes = [*index.notes, *index.known.notes]
     if not hits:
-        notes.append("nothing in the map can be compared with it")
+        notes.append("nothing in the map is comparable with the query")
     report = FindReport(
         query=request.words,
         by="embedding" if isinstance(asked, _QueryVector) else "likeness",
@@ -237,8 +237,8 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
     notes = []
     if recipe != now:
         notes.append(
-            f"answered by the graphs of an earlier recipe, which knows {len(made[recipe])} of {len(scenes)} captures; "
-            f"the present one knows {len(mine)}: gsmap update describes the rest"
+            f"searched the graphs of an earlier recipe, which has {len(made[recipe])} of {len(scenes)} captures; "
+            f"the current recipe has {len(mine)}: gsmap update describes the rest"
         )
     elif len(mine) < len(scenes):
         notes.append(
@@ -264,7 +264,7 @@ def _require_same_meaning(index: _SearchIndex, descriptor: str) -> None:
     layers = [graph.layers["objects"] for graph in index.graphs.values() if "objects" in graph.layers]
     if not layers:
         raise NotFoundError(
-            "the map's graphs hold no embeddings, since describe.objects is off: show a thing instead",
+            "the map's graphs hold no embeddings, since describe.objects is off: search with --like or --at",
             code="no_embeddings",
         )
     if any(layer.descriptor_id != descriptor for layer in layers):
@@ -311,7 +311,7 @@ def _asked(store: Store, request: Request, index: _SearchIndex) -> Sequence[Obje
     ref, _, number = request.like.rpartition(":")
     if not ref or not number.isdecimal():
         raise NotFoundError(
-            f"{request.like!r} is neither an object of the map (gsmap graph lists them) nor SCENE:NODE",
+            f"{request.like!r} is neither an object of the map (gsmap graph MAP) nor SCENE:NODE",
             code="object_not_found",
         )
     scene = store.scenes.get(ref)

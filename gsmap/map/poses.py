@@ -112,7 +112,7 @@ def _write_tum(path: Path, members: Sequence[ScenePose], scenes: Mapping[str, Sc
     times, remarks = None, []
     if undated:
         have = "has no date" if len(undated) == 1 else "have no date"
-        remarks.append(f"times are made up, 0, 1, 2, ... in the order of names: {few(undated)} {have} ({NO_DATE})")
+        remarks.append(f"times are placeholders, 0, 1, 2, ... in the order of names: {few(undated)} {have} ({NO_DATE})")
     else:
         dates = [parse_moment(scenes[pose.scene].captured_at or "").timestamp() for pose in members]
         order = np.argsort(dates, kind="stable")
@@ -165,7 +165,7 @@ def _unit(path: Path, metre: MetricScale) -> tuple[float, str]:
     if not metre.is_rough:
         return metre.metres_per_unit, f"lengths in metres ({metre.text()} of the map)"
     remark = f"lengths in the unit of the map: {metre.text()}"
-    _log.warning("%s: %s (gsmap edit MAP SCENE --metres-per-unit X tells)", path, remark)
+    _log.warning("%s: %s (set it with gsmap edit MAP SCENE --metres-per-unit X)", path, remark)
     return 1.0, remark
 
 

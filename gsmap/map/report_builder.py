@@ -119,7 +119,7 @@ def check_target(path: Path) -> None:
     """Refuse a file to which no report may be written; see `write_report` for the errors."""
     if path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(
-            f"a report is a page: name a file that ends with .html, not {path.name or path}", code="wrong_suffix"
+            f"a report is an HTML page: name a file that ends with .html, not {path.name or path}", code="wrong_suffix"
         )
     if path.is_dir():
         raise ConfigError(
@@ -129,7 +129,7 @@ def check_target(path: Path) -> None:
         raise NotFoundError(f"cannot write {path}: {path.parent} does not exist", code="folder_not_found")
     if path.exists() and not is_stream(path) and owner_of(path) is None:
         raise ConfigError(
-            f"{path} is there and was not written by gsmap report: choose another name, or delete it",
+            f"{path} exists and was not written by gsmap report: choose another name, or delete it",
             code="foreign_export",
         )
 

@@ -42,9 +42,9 @@ def scan_rows(
     requests = {number: Request(Path(path), near=near) for number, path in enumerate(files) if scans.is_scan(path)}
     if depth is not None:
         if len(files) != 1 or requests:
-            raise ConfigError("a depth picture belongs to one photo: give that photo alone", code="conflicting_options")
+            raise ConfigError("--depth takes exactly one photo", code="conflicting_options")
         if lens.intrinsics_px is None:
-            raise ConfigError("a depth picture needs its intrinsics: --intrinsics fx,fy,cx,cy", code="missing_option")
+            raise ConfigError("a depth image needs --intrinsics fx,fy,cx,cy", code="missing_option")
         requests[0] = Request(Path(depth), lens.intrinsics_px, files[0], depth_scale, near=near)
     found = {number: localize_scan(store, request, settings, progress) for number, request in requests.items()}
     rows = {number: _row(os.fspath(files[number]), row) for number, row in found.items()}

@@ -78,7 +78,7 @@ def look_up_graph(
                 raise
         except CorruptError as error:
             raise CorruptError(
-                f"{error}: gsmap register {store.home} makes the index anew", code="index_damaged"
+                f"{error}: gsmap register {store.home} rebuilds the index", code="index_damaged"
             ) from error
     raise AssertionError("unreachable")
 

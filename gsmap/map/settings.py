@@ -237,14 +237,14 @@ def write_settings(
     unknown = [name for name in drop if name not in old]
     if unknown:
         raise ConfigError(
-            f"{unknown[0]} is not changed in {folder / FILE_NAME}: there is nothing to take back",
+            f"{unknown[0]} is not set in {folder / FILE_NAME}: nothing to unset",
             code="setting_not_changed",
         )
     _combined(folder, preset or old_preset, kept, values)
     if of_run := [name for name in values if _is_of_the_run(name)]:
         raise ConfigError(
-            f"{of_run[0]} is not kept with a map: say it with each run (--executor, --scheduler), or by GSMAP_EXECUTOR "
-            "and GSMAP_SCHEDULER",
+            f"{of_run[0]} is not stored with a map: give it with each run (--executor, --scheduler), or by "
+            "GSMAP_EXECUTOR and GSMAP_SCHEDULER",
             code="setting_of_run",
         )
     save(folder / FILE_NAME, {**({PRESET: preset} if preset else {}), **values}, drop)

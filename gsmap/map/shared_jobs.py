@@ -91,7 +91,7 @@ class SharedJobs:
         """
         if self._todo and is_beginning():  # its parent, who does these jobs, waits for it to have begun
             raise ConfigError(
-                "a worker process reads the script that started it, and comes to what starts workers: put what the "
+                "a worker process would start workers again when it imports the script: put what the "
                 'script does below `if __name__ == "__main__":`',
                 code="main_guard_missing",
             )
@@ -147,8 +147,8 @@ class SharedJobs:
     def _put_aside(self, key: str, reason: str) -> None:
         about = " ".join(self._about[key])
         self._set_aside.add(self._lease(key), about, reason)
-        _log.warning("%s of %s is set aside: %s", self._kind, about, reason)
-        self.saved(key, f"set aside: {reason}")
+        _log.warning("%s of %s is quarantined: %s", self._kind, about, reason)
+        self.saved(key, f"quarantined: {reason}")
 
     def num_kept(self) -> int:
         """Return the number of results in the catalog."""
@@ -234,7 +234,7 @@ def announce_work(store: Store, task: str) -> Iterator[None]:
     """Register this process as working on the map, and log the other processes at work."""
     with store.leases.announce(task) as others:
         for other in others:
-            _log.warning("another %s is at work: what is left is shared", other.who)
+            _log.warning("%s is also running: the remaining jobs are shared", other.who)
         yield
 
 

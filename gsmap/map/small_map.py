@@ -103,10 +103,10 @@ def export_small(
         NotFoundError: the map has no poses yet.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise StoreError(f"{out} exists already: choose another name", code="already_exists")
+        raise StoreError(f"{out} exists: choose another name", code="already_exists")
     if settings.localize.extractor != "sift":
         raise ConfigError(
-            "a small map holds no model: export it with the built-in features (--set localize.extractor=sift)",
+            "a small map cannot store a model: export it with the built-in features (--set localize.extractor=sift)",
             code="small_map_extractor",
         )
     localizer = Localizer(store, settings, progress)
@@ -473,12 +473,12 @@ def _scene(row: Mapping[str, Any]) -> SmallMapScene:
     known = None if row["covariance"] is None else np.array(row["covariance"], np.float64)
     bounds = np.array(row["bounds"], np.float64)
     if bounds.shape != (2, 3) or not np.isfinite(bounds).all():
-        raise ValueError("a box that is none")
+        raise ValueError("an invalid box")
     if known is not None and (known.shape != (7, 7) or not np.isfinite(known).all()):
-        raise ValueError("a covariance that is none")
+        raise ValueError("an invalid covariance")
     texts = (row["id"], row["name"], row["sha256"])
     if not all(isinstance(text, str) for text in texts) or not row["id"].isalnum():
-        raise ValueError("names that are none")
+        raise ValueError("invalid names")
     return SmallMapScene(
         row["id"],
         row["name"],
@@ -498,6 +498,4 @@ def _positive(value: Any) -> float:
 
 
 def _corrupt(path: Path, error: Exception) -> CorruptError:
-    return CorruptError(
-        f"{path} is no small map that gsmap wrote, or damaged ({error}): export it again", code="small_map_damaged"
-    )
+    return CorruptError(f"{path} is not a small map or is damaged ({error}): export it again", code="small_map_damaged")

@@ -63,7 +63,7 @@ def parse_point(store: Store, text: str) -> SpecifiedPoint:
         scene = store.scenes.get(scene_name).id
         found = picked_point(store, scene, camera, numbers, DEPTH_SIGMA_FRACTION, PIXEL_SIGMA_PX)
         return SpecifiedPoint(text, *found, scene=scene)
-    raise ConfigError(f"{text!r} is no point: give {HOW}", code="invalid_point")
+    raise ConfigError(f"{text!r} is not a point: give {HOW}", code="invalid_point")
 
 
 def parse_scene_point(store: Store, text: str) -> SpecifiedPoint:

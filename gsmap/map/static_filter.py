@@ -110,7 +110,7 @@ def dynamic_rows(store: Store, scene: str, passing: DynamicContent) -> np.ndarra
     """Return (N,) bool, the dynamic Gaussians of a scene.
 
     Raises:
-        NotFoundError: what it was told from was pruned meanwhile.
+        NotFoundError: its segments or changes were pruned meanwhile.
     """
     out = np.zeros(store.scenes.get(scene).num_gaussians, bool)
     for number in dict.fromkeys(change[0] for change in passing.changes):
@@ -120,7 +120,7 @@ def dynamic_rows(store: Store, scene: str, passing: DynamicContent) -> np.ndarra
     graph = store.graphs.load(scene, passing.graph) if passing.graph else None
     if passing.graph and graph is None:
         raise NotFoundError(
-            f"the things of scene {scene[:12]} were dropped meanwhile: run the same export again",
+            f"the segments of scene {scene[:12]} were deleted meanwhile: run the same export again",
             code="changed_meanwhile",
         )
     if graph is not None and graph.things is not None and len(graph.things):
@@ -141,11 +141,11 @@ def dynamic_notes(known: MapObjects, passing: Mapping[str, DynamicContent]) -> l
     called = [thing.words.name or thing.words.label or thing.id for thing in gone]
     told = sum(len(one.changes) for one in passing.values())
     said = [
-        f"{len(gone)} of {len(known.objects)} objects are left out, since they moved or were gone in a look at their "
-        f"place{': ' + ', '.join(called[:8]) if gone else ''}{' ...' if len(gone) > 8 else ''}"
+        f"{len(gone)} of {len(known.objects)} objects are left out, since they moved or were observed to be "
+        f"absent{': ' + ', '.join(called[:8]) if gone else ''}{' ...' if len(gone) > 8 else ''}"
     ]
     if told:
-        said.append(f"so is what {told} sides of changes say")
+        said.append(f"also left out: the Gaussians of {told} changes")
     if once:
-        said.append(f"{once} objects were looked at once: they are kept, and nobody knows whether they stay")
+        said.append(f"{once} objects were observed only once and are kept")
     return said

@@ -53,7 +53,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
         "unregistered",
         len(living - registered) if len(scenes) > 1 else 0,
         update,
-        "scenes that were never tried with another",
+        "scenes that were never registered with another",
     )
     add(
         "stale_edges",
@@ -71,22 +71,22 @@ def status(store: Store, settings: Settings) -> MapStatus:
     poses = [pose for scene, pose in graph.poses.items() if scene in living]
     tentative = [pose for pose in poses if pose.status == "tentative"]
     unconfirmed = [pair for pair in store.revisions.tentative() if living.issuperset(pair)]
-    add("tentative", len(tentative), _look(store, unconfirmed), "scenes that rest on edges no cycle confirms")
+    add("tentative", len(tentative), _look(store, unconfirmed), "scenes placed by edges without an agreeing cycle")
     judged = store.revisions.undecided(newest.number).get(newest.number, []) if newest else []
     undecided = [pair for pair in judged if living.issuperset(pair)]
-    add("undecided", len(undecided), _look(store, undecided), "edges that nothing could decide: confirm or reject")
+    add("undecided", len(undecided), _look(store, undecided), "undecided edges: confirm or reject them")
     todo += quarantined_rows(store)
-    add("changes", num_open(store, settings), f"gsmap changes {at}", "changes nobody looked at")
+    add("changes", num_open(store, settings), f"gsmap changes {at}", "unreviewed changes")
     outweighed = [scene for scene in (newest.provenance.contradicted_priors if newest else ()) if scene in living]
-    add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
+    add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that contradict the edges")
     contrary = sum(row.use == "outlier" for tie in graph.world for row in tie.residuals)
     add("world_outliers", contrary, f"gsmap georeference {at}", "observations of the world that contradict the others")
     untied = sum(bool(tie.problem) for tie in graph.world)
-    add("untied", untied, f"gsmap georeference {at}", "components whose place in the world is not determined yet")
+    add("untied", untied, f"gsmap georeference {at}", "components that are not georeferenced")
     twice = store.registrations.current_with_note(SAME_CAPTURE)
     add("duplicates", len(twice), f"gsmap list {at} edges", "pairs that are the same capture twice: remove one of each")
     isolated = [pose for pose in poses if pose.status == "isolated"]
-    add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes that nothing ties to others")
+    add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes without edges to others")
     metres = map_metres(store, settings, graph)
     components = len({pose.component for pose in poses})
     return MapStatus(
@@ -128,7 +128,7 @@ def quarantined_rows(store: Store) -> list[TodoRow]:
                 continue  # of a scene that was removed
             about = ":".join(scenes)
             verb = f"gsmap {_TRIES_AGAIN[kind]} {at} {shlex.quote(about)}"
-        rows.append(TodoRow(what="set_aside", count=1, verb=verb, meaning=f"{about} is set aside: {one.reason}"))
+        rows.append(TodoRow(what="set_aside", count=1, verb=verb, meaning=f"{about} is quarantined: {one.reason}"))
     return rows
 
 

@@ -104,7 +104,7 @@ class Family:
             except (Exception, SystemExit) as error:  # another package's code may fail in any way
                 raise ConfigError(
                     f"{self.name} {name!r} of the package {_package(added[name])} cannot be loaded "
-                    f"({type(error).__name__}: {error}): mend or uninstall that package",
+                    f"({type(error).__name__}: {error}): repair or uninstall that package",
                     code="method_not_loadable",
                 ) from error
         else:
@@ -165,7 +165,7 @@ class MethodParams(Mapping[str, Any]):
         return len(_family(self.family).usable())
 
     def __contains__(self, name: object) -> bool:
-        """Whether a method has this name; nothing is imported, so it may fail to load."""
+        """Return true if a method has this name; nothing is imported, so it may fail to load."""
         return name in _family(self.family).names()
 
     def __hash__(self) -> int:

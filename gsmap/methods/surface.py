@@ -40,7 +40,7 @@ class Surface(Protocol):
         """Return the scene's cameras in its own unit; None if it has none."""
 
     def __len__(self) -> int:
-        """How many points there are."""
+        """Number of points."""
 
     @property
     def coarse(self) -> tuple[np.ndarray, np.ndarray]:

@@ -28,12 +28,14 @@ def load(path: Path) -> dict[str, Any]:
         return {}
     except UnicodeDecodeError as error:
         raise ConfigError(
-            f"{path} is not a text file in UTF-8: mend or remove it", code="invalid_settings_file"
+            f"{path} is not a text file in UTF-8: correct or remove it", code="invalid_settings_file"
         ) from error
     try:
         return dict(_flat(tomllib.loads(text)))
     except (ValueError, RecursionError) as error:  # not only what tomllib names: an integer of 5000 digits, too
-        raise ConfigError(f"{path} is not TOML ({error}): mend or remove it", code="invalid_settings_file") from error
+        raise ConfigError(
+            f"{path} is not TOML ({error}): correct or remove it", code="invalid_settings_file"
+        ) from error
 
 
 def save(path: Path, values: Mapping[str, Any], drop: tuple[str, ...] = ()) -> None:

@@ -199,7 +199,7 @@ def _of_type(value: Any, annotation: Any, name: str) -> Any:
                 continue
         raise _wrong(value, annotation, name)
     if value is None and (annotation is str or origin is Literal):
-        value = "none"  # TOML knows no null, so the word stands for it; where nothing may be missing it is a word
+        value = "none"  # TOML has no null, so the word stands for it
     if origin is Literal:
         if value in inner:
             return value

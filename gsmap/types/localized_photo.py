@@ -33,9 +33,11 @@ class PhotoObjectObservation:
     def __post_init__(self) -> None:
         at = np.asarray(self.position, dtype=np.float64)
         if at.shape != (3,) or not (np.abs(at) < _FAR).all():
-            raise InputError("a thing in a photo needs a place of three numbers", code="invalid_record")
+            raise InputError("an object observation in a photo needs a position (3,)", code="invalid_record")
         if self.state not in ("seen", "absent") or not 0 <= self.share <= 1:
-            raise InputError("a thing in a photo is seen or absent, by a share in [0, 1]", code="invalid_record")
+            raise InputError(
+                "an object observation in a photo is seen or absent, with a fraction in [0, 1]", code="invalid_record"
+            )
         object.__setattr__(self, "position", at)
 
 
@@ -82,9 +84,9 @@ class LocalizedPhoto:
             )
         turn = pose[:3, :3]
         if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0 or (np.abs(pose) >= _FAR).any():
-            raise InputError("the pose of a photo is no rigid transform", code="invalid_pose")
+            raise InputError("the pose of a photo is not a rigid transform", code="invalid_pose")
         if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6 or not 0 <= self.probability <= 1 or (lens[:2] <= 0).any():
-            raise InputError("the pose, intrinsics or probability of a photo cannot be", code="invalid_record")
+            raise InputError("the pose, intrinsics or probability of a photo is invalid", code="invalid_record")
         if len(self.size_px) != 2 or not all(isinstance(n, int) and 0 < n < 10**6 for n in self.size_px):
             raise InputError("a photo has a width and a height in pixels", code="invalid_record")
         for name, value in (("T_scene_camera", pose), ("covariance", known), ("intrinsics_px", lens)):

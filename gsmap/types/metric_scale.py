@@ -11,7 +11,7 @@ from gsmap.errors import InputError
 
 KnownBy = Literal["surveyed", "measured", "told", "assumed", "guessed", "unknown"]
 
-_ROUGH_SIGMA = 0.2  # beyond it an error is told as a factor, not in percent
+_ROUGH_SIGMA = 0.2  # above it, an error is reported as a factor, not in percent
 
 KNOWN_BY: tuple[KnownBy, ...] = get_args(KnownBy)
 

@@ -16,7 +16,7 @@ class Tensor:
 
     @property
     def is_image(self) -> bool:
-        """Whether it can hold pictures: (N, 3, H, W) or (N, H, W, 3), or (H, W, 3) as some SAM encoders take."""
+        """True for an image tensor: (N, 3, H, W) or (N, H, W, 3), or (H, W, 3) as some SAM encoders take."""
         s = self.shape
         channels_first = len(s) == 4 and s[1] in (3, None)
         return channels_first or (len(s) in (3, 4) and s[-1] == 3)

@@ -76,7 +76,7 @@ def places_of(rows: np.ndarray, num_members: int) -> np.ndarray:
     """
     places = np.ascontiguousarray(rows[:, -PLACE_BYTES:]).view("<i4")[:, 0]
     if len(places) and not (places.min() >= 0 and places.max() < num_members):
-        raise CorruptError("an index has rows of scenes that it has not", code="index_damaged")
+        raise CorruptError("an index has rows of unknown scenes", code="index_damaged")
     return places
 
 
@@ -142,7 +142,7 @@ def lists_of(segment: Segment) -> tuple[np.ndarray, np.ndarray]:
         and (np.diff(keys) > 0).all()
     )
     if not sound:
-        raise CorruptError("the lists of an index make no sense", code="index_damaged")
+        raise CorruptError("the lists of an index are invalid", code="index_damaged")
     return keys, starts
 
 

@@ -1,4 +1,4 @@
-"""What ties a map to the world: a coordinate reference system, observations of where things lie in it, and the answer.
+"""Georeferencing: the coordinate reference system, observations of the world, and the estimated poses in the world.
 
 World coordinates are in a *CRS*: longitude or easting first, then latitude or northing, then height (what PROJ calls
 ``always_xy``), with the height in the CRS's own vertical axis; where it has none, above the ellipsoid, in the unit of
@@ -168,7 +168,7 @@ class ScaleBar:
         _finite(f"scale bar {self.name}", self.points, 2, 3)
         _positive(f"scale bar {self.name}", self.length_m, self.sigma_m, *self.point_sigmas)
         if self.scenes[0] == self.scenes[1] and np.allclose(self.points[0], self.points[1], rtol=0, atol=1e-12):
-            raise InputError(f"the ends of scale bar {self.name} are one point: pick two", code="invalid_observation")
+            raise InputError(f"scale bar {self.name} has two equal ends: pick two points", code="invalid_observation")
 
 
 @dataclass(frozen=True, eq=False)

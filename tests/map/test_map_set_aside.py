@@ -60,7 +60,7 @@ def test_the_rest_is_done_and_status_says_what_is_left(site: Map, caplog: pytest
     site.describe()
     assert described(site) == {"light", "other"}
     (row,) = [row for row in site.status().todo if row.what == "set_aside"]
-    assert row.meaning == f"heavy is set aside: {REASON}"
+    assert row.meaning == f"heavy is quarantined: {REASON}"
     assert row.verb.endswith("site.gsmap heavy")
     assert row.verb.startswith("gsmap describe ")
     assert REASON in caplog.text

@@ -55,7 +55,7 @@ def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
         except NotFoundError:
             continue
     raise NotFoundError(
-        f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows",
+        f"no pair {pair!r}: write A:B with names from gsmap list MAP scenes",
         code="scene_not_found",
     )
 
@@ -67,5 +67,5 @@ def checked_pair(a: Scene, b: Scene) -> tuple[Scene, Scene]:
         ConfigError: they are one.
     """
     if a.id == b.id:
-        raise ConfigError(f"{a.name} with itself is no pair: name two scenes", code="same_scene")
+        raise ConfigError(f"{a.name} is given twice: name two different scenes", code="same_scene")
     return a, b

@@ -318,7 +318,7 @@ def _export(
             write_streams(*tree, cameras=cameras, levels=levels)
     if store.catalog.writable:
         refused = ""
-        try:  # what an interrupted export, or one that could not be noted, left untold is told now
+        try:  # record what an interrupted or unrecorded export wrote
             known = {tile.path: tile for tile in store.exports.tiles(out)}
             for tile in result.tiles:
                 same = known.pop(tile.path, None)
@@ -374,7 +374,7 @@ def _put_aside(store: Store, out: Path, planned: ExportPlan, result: ExportResul
     about = escaped(str(out.resolve()))
     now = {f"tile {planned.recipe.key(tile)}": (tile, reason) for tile, reason in result.set_aside}
     for tile, reason in now.values():
-        _log.warning("tile component_%d/%s is set aside: %s", tile.component, tile.name, reason)
+        _log.warning("tile component_%d/%s is quarantined: %s", tile.component, tile.name, reason)
     if not store.catalog.writable:
         return
     with suppress(DiskFullError, ReadOnlyError):

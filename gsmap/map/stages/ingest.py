@@ -116,7 +116,7 @@ def _set_aside(store: Store, bad: Sequence[SkippedPath], done: Sequence[Path]) -
         done: files and folders that were searched; their other captures are in the map.
     """
     for one in bad:
-        _log.warning("a capture is set aside: %s", one.reason)
+        _log.warning("a capture is quarantined: %s", one.reason)
         store.quarantine.add(_what(one.path), escaped(str(one.path.absolute())), escaped(one.reason))
     still, mended = {_what(one.path) for one in bad}, {_what(path) for path in done}
     places = {place for path in done for place in (path.absolute(), path.resolve())}
@@ -170,16 +170,16 @@ def readers(
     check_scale(scale)
     memory = [source for source in sources if isinstance(source, Gaussians)]
     if memory and len(sources) > 1:
-        raise ConfigError("Gaussians in memory are ingested one capture at a time", code="in_memory_mismatch")
+        raise ConfigError("pass in-memory Gaussians one capture at a time", code="in_memory_mismatch")
     if memory:
         if cameras is not None and not isinstance(cameras, Cameras):
-            raise ConfigError("Gaussians in memory go with gsmap.Cameras, or with none", code="in_memory_mismatch")
+            raise ConfigError("pass gsmap.Cameras or None with in-memory Gaussians", code="in_memory_mismatch")
         called = name or "capture"
         take = partial(take_capture, memory[0], cameras, name=called, captured_at=captured_at, scale_policy=scale)
         return [CaptureReader(called, take)], SearchResult()
     if isinstance(cameras, Cameras):
         raise ConfigError(
-            "cameras in memory go with Gaussians in memory; for a file name a file of cameras",
+            "pass in-memory cameras with in-memory Gaussians, or a camera file with a Gaussian file",
             code="in_memory_mismatch",
         )
     search = search_captures([Path(source) for source in sources if not isinstance(source, Gaussians)])
@@ -210,5 +210,5 @@ def _add(store: Store, capture: Capture, dates: dict[str, str | None]) -> Ingest
     dates[scene.id] = scene.captured_at
     notes = capture.notes
     if not new and not dated and capture.captured_at not in (None, scene.captured_at):
-        notes = (*notes, f"its date stays {scene.captured_at or 'unknown'}, as was said before; --captured-at sets it")
+        notes = (*notes, f"its date stays {scene.captured_at or 'unknown'}; --captured-at changes it")
     return IngestResult(scene, new, dated and not new, notes)

@@ -66,9 +66,7 @@ class Request:
                 f"scale must be one of {', '.join(SCALE_POLICIES)}, got {self.scale!r}", code="invalid_choice"
             )
         if self.colour is not None and self.intrinsics_px is None:
-            raise ConfigError(
-                "colours belong to a depth picture: give its intrinsics fx,fy,cx,cy, too", code="missing_option"
-            )
+            raise ConfigError("--colour needs the intrinsics of a depth image: fx,fy,cx,cy", code="missing_option")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +83,7 @@ class _ScanQuery:
 
 
 def localize_scan(store: Store, request: Request, settings: Settings, progress: StageProgress) -> ScanRow:
-    """Where a scan lies in the map, by the scenes that show it; nothing is written.
+    """Localize a scan in the map by the scenes that show it; nothing is written.
 
     It is described by the recipe of the map's graphs, the index tells the likeliest scenes, and it is registered with
     each of these as any pair is. All are asked, however many show it: one that shows it elsewhere says that the map
@@ -118,13 +116,13 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     candidates = [one.scene for one in look_up_graph(store, known, graph, settings.retrieve)[: settings.retrieve.top_k]]
     notes: list[str] = []
     if not sought.coloured:
-        # The index knows scenes by their colours, and shapes repeat: all are asked, and all have a say.
+        # The index depends on colours, and shapes repeat: compare all scenes.
         rest = sorted(set(known) - set(candidates))
         candidates = [*candidates, *rest][: settings.scan.max_scenes_by_shape]
         if len(candidates) < len(known):
             notes.append(
-                f"{len(candidates)} of {len(known)} scenes were compared: without colours nothing tells which are the "
-                "likeliest; say where it may lie with near"
+                f"{len(candidates)} of {len(known)} scenes were compared: without colours retrieval cannot rank "
+                "them; restrict the search with --near"
             )
     assert poses is not None
     found: list[Registration] = []
@@ -179,7 +177,7 @@ def _of_scan(scan: Scan, policy: str, settings: Settings) -> _ScanQuery:
     cameras = synthesise_cameras(gaussians) if scan.camera is None else scan.camera
     notes = list(scan.notes)
     if scan.colours is None:
-        notes.append("the scan has no colours: it is told by its shape alone, which says less")
+        notes.append("the scan has no colours: localization by shape alone is less certain")
     return _ScanQuery(gaussians, cameras, scan.kind, policy, scan.colours is not None, scan.origin, tuple(notes))
 
 
@@ -246,7 +244,7 @@ def _row(
 ) -> ScanRow:
     notes = [*sought.notes, *remarks]
     if any(support.tentative for support in supports):
-        notes.append("a scene that shows it is itself placed by edges that no cycle confirms")
+        notes.append("a supporting scene is tentative: no cycle of edges confirms its pose")
     S = None if joined is None else joined.S_map_scan
     probabilities = [one.evidence.get("probability", np.nan) for one in found]
     best = float(np.nanmax(probabilities)) if np.isfinite(probabilities).any() else 0.0

@@ -64,7 +64,7 @@ def objects_of_components(
     placed = store.revisions.get()
     if placed is None:
         raise NotFoundError(
-            "the map has no poses yet, so that things of captures are not known to be one: run gsmap update",
+            "the map has no poses yet, so objects cannot be associated: run gsmap update",
             code="no_poses",
         )
     scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in placed.poses}
@@ -93,9 +93,7 @@ def objects_of_components(
             parts.append(ComponentObjects(component, kept, None, None))
             given |= {thing.id for thing in kept.objects}
         elif not make:
-            raise NotFoundError(
-                "the objects of the map are out of date: gsmap graph MAP makes them", code="objects_outdated"
-            )
+            raise NotFoundError("the objects of the map are out of date: run gsmap graph MAP", code="objects_outdated")
         else:
             read = (
                 graphs if graphs is not None else {scene.id: store.graphs.load(scene.id) for scene in mine[component]}
@@ -104,20 +102,17 @@ def objects_of_components(
         without += [scenes[scene].name for scene, digest in parts[-1].made.things.items() if not digest]
     notes = []
     if without:
-        notes.append(
-            f"nobody knows the things of {few(without)}: gsmap describe MAP SCENE tells them, where describe.things "
-            "is on"
-        )
+        notes.append(f"no segments of {few(without)}: run gsmap describe MAP SCENE with describe.things is on")
     thinned = {scene.name: scene.thinning for scene in scenes.values() if scene.thinning is not None}
     if thinned:
         notes.append(
-            f"{few(list(thinned))} {'is' if len(thinned) == 1 else 'are'} thinned: the things they showed are told, "
-            "and what they were found to show of others before; they are asked no more"
+            f"{few(list(thinned))} {'is' if len(thinned) == 1 else 'are'} thinned: their segments are kept, "
+            "and their earlier observations of other objects; they are not searched again"
         )
     unmapped = [name for name, thinning in thinned.items() if not thinning.has_row_map]
     if unmapped:
         notes.append(
-            f"changes do not tell which things of {few(unmapped)} changed: an older gsmap thinned "
+            f"changes cannot be assigned to segments of {few(unmapped)}: an older gsmap thinned "
             f"{'it' if len(unmapped) == 1 else 'them'} without a row map; ingest the capture again"
         )
     undated = [scene.name for scene in scenes.values() if scene.captured_at is None]

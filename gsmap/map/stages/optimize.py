@@ -60,7 +60,7 @@ class PoseBasis:
         named = [name for (a, b), name in self.named.items() if a in some and b in some]
         told = [(p.scene, p.S_map_scene.matrix(), p.sigmas, p.up, p.up_sigma_rad) for p in self.priors]
         ups = of_plain({scene: up.tolist() for scene, up in self.ups.items() if scene in some})
-        # As it was told: the same key wherever PROJ is another.
+        # As specified by the user, so that the key does not depend on the version of PROJ.
         seen = [canonical(self.observed)] if self.observed else []
         mine = [scene for scene in self.scenes if scene in some]
         return self.recipe.of(*mine, *named, canonical(told), ups, *seen)

@@ -64,7 +64,8 @@ def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, 
             done = done or [(one, p) for one in catalogs for p in purging.list_purges(one) if p.scene == ref]
             if not done:
                 raise NotFoundError(
-                    f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes", code="scene_not_found"
+                    f"no scene is called {ref!r}, and no id starts with it: gsmap list MAP scenes",
+                    code="scene_not_found",
                 )
         else:
             holding = [one for one in catalogs if _holds(one, scene)]
@@ -117,7 +118,7 @@ def _finish(store: Store, begun: Purge) -> Purge:
                 unreachable.append(f"{out}: it is not there, or no report, and holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
             if (passing := _passing(error)) is not None:
-                raise passing(f"{target} is not clean of it yet ({error}): run the same command again") from error
+                raise passing(f"{target} could not be cleaned yet ({error}): run the same command again") from error
             unreachable.append(f"{target}: {error}")
     return purging.finish(store, begun, unreachable)
 

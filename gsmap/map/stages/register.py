@@ -216,7 +216,7 @@ def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> 
     if new:
         look_up_scenes(store, work.described, new, params, work.progress)
     ties = Counter(scene for pair in known.held.values() for scene in pair)
-    # Whose list was not gone down to its end, and who has lost edges since.
+    # Scenes with untried candidates, and scenes that have lost edges since.
     short = {
         s
         for s, (_, left) in asked.items()

@@ -50,16 +50,12 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         NotFoundError: the map has no poses.
     """
     if request.keep_days is None and request.budget_bytes is None:
-        raise ConfigError(
-            "say what to keep: days (--keep-days 365), a size (--budget 2GiB), or both", code="nothing_requested"
-        )
+        raise ConfigError("give --keep-days DAYS, --budget SIZE, or both", code="nothing_requested")
     if not (request.keep_days or 0) >= 0 or (request.budget_bytes or 0) < 0:
         raise ConfigError("days and sizes must not be negative", code="out_of_range")
     graph = store.revisions.get()
     if graph is None:
-        raise NotFoundError(
-            "the map has no poses yet, so nobody knows what supersedes what: run gsmap update first", code="no_poses"
-        )
+        raise NotFoundError("the map has no poses yet: run gsmap update first", code="no_poses")
     living = {scene.id: scene for scene in store.scenes.list()}
     dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
     try:
