@@ -7,7 +7,7 @@ from raising import raises
 from settings_tree import Tree
 
 from gsmap.errors import ConfigError
-from gsmap.settings import changed, differences, leaves, parse
+from gsmap.settings import changed, contains, differences, leaves, parse
 
 
 def test_leaves_are_all_settings_with_meaning_and_unit(tree):
@@ -117,3 +117,11 @@ def test_settings_on_the_command_line(text, name, value):
 def test_what_sets_nothing_is_refused(text):
     with raises(ConfigError, code="invalid_assignment"):
         parse(text)
+
+
+def test_a_tree_contains_settings_and_groups_and_nothing_below_a_value(tree):
+    assert contains(tree, "bars.far_m")
+    assert contains(tree, "bars")
+    assert contains(tree, "toys.wood.label")
+    for name in ("bars.near", "bars.far_m.more", "toys.steel.label", ""):
+        assert not contains(tree, name)
