@@ -1,6 +1,14 @@
-"""Find: which things of a map are like one that is shown, named or pointed at."""
+"""Find the objects of a map that are similar to a query, by geometry and colour or by embeddings."""
 
-from gsmap.find.likeness import Look, Model, look_of, looks_of
-from gsmap.find.ranking import best_of, by_likeness, cosines
+from gsmap.find.ranking import best_per_owner, cosine_similarities, rank_by_similarity
+from gsmap.find.similarity import SegmentDescriptor, SimilarityModel, describe_samples, describe_segments
 
-__all__ = ["Look", "Model", "best_of", "by_likeness", "cosines", "look_of", "looks_of"]
+__all__ = [
+    "SegmentDescriptor",
+    "SimilarityModel",
+    "best_per_owner",
+    "cosine_similarities",
+    "describe_samples",
+    "describe_segments",
+    "rank_by_similarity",
+]

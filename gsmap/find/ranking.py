@@ -1,4 +1,4 @@
-"""Places ranked by what is asked: by the likeness of things, or by the cosine of embeddings."""
+"""Rank objects for a query by similarity of segments or by cosine similarity of embeddings."""
 
 from __future__ import annotations
 
@@ -6,47 +6,49 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsmap.find.likeness import Look, Model, differences
+from gsmap.find.similarity import SegmentDescriptor, SimilarityModel, differences
 
 
-def by_likeness(
-    asked: Sequence[Look], shown: Sequence[Sequence[Look]], model: Model | None = None
+def rank_by_similarity(
+    query: Sequence[SegmentDescriptor],
+    objects: Sequence[Sequence[SegmentDescriptor]],
+    model: SimilarityModel | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How probably each of some objects is of one kind with one that is asked for.
+    """Return the probabilities that objects are of one kind with the query object.
 
-    Captures see things from one side, or in part: what counts is the best match of any sighting of the one with any of
-    the other.
+    Captures see objects from one side or in part, so the best match of any observation of the query with any
+    observation of an object counts.
 
     Args:
-        asked: what the captures show of the one that is asked for.
-        shown: of each object what they show of it.
+        query: observations of the query object.
+        objects: observations of each object.
 
     Returns:
-        (N,) probabilities where as many are of one kind as are not, and (N,) which sighting of each object matched; 0
-        and -1 where nothing is known of it.
+        (N,) probabilities at a prior of 0.5, and (N,) observation of each object that matched best; 0 and -1 for
+        objects without observations.
     """
-    model = model or Model.load()
-    owner = np.repeat(np.arange(len(shown)), [len(looks) for looks in shown])
-    flat = [look for looks in shown for look in looks]
+    model = model or SimilarityModel.load()
+    owner = np.repeat(np.arange(len(objects)), [len(observations) for observations in objects])
+    flat = [one for observations in objects for one in observations]
     odds = np.full(len(flat), -np.inf)
-    for look in asked:
-        odds = np.maximum(odds, model.log_odds(differences(look, flat)))
-    scores, best = best_of(odds, owner, len(shown))
-    first = np.concatenate([[0], np.cumsum([len(looks) for looks in shown])[:-1]]).astype(np.int64)
+    for one in query:
+        odds = np.maximum(odds, model.log_odds(differences(one, flat)))
+    scores, best = best_per_owner(odds, owner, len(objects))
+    first = np.concatenate([[0], np.cumsum([len(observations) for observations in objects])[:-1]]).astype(np.int64)
     with np.errstate(over="ignore"):
         return 1.0 / (1.0 + np.exp(-scores)), np.where(best < 0, -1, best - first)
 
 
-def cosines(asked: np.ndarray, told: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
-    """(M,) cosine of one vector (F,) with each of some (M, F), over the entries that are told of it (F,) bool."""
-    a, b = np.where(told, asked, 0.0).astype(np.float64), np.where(told, embeddings, 0.0).astype(np.float64)
+def cosine_similarities(query: np.ndarray, valid: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
+    """Return (M,) cosines of a vector (F,) with vectors (M, F), over its valid entries (F,) bool."""
+    a, b = np.where(valid, query, 0.0).astype(np.float64), np.where(valid, embeddings, 0.0).astype(np.float64)
     norms = np.linalg.norm(a) * np.linalg.norm(b, axis=1)
     out: np.ndarray = np.where(norms > 0, b @ a / np.where(norms > 0, norms, 1.0), -1.0)
     return out
 
 
-def best_of(scores: np.ndarray, owner: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The best score of each of ``count`` owners (-inf for one without any), and its row (-1); equals: the first."""
+def best_per_owner(scores: np.ndarray, owner: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best score of each owner (-inf without any) and its row (-1); of equal scores the first."""
     order = np.lexsort((np.arange(len(scores)), -scores, owner))
     owners, first = np.unique(owner[order], return_index=True)
     best, row = np.full(count, -np.inf), np.full(count, -1, np.int64)

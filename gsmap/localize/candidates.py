@@ -1,36 +1,45 @@
-"""Where a photograph may have been taken: views that look alike, matches with them, poses that these agree on.
+"""Estimate candidate poses of a photo from its matches with views of the map.
 
-Most matches are wrong, and among a thousand a dozen agree on some pose by chance. But each match alone says about how
-the camera was turned (`gsmap.localize.turned`); so poses are looked for among matches that say the same of it, and
-those that say otherwise do not count for a pose. Then four that agree are worth a look.
+Most matches are wrong, and of a thousand a dozen agree on some pose by chance. Since a single match gives the camera's
+orientation roughly (`gsmap.localize.feature_frames`), poses are estimated from matches with a common orientation, and
+only these count as inliers. Four of them then suffice for a candidate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gsmap.geometry.rotations import angle_between, matrices_to_quats, multiply_quats
-from gsmap.localize import matching, resection, turned
-from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize import feature_frames, matching, resection
+from gsmap.localize.map_scene import MapScene
 
-_SEEDS = 1000  # matches, at most, whose turn others are asked for
-_SAME_TURN = 1 / 3  # of what matches may differ by: nearer turns than this lead to the same set
+MAX_TURN_DEG = 30.0
+"""Angle between the orientation from a match and that of the pose."""
+
+MAX_ORIENTATIONS = 10
+"""Clusters of orientations that poses are estimated from, the largest first."""
+
+DUPLICATE_M, DUPLICATE_DEG = 0.4, 12.0
+"""Poses that are nearer to each other would be refined to one pose."""
+
+_MAX_SEEDS = 1000  # matches that clusters of orientations are grown from
+_SAME_CLUSTER = 1 / 3  # of MAX_TURN_DEG: nearer orientations lead to the same cluster
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """A place to look at.
+class PoseCandidate:
+    """A candidate pose.
 
     Args:
         component: of the map.
         T_metric_camera: (4, 4) camera-to-component, metres.
         intrinsics_px: (4,).
-        num_inliers: different features of the photo that agree.
-        scenes: ids, those with most of them first.
-        pixels, points: (K, 2), (K, 3) the matches that agree, metres.
+        num_inliers: number of different features of the photo among the inliers.
+        scenes: ids, those with most inliers first.
+        pixels, points: (K, 2), (K, 3) the inlier matches, metres.
     """
 
     component: int
@@ -43,15 +52,15 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
-    """Features of a photo, and places of the map that they may show.
+class PointMatches:
+    """Matches of a photo's features with points of one component.
 
     Args:
-        feature: (K,) rows of the photo's.
+        feature: (K,) rows of the photo's features.
         points: (K, 3) in the frame of the component, metres.
-        scene: (K,) whose, among ``scenes``.
-        view: (K,) by which of the views.
-        turns: (K, 4) how the camera was turned in the frame of the component, as each alone says.
+        scene: (K,) index of the scene in ``scenes``.
+        view: (K,) index of the view.
+        orientations: (K, 4) of the camera in the frame of the component, from each match alone.
         scenes: ids.
     """
 
@@ -59,154 +68,155 @@ class Matches:
     points: np.ndarray
     scene: np.ndarray
     view: np.ndarray
-    turns: np.ndarray
+    orientations: np.ndarray
     scenes: tuple[str, ...]
 
 
-def matches_by_component(
-    photo: matching.Described,
-    turns: np.ndarray,
+def match_views(
+    photo: matching.FeatureSet,
+    frames: np.ndarray,
     views: Sequence[tuple[str, int]],
-    scenes: Mapping[str, PlacedFeatures],
-    params: matching.Params,
-) -> dict[int, Matches]:
-    """What the features of a photo match in some views (of scenes, by number), by component of the map.
+    scenes: Mapping[str, MapScene],
+) -> dict[int, PointMatches]:
+    """Match a photo with views (of scenes, by number), and pool the matches of each component.
 
-    Matches with all views of a component are one set, so that captures which each show a part of the place add up.
+    Captures that each show a part of the place thus add up.
 
     Args:
-        turns: (N, 4) of the photo's features in its camera (`gsmap.localize.turned`).
+        frames: (N, 4) of the photo's features in its camera (`gsmap.localize.feature_frames`).
     """
     chosen: dict[int, list[tuple[str, int]]] = {}
     for scene, view in views:
         chosen.setdefault(scenes[scene].component, []).append((scene, view))
-    return {component: _matches(photo, turns, mine, scenes, params) for component, mine in chosen.items()}
+    return {component: _match_component(photo, frames, of_one, scenes) for component, of_one in chosen.items()}
 
 
-def _matches(
-    photo: matching.Described,
-    turns: np.ndarray,
+def _match_component(
+    photo: matching.FeatureSet,
+    frames: np.ndarray,
     views: Sequence[tuple[str, int]],
-    scenes: Mapping[str, PlacedFeatures],
-    params: matching.Params,
-) -> Matches:
+    scenes: Mapping[str, MapScene],
+) -> PointMatches:
     names = tuple(dict.fromkeys(scene for scene, _ in views))
     in_component = {scene: matrices_to_quats(scenes[scene].S_metric_scene.rotation) for scene in names}
-    feature, points, whose, view_of, turned_by = [], [], [], [], []
+    feature, points, scene_of, view_of, orientations = [], [], [], [], []
     for number, (scene, view) in enumerate(views):
-        held = scenes[scene].features
-        part = slice(int(held.starts[view]), int(held.starts[view + 1]))
-        mine, theirs = matching.matched(photo, matching.Described(held.descriptors[part], held.angles[part]), params)
-        feature.append(mine)
-        points.append(scenes[scene].S_metric_scene.apply(held.points[part][theirs]))
-        whose.append(np.full(len(mine), names.index(scene)))
-        view_of.append(np.full(len(mine), number))
-        there = turned.in_scene(held, part.start + theirs, np.full(len(theirs), view))
-        turned_by.append(multiply_quats(in_component[scene], turned.of_camera(there, turns[mine])))
-    return Matches(
+        stored = scenes[scene].features
+        part = slice(int(stored.starts[view]), int(stored.starts[view + 1]))
+        rows, columns = matching.match_features(
+            photo, matching.FeatureSet(stored.descriptors[part], stored.angles[part])
+        )
+        feature.append(rows)
+        points.append(scenes[scene].S_metric_scene.apply(stored.points[part][columns]))
+        scene_of.append(np.full(len(rows), names.index(scene)))
+        view_of.append(np.full(len(rows), number))
+        in_scene = feature_frames.scene_frames(stored, part.start + columns, np.full(len(columns), view))
+        orientations.append(
+            multiply_quats(in_component[scene], feature_frames.camera_orientations(in_scene, frames[rows]))
+        )
+    return PointMatches(
         np.concatenate(feature),
         np.concatenate(points),
-        np.concatenate(whose),
+        np.concatenate(scene_of),
         np.concatenate(view_of),
-        np.concatenate(turned_by),
+        np.concatenate(orientations),
         names,
     )
 
 
-def candidates(
+def propose_poses(
     pixels: np.ndarray,
-    found: Mapping[int, Matches],
+    found: Mapping[int, PointMatches],
     intrinsics_px: np.ndarray,
     size_px: tuple[int, int],
     focal_sigma: float,
-    params: resection.Params,
     *,
-    angles_known: bool = True,
-) -> list[Candidate]:
-    """Poses that matches agree on, most inliers first, none twice.
+    has_angles: bool = True,
+) -> list[PoseCandidate]:
+    """Estimate poses from clusters of matches, most inliers first, without duplicates.
 
     Args:
         pixels: (N, 2) of all features of the photo.
-        angles_known: whether the extractor says how features are turned; else matches say how the camera was turned but
-            for a roll that they share.
+        has_angles: the extractor measures the angles of features; else orientations from matches share an unknown
+            roll.
     """
-    fewest = resection.fewest(focal_sigma, params)
-    bars = replace(params, min_inliers=fewest)
-    out: list[Candidate] = []
+    min_inliers = resection.min_inliers(focal_sigma)
+    out: list[PoseCandidate] = []
     for component, matches in found.items():
         at = pixels[matches.feature]
-        for rows in _turned_alike(matches, params):
-            if len(np.unique(matches.feature[rows])) < fewest:
+        for rows in _cluster_orientations(matches):
+            if len(np.unique(matches.feature[rows])) < min_inliers:
                 continue
-            pose = resection.resect(at[rows], matches.points[rows], intrinsics_px, size_px, focal_sigma, bars)
+            pose = resection.resect(
+                at[rows], matches.points[rows], intrinsics_px, size_px, focal_sigma, min_inliers=min_inliers
+            )
             if pose is None:
                 continue
-            agreeing = resection.agreeing(at, matches.points, pose.T_map_camera, pose.intrinsics_px, size_px, params)
-            turn = matrices_to_quats(pose.T_map_camera[None, :3, :3])
-            if not angles_known:
-                turn = turned.rolled(turn, matches.turns[agreeing])
-            agreeing &= turned.alike(matches.turns, turn, params.max_turn_deg)[:, 0]
-            count = len(np.unique(matches.feature[agreeing]))
-            if count >= fewest:
-                scenes = _by_support(matches, agreeing)
-                agree = at[agreeing], matches.points[agreeing]
-                out.append(Candidate(component, pose.T_map_camera, pose.intrinsics_px, count, scenes, *agree))
+            inliers = resection.find_inliers(at, matches.points, pose.T_map_camera, pose.intrinsics_px, size_px)
+            orientation = matrices_to_quats(pose.T_map_camera[None, :3, :3])
+            if not has_angles:
+                orientation = feature_frames.fit_roll(orientation, matches.orientations[inliers])
+            inliers &= feature_frames.within_angle(matches.orientations, orientation, MAX_TURN_DEG)[:, 0]
+            count = len(np.unique(matches.feature[inliers]))
+            if count >= min_inliers:
+                scenes = _scenes_by_inliers(matches, inliers)
+                of_pose = at[inliers], matches.points[inliers]
+                out.append(PoseCandidate(component, pose.T_map_camera, pose.intrinsics_px, count, scenes, *of_pose))
     out.sort(key=lambda one: (-one.num_inliers, one.component))
-    return _different(out, params)
+    return _without_duplicates(out)
 
 
-def _turned_alike(matches: Matches, params: resection.Params) -> list[np.ndarray]:
-    """Sets (n,) of matches that say about the same of how the camera was turned: of all, those of most features of the
-    photo, then of those that say otherwise, and so on; and of each view alone that of most.
-    """
+def _cluster_orientations(matches: PointMatches) -> list[np.ndarray]:
+    """Return clusters (n,) of matches by orientation: of all views the largest ones, and of each view the largest."""
     if not len(matches.feature):
         return []
-    seeds = np.unique(np.linspace(0, len(matches.feature) - 1, _SEEDS).astype(int))
-    alike = turned.alike(matches.turns[seeds], matches.turns, params.max_turn_deg)
-    count = _distinct(alike, matches.feature)
+    seeds = np.unique(np.linspace(0, len(matches.feature) - 1, _MAX_SEEDS).astype(int))
+    within = feature_frames.within_angle(matches.orientations[seeds], matches.orientations, MAX_TURN_DEG)
+    count = _count_features(within, matches.feature)
     out = []
-    for _ in range(params.turns):
+    for _ in range(MAX_ORIENTATIONS):
         best = int(np.argmax(count))
-        if count[best] < params.min_agreeing:
+        if count[best] < resection.MIN_INLIERS:
             break
-        out.append(np.flatnonzero(alike[best]))
-        near = turned.alike(matches.turns[seeds], matches.turns[seeds[best]][None], _SAME_TURN * params.max_turn_deg)
+        out.append(np.flatnonzero(within[best]))
+        near = feature_frames.within_angle(
+            matches.orientations[seeds], matches.orientations[seeds[best]][None], _SAME_CLUSTER * MAX_TURN_DEG
+        )
         count[near[:, 0]] = 0
     for view in np.unique(matches.view):
-        mine = np.flatnonzero(matches.view == view)
-        alike = turned.alike(matches.turns[mine], matches.turns[mine], params.max_turn_deg)
-        out.append(mine[alike[int(np.argmax(alike.sum(1)))]])
+        rows = np.flatnonzero(matches.view == view)
+        within = feature_frames.within_angle(matches.orientations[rows], matches.orientations[rows], MAX_TURN_DEG)
+        out.append(rows[within[int(np.argmax(within.sum(1)))]])
     return out
 
 
-def _distinct(chosen: np.ndarray, feature: np.ndarray) -> np.ndarray:
-    """(S,) how many different features there are among those that are chosen (S, K)."""
+def _count_features(chosen: np.ndarray, feature: np.ndarray) -> np.ndarray:
+    """Return (S,) number of different features among the chosen matches (S, K)."""
     order = np.argsort(feature, kind="stable")
     first = np.flatnonzero(np.r_[True, np.diff(feature[order]) > 0])
     out: np.ndarray = np.logical_or.reduceat(chosen[:, order], first, axis=1).sum(1)
     return out
 
 
-def _different(found: Sequence[Candidate], params: resection.Params) -> list[Candidate]:
-    """The candidates without those that would settle where a better one does."""
-    out: list[Candidate] = []
+def _without_duplicates(found: Sequence[PoseCandidate]) -> list[PoseCandidate]:
+    out: list[PoseCandidate] = []
     for one in found:
-        if not any(near_to(one, other, params) for other in out):
+        if not any(is_duplicate(one, other) for other in out):
             out.append(one)
     return out
 
 
-def near_to(one: Candidate, other: Candidate, params: resection.Params) -> bool:
-    """Whether two poses would settle at one."""
+def is_duplicate(one: PoseCandidate, other: PoseCandidate) -> bool:
+    """Check whether two candidates are so near that they would be refined to one pose."""
     if one.component != other.component:
         return False
     far = np.linalg.norm(one.T_metric_camera[:3, 3] - other.T_metric_camera[:3, 3])
     angle = angle_between(one.T_metric_camera[:3, :3], other.T_metric_camera[:3, :3])
-    return bool(far < params.same_m and np.degrees(angle) < params.same_deg)
+    return bool(far < DUPLICATE_M and np.degrees(angle) < DUPLICATE_DEG)
 
 
-def _by_support(matches: Matches, agreeing: np.ndarray) -> tuple[str, ...]:
-    """Ids of the scenes, those with most inliers first; those that were looked into and have none last."""
-    counts = np.bincount(matches.scene[agreeing], minlength=len(matches.scenes))
+def _scenes_by_inliers(matches: PointMatches, inliers: np.ndarray) -> tuple[str, ...]:
+    """Return ids of all matched scenes, those with most inliers first."""
+    counts = np.bincount(matches.scene[inliers], minlength=len(matches.scenes))
     order: Sequence[int] = np.argsort(-counts, kind="stable").tolist()
     return tuple(matches.scenes[k] for k in order)

@@ -1,4 +1,4 @@
-"""Clips: their sharpest frames, some a second, as photographs of one place."""
+"""Read video clips: the sharpest frame of every interval, as photos of one place."""
 
 from __future__ import annotations
 
@@ -9,36 +9,38 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError, MissingDependencyError, NotFoundError
-from gsmap.localize.photos import Lens, taken_with
+from gsmap.localize.photos import Lens, make_photo
 from gsmap.types.localization import Photo
 
-_MAX_FRAME_PX = 35_651_584  # of H.264, H.265 and AV1 at level 6.2, their largest: 8192 x 4352
+_MAX_FRAME_PX = 35_651_584  # 8192 x 4352, the largest frame of H.264, H.265 and AV1 (level 6.2)
 
 
 @dataclass(frozen=True)
 class Params:
-    """Which frames of a clip are looked at.
+    """Settings of choosing frames of a video clip.
 
     Args:
-        every_s: one of each stretch of so many seconds, the sharpest.
-        max_frames: at most; stretches are longer where a clip is, and double where its header does not say how long.
-        longest_side_px: larger frames are reduced as they are read.
+        interval_s: Length in seconds, positive, of the intervals of which the sharpest frame each is used; larger is
+            faster.
+        max_frames: Number of frames, at least 1, that are used; intervals of long clips are longer, and larger values
+            take longer.
+        max_side_px: Longer side in pixels, at least 64, to which larger frames are reduced; larger keeps more detail.
     """
 
-    every_s: float = 0.5
+    interval_s: float = 0.5
     max_frames: int = 40
-    longest_side_px: int = 1280
+    max_side_px: int = 1280
 
 
 def read_clip(
     path: str | os.PathLike[str], lens: Lens | None = None, params: Params | None = None
 ) -> list[tuple[float, Photo]]:
-    """Frames of a clip with their times in seconds, upright as it says it is to be shown.
+    """Read frames of a clip with their times in seconds, upright by the clip's rotation.
 
     Raises:
         MissingDependencyError: PyAV is not installed.
         NotFoundError: no such file.
-        InputError: not a clip that FFmpeg reads, frames of more than 36 million pixels, or none.
+        InputError: FFmpeg cannot read the clip, its frames have more than 36 million pixels, or it has none.
     """
     try:
         import av
@@ -58,11 +60,11 @@ def read_clip(
         raise InputError(f"{path} is not a clip that can be read ({error})", code="clip_unreadable") from error
     if not chosen:
         raise InputError(f"{path} has no frame that can be read", code="clip_unreadable")
-    return [(at, taken_with(rgb, lens, None, f"{path.name}#{at:.2f}")) for at, rgb in chosen]
+    return [(at, make_photo(rgb, lens, None, f"{path.name}#{at:.2f}")) for at, rgb in chosen]
 
 
 def _require_size(path: Path, stream) -> None:  # type: ignore[no-untyped-def]
-    """Refuse frames larger than codecs provide for, and keep a stream from growing to such in its middle."""
+    """Reject frames larger than any codec level, also those later in the stream."""
     codec = stream.codec_context
     if codec.width * codec.height > _MAX_FRAME_PX:
         raise InputError(
@@ -73,31 +75,31 @@ def _require_size(path: Path, stream) -> None:  # type: ignore[no-untyped-def]
 
 
 def _sharpest(container, params: Params) -> list[tuple[float, np.ndarray]]:  # type: ignore[no-untyped-def]
-    """The frame of each stretch with most fine detail, as (seconds, (H, W, 3) uint8), at most ``max_frames``.
+    """Return the frame of each interval with most fine detail, as (seconds, (H, W, 3) uint8), at most ``max_frames``.
 
-    How long stretches must be is known when the clip ends, for headers lie and streams have none: they double, and the
-    sharper of two neighbours stays, whenever there are more frames than may be kept.
+    The duration in the header may be wrong or missing. Whenever there are too many frames, the interval doubles, and
+    the sharper of two neighbours is kept.
     """
     start = None
-    every_s = max(params.every_s, float(container.duration or 0) / 1e6 / params.max_frames)
-    best: dict[int, tuple[float, float, np.ndarray]] = {}  # by stretch: detail, seconds, pixels
+    interval_s = max(params.interval_s, float(container.duration or 0) / 1e6 / params.max_frames)
+    best: dict[int, tuple[float, float, np.ndarray]] = {}  # by interval: detail, seconds, pixels
     for number, frame in enumerate(container.decode(video=0)):
         at = float(frame.time) if frame.time is not None else number / 30.0
         start = at if start is None else start
-        factor = min(1.0, params.longest_side_px / max(frame.width, frame.height))
+        factor = min(1.0, params.max_side_px / max(frame.width, frame.height))
         size = (max(2, round(frame.width * factor)), max(2, round(frame.height * factor)))
         rgb = frame.to_ndarray(format="rgb24", width=size[0], height=size[1])
         rgb = np.ascontiguousarray(np.rot90(rgb, round(getattr(frame, "rotation", 0) / 90) % 4))
         grey = rgb[::2, ::2].astype(np.float32).mean(2)
         detail = float(np.abs(np.diff(grey, 2, axis=0)).mean() + np.abs(np.diff(grey, 2, axis=1)).mean())
-        stretch = int((at - start) // every_s)
-        if stretch not in best or detail > best[stretch][0]:
-            best[stretch] = detail, at, rgb
+        interval = int((at - start) // interval_s)
+        if interval not in best or detail > best[interval][0]:
+            best[interval] = detail, at, rgb
         while len(best) > params.max_frames:
-            every_s *= 2
+            interval_s *= 2
             longer: dict[int, tuple[float, float, np.ndarray]] = {}
-            for stretch, one in best.items():
-                if stretch // 2 not in longer or one[0] > longer[stretch // 2][0]:
-                    longer[stretch // 2] = one
+            for interval, one in best.items():
+                if interval // 2 not in longer or one[0] > longer[interval // 2][0]:
+                    longer[interval // 2] = one
             best = longer
-    return [best[stretch][1:] for stretch in sorted(best)]
+    return [best[interval][1:] for interval in sorted(best)]

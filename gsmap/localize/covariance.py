@@ -1,115 +1,94 @@
-"""How well a photograph's pose is known."""
+"""Covariance of a photo's pose, from residuals, the agreement of renders, and the poses of scenes."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.geometry.rotations import skew
-from gsmap.localize import aligning, resection
-from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize import direct_alignment, resection
+from gsmap.localize.map_scene import MapScene
 from gsmap.types import Sim3
 
+# Fitted on synthetic places by ``tools/fit/localize.py PLACES sigma``.
+MODEL_SIGMA_M, MODEL_SIGMA_RAD = 0.003, 0.0003
+"""Standard deviations of a pose without residuals: splats lie beside the surfaces that photos show."""
 
-@dataclass(frozen=True)
-class Params:
-    """How residuals become a covariance.
+PATCH_SCALE, ALIGNMENT_SCALE = 2.1, 4.7
+"""Factors by which residuals of patches and of colours underestimate sigmas where the agreement is 0.5."""
 
-    Args:
-        blocks: columns and rows of the picture; residuals within one block err together, for the surfaces that they lie
-            on do.
-        least_px: no patch is known better than this, at 480 pixels.
-        hidden_m: standard deviation of a translation that leaves no residual: the splats of a capture lie beside the
-            surface that its photographs show; fitted on made places by ``tools/fit/localize.py``.
-        hidden_rad: the same of a rotation.
-        swell: by how many times the standard deviations that residuals of patches tell are too small on made places,
-            where a render agrees by one half with the photo.
-        swell_aligned: the same of what differences of colours tell.
-        disagreeing: where it agrees less or more they are multiplied by exp(disagreeing * (0.5 - agreement)).
-        differing: by what poses by patches and by colours differ either may be wrong: so large a share of its square is
-            added.
-    """
+AGREEMENT_SLOPE = 2.0
+"""Sigmas grow by exp(slope * (0.5 - agreement)) where renders agree less with the photo."""
 
-    blocks: tuple[int, int] = (6, 4)
-    least_px: float = 0.15
-    hidden_m: float = 0.003
-    hidden_rad: float = 0.0003
-    swell: float = 2.1
-    swell_aligned: float = 4.7
-    disagreeing: float = 2.0
-    differing: float = 0.25
+DIFFERENCE_WEIGHT = 0.25
+"""Share of the squared difference between the poses by patches and by colours that is added to their covariance."""
+
+_BLOCKS = (6, 4)  # columns and rows of the photo; residuals of one block are correlated, as their surfaces are
+_MIN_PATCH_SIGMA_PX = 0.15  # for a photo of 480 pixels
 
 
-def of_patches(
-    fit: resection.Refined, pixels: np.ndarray, size_px: tuple[int, int], params: Params, focal_sigma: float
+def patch_covariance(
+    fit: resection.LeastSquaresPose, pixels: np.ndarray, size_px: tuple[int, int], focal_sigma: float
 ) -> np.ndarray:
-    """(dim, dim) over [rot_rad, trans, log focal length] on the camera's side, in the unit of the points, of what the
-    residuals of patches at pixels (K, 2) tell alone.
+    """Return (dim, dim) over [rot_rad, trans, log focal length] on the camera's side, from residuals of patches.
 
     Args:
-        focal_sigma: as in `Photo`; what a focal length that was solved for costs the pose is in.
+        pixels: (K, 2) of the patches.
+        focal_sigma: as in `Photo`; an estimated focal length adds to the covariance of the pose.
     """
-    least = (params.least_px * max(size_px) / 480) ** 2
+    min_variance = (_MIN_PATCH_SIGMA_PX * max(size_px) / 480) ** 2
     weights = np.repeat(fit.weights[:, None], 2, axis=1)
     prior = 1 / focal_sigma**2 if 0 < focal_sigma < np.inf else 0.0
-    told = _sandwich(fit.jacobian, weights, fit.residuals_px, pixels / size_px, least, prior, params.blocks)
-    return told * params.swell**2
+    found = _cluster_sandwich(fit.jacobian, weights, fit.residuals_px, pixels / size_px, min_variance, prior)
+    return found * PATCH_SCALE**2
 
 
-def of_aligned(fit: aligning.Aligned, size_px: tuple[int, int], params: Params, focal_sigma: float) -> np.ndarray:
-    """(dim, dim) of what the differences of colours tell alone.
+def alignment_covariance(
+    fit: direct_alignment.DirectAlignment, size_px: tuple[int, int], focal_sigma: float
+) -> np.ndarray:
+    """Return (dim, dim) as `patch_covariance`, from colour residuals of a direct alignment.
 
     Args:
-        size_px: of the picture that it was aligned with.
+        size_px: of the aligned photo.
     """
     noise = float((fit.weights * fit.residuals**2).sum() / max(fit.weights.sum(), 1e-9))
     prior = noise / focal_sigma**2 if 0 < focal_sigma < np.inf else 0.0
-    told = _sandwich(fit.jacobian, fit.weights, fit.residuals, fit.pixels / size_px, 0.0, prior, params.blocks)
-    return told * params.swell_aligned**2
+    found = _cluster_sandwich(fit.jacobian, fit.weights, fit.residuals, fit.pixels / size_px, 0.0, prior)
+    return found * ALIGNMENT_SCALE**2
 
 
-def doubt_of(agreement: np.ndarray | float, disagreeing: float) -> np.ndarray:
-    """By how many times standard deviations are larger than where a render agrees by one half with the photo.
+def agreement_scale(agreement: np.ndarray | float, slope: float | None = None) -> np.ndarray:
+    """Return the factor on sigmas, relative to an agreement of 0.5 between render and photo.
 
-    Where it agrees less the splats show less, from farther away, and where nobody looked from that side: their errors
-    are of many pixels together, and residuals do not tell them.
+    Low agreement means distant or unobserved surfaces, whose errors are correlated over many pixels and thus invisible
+    in residuals.
 
     Args:
-        agreement: of the render that was laid over it last, in [0, 1] (`gsmap.localize.aligning.Aligned`).
-        disagreeing: of `Params`.
+        agreement: of the last direct alignment, in [0, 1].
+        slope: in place of `AGREEMENT_SLOPE`.
     """
-    return np.exp(disagreeing * (0.5 - np.asarray(agreement)))
+    return np.exp((AGREEMENT_SLOPE if slope is None else slope) * (0.5 - np.asarray(agreement)))
 
 
-def with_hidden(told: np.ndarray, params: Params) -> np.ndarray:
-    """(6, 6) of a pose of which residuals tell so much, with what leaves none."""
-    hidden = np.r_[np.full(3, params.hidden_rad), np.full(3, params.hidden_m)]
-    out: np.ndarray = (told + told.T) / 2 + np.diag(hidden**2)
+def add_model_error(covariance: np.ndarray) -> np.ndarray:
+    """Return (6, 6) of a pose with the errors of the map that leave no residuals."""
+    sigmas = np.r_[np.full(3, MODEL_SIGMA_RAD), np.full(3, MODEL_SIGMA_M)]
+    out: np.ndarray = (covariance + covariance.T) / 2 + np.diag(sigmas**2)
     return out
 
 
-def _sandwich(
-    J: np.ndarray,
-    weights: np.ndarray,
-    r: np.ndarray,
-    at: np.ndarray,
-    least: float,
-    focal: float,
-    blocks: tuple[int, int],
+def _cluster_sandwich(
+    J: np.ndarray, weights: np.ndarray, r: np.ndarray, at: np.ndarray, min_variance: float, focal: float
 ) -> np.ndarray:
-    """(dim, dim): the information between the scores of blocks of the picture (Liang and Zeger 1986).
+    """Return (dim, dim) cluster-robust sandwich covariance, clustered by blocks of the photo (Liang and Zeger 1986).
 
-    Residuals of one block are one measurement, however many it holds. Shrunk towards what independent residuals would
-    tell, for there are few blocks.
+    It is shrunk towards that of independent residuals, for there are few blocks.
 
     Args:
         J: (K, C, dim).
         weights, r: (K, C).
-        at: (K, 2) shares of the picture's width and height.
-        least: variance of a residual, at the least.
-        focal: information of the focal length from elsewhere.
-        blocks: columns and rows.
+        at: (K, 2) as shares of the photo's width and height.
+        min_variance: lower limit of the variance of a residual.
+        focal: prior information of the focal length.
     """
     dim = J.shape[2]
     information = np.einsum("kcd,kc,kce->de", J, weights, J, optimize=True)
@@ -117,48 +96,48 @@ def _sandwich(
         information[6, 6] += focal
     inverse = np.linalg.pinv(information, hermitian=True)
     scores = np.einsum("kcd,kc,kc->kd", J, weights, r, optimize=True)
-    cell = np.clip((at * blocks).astype(int), 0, np.array(blocks) - 1)
-    block = cell[:, 1] * blocks[0] + cell[:, 0]
-    sums = np.zeros((blocks[0] * blocks[1], dim))
+    cell = np.clip((at * _BLOCKS).astype(int), 0, np.array(_BLOCKS) - 1)
+    block = cell[:, 1] * _BLOCKS[0] + cell[:, 0]
+    sums = np.zeros((_BLOCKS[0] * _BLOCKS[1], dim))
     np.add.at(sums, block, scores)
     used = len(np.unique(block))
     clustered = sums.T @ sums * (used / max(used - dim / 2, 1.0))
-    # Each alone, at its own noise or at the least there is, times how many lie in a block together: an upper end of
-    # what blocks could show had chance not made their sums small.
+    # Independent residuals, times the number in a block: a bound of the clustered estimate, should its sums be small
+    # by chance.
     seen = float((weights * r**2).sum() / max(weights.sum() - dim, 1.0))
-    many = len(J) / max(used, 1)
-    independent = information * max(seen, least) * np.sqrt(many)
+    per_block = len(J) / max(used, 1)
+    independent = information * max(seen, min_variance) * np.sqrt(per_block)
     share = used / (used + 2.0 * dim)
     middle = share * clustered + (1 - share) * independent
     out: np.ndarray = inverse @ middle @ inverse
     return out
 
 
-def with_scene(
-    covariance: np.ndarray, T_metric_camera: np.ndarray, scenes: list[tuple[PlacedFeatures, float]]
+def add_scene_covariance(
+    covariance: np.ndarray, T_metric_camera: np.ndarray, scenes: list[tuple[MapScene, float]]
 ) -> np.ndarray:
-    """The same with what is not known of where the scenes lie in the map.
+    """Add the uncertainty of the poses of the supporting scenes.
 
     Args:
         covariance: (6, 6), metres.
-        scenes: those that the patches were found in, and their shares of them. Scenes that lie side by side in the map
-            err together, so their covariances are averaged and not divided.
+        scenes: with their shares of the patches. Errors of neighbouring scenes are correlated, so their covariances are
+            averaged.
     """
     out = covariance.copy()
     total = sum(share for _, share in scenes)
     for scene, share in scenes:
         if scene.covariance is None or total <= 0:
             continue
-        out += share / total * _carried(scene.covariance, scene.S_metric_scene, T_metric_camera)
+        out += share / total * _propagate(scene.covariance, scene.S_metric_scene, T_metric_camera)
     return out
 
 
-def _carried(covariance: np.ndarray, S_metric_scene: Sim3, T_metric_camera: np.ndarray) -> np.ndarray:
-    """(6, 6) of a camera fixed to a scene whose pose errs (7, 7, on the scene's side and in its unit)."""
-    # S Exp(xi) p: seen from the camera, the scene moves it by the adjoint of (scene in camera).
+def _propagate(covariance: np.ndarray, S_metric_scene: Sim3, T_metric_camera: np.ndarray) -> np.ndarray:
+    """Return (6, 6) of a camera fixed to a scene with covariance (7, 7) on the scene's side and in its unit."""
+    # By the adjoint of the scene's pose in the camera: S Exp(xi) p.
     scale = S_metric_scene.scale
     R = T_metric_camera[:3, :3].T @ S_metric_scene.rotation  # camera from scene
-    centre = S_metric_scene.inverse().apply(T_metric_camera[:3, 3])  # the camera's place in the scene
+    centre = S_metric_scene.inverse().apply(T_metric_camera[:3, 3])  # the camera in the scene frame
     J = np.zeros((6, 7))
     J[:3, :3] = R
     J[3:, :3] = -scale * R @ skew(centre)

@@ -1,11 +1,10 @@
-"""What a placed photograph shows otherwise than the map does there.
+"""Find regions of a localized photo that differ from the map.
 
-The map is rendered from the photograph's pose, each scene alone. Light differs between any two days: a robust line per
-channel (`gsmap.compare.colours`) takes the colours of the render to those of the photo first, and what is left is
-compared by hue, which shading leaves alone; by lightness only where neither a smooth field of light nor the same
-pattern in another light explains it. A pixel counts only where its surface is known: opaque, away from edges by as much
-as the pose is uncertain there, and looked at by the capture's own cameras from about that side. Where any scene shows
-what the photo shows, nothing differs.
+Each supporting scene is rendered from the photo's pose. A robust line per channel (`gsmap.compare.colours`) first
+adapts the render's colours to the photo's light. The rest is compared by hue, which shading does not change, and by
+lightness only where neither a smooth light field nor an equal pattern explains it. A pixel is compared where its
+surface is known: opaque, away from edges by the uncertainty of the pose, and seen by the capture's own cameras from a
+similar direction. A pixel that agrees with any scene does not differ.
 """
 
 from __future__ import annotations
@@ -18,34 +17,47 @@ from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, labe
 
 from gsmap.compare.colours import Balance, balance
 from gsmap.geometry.projection import in_image, project
-from gsmap.localize.differing import Params
-from gsmap.localize.localizing import prepared
-from gsmap.localize.looks import GREY, Look, look
-from gsmap.localize.params import Params as LocalizeParams
-from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize.candidate_renders import GREY, SceneRender, render_scenes
+from gsmap.localize.localization import scale_photo
+from gsmap.localize.map_scene import MapScene
+from gsmap.localize.refinement import MAX_SCENES
 from gsmap.render import render
 from gsmap.types import Cameras
 from gsmap.types.change import ChangeKind
 from gsmap.types.localization import Photo
 
-_FLOOR = 0.02  # of colours whose logarithm is taken
-_FEWEST_EYES = 2
-_ROUND = 1.0  # pixels that patches are off however sure the pose is: the map's own error
+_HALF_PX = 6  # half width of the patches over which differences are averaged
+_MIN_CHROMA, _CHROMA_SPREADS = 0.1, 4.0  # difference of hue that counts: absolute, and in robust standard deviations
+_MIN_LIGHTNESS, _LIGHTNESS_SPREADS = 0.11, 5.0  # the same of lightness, without the light field
+_LIGHT_FIELD_PX = 40.0  # standard deviation of the blur that estimates the light field
+_SAME_PATTERN = 0.4  # correlation of patterns, from which on a difference of lightness is one of light
+_MIN_STRENGTH = 1.6  # mean difference of a region, in units of the thresholds
+_CAPTURE_VIEWS, _CAPTURE_VIEW_SIDE_PX = 32, 128
+_MIN_CAPTURE_VIEWS = 2  # that must have seen a surface
+_SURFACE_M, _SURFACE_FRACTION = 0.05, 0.03  # tolerance of depths: absolute, and per depth
+_MAX_TURN_DEG = 60.0  # between the photo's direction and that of a capture view
+_MIN_SHARE = 0.05  # of the photo that a scene must cover to be compared ...
+_MIN_AGREEING = 0.5  # ... and share of it that must agree, else the scene shows another place
+_MIN_COLOUR = 0.02  # of logarithms
+_MAP_ERROR_PX = 1.0  # of renders from an exact pose
+_RECOLOURED_PATTERN = 0.6  # median correlation of patterns in a recoloured region
+_RIM_PX = 4  # reach of the outline of a region, to either side
+_OUTLINE_RATIO = 1.4  # of the contrast of an outline in photo and render, for it to belong to one of them
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
-    """A part of a photograph that shows something else than the map.
+class ChangedRegion:
+    """A region of a photo that differs from the map.
 
     Args:
         box_px: ``x0 y0 x1 y1`` in pixels of the photo itself.
-        share: of the picture.
-        strength: mean difference in units of what light and noise explain; more is surer.
-        kind: ``appeared`` (something stands there that the map has not), ``disappeared`` (what the map has there is
-            gone), ``recoloured`` or ``replaced``: as far as one photograph can tell.
-        mask: (H, W) bool, at the size that the photo was worked on.
-        point: (3,) the middle of what the map has there, metres, its component's frame.
-        scene: id of the one that shows it.
+        share: of the photo.
+        strength: mean difference in units of what light and noise explain.
+        kind: ``appeared`` (the photo shows something before the map's surface), ``disappeared`` (the map's content is
+            gone), ``recoloured`` or ``replaced``, as far as one photo shows it.
+        mask: (H, W) bool, at the size of comparison.
+        point: (3,) median of the map's surface there, metres, in its component's frame.
+        scene: id of the scene that it is compared with.
     """
 
     box_px: np.ndarray
@@ -58,44 +70,44 @@ class Region:
 
 
 @dataclass(frozen=True, eq=False)
-class Differences:
-    """A photograph beside the map.
+class PhotoComparison:
+    """Comparison of a localized photo with the map.
 
     Args:
         regions: the strongest first.
-        judged: share of the picture that could be compared.
-        compared: (H, W) bool, which.
-        agrees: (H, W) bool: of these, where the map shows the same.
-        shown: (H, W, 3) float32 what the map shows there, in the light of the photo.
-        points: (H, W, 3) float64 surface of the map, metres; NaN where it could not be compared.
-        scale: (4,) by what intrinsics of the photo are multiplied to be of these sizes.
+        compared_fraction: share of the photo that is compared.
+        compared: (H, W) bool pixels that are compared.
+        agrees: (H, W) bool compared pixels that agree with the map.
+        rendered: (H, W, 3) float32 render of the map, in the light of the photo.
+        points: (H, W, 3) float64 surface of the map, metres; NaN where it is not compared.
+        scale: (4,) factors on the photo's intrinsics to this size.
     """
 
-    regions: tuple[Region, ...]
-    judged: float
+    regions: tuple[ChangedRegion, ...]
+    compared_fraction: float
     compared: np.ndarray
     agrees: np.ndarray
-    shown: np.ndarray
+    rendered: np.ndarray
     points: np.ndarray
     scale: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Eyes:
-    """What a scene's own cameras saw: cameras of its frame and unit, and the depth (h, w) of each, 0 for nothing."""
+class CaptureViews:
+    """A scene's own cameras, in its frame and unit, with the depth (h, w) that each sees, 0 for nothing."""
 
     cameras: tuple[Cameras, ...]
     depths: tuple[np.ndarray, ...]
 
 
-def open_eyes(scene: PlacedFeatures, cameras: Cameras | None, params: Params) -> Eyes:
-    """Render a scene through its own cameras; without cameras it has looked at nothing."""
+def render_capture_views(scene: MapScene, cameras: Cameras | None) -> CaptureViews:
+    """Render the depth of a scene from its own cameras; without cameras there are no views."""
     if cameras is None or not len(cameras):
-        return Eyes((), ())
-    small = cameras.evenly(params.eyes).resized(params.eyes_px)
+        return CaptureViews((), ())
+    small = cameras.evenly(_CAPTURE_VIEWS).resized(_CAPTURE_VIEW_SIDE_PX)
     views = tuple(small[i] for i in range(len(small)))
     seen = [render(scene.gaussians, view, dominant_id=False, backend="native") for view in views]
-    return Eyes(views, tuple(np.where(one.alpha[0] > 0.8, one.depth[0], np.float32(0)) for one in seen))
+    return CaptureViews(views, tuple(np.where(one.alpha[0] > 0.8, one.depth[0], np.float32(0)) for one in seen))
 
 
 def compare_photo(
@@ -103,115 +115,120 @@ def compare_photo(
     T_metric_camera: np.ndarray,
     covariance: np.ndarray,
     intrinsics_px: np.ndarray,
-    scenes: Sequence[PlacedFeatures],
-    eyes: Mapping[str, Eyes],
-    params: LocalizeParams,
-) -> Differences:
-    """Compare a placed photograph with what the map shows there.
+    scenes: Sequence[MapScene],
+    capture_views: Mapping[str, CaptureViews],
+    image_size_px: int,
+    min_change_fraction: float,
+) -> PhotoComparison:
+    """Compare a localized photo with renders of the map.
 
     Args:
         T_metric_camera: (4, 4) camera-to-component, metres.
         covariance: (6, 6) over [rot_rad, trans_m], camera's side.
         intrinsics_px: (4,) of the photo's own size.
-        scenes: that support its pose, who supports most first.
-        eyes: of `open_eyes`, by scene id.
+        scenes: that support its pose, those with most support first.
+        capture_views: of `render_capture_views`, by scene id.
+        image_size_px: longer side at which they are compared.
+        min_change_fraction: share of the photo that a region must cover.
     """
-    told = params.differences
-    picture, scale = prepared(photo, params)
+    scaled, scale = scale_photo(photo, image_size_px)
     lens = intrinsics_px * scale
-    grey = gaussian_filter(picture.rgb, (_ROUND, _ROUND, 0))  # renders show nothing so fine
-    shape = picture.grey.shape
+    rgb = gaussian_filter(scaled.rgb, (_MAP_ERROR_PX, _MAP_ERROR_PX, 0))  # renders have no finer detail
+    shape = scaled.grey.shape
     best = np.full(shape, np.inf, np.float32)
     pattern = np.full(shape, -1.0, np.float32)
-    shown, whose = picture.rgb.copy(), np.full(shape, -1)
+    rendered, scene_of = scaled.rgb.copy(), np.full(shape, -1)
     points = np.full((*shape, 3), np.nan)
-    looks = look(scenes[: params.settling.max_scenes], T_metric_camera, lens, picture.size_px, params.features)
-    for number, one in enumerate(looks):
-        places = _points(one, T_metric_camera, lens)
-        off = _uncertainty_px(one.depth_m, covariance, lens)
-        usable = _away_from_edges(one.sound, off)
-        if picture.known is not None:
-            usable &= picture.known
+    renders = render_scenes(scenes[:MAX_SCENES], T_metric_camera, lens, scaled.size_px)
+    for number, one in enumerate(renders):
+        positions = _all_points(one)
+        sigma_px = _uncertainty_px(one.depth_m, covariance, lens)
+        usable = _away_from_edges(one.smooth, sigma_px)
+        if scaled.mask is not None:
+            usable &= scaled.mask
         rows = np.flatnonzero(usable)
-        if len(rows) < told.min_share * usable.size:
+        if len(rows) < _MIN_SHARE * usable.size:
             continue
-        looked = np.zeros(usable.size, bool)
-        looked[rows] = _looked_at(scenes[number], eyes[one.scene], places.reshape(-1, 3)[rows], T_metric_camera, told)
-        known = looked.reshape(shape)
-        if known.mean() < told.min_share:
+        seen = np.zeros(usable.size, bool)
+        seen[rows] = _is_observed(
+            scenes[number], capture_views[one.scene], positions.reshape(-1, 3)[rows], T_metric_camera
+        )
+        known = seen.reshape(shape)
+        if known.mean() < _MIN_SHARE:
             continue
-        line = balance(one.rgb[known], grey[known])
-        apart, alike = _apart(line, one.rgb, grey, known, off, told)
-        judged = known & (uniform_filter(known.astype(np.float32), 2 * told.half_px + 1) > 0.6)
-        if not judged.any() or (apart[judged] <= 1).mean() < told.min_agreeing:
+        line = balance(one.rgb[known], rgb[known])
+        difference, correlation = _measure_difference(line, one.rgb, rgb, known, sigma_px)
+        compared = known & (uniform_filter(known.astype(np.float32), 2 * _HALF_PX + 1) > 0.6)
+        if not compared.any() or (difference[compared] <= 1).mean() < _MIN_AGREEING:
             continue
-        better = judged & (apart < best)
-        best[better], pattern[better], whose[better] = apart[better], alike[better], number
-        shown[better] = line.applied(one.rgb)[better]
-        points[better] = places[better]
+        better = compared & (difference < best)
+        best[better], pattern[better], scene_of[better] = difference[better], correlation[better], number
+        rendered[better] = line.applied(one.rgb)[better]
+        points[better] = positions[better]
     compared = np.isfinite(best)
-    found = _regions(best, compared, told)
-    regions = [_region(mask, best, pattern, shown, points, whose, looks, grey, scale) for mask in found]
+    masks = _connected_regions(best, compared, min_change_fraction)
+    regions = [_describe_region(mask, best, pattern, rendered, points, scene_of, renders, rgb, scale) for mask in masks]
     regions = sorted(
-        (one for one in regions if one.strength >= told.min_strength), key=lambda one: -one.strength * one.share
+        (one for one in regions if one.strength >= _MIN_STRENGTH), key=lambda one: -one.strength * one.share
     )
-    return Differences(tuple(regions), float(compared.mean()), compared, compared & (best <= 1), shown, points, scale)
+    agrees = compared & (best <= 1)
+    return PhotoComparison(tuple(regions), float(compared.mean()), compared, agrees, rendered, points, scale)
 
 
-def _points(one: Look, T_metric_camera: np.ndarray, lens: np.ndarray) -> np.ndarray:
-    """(H, W, 3) places of all pixels of a look, metres."""
+def _all_points(one: SceneRender) -> np.ndarray:
+    """Return (H, W, 3) positions of all pixels of a render, metres."""
     height, width = one.grey.shape
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
     return one.points(pixels).reshape(height, width, 3)
 
 
 def _uncertainty_px(depth_m: np.ndarray, covariance: np.ndarray, lens: np.ndarray) -> np.ndarray:
-    """(H, W) pixels by which the surface at each pixel may lie off (one standard deviation of the worst direction)."""
+    """Return (H, W) standard deviation of the surface at each pixel, in the least certain direction."""
     turn, shift = (float(np.linalg.eigvalsh(covariance[p, p])[-1].clip(0)) for p in (slice(3), slice(3, 6)))
     out: np.ndarray = lens[0] * np.sqrt(turn + shift / np.maximum(depth_m, 0.1) ** 2)
     return out
 
 
-def _away_from_edges(sound: np.ndarray, off_px: np.ndarray) -> np.ndarray:
-    """Pixels around which all is sound, as far as two standard deviations of the pose reach."""
-    out = sound.copy()
-    for step in range(1, 9):  # beyond that nothing near an edge is left anyhow
-        wide = 2 * off_px + _ROUND > step + 2  # soundness itself keeps a few pixels from edges
+def _away_from_edges(smooth: np.ndarray, sigma_px: np.ndarray) -> np.ndarray:
+    """Return (H, W) bool: pixels whose surroundings within two standard deviations of the pose are smooth."""
+    out = smooth.copy()
+    for step in range(1, 9):
+        wide = 2 * sigma_px + _MAP_ERROR_PX > step + 2  # smooth pixels keep a few pixels from edges
         if not wide.any():
             break
-        out &= ~wide | binary_erosion(sound, iterations=step, border_value=1)
+        out &= ~wide | binary_erosion(smooth, iterations=step, border_value=1)
     return out
 
 
-def _looked_at(
-    scene: PlacedFeatures, eyes: Eyes, points: np.ndarray, T_metric_camera: np.ndarray, params: Params
+def _is_observed(
+    scene: MapScene, capture_views: CaptureViews, points: np.ndarray, T_metric_camera: np.ndarray
 ) -> np.ndarray:
-    """(K,) bool of points (metres): whether the scene's own cameras saw them from about the side of a camera."""
+    """Return (K,) bool: points (metres) that the scene's own cameras saw from a similar direction as a camera."""
     S = scene.S_metric_scene.inverse()
     at, here, unit = S.apply(points), S.apply(T_metric_camera[:3, 3]), scene.S_metric_scene.scale
-    way = at - here
-    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    direction = at - here
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
     count = np.zeros(len(at), np.int64)
-    least = np.cos(np.radians(params.max_turn_deg))
-    for camera, depth in zip(eyes.cameras, eyes.depths, strict=True):
+    min_cosine = np.cos(np.radians(_MAX_TURN_DEG))
+    for camera, depth in zip(capture_views.cameras, capture_views.depths, strict=True):
         pixels, z = project(at, camera.T_camera_frame[0], camera.intrinsics_px[0])
         rows = np.flatnonzero(in_image(pixels, z, camera.sizes_px[0], near=0.05 / unit))
         column, row = pixels[rows].astype(np.int64).T
         surface, z = depth[row, column], z[rows]
-        own = (surface > 0) & (np.abs(surface - z) < params.tolerance_m / unit + params.tolerance * z)
+        own = (surface > 0) & (np.abs(surface - z) < _SURFACE_M / unit + _SURFACE_FRACTION * z)
         rows = rows[own]
-        theirs = at[rows] - camera.centers[0]
-        theirs /= np.maximum(np.linalg.norm(theirs, axis=1, keepdims=True), 1e-9)
-        count[rows] += (theirs * way[rows]).sum(1) > least
-    out: np.ndarray = count >= _FEWEST_EYES
+        rays = at[rows] - camera.centers[0]
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
+        count[rows] += (rays * direction[rows]).sum(1) > min_cosine
+    out: np.ndarray = count >= _MIN_CAPTURE_VIEWS
     return out
 
 
-def _apart(
-    line: Balance, shown: np.ndarray, photo: np.ndarray, known: np.ndarray, off_px: np.ndarray, params: Params
+def _measure_difference(
+    line: Balance, rendered: np.ndarray, photo: np.ndarray, known: np.ndarray, sigma_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) how far a photo lies from a render in units of what light and noise explain; how patterns correlate."""
-    side = 2 * params.half_px + 1
+    """Return (H, W) differences in units of what light and noise explain, and (H, W) correlations of patterns."""
+    side = 2 * _HALF_PX + 1
     weight = known.astype(np.float32)
     share = np.maximum(uniform_filter(weight, side), 1e-3)
 
@@ -219,22 +236,22 @@ def _apart(
         out: np.ndarray = uniform_filter(np.where(known, values, 0).astype(np.float32), side) / share
         return out
 
-    chroma, light = line.differences(shown, photo, known)
-    field = gaussian_filter(light * weight, params.light_px) / np.maximum(
-        gaussian_filter(weight, params.light_px), 1e-3
+    chroma, light = line.differences(rendered, photo, known)
+    field = gaussian_filter(light * weight, _LIGHT_FIELD_PX) / np.maximum(
+        gaussian_filter(weight, _LIGHT_FIELD_PX), 1e-3
     )
     hue = mean(np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1])))
     bright = mean(np.abs(light - field))
-    alike = _pattern(line.applied(shown), photo, off_px[known], side)
-    out = hue / max(params.min_chroma, params.chroma_spreads * line.chroma_spread)
-    bright = bright / max(params.min_lightness, params.lightness_spreads * line.lightness_spread)
-    return np.maximum(out, np.where(alike < params.same_pattern, bright, 0)).astype(np.float32), alike
+    correlation = _correlate_patterns(line.applied(rendered), photo, sigma_px[known], side)
+    out = hue / max(_MIN_CHROMA, _CHROMA_SPREADS * line.chroma_spread)
+    bright = bright / max(_MIN_LIGHTNESS, _LIGHTNESS_SPREADS * line.lightness_spread)
+    return np.maximum(out, np.where(correlation < _SAME_PATTERN, bright, 0)).astype(np.float32), correlation
 
 
-def _pattern(shown: np.ndarray, photo: np.ndarray, off_px: np.ndarray, side: int) -> np.ndarray:
-    """(H, W) best correlation of patches within the pixels that a pose may be off."""
-    a, b = (np.log(x @ GREY + _FLOOR).astype(np.float64) for x in (shown, photo))
-    reach = int(np.clip(np.ceil(2 * np.median(off_px)), 1, 3)) if len(off_px) else 1
+def _correlate_patterns(rendered: np.ndarray, photo: np.ndarray, sigma_px: np.ndarray, side: int) -> np.ndarray:
+    """Return (H, W) best correlation of patches over shifts within the uncertainty of the pose."""
+    a, b = (np.log(x @ GREY + _MIN_COLOUR).astype(np.float64) for x in (rendered, photo))
+    reach = int(np.clip(np.ceil(2 * np.median(sigma_px)), 1, 3)) if len(sigma_px) else 1
     mean_a, mean_b = uniform_filter(a, side), uniform_filter(b, side)
     spread_a = np.maximum(uniform_filter(a * a, side) - mean_a**2, 1e-5)
     spread_b = np.maximum(uniform_filter(b * b, side) - mean_b**2, 1e-5)
@@ -247,56 +264,50 @@ def _pattern(shown: np.ndarray, photo: np.ndarray, off_px: np.ndarray, side: int
     return best.astype(np.float32)
 
 
-def _regions(apart: np.ndarray, compared: np.ndarray, params: Params) -> list[np.ndarray]:
-    """Masks of the connected parts that differ and are large enough."""
-    differs = compared & (apart > 1)
+def _connected_regions(difference: np.ndarray, compared: np.ndarray, min_fraction: float) -> list[np.ndarray]:
+    """Return masks of the connected regions that differ and are large enough."""
+    differs = compared & (difference > 1)
     labels, count = label(differs)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    return [labels == k for k in range(1, count + 1) if sizes[k] >= params.min_area * apart.size]
+    return [labels == k for k in range(1, count + 1) if sizes[k] >= min_fraction * difference.size]
 
 
-def _region(
+def _describe_region(
     mask: np.ndarray,
-    apart: np.ndarray,
+    difference: np.ndarray,
     pattern: np.ndarray,
-    shown: np.ndarray,
+    rendered: np.ndarray,
     points: np.ndarray,
-    whose: np.ndarray,
-    looks: Sequence[Look],
+    scene_of: np.ndarray,
+    renders: Sequence[SceneRender],
     photo: np.ndarray,
     scale: np.ndarray,
-) -> Region:
+) -> ChangedRegion:
     row, column = np.nonzero(mask)
     box = np.array([column.min(), row.min(), column.max() + 1, row.max() + 1], np.float64) / scale[[0, 1, 0, 1]]
-    counts = np.bincount(whose[mask], minlength=len(looks))
-    return Region(
+    counts = np.bincount(scene_of[mask], minlength=len(renders))
+    return ChangedRegion(
         box,
         float(mask.mean()),
-        float(np.minimum(apart[mask], 4).mean()),
-        _kind(mask, shown, photo, float(np.median(pattern[mask]))),
+        float(np.minimum(difference[mask], 4).mean()),
+        _classify(mask, rendered, photo, float(np.median(pattern[mask]))),
         mask,
         np.median(points[mask], axis=0),
-        looks[int(counts.argmax())].scene,
+        renders[int(counts.argmax())].scene,
     )
 
 
-def _kind(mask: np.ndarray, shown: np.ndarray, photo: np.ndarray, pattern: float) -> ChangeKind:
-    """What one picture can tell: by whether the region's outline is one of the photo, of the map, or of both."""
-    if pattern > _SAME:
+def _classify(mask: np.ndarray, rendered: np.ndarray, photo: np.ndarray, pattern: float) -> ChangeKind:
+    """Classify a region by whether its outline is one of the photo, of the map, or of both."""
+    if pattern > _RECOLOURED_PATTERN:
         return "recoloured"
-    rim = binary_dilation(mask, iterations=_RIM) & ~binary_erosion(mask, iterations=_RIM)
+    rim = binary_dilation(mask, iterations=_RIM_PX) & ~binary_erosion(mask, iterations=_RIM_PX)
     edges = []
-    for rgb in (photo, shown):
+    for rgb in (photo, rendered):
         smooth = gaussian_filter(rgb, (2, 2, 0))
         steps = np.sqrt(sum(g**2 for g in np.gradient(smooth, axis=(0, 1))))
         edges.append(float(np.quantile(steps.max(-1)[rim], 0.75)))
     in_photo, in_map = edges
-    if in_photo > _OUTLINED * in_map:
+    if in_photo > _OUTLINE_RATIO * in_map:
         return "appeared"
-    return "disappeared" if in_map > _OUTLINED * in_photo else "replaced"
-
-
-_SAME = 0.6
-_RIM = 4
-_OUTLINED = 1.4
-"""So much stronger an outline is in one of the two than in the other, to be only its own."""
+    return "disappeared" if in_map > _OUTLINE_RATIO * in_photo else "replaced"

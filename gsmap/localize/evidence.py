@@ -1,60 +1,42 @@
-"""What speaks for and against a photograph's place: what the map shows from there, beside what the photograph shows."""
+"""Compare a photo with renders from its pose, patch by patch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from gsmap.localize.filters import means
-from gsmap.localize.looks import GREY, Look, smaller, wholly
-from gsmap.localize.unlike import Unlike
+from gsmap.localize.candidate_renders import GREY, SceneRender, downsample, downsample_mask
+from gsmap.localize.filters import box_means
+from gsmap.localize.mismatch import MismatchMap
 
+HALF_PX = 8
+"""Half width of the compared patches."""
 
-@dataclass(frozen=True)
-class Params:
-    """How a photograph is compared with renders.
+STEP_PX = 8
+"""Distance between the centres of neighbouring patches."""
 
-    Args:
-        half_px: patterns are compared within patches that reach so far from their middle.
-        step_px: from one patch to the next.
-        min_structure: least contrast of a patch (standard deviation, grey in [0, 1]) in the photo or the render, for it
-            to be compared.
-        agree: normalised correlation from which on a patch is explained.
-        contradict: ... and under which it shows something else.
-        inlier_px: a patch that is found again this near to where the pose predicts it is an inlier, at 480 pixels.
-        blocks: columns and rows of the picture over which inliers should be spread.
-        coarse: patterns are compared once more in pictures so many times smaller, where renders are as sharp as photos.
-        likely, surely: so probably a cell of the photo shows something else than the map (`gsmap.localize.unlike`).
-        ask_from: where all else leaves a lower probability at most, that is not asked.
-        near_m: surfaces nearer than this stand in a camera's face.
-    """
+EXPLAINED_CORRELATION, CONTRADICTED_CORRELATION = 0.5, 0.15
+"""Normalized correlations from which on a patch is explained by the map, and below which it is contradicted."""
 
-    half_px: int = 8
-    step_px: int = 8
-    min_structure: float = 0.02
-    agree: float = 0.5
-    contradict: float = 0.15
-    inlier_px: float = 2.0
-    blocks: tuple[int, int] = (8, 6)
-    coarse: int = 4
-    likely: float = 0.5
-    surely: float = 0.8
-    ask_from: float = 0.05
-    near_m: float = 0.1
+COARSE = 4
+"""Reduction of the second comparison, at which renders are as sharp as photos."""
+
+_MIN_CONTRAST = 0.02  # standard deviation in the photo or the render, grey in [0, 1], for a patch to be compared
+_BLOCKING_M = 0.1  # surfaces nearer than this block the camera
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
-    """A photograph beside what the map shows from one pose.
+class RenderComparison:
+    """Agreement of a photo with renders from one pose.
 
     Args:
-        correlation: (R, C) of each patch with that scene's that shows it best; NaN where nothing can be compared.
-        seen: share of the picture where some scene is opaque.
+        correlation: (R, C) of each patch with the best scene; NaN where none can be compared.
+        seen: share of the photo in which some scene is opaque.
         colour: correlation of the chroma of photo and renders over patches; NaN where neither has any.
-        blocked: share of the picture where something stands in the camera's face.
+        blocked: share of the photo in which a surface blocks the camera.
     """
 
     correlation: np.ndarray
@@ -62,99 +44,96 @@ class Comparison:
     colour: float
     blocked: float
 
-    def explained(self, agree: float) -> float:
-        """Share of the patches that could be compared which agree; 0 of none."""
-        judged = self.correlation[np.isfinite(self.correlation)]
-        return float((judged >= agree).mean()) if len(judged) else 0.0
+    def explained(self, min_correlation: float = EXPLAINED_CORRELATION) -> float:
+        """Return the share of compared patches that the map explains; 0 without any."""
+        compared = self.correlation[np.isfinite(self.correlation)]
+        return float((compared >= min_correlation).mean()) if len(compared) else 0.0
 
-    def contradicted(self, bar: float) -> float:
-        """Share of the patches that could be compared which show something else; 0 of none."""
-        judged = self.correlation[np.isfinite(self.correlation)]
-        return float((judged < bar).mean()) if len(judged) else 0.0
+    def contradicted(self) -> float:
+        """Return the share of compared patches that the map contradicts; 0 without any."""
+        compared = self.correlation[np.isfinite(self.correlation)]
+        return float((compared < CONTRADICTED_CORRELATION).mean()) if len(compared) else 0.0
 
     @property
-    def num_judged(self) -> int:
+    def num_compared(self) -> int:
         return int(np.isfinite(self.correlation).sum())
 
 
 def compare(
     rgb: np.ndarray,
-    looks: Sequence[Look],
-    params: Params,
-    other: Unlike | None = None,
-    times: int = 1,
-    known: np.ndarray | None = None,
-) -> Comparison:
+    renders: Sequence[SceneRender],
+    mismatch: MismatchMap | None = None,
+    reduction: int = 1,
+    mask: np.ndarray | None = None,
+    step_px: int = STEP_PX,
+) -> RenderComparison:
     """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose.
 
     Args:
-        other: a part of the photo that shows something else is left out.
-        times: the photo was so many times larger when that was asked.
-        known: (H, W) bool: pixels of the photo that count; None of all.
+        mismatch: its largest part is excluded.
+        reduction: of this photo's size to that of the mismatch map.
+        mask: (H, W) bool: valid pixels of the photo; None where all are.
     """
     grey = rgb @ GREY
-    # Of patches around every so many pixels: means of the photo, of its square, and of its colours.
-    around = partial(
-        _around, rows=rgb.shape[0] - 2 * params.half_px, columns=rgb.shape[1] - 2 * params.half_px, params=params
-    )
+    around = partial(_patch_means, rows=rgb.shape[0] - 2 * HALF_PX, columns=rgb.shape[1] - 2 * HALF_PX, step_px=step_px)
     mean, square, photo_colour = around(grey), around(grey * grey), around(rgb)
     variance = np.maximum(square - mean**2, 0)
     best = np.full(mean.shape, -np.inf, np.float32)
-    judged = np.zeros(best.shape, bool)
-    asked = np.ones(best.shape, bool)
-    if other is not None:
-        asked = ~other.covers(best.shape, times * params.half_px, times * params.step_px)
+    compared = np.zeros(best.shape, bool)
+    included = np.ones(best.shape, bool)
+    if mismatch is not None:
+        included = ~mismatch.covers(best.shape, reduction * HALF_PX, reduction * step_px)
     seen, blocked = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
-    shown = np.zeros((*best.shape, 3), np.float32)
-    for one in looks:
+    render_colour = np.zeros((*best.shape, 3), np.float32)
+    for one in renders:
         opaque = one.alpha > 0.9
-        if known is not None:
-            opaque &= known
+        if mask is not None:
+            opaque &= mask
         seen |= opaque
-        blocked |= opaque & (one.depth_m < params.near_m)
+        blocked |= opaque & (one.depth_m < _BLOCKING_M)
         level = around(one.grey)
         spread = np.maximum(around(one.grey**2) - level**2, 0)
         both = around(grey * one.grey) - mean * level
         correlation = both / np.sqrt(np.maximum(variance * spread, 1e-12))
-        whole = asked & (around(opaque.astype(np.float32)) > 0.95)
-        tells = whole & (np.maximum(variance, spread) > params.min_structure**2) & (np.minimum(variance, spread) > 4e-5)
-        correlation = np.where(tells, correlation, -np.inf)
+        whole = included & (around(opaque.astype(np.float32)) > 0.95)
+        valid = whole & (np.maximum(variance, spread) > _MIN_CONTRAST**2) & (np.minimum(variance, spread) > 4e-5)
+        correlation = np.where(valid, correlation, -np.inf)
         better = correlation > best
-        shown[better] = around(one.rgb)[better]
+        render_colour[better] = around(one.rgb)[better]
         best = np.maximum(best, correlation)
-        judged |= tells
-    best = np.where(judged, best, np.nan)
-    of_picture = 1.0 if known is None else max(float(known.mean()), 1e-9)
-    shares = float(seen.mean()) / of_picture, float(blocked.mean()) / of_picture
-    return Comparison(best, shares[0], _chroma(photo_colour[judged], shown[judged]), shares[1])
+        compared |= valid
+    best = np.where(compared, best, np.nan)
+    valid_share = 1.0 if mask is None else max(float(mask.mean()), 1e-9)
+    shares = float(seen.mean()) / valid_share, float(blocked.mean()) / valid_share
+    return RenderComparison(
+        best, shares[0], _chroma_correlation(photo_colour[compared], render_colour[compared]), shares[1]
+    )
 
 
-def _around(image: np.ndarray, rows: int, columns: int, params: Params) -> np.ndarray:
-    """Means over the patches that are compared, those that lie wholly within the picture."""
-    found = means(image, 2 * params.half_px + 1, first=params.half_px, step=params.step_px)
-    return found[: -(-rows // params.step_px), : -(-columns // params.step_px)]
+def _patch_means(image: np.ndarray, rows: int, columns: int, step_px: int) -> np.ndarray:
+    """Return means over the patches that lie wholly within the photo."""
+    found = box_means(image, 2 * HALF_PX + 1, first=HALF_PX, step=step_px)
+    return found[: -(-rows // step_px), : -(-columns // step_px)]
 
 
 def compare_coarsely(
     rgb: np.ndarray,
-    looks: Sequence[Look],
-    params: Params,
-    other: Unlike | None = None,
-    known: np.ndarray | None = None,
-) -> Comparison:
-    """The same in pictures that are ``coarse`` times smaller, each patch as many pixels wide as before."""
-    fewer = replace(params, step_px=params.half_px // 2)
-    small = [one.smaller(params.coarse) for one in looks]
-    return compare(smaller(rgb, params.coarse), small, fewer, other, params.coarse, wholly(known, params.coarse))
+    renders: Sequence[SceneRender],
+    mismatch: MismatchMap | None = None,
+    mask: np.ndarray | None = None,
+) -> RenderComparison:
+    """Compare as `compare` at a size reduced by `COARSE`, with patches of the same number of pixels."""
+    small = [one.downsampled(COARSE) for one in renders]
+    return compare(downsample(rgb, COARSE), small, mismatch, COARSE, downsample_mask(mask, COARSE), HALF_PX // 2)
 
 
-def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:
-    """Correlation of two differences of channels, so that neither brightness nor white balance counts."""
+def _chroma_correlation(photo: np.ndarray, rendered: np.ndarray) -> float:
+    """Correlate two log ratios of channels, which brightness and white balance do not change."""
     if len(photo) < 12:
         return float("nan")
     products, squares = 0.0, [0.0, 0.0]
     for one, two in ((0, 1), (2, 1)):
-        a, b = (np.log((x[:, one] + 0.02) / (x[:, two] + 0.02)) for x in (photo, shown))
+        a, b = (np.log((x[:, one] + 0.02) / (x[:, two] + 0.02)) for x in (photo, rendered))
         a, b = a - a.mean(), b - b.mean()
         products += float(a @ b)
         squares[0] += float(a @ a)
@@ -162,9 +141,3 @@ def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:
     if min(squares) < 1e-4 * len(photo):
         return float("nan")
     return products / float(np.sqrt(squares[0] * squares[1]))
-
-
-def spread(pixels: np.ndarray, size_px: tuple[int, int], blocks: tuple[int, int]) -> float:
-    """Share of the picture's blocks in which any of the pixels (K, 2) lies."""
-    at = np.clip((pixels / size_px * blocks).astype(int), 0, np.array(blocks) - 1)
-    return len(np.unique(at[:, 1] * blocks[0] + at[:, 0])) / (blocks[0] * blocks[1])

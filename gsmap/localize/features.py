@@ -1,13 +1,11 @@
-"""What the views of a scene show: rendered, features found in them, and each lifted to the surface that it lies on."""
+"""Extract local features from rendered views of a scene and lift them to its surfaces."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.localize import views
-from gsmap.localize.filters import highest, lowest
+from gsmap.localize.filters import maximum, minimum
 from gsmap.methods.extractor import Extractor
 from gsmap.render import Rendering, render
 from gsmap.types import Cameras, Gaussians
@@ -16,60 +14,42 @@ from gsmap.types.localization import Keypoints, SceneFeatures
 VERSION = 3
 
 UNIT = 254.0
-"""Length of quantised descriptors: unit vectors of 64 and more dimensions hardly have a part above a half."""
+"""Length of quantized descriptors; unit vectors of 64 and more dimensions hardly have a component above a half."""
 
+INDEXED_FEATURES = 150
+"""Features of a view that are indexed, the largest: small ones repeat. Without sizes, the first."""
 
-@dataclass(frozen=True)
-class Params:
-    """Which features of a render are kept.
-
-    Args:
-        max_features: of a view; those that the extractor gives first.
-        indexed: of these, the largest that photographs are looked for by: small ones repeat themselves. Of an extractor
-            that says no sizes, the first.
-        min_alpha: where the render is fainter, nothing is known of the surface.
-        max_step: a feature whose surroundings differ in depth by more than this share lies on an edge, and its place
-            is not known.
-        around_px: how far those surroundings reach.
-    """
-
-    max_features: int = 600
-    indexed: int = 150
-    min_alpha: float = 0.9
-    max_step: float = 0.05
-    around_px: int = 3
+_MIN_ALPHA = 0.9
+_MAX_DEPTH_STEP = 0.05  # relative depth difference around a pixel, from which on it lies at an edge ...
+_EDGE_REACH_PX = 3  # ... within so many pixels
+_MIN_COVERAGE = 0.2  # of a view; others look out of the scene, or stand inside an object
 
 
 def scene_features(
-    scene: str,
-    gaussians: Gaussians,
-    cameras: Cameras,
-    extractor: Extractor,
-    view_params: views.Params | None = None,
-    params: Params | None = None,
+    scene: str, gaussians: Gaussians, cameras: Cameras, extractor: Extractor, params: views.Params | None = None
 ) -> SceneFeatures:
-    """Render a scene and keep what photographs can be found by.
+    """Render views of a scene and extract their features.
 
     Args:
-        scene: its id.
+        scene: id of the scene.
         gaussians, cameras: scene frame and unit.
     """
-    params = params or Params()
-    chosen = views.choose_views(gaussians, cameras, view_params)
+    params = params or views.Params()
+    chosen = views.select_views(gaussians, cameras, params)
     points, descriptors, angles, kept = [], [], [], []
     for row in range(len(chosen)):
         camera = chosen[row]
-        shown = render(gaussians, camera, dominant_id=False, backend="native")
-        if (shown.alpha[0] > params.min_alpha).mean() < 0.2:  # it looks out of the scene, or stands inside something
+        rendered = render(gaussians, camera, dominant_id=False, backend="native")
+        if (rendered.alpha[0] > _MIN_ALPHA).mean() < _MIN_COVERAGE:
             continue
-        found = extractor.extract(picture(shown))
-        rows, places = lifted(found, shown, camera, params)
-        first = _largest_first(found, rows[: params.max_features])
+        found = extractor.extract(to_uint8(rendered))
+        rows, positions = lift(found, rendered, camera)
+        first = _order_by_size(found, rows[: params.max_features])
         rows = rows[first]
         kept.append(row)
-        points.append(places[first].astype(np.float32))
-        descriptors.append(quantised(found.descriptors[rows]))
-        angles.append(turns(found)[rows])
+        points.append(positions[first].astype(np.float32))
+        descriptors.append(quantize(found.descriptors[rows]))
+        angles.append(quantize_angles(found)[rows])
     count = np.array([len(p) for p in points], dtype=np.int64)
     width = descriptors[0].shape[1] if descriptors else 0
     return SceneFeatures(
@@ -82,66 +62,62 @@ def scene_features(
     )
 
 
-def _largest_first(found: Keypoints, rows: np.ndarray) -> np.ndarray:
-    """(n,) order of some features by size; as they are where sizes are not known."""
+def _order_by_size(found: Keypoints, rows: np.ndarray) -> np.ndarray:
+    """Return (n,) order of features by decreasing size; as they are without sizes."""
     if found.sizes_px is None:
         return np.arange(len(rows))
     return np.argsort(-found.sizes_px[rows], kind="stable")
 
 
-def picture(shown: Rendering, row: int = 0) -> np.ndarray:
-    """(H, W, 3) uint8 of a render."""
-    return (np.clip(np.nan_to_num(shown.colour[row]), 0, 1) * 255 + 0.5).astype(np.uint8)
+def to_uint8(rendered: Rendering, row: int = 0) -> np.ndarray:
+    """Return (H, W, 3) uint8 of a render."""
+    return (np.clip(np.nan_to_num(rendered.colour[row]), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def lifted(
-    found: Keypoints, shown: Rendering, camera: Cameras, params: Params | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which features lie on a surface whose place is known, and where.
+def lift(found: Keypoints, rendered: Rendering, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Lift features to the rendered surface.
 
     Args:
-        shown: the render that they were found in, with depth.
-        camera: that it was rendered through.
+        rendered: the render that the features are from, with depth.
+        camera: of the render.
 
     Returns:
-        (n,) their rows, and (n, 3) places in the camera's frame of reference.
+        (n,) rows of the features on smooth surfaces, and (n, 3) their positions in the camera's frame of reference.
     """
-    params = params or Params()
-    at = sound_depth(shown, params)
+    at = smooth_depth(rendered)
     column, row = found.pixels.astype(np.int64).T
     height, width = at.shape
     rows = np.flatnonzero((column >= 0) & (column < width) & (row >= 0) & (row < height))
     depth = at[row[rows], column[rows]]
     rows, depth = rows[depth > 0], depth[depth > 0]
-    return rows, unprojected(found.pixels[rows], depth, camera)
+    return rows, unproject(found.pixels[rows], depth, camera)
 
 
-def sound_depth(shown: Rendering, params: Params | None = None) -> np.ndarray:
-    """(H, W) depth where the surface is opaque and smooth, else 0."""
-    params = params or Params()
-    depth, size = shown.depth[0], 2 * params.around_px + 1
-    solid = shown.alpha[0] > params.min_alpha
-    near = lowest(np.where(solid, depth, 0), size)
-    far = highest(depth, size)
-    return np.where(solid & (far - near <= params.max_step * depth), depth, np.float32(0))
+def smooth_depth(rendered: Rendering) -> np.ndarray:
+    """Return (H, W) depth where the surface is opaque and away from depth edges, else 0."""
+    depth, size = rendered.depth[0], 2 * _EDGE_REACH_PX + 1
+    solid = rendered.alpha[0] > _MIN_ALPHA
+    near = minimum(np.where(solid, depth, 0), size)
+    far = maximum(depth, size)
+    return np.where(solid & (far - near <= _MAX_DEPTH_STEP * depth), depth, np.float32(0))
 
 
-def unprojected(pixels: np.ndarray, depth: np.ndarray, camera: Cameras) -> np.ndarray:
-    """(N, 3) places of pixels (N, 2) at depths (N,) along the axis, in the frame that one camera is posed in."""
+def unproject(pixels: np.ndarray, depth: np.ndarray, camera: Cameras) -> np.ndarray:
+    """Return (N, 3) positions of pixels (N, 2) at depths (N,) along the axis, in the frame of the camera's pose."""
     fx, fy, cx, cy = camera.intrinsics_px[0]
     local = np.stack([(pixels[:, 0] - cx) / fx * depth, (pixels[:, 1] - cy) / fy * depth, depth], axis=1)
     out: np.ndarray = local @ camera.T_frame_camera[0, :3, :3].T + camera.centers[0]
     return out
 
 
-def quantised(descriptors: np.ndarray) -> np.ndarray:
-    """(N, D) int8 of unit vectors, whose dot products are those of the vectors times 254 squared, to a percent."""
+def quantize(descriptors: np.ndarray) -> np.ndarray:
+    """Return (N, D) int8 of unit vectors; dot products are those of the vectors times 254 squared, to a percent."""
     out: np.ndarray = np.clip(np.round(descriptors * UNIT), -127, 127).astype(np.int8)
     return out
 
 
-def turns(found: Keypoints) -> np.ndarray:
-    """(N,) uint8 of the angles of features, 256 to a full turn; zeros where there are none."""
+def quantize_angles(found: Keypoints) -> np.ndarray:
+    """Return (N,) uint8 angles of features, 256 to a full turn; zeros without angles."""
     if found.angles_rad is None:
         return np.zeros(len(found), np.uint8)
     out: np.ndarray = np.round(found.angles_rad * (128 / np.pi)).astype(np.int64).astype(np.uint8)

@@ -1,9 +1,8 @@
-"""Gaussians of one colour in four to six bytes each: for renders that photographs are laid over, not to look at.
+"""Pack Gaussians of one colour into four to six bytes each, for renders that photos are aligned with.
 
-What renders show is rounded to what they cannot show: places to a share of the Gaussians' size, shapes as logarithms of
-their covariances. So a Gaussian that is nearly round says nearly nothing of how it is turned, and a flat one as much as
-matters (Arsigny et al. 2006, Log-Euclidean metrics). They are put in the order of a curve through space, along which
-colours hardly change.
+Values are rounded to steps that renders do not show: means to a share of the Gaussians' size, shapes as logarithms of
+their covariances (Log-Euclidean metrics, Arsigny et al. 2006), so that the rotation of a round Gaussian costs nothing.
+They are sorted along a Morton curve, on which colours change little.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
-from gsmap.localize import streams
+from gsmap.localize import compression
 from gsmap.types import Gaussians
 
 NAMES = ("gaussians.grid", "gaussians.ranges", "gaussians.places", "gaussians.shapes", "gaussians.colours")
@@ -26,55 +25,55 @@ _BYTE = 255.0
 
 
 def pack(gaussians: Gaussians, coarse: float = 1.0) -> dict[str, np.ndarray]:
-    """Arrays of finite Gaussians, put in the order of a curve; of their colours the one that has no direction.
+    """Pack finite Gaussians into arrays, sorted along a curve; colours without view dependence.
 
     Args:
-        coarse: how many times larger steps than those that renders hardly show all is rounded to.
+        coarse: factor on the rounding steps; 1 for steps that renders hardly show.
     """
     low = gaussians.means.min(0).astype(np.float64) if len(gaussians) else np.zeros(3)
-    step = streams.finest_step(gaussians.means, coarse * place_step(gaussians))
-    codes = streams.codes_of(gaussians.means, low, step)
+    step = compression.finest_step(gaussians.means, coarse * place_step(gaussians))
+    codes = compression.encode_points(gaussians.means, low, step)
     order = np.argsort(codes, kind="stable")
-    shapes, shape_range = _rounded(_log_covariances(gaussians)[order], coarse, *_SHAPE_STEPS)
+    shapes, shape_range = _quantize(_log_covariances(gaussians)[order], coarse, *_SHAPE_STEPS)
     greens = _green_first(gaussians.sh[order, 0].astype(np.float64))
-    colours, colour_range = _rounded(greens, coarse, *_COLOUR_STEPS)
+    colours, colour_range = _quantize(greens, coarse, *_COLOUR_STEPS)
     opacity = 1 / (1 + np.exp(-gaussians.logit_opacities[order].astype(np.float64)))
     opacities = np.round(opacity * _OPACITY_LEVELS).astype(np.uint8)
     changes = np.diff(colours, axis=0, prepend=np.uint8(0))  # modulo 256
     return {
         "gaussians.grid": np.r_[len(order), low, step],
         "gaussians.ranges": np.concatenate([shape_range, colour_range], axis=1),
-        "gaussians.places": streams.squeezed(streams.steps_between(codes[order], np.zeros(1, np.int64))),
-        "gaussians.shapes": streams.squeezed(shapes.T),
-        "gaussians.colours": streams.squeezed(np.concatenate([changes.T, opacities[None]])),
+        "gaussians.places": compression.compress(compression.code_steps(codes[order], np.zeros(1, np.int64))),
+        "gaussians.shapes": compression.compress(shapes.T),
+        "gaussians.colours": compression.compress(np.concatenate([changes.T, opacities[None]])),
     }
 
 
 def unpack(arrays: Mapping[str, np.ndarray], most: int) -> Gaussians:
-    """The Gaussians again.
+    """Unpack the Gaussians of `pack`.
 
     Args:
-        most: that there may be: bytes that claim to be more are damaged.
+        most: number of Gaussians from which on the arrays are damaged.
 
     Raises:
-        ValueError, KeyError: these are no arrays of `pack`.
+        ValueError, KeyError: the arrays are not those of `pack`.
     """
     grid, ranges = arrays["gaussians.grid"], arrays["gaussians.ranges"]
     if grid.shape != (5,) or ranges.shape != (2, 9) or not (np.isfinite(grid).all() and np.isfinite(ranges).all()):
-        raise ValueError("numbers that are none")
+        raise ValueError("invalid ranges")
     count = int(grid[0])
     if not 0 <= count <= most:
         raise ValueError(f"{count} Gaussians")
-    steps = streams.expanded(arrays["gaussians.places"], (8, count), np.uint8)
-    codes = streams.codes_between(steps, np.zeros(1, np.int64))
-    shapes = streams.expanded(arrays["gaussians.shapes"], (6, count), np.uint8).T
-    rest = streams.expanded(arrays["gaussians.colours"], (4, count), np.uint8).T
+    steps = compression.decompress(arrays["gaussians.places"], (8, count), np.uint8)
+    codes = compression.codes_from_steps(steps, np.zeros(1, np.int64))
+    shapes = compression.decompress(arrays["gaussians.shapes"], (6, count), np.uint8).T
+    rest = compression.decompress(arrays["gaussians.colours"], (4, count), np.uint8).T
     colours = np.cumsum(rest[:, :3], axis=0, dtype=np.uint8)
     low, step = ranges
-    quats, log_scales = _of_log_covariances(low[:6] + shapes * step[:6])
+    quats, log_scales = _from_log_covariances(low[:6] + shapes * step[:6])
     opacity = np.clip(rest[:, 3], 0.25, _OPACITY_LEVELS - 0.25) / _OPACITY_LEVELS
     return Gaussians(
-        streams.places_of(codes, grid[1:4], grid[4]).astype(np.float32),
+        compression.decode_points(codes, grid[1:4], grid[4]).astype(np.float32),
         quats,
         log_scales,
         np.log(opacity / (1 - opacity)).astype(np.float32),
@@ -83,16 +82,16 @@ def unpack(arrays: Mapping[str, np.ndarray], most: int) -> Gaussians:
 
 
 def place_step(gaussians: Gaussians) -> float:
-    """What places of Gaussians, and of what lies on them, are rounded to; renders do not show it."""
+    """Return the step to which positions of Gaussians and features are rounded."""
     return _PLACE_STEP * float(np.exp(np.median(gaussians.log_scales))) if len(gaussians) else 1.0
 
 
-def _rounded(values: np.ndarray, coarse: float, first: float, others: float) -> tuple[np.ndarray, np.ndarray]:
-    """(N, D) uint8 of values, and (2, D) what 0 stands for and what each step more.
+def _quantize(values: np.ndarray, coarse: float, first: float, others: float) -> tuple[np.ndarray, np.ndarray]:
+    """Quantize values to (N, D) uint8; also return (2, D) offsets and steps.
 
     Args:
-        coarse: times the wanted steps, ...
-        first, others: ... of the first column and of the others.
+        coarse: factor on the steps.
+        first, others: steps of the first column and of the others.
     """
     low = values.min(0) if len(values) else np.zeros(values.shape[1])
     spread = values.max(0) - low if len(values) else np.zeros(values.shape[1])
@@ -101,9 +100,9 @@ def _rounded(values: np.ndarray, coarse: float, first: float, others: float) -> 
 
 
 def _log_covariances(gaussians: Gaussians) -> np.ndarray:
-    """(N, 6) half the logarithms of covariances: the mean of the diagonal, two differences from it, and what is beside.
+    """Return (N, 6) halved log covariances: mean of the diagonal, two differences from it, and off-diagonal elements.
 
-    Of a round Gaussian all but the first are zero.
+    All but the first are zero for round Gaussians.
     """
     turned = quats_to_matrices(gaussians.quats.astype(np.float64))
     logs = np.einsum("nij,nj,nkj->nik", turned, gaussians.log_scales.astype(np.float64), turned)
@@ -113,8 +112,8 @@ def _log_covariances(gaussians: Gaussians) -> np.ndarray:
     )
 
 
-def _of_log_covariances(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternions (N, 4) and logarithms of deviations (N, 3), float32."""
+def _from_log_covariances(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return quaternions (N, 4) and log scales (N, 3), float32."""
     mean, first, second, xy, xz, yz = values.T
     logs = np.empty((len(values), 3, 3))
     logs[:, 0, 0], logs[:, 1, 1], logs[:, 2, 2] = mean + first, mean + second, mean - first - second
@@ -127,7 +126,7 @@ def _of_log_covariances(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _green_first(rgb: np.ndarray) -> np.ndarray:
-    """Green, and what red and blue are more."""
+    """Return green, and the differences of red and blue from it."""
     return np.stack([rgb[:, 1], rgb[:, 0] - rgb[:, 1], rgb[:, 2] - rgb[:, 1]], axis=1)
 
 

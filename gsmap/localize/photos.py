@@ -1,4 +1,4 @@
-"""Photographs in files: their pixels the right way up, and what they say of their lens."""
+"""Read photos, upright by their EXIF orientation, with their intrinsics and masks."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from gsmap.types.localization import Photo
 
 _EXIF_IFD, _FOCAL_35MM = 0x8769, 0xA405
 _FILM_DIAGONAL_MM = 43.267  # of a frame of 36 x 24 mm, which equivalent focal lengths mean
-_EXIF_SIGMA = 0.05  # whole millimetres, and a crop that phones do not tell of
-_LIKELY, _ANY = 0.8, float("inf")  # of the longer side: 64 degrees across, between phones and kit lenses
+_EXIF_SIGMA = 0.05  # relative: focal lengths are rounded to millimetres, and phones do not record crops
+_DEFAULT_FOCAL, _UNKNOWN = 0.8, float("inf")  # per longer side: 64 degrees, between phones and kit lenses
 
 
 @dataclass(frozen=True)
 class Lens:
-    """What a person says of the lens that took a photograph.
+    """Specified intrinsics of a photo.
 
     Args:
-        intrinsics_px: ``fx fy cx cy``, in pixels of the upright picture; None where only less is known.
-        focal_px: the focal length in pixels, with the principal point in the middle; None where it is not known.
-        ask_file: believe what the file says (EXIF), where nothing else is said.
+        intrinsics_px: ``fx fy cx cy``, in pixels of the upright photo; None if unknown.
+        focal_px: focal length in pixels, with the principal point in the middle; None if unknown.
+        use_exif: use the focal length in EXIF, if none is specified.
     """
 
     intrinsics_px: tuple[float, float, float, float] | None = None
     focal_px: float | None = None
-    ask_file: bool = True
+    use_exif: bool = True
 
     def __post_init__(self) -> None:
         given = (*(self.intrinsics_px or ()), *((self.focal_px,) if self.focal_px is not None else ()))
@@ -44,14 +44,14 @@ class Lens:
 def read_photo(
     path: str | os.PathLike[str], lens: Lens | None = None, masks: str | os.PathLike[str] | None = None
 ) -> Photo:
-    """Read a picture, turned the way its EXIF says it was held.
+    """Read a photo, upright by its EXIF orientation.
 
     Args:
-        masks: the folder that its mask is in (`read_mask`).
+        masks: folder of its mask (`read_mask`).
 
     Raises:
-        NotFoundError: no such file, or no mask of it.
-        InputError, MissingDependencyError: not a picture that gsmap reads (`open_picture`); or its mask is none.
+        NotFoundError: the file or its mask does not exist.
+        InputError, MissingDependencyError: the photo or its mask cannot be read (`open_picture`).
     """
     from PIL import ImageOps
 
@@ -63,19 +63,19 @@ def read_photo(
         focal_35mm = picture.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
         ImageOps.exif_transpose(picture, in_place=True)
         rgb = np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB"))
-    photo = taken_with(rgb, lens, focal_35mm, path.name)
+    photo = make_photo(rgb, lens, focal_35mm, path.name)
     return photo if masks is None else replace(photo, known=read_mask(path, masks, photo.size_px))
 
 
 def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_px: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool of a photo: what its mask in a folder of masks leaves.
+    """Read a photo's mask (H, W) bool from a folder of masks; true at valid pixels.
 
-    As COLMAP has them: of ``photo.jpg`` the mask is ``photo.jpg.png``, of the photo's size once that is upright, and
-    black where the photo does not count. ``photo.png`` is taken as well.
+    As in COLMAP, the mask of ``photo.jpg`` is ``photo.jpg.png``, of the size of the upright photo, and black at invalid
+    pixels. ``photo.png`` is accepted as well.
 
     Raises:
-        NotFoundError: no such folder or mask; a photo whose mask is missing is not taken as a whole.
-        InputError: not a picture, of another size, or black everywhere.
+        NotFoundError: the folder or the mask does not exist.
+        InputError: the mask cannot be read, has another size, or is black everywhere.
     """
     folder, name = Path(masks), Path(path)
     if not folder.is_dir():
@@ -100,14 +100,14 @@ def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_
     return known
 
 
-def taken_with(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str = "photo") -> Photo:
-    """A photo of pixels (H, W, 3) uint8 and what is known of its lens.
+def make_photo(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str = "photo") -> Photo:
+    """Return a photo of pixels (H, W, 3) uint8 with intrinsics as specified, from EXIF, or by default.
 
     Args:
-        focal_35mm: equivalent focal length in millimetres, as its file says; whatever is no such number is ignored.
+        focal_35mm: equivalent focal length in millimetres from EXIF; invalid values are ignored.
     """
     height, width = rgb.shape[:2]
-    focal, sigma = _LIKELY * max(width, height), _ANY
+    focal, sigma = _DEFAULT_FOCAL * max(width, height), _UNKNOWN
     if lens.intrinsics_px is not None:
         cx, cy = lens.intrinsics_px[2:]
         if not (cx < width and cy < height):
@@ -118,13 +118,13 @@ def taken_with(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str
         return Photo(rgb, np.array(lens.intrinsics_px), 0.0, name)
     if lens.focal_px is not None:
         focal, sigma = lens.focal_px, 0.0
-    elif lens.ask_file and (equivalent := _number(focal_35mm)) is not None:
+    elif lens.use_exif and (equivalent := _number(focal_35mm)) is not None:
         focal, sigma = equivalent / _FILM_DIAGONAL_MM * float(np.hypot(width, height)), _EXIF_SIGMA
     return Photo(rgb, np.array([focal, focal, width / 2, height / 2]), sigma, name)
 
 
 def _number(value: object) -> float | None:
-    """A plausible focal length of a lens in millimetres, or None."""
+    """Parse a plausible focal length in millimetres; None if it is not."""
     try:
         found = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):

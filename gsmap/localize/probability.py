@@ -1,10 +1,9 @@
-"""How probable it is that a photograph was taken where it is said to have been, of all evidence together.
+"""Probability that a photo's pose is right, from all evidence together.
 
-What looks like the place is the place, another one that shares nothing with it, or a room that looks alike: against
-either of the last two the evidence is worth something else, and how frequent they are is told apart
-(`gsmap.localize.verdict.Params`). The curves of `gsmap.compare.odds` are fitted by ``tools/fit/localize.py`` on made
-places, photographed in other light by other lenses, some of them changed or with somebody in the picture, and on
-streets whose rooms look alike.
+A pose is right, or lies at an unrelated place, or in an aliased room (one that looks like the photo's). The evidence
+has other weights against each of the two wrong answers, and each has its own prior (`gsmap.localize.verdict.Params`).
+The curves of `gsmap.compare.odds` are fitted by ``tools/fit/localize.py`` on synthetic places with changed light,
+lenses and content, and on streets with aliased rooms.
 """
 
 from __future__ import annotations
@@ -19,91 +18,102 @@ import numpy as np
 
 from gsmap.compare.odds import Odds
 from gsmap.localize import evidence
-from gsmap.localize.settling import Picture, Settled, inliers
-from gsmap.localize.unlike import Unlike
+from gsmap.localize.mismatch import MISMATCH_PROBABILITY, MismatchMap
+from gsmap.localize.refinement import RefinedPose, ScaledPhoto
+
+PRIOR = 0.3
+"""Share of the candidate poses that are right."""
 
 _FILE = "probability.json"
+_BLOCKS = (8, 6)  # columns and rows of the photo over which inliers should be spread
+_HIGH_MISMATCH_PROBABILITY = 0.8
 
 
 @dataclass(frozen=True)
-class Model:
-    """What evidence is worth for a pose against what else it may be.
+class EvidenceModel:
+    """Log-odds of evidence for a pose against two alternatives.
 
     Args:
-        other: against a place that has nothing to do with the photograph.
-        alike: against a room that looks like the photograph's.
+        other: against an unrelated place.
+        aliased: against an aliased room.
     """
 
     other: Odds
-    alike: Odds
+    aliased: Odds
 
-    def probability(self, told: Mapping[str, float], right: float, alike: float, *, at_best: bool = False) -> float:
-        """That a pose is right.
+    def probability(
+        self, evidence: Mapping[str, float], aliased_prior: float, prior: float = PRIOR, *, optimistic: bool = False
+    ) -> float:
+        """Return the probability that a pose is right.
 
         Args:
-            told: evidence by name.
-            right: share of the poses that are looked into that are right ...
-            alike: ... and of those that are of a room that looks alike, before anything is known of them.
-            at_best: what is not named is as good as can be.
+            evidence: by name.
+            aliased_prior: share of the candidate poses that are of an aliased room.
+            prior: share of the candidate poses that are right.
+            optimistic: missing evidence is as good as possible.
         """
-        against = (1 - right - alike) * np.exp(-self.other.log_odds(told, at_best=at_best))
-        against += alike * np.exp(-self.alike.log_odds(told, at_best=at_best))
-        return float(np.clip(right / (right + against), self.other.least, 1 - self.other.least))
+        against = (1 - prior - aliased_prior) * np.exp(-self.other.log_odds(evidence, at_best=optimistic))
+        against += aliased_prior * np.exp(-self.aliased.log_odds(evidence, at_best=optimistic))
+        return float(np.clip(prior / (prior + against), self.other.least, 1 - self.other.least))
 
-    def shortfalls(self, told: Mapping[str, float]) -> list[str]:
-        """The names of the evidence, what lacks most of what it could be worth against what is likelier first."""
-        return min((self.other, self.alike), key=lambda odds: odds.log_odds(told)).shortfalls(told)
+    def shortfalls(self, evidence: Mapping[str, float]) -> list[str]:
+        """Return the names of the evidence against the likelier alternative, that which lacks most log-odds first."""
+        return min((self.other, self.aliased), key=lambda odds: odds.log_odds(evidence)).shortfalls(evidence)
 
 
 @lru_cache(maxsize=1)
-def model() -> Model:
-    """The model that gsmap comes with."""
+def load_model() -> EvidenceModel:
+    """Load the model of this package."""
     stored = json.loads((files("gsmap.localize") / _FILE).read_text())
-    return Model(Odds.of_stored(stored["other"]), Odds.of_stored(stored["alike"]))
+    return EvidenceModel(Odds.of_stored(stored["other"]), Odds.of_stored(stored["alike"]))
 
 
-def evidence_of_settling(
-    picture: Picture, settled: Settled, sigmas: tuple[float, float], num_matches: int, params: evidence.Params
+def refinement_evidence(
+    photo: ScaledPhoto, refined: RefinedPose, sigmas: tuple[float, float], num_matches: int
 ) -> dict[str, float]:
-    """What settling a pose tells; each piece such that a step of it means about the same everywhere.
+    """Return the evidence of refining a pose, scaled so that equal steps weigh about the same.
 
     Args:
         sigmas: largest standard deviation of rotation (rad) and translation (metres).
-        num_matches: features of the photo that agreed on the rough pose.
+        num_matches: features of the photo that agree with the candidate pose.
     """
-    kept = inliers(settled, params, picture.size_px)
-    count = int(kept.sum())
+    inliers = refined.inliers(photo.size_px)
+    count = int(inliers.sum())
     return {
         "matches": float(np.log10(num_matches + 1)),
         "inliers": float(np.log10(count + 1)),
-        "found_again": count / settled.tried if settled.tried else 0.0,
-        "laid": settled.agreement,
-        "spread": evidence.spread(settled.pixels[kept], picture.size_px, params.blocks),
+        "found_again": count / refined.num_tracked if refined.num_tracked else 0.0,
+        "laid": refined.agreement,
+        "spread": block_coverage(refined.pixels[inliers], photo.size_px),
         "sigma_m": float(np.log10(np.clip(sigmas[1], 1e-4, 10.0))),
     }
 
 
-def evidence_of_looks(
-    comparison: evidence.Comparison, coarse: evidence.Comparison, other: Unlike, params: evidence.Params
+def render_evidence(
+    comparison: evidence.RenderComparison, coarse: evidence.RenderComparison, mismatch: MismatchMap
 ) -> dict[str, float]:
-    """What the map shows from there, likewise; NaN where something could not be had.
+    """Return the evidence of comparing the photo with renders, scaled likewise; NaN where there is none.
 
     Args:
-        comparison, coarse: of the photo with renders from there, as they are and in smaller pictures, but for the part
-            of it that shows something else.
-        other: how much of it does.
+        comparison, coarse: at full and at reduced size, without the largest part of the mismatch.
     """
     return {
-        "explained": comparison.explained(params.agree),
-        "contradicted": comparison.contradicted(params.contradict),
-        "explained_coarsely": coarse.explained(params.agree),
-        "contradicted_coarsely": coarse.contradicted(params.contradict),
-        "unlike_part": other.in_part(),
-        "unlike": other.outside(),
-        "unlike_likely": other.surely_outside(params.likely),
-        "unlike_surely": other.surely_outside(params.surely),
-        "compared": float(np.log10(comparison.num_judged + 1)),
+        "explained": comparison.explained(),
+        "contradicted": comparison.contradicted(),
+        "explained_coarsely": coarse.explained(),
+        "contradicted_coarsely": coarse.contradicted(),
+        "unlike_part": mismatch.part_share(),
+        "unlike": mismatch.mean_outside(),
+        "unlike_likely": mismatch.share_outside(MISMATCH_PROBABILITY),
+        "unlike_surely": mismatch.share_outside(_HIGH_MISMATCH_PROBABILITY),
+        "compared": float(np.log10(comparison.num_compared + 1)),
         "colour": comparison.colour,
         "seen": comparison.seen,
         "blocked": comparison.blocked,
     }
+
+
+def block_coverage(pixels: np.ndarray, size_px: tuple[int, int]) -> float:
+    """Return the share of the photo's blocks that hold any of the pixels (K, 2)."""
+    at = np.clip((pixels / size_px * _BLOCKS).astype(int), 0, np.array(_BLOCKS) - 1)
+    return len(np.unique(at[:, 1] * _BLOCKS[0] + at[:, 0])) / (_BLOCKS[0] * _BLOCKS[1])

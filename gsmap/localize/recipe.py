@@ -1,4 +1,4 @@
-"""What names the stored features of a scene."""
+"""Recipe key of the stored features of a scene."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gsmap.types.plain import plain
 
 
 def recipe_key(params: Params, models: Mapping[str, ModelSpec] | None = None) -> RecipeKey:
-    """The recipe of the features of a scene's views: what takes part in them, and nothing of how photos are judged.
+    """Return the recipe of the features of a scene's views; settings that only judge photos take no part.
 
-    The input, which the caller adds with `RecipeKey.of`, is the scene.
+    The caller adds the scene as input with `RecipeKey.of`.
     """
     name = params.extractor
     needed = [models[kind] for kind in family("extractor").get(name).MODELS] if models else []
@@ -24,7 +24,6 @@ def recipe_key(params: Params, models: Mapping[str, ModelSpec] | None = None) ->
         version={"features": features.VERSION, **family("extractor").version(name)},
         settings={
             "views": plain(params.views),
-            "features": plain(params.features),
             "extractor": plain(params.extractors[name]),
             "models": [spec.digest for spec in needed],
         },

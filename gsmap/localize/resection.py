@@ -1,4 +1,4 @@
-"""A camera's pose from points that it sees: LO-RANSAC, then least squares that doubts what is far off."""
+"""Estimate a camera pose from 2D-3D correspondences: resection by LO-RANSAC, then robust least squares."""
 
 from __future__ import annotations
 
@@ -10,45 +10,30 @@ from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3, skew
 from gsmap.geometry.similarities import rotation_vectors
 
-_FOCAL_KNOWN = 0.01  # standard deviation of the logarithm of a focal length that is taken as it is
+MAX_ERROR_PX = 6.0
+"""Reprojection error of an inlier, for a photo of 480 pixels; it scales with the longer side."""
 
+MIN_INLIERS, MIN_INLIERS_FREE_FOCAL = 4, 6
+"""Different features of the photo that must agree; four always fit a pose with a free focal length."""
 
-@dataclass(frozen=True)
-class Params:
-    """How a pose is found among wrong matches.
+ROBUST_SCALE_PX = 1.5
+"""Scale of Cauchy's loss in the least squares."""
 
-    Args:
-        max_error_px: of an inlier, at a picture of 480 pixels; in proportion to its longer side.
-        max_trials: samples of three matches at most.
-        min_inliers: different features of the photo, for a pose to be looked into at all ...
-        min_agreeing: ... and where each also says about how the camera was turned.
-        max_turn_deg: by how much that may be otherwise than the pose.
-        turns: how many ways that the camera may have been turned are tried, those that most features say first.
-        same_m, same_deg: poses that are nearer to each other are one candidate.
-        doubt_px: residuals count less from about here on while the pose is refined.
-        iterations: of that.
-    """
+ITERATIONS = 12
+"""Maximum number of Gauss-Newton steps."""
 
-    max_error_px: float = 6.0
-    max_trials: int = 6000
-    min_inliers: int = 6
-    min_agreeing: int = 4
-    max_turn_deg: float = 30.0
-    turns: int = 10
-    same_m: float = 0.4
-    same_deg: float = 12.0
-    doubt_px: float = 1.5
-    iterations: int = 12
+_MAX_TRIALS = 6000  # of RANSAC
+_FIXED_FOCAL_SIGMA = 0.01  # standard deviation of the log focal length up to which it is not estimated
 
 
 @dataclass(frozen=True, eq=False)
 class Resection:
-    """A camera's pose, and what speaks for it.
+    """A camera pose estimated by RANSAC.
 
     Args:
         T_map_camera: (4, 4).
         intrinsics_px: (4,).
-        inliers: (K,) bool, of the matches that were given.
+        inliers: (K,) bool of the given matches.
     """
 
     T_map_camera: np.ndarray
@@ -57,14 +42,13 @@ class Resection:
 
 
 def is_free(focal_sigma: float) -> bool:
-    """Whether a focal length that is known so well (as in `Photo`) is solved for."""
-    return focal_sigma > _FOCAL_KNOWN
+    """Check whether a focal length with this uncertainty (as in `Photo`) is estimated."""
+    return focal_sigma > _FIXED_FOCAL_SIGMA
 
 
-def fewest(focal_sigma: float, params: Params) -> int:
-    """How many features must agree on a pose, and say that the camera was turned so, for it to be looked into: four fix
-    one of an unknown focal length, whatever they are."""
-    return params.min_inliers if is_free(focal_sigma) else params.min_agreeing
+def min_inliers(focal_sigma: float) -> int:
+    """Return the number of features that must agree on a pose and on its orientation."""
+    return MIN_INLIERS_FREE_FOCAL if is_free(focal_sigma) else MIN_INLIERS
 
 
 def resect(
@@ -73,9 +57,10 @@ def resect(
     intrinsics_px: np.ndarray,
     size_px: tuple[int, int],
     focal_sigma: float,
-    params: Params,
+    *,
+    min_inliers: int = MIN_INLIERS_FREE_FOCAL,
 ) -> Resection | None:
-    """The pose that most matches agree with, by LO-RANSAC (Chum et al. 2003); None where too few agree with any.
+    """Estimate the pose with most inliers by LO-RANSAC (Chum et al. 2003); None where there are too few.
 
     Args:
         pixels: (K, 2) in the photo.
@@ -96,17 +81,17 @@ def resect(
     )
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.estimate_focal_length = free
-    options.ransac.max_error = params.max_error_px * max(size_px) / 480
-    options.ransac.max_num_trials = params.max_trials
-    # As many trials as find a pose that so few agree with; where matches are few, that is soon.
-    options.ransac.min_inlier_ratio = max(0.01, min(params.min_inliers / len(pixels), 1.0))
+    options.ransac.max_error = MAX_ERROR_PX * max(size_px) / 480
+    options.ransac.max_num_trials = _MAX_TRIALS
+    # As many trials as a pose with so few inliers takes; with few matches these are few.
+    options.ransac.min_inlier_ratio = max(0.01, min(min_inliers / len(pixels), 1.0))
     options.ransac.confidence = 0.9999
     options.ransac.random_seed = 1
     found = pycolmap.estimate_absolute_pose(pixels.astype(np.float64), points.astype(np.float64), camera, options)
     if found is None:
         return None
     inliers = np.asarray(found["inlier_mask"], bool)
-    if len(np.unique(pixels[inliers], axis=0)) < params.min_inliers:
+    if len(np.unique(pixels[inliers], axis=0)) < min_inliers:
         return None
     if free:
         focal = float(camera.params[0])
@@ -116,31 +101,30 @@ def resect(
     return Resection(np.linalg.inv(pose), np.asarray(intrinsics_px, float), inliers)
 
 
-def agreeing(
+def find_inliers(
     pixels: np.ndarray,
     points: np.ndarray,
     T_map_camera: np.ndarray,
     intrinsics_px: np.ndarray,
     size_px: tuple[int, int],
-    params: Params,
 ) -> np.ndarray:
-    """(K,) bool: matches within the bar of a pose."""
+    """Return (K,) bool: matches within `MAX_ERROR_PX` of their projection."""
     at, depth = project(points, np.linalg.inv(T_map_camera), intrinsics_px)
-    bar = params.max_error_px * max(size_px) / 480
+    bar = MAX_ERROR_PX * max(size_px) / 480
     out: np.ndarray = (depth > 0) & (np.linalg.norm(at - pixels, axis=1) < bar)
     return out
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class LeastSquaresPose:
     """A pose by least squares.
 
     Args:
-        T_map_camera, intrinsics_px: the answer.
-        residuals_px: (K, 2) found less predicted.
-        weights: (K,) of Cauchy's loss at the answer, times those that were given.
-        jacobian: (K, 2, 6 or 7) of the prediction by [rot_rad, trans] on the camera's side, and the log of the focal
-            length where it was free.
+        T_map_camera, intrinsics_px: the estimate.
+        residuals_px: (K, 2) measured minus predicted.
+        weights: (K,) of Cauchy's loss at the estimate, times the given ones.
+        jacobian: (K, 2, 6 or 7) of the prediction by [rot_rad, trans] on the camera's side, and the log focal length
+            where it is estimated.
     """
 
     T_map_camera: np.ndarray
@@ -155,50 +139,49 @@ def refine(
     points: np.ndarray,
     T_map_camera: np.ndarray,
     intrinsics_px: np.ndarray,
-    params: Params,
     *,
     weights: np.ndarray | None = None,
     focal: tuple[float, float] | None = None,
-) -> Refined:
-    """Minimise robust reprojection errors over the pose, and the focal length if it is free (Gauss-Newton).
+) -> LeastSquaresPose:
+    """Minimize robust reprojection errors over the pose, and the focal length if it is free (Gauss-Newton).
 
     Args:
         pixels: (K, 2).
         points: (K, 3) map.
         weights: (K,) of the matches.
-        focal: its expected value and ``focal_sigma``, where it is free.
+        focal: expected focal length and ``focal_sigma``, where it is estimated.
     """
     pose, intrinsics = T_map_camera.copy(), intrinsics_px.astype(float).copy()
     given = np.ones(len(pixels)) if weights is None else weights
     dim = 6 if focal is None else 7
     damping = 1e-6
-    residuals, jacobian = linearised(pixels, points, pose, intrinsics, dim)
-    for _ in range(params.iterations):
-        robust = given * doubted(residuals, params.doubt_px)
+    residuals, jacobian = linearize(pixels, points, pose, intrinsics, dim)
+    for _ in range(ITERATIONS):
+        robust = given * robust_weights(residuals, ROBUST_SCALE_PX)
         J, w = jacobian.reshape(-1, dim), np.repeat(robust, 2)
         A, b = (J.T * w) @ J, J.T @ (w * residuals.ravel())
-        cost = _cost(residuals, given, params, intrinsics, focal)
+        cost = _cost(residuals, given, intrinsics, focal)
         if focal is not None and np.isfinite(focal[1]):
             A[6, 6] += 1.0 / focal[1] ** 2
             b[6] += np.log(focal[0] / intrinsics[0]) / focal[1] ** 2
         step = np.linalg.solve(A + damping * np.diag(np.diag(A)) + 1e-12 * np.eye(dim), b)
-        tried, lens = moved(pose, step[:6]), intrinsics.copy()
+        next_pose, lens = retract_pose(pose, step[:6]), intrinsics.copy()
         if focal is not None:
             lens[:2] *= np.exp(np.clip(step[6], -0.3, 0.3))
-        after, J_after = linearised(pixels, points, tried, lens, dim)
-        if _cost(after, given, params, lens, focal) > cost:
+        after, J_after = linearize(pixels, points, next_pose, lens, dim)
+        if _cost(after, given, lens, focal) > cost:
             damping = max(damping * 100, 1e-3)
             if damping > 1e3:
                 break
             continue
-        pose, intrinsics, residuals, jacobian, damping = tried, lens, after, J_after, damping / 10
+        pose, intrinsics, residuals, jacobian, damping = next_pose, lens, after, J_after, damping / 10
         if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:6]).max() < 1e-7 * (1 + np.abs(pose[:3, 3]).max()):
             break
-    return Refined(pose, intrinsics, residuals, given * doubted(residuals, params.doubt_px), jacobian)
+    return LeastSquaresPose(pose, intrinsics, residuals, given * robust_weights(residuals, ROBUST_SCALE_PX), jacobian)
 
 
-def moved(T_map_camera: np.ndarray, xi: np.ndarray) -> np.ndarray:
-    """``T Exp(xi)`` of xi = [rot_rad (3), trans (3)], on the camera's side as `gsmap.geometry.rotations.retract`."""
+def retract_pose(T_map_camera: np.ndarray, xi: np.ndarray) -> np.ndarray:
+    """Return ``T Exp(xi)`` of xi = [rot_rad (3), trans (3)], on the camera's side."""
     out = np.eye(4)
     out[:3, :3] = T_map_camera[:3, :3] @ exp_so3(xi[:3])
     u, _, vt = np.linalg.svd(out[:3, :3])
@@ -207,16 +190,16 @@ def moved(T_map_camera: np.ndarray, xi: np.ndarray) -> np.ndarray:
     return out
 
 
-def moved_by(T_map_camera: np.ndarray, to: np.ndarray) -> np.ndarray:
-    """(6,) the xi by which `moved` takes a pose to another one."""
+def relative_xi(T_map_camera: np.ndarray, to: np.ndarray) -> np.ndarray:
+    """Return (6,) xi by which `retract_pose` takes a pose to another one."""
     apart = np.linalg.inv(T_map_camera) @ to
     return np.r_[rotation_vectors(apart[:3, :3])[0], apart[:3, 3]]
 
 
-def linearised(
+def linearize(
     pixels: np.ndarray, points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray, dim: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (K, 2) and the prediction's derivative (K, 2, dim); what lies behind the camera counts for nothing."""
+    """Return residuals (K, 2) and the prediction's derivative (K, 2, dim); 0 for points behind the camera."""
     fx, fy, cx, cy = intrinsics
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     z = local[:, 2]
@@ -227,7 +210,7 @@ def linearised(
     by_point = np.zeros((len(points), 2, 3))
     by_point[:, 0, 0], by_point[:, 0, 2] = fx / z, -fx * x / z
     by_point[:, 1, 1], by_point[:, 1, 2] = fy / z, -fy * y / z
-    # local' = Exp(-w) local - v: a turn of the camera moves what it sees the other way.
+    # local' = Exp(-w) local - v: points move against the camera.
     jacobian = np.zeros((len(points), 2, dim))
     jacobian[:, :, :3] = by_point @ skew(local)
     jacobian[:, :, 3:6] = -by_point
@@ -238,17 +221,15 @@ def linearised(
     return residuals, jacobian
 
 
-def doubted(residuals: np.ndarray, scale_px: float) -> np.ndarray:
-    """(K,) weights of Cauchy's loss: a match that is far off says little."""
+def robust_weights(residuals: np.ndarray, scale_px: float) -> np.ndarray:
+    """Return (K,) weights of Cauchy's loss."""
     out: np.ndarray = 1 / (1 + (residuals**2).sum(1) / scale_px**2)
     return out
 
 
-def _cost(
-    residuals: np.ndarray, given: np.ndarray, params: Params, intrinsics: np.ndarray, focal: tuple[float, float] | None
-) -> float:
-    """What is minimised; a weight of one is a match that is known to a pixel."""
-    scale = params.doubt_px**2
+def _cost(residuals: np.ndarray, given: np.ndarray, intrinsics: np.ndarray, focal: tuple[float, float] | None) -> float:
+    """Return the cost, in which a match of weight one has a standard deviation of a pixel."""
+    scale = ROBUST_SCALE_PX**2
     cost = scale * (given * np.log1p((residuals**2).sum(1) / scale)).sum()
     if focal is not None and np.isfinite(focal[1]):
         cost += (np.log(focal[0] / intrinsics[0]) / focal[1]) ** 2

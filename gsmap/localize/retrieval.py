@@ -1,10 +1,9 @@
-"""Which views of the map show what a photograph shows: its features vote, by an index of those of all views.
+"""Retrieve the views of the map that are most similar to a photo, from an inverted index of their features.
 
-Of each view the first features lie in the list of their word (`gsmap.localize.words`). A feature of the photo looks
-into the lists of its nearest words; a match says more the fewer features of the map are as near. It also says how the
-camera was turned: a feature has a frame of its ray and of the turn that it was described by, and the two frames of a
-match are one. So matches with a scene count as far as they agree on that, each feature of the photo once (a weak check
-of geometry as in Jegou et al. 2008, by whole rotations in place of angles).
+The indexed features of each view lie in the list of their visual word (`gsmap.localize.vocabulary`). A feature of the
+photo is matched with the lists of its nearest words; a match weighs more the fewer features of the map are as near.
+Each match also gives the camera's orientation (`gsmap.localize.feature_frames`), and only matches with a common
+orientation count (weak geometric consistency, Jegou et al. 2008, with rotations in place of angles).
 """
 
 from __future__ import annotations
@@ -16,55 +15,47 @@ from itertools import pairwise
 import numpy as np
 
 from gsmap._native import near_signatures
-from gsmap.localize import turned
-from gsmap.localize.features import UNIT
-from gsmap.localize.words import VERSION, Words, words_for
+from gsmap.localize import feature_frames
+from gsmap.localize.features import INDEXED_FEATURES, UNIT
+from gsmap.localize.vocabulary import VERSION, Vocabulary, load_vocabulary
 from gsmap.methods import RecipeKey
 from gsmap.types.localization import Keypoints, SceneFeatures
 from gsmap.types.retrieval import IndexedScene
 from gsmap.types.segments import PLACE_BYTES, InMemory, Segment, in_lists, lists_of, places_of, write_places
 
+NUM_WORDS = 4
+"""Nearest words whose lists a feature of the photo is matched with."""
+
+MAX_HAMMING = 20
+"""Signs, of 64, that two matching features may differ in."""
+
+PRIOR_SCENES = 200
+"""Imaginary scenes with the expected number of chance matches, in the weight of a match."""
+
+MIN_WEIGHT = 0.3
+"""Negative log probability of a chance match, below which a match is dropped."""
+
+MAX_TURN_DEG = 25.0
+"""Angle between the orientations of two consistent matches."""
+
+_VERIFIED_SCENES = 60  # scenes whose matches are checked for a common orientation
+_MAX_MATCHES = 400  # of a scene, those of largest weight
+_RANKED_SCENES = 12  # scenes whose views are ranked
+_SCENE_WEIGHT = 0.3  # share of a scene's score that each of its views gets
 _SIGNS = slice(0, 8)
 _TURN = slice(8, 12)
 _VIEW = slice(12, 14)
 _WIDTH = 14 + PLACE_BYTES
-_BLOCK_ROWS = 200_000  # of an index that are in memory at a time: 4 MB
-
-
-@dataclass(frozen=True)
-class Params:
-    """Which views a photograph is matched with.
-
-    Args:
-        words: nearest ones, in whose lists a feature of the photo looks.
-        max_signs: that may differ between two features of one place, of 64.
-        scenes_beside: what features of other scenes are like is known before as well as so many scenes tell.
-        least: worth of a match that counts; the logarithm of how rare it is.
-        max_turn_deg: two matches that turn the camera otherwise by more than this are not both right.
-        first: scenes whose matches are looked at for how they turn the camera, those that most speaks for first; ...
-        most: ... of each scene at most so many, those worth most; ...
-        scenes: ... and of these scenes the views are ranked.
-        of_scene: how much of what speaks for a scene speaks for each of its views.
-    """
-
-    words: int = 4
-    max_signs: int = 20
-    scenes_beside: int = 200
-    least: float = 0.3
-    max_turn_deg: float = 25.0
-    first: int = 60
-    most: int = 400
-    scenes: int = 12
-    of_scene: float = 0.3
+_BLOCK_ROWS = 200_000  # of the index that are in memory at a time: 4 MB
 
 
 @dataclass(frozen=True, eq=False)
 class ViewIndex:
-    """The views of many scenes.
+    """An inverted index of the views of many scenes.
 
     Args:
-        segments: of their features; what counts of these.
-        wanted: ids of the scenes that may be named.
+        segments: of their features.
+        wanted: ids of the scenes that may be returned.
     """
 
     segments: Sequence[Segment]
@@ -74,41 +65,40 @@ class ViewIndex:
         return len(self.wanted)
 
     def only(self, scenes: Collection[str]) -> ViewIndex:
-        """The same, of some of its scenes; how rare a feature is, all of them tell."""
+        """Restrict the index to some scenes; weights of matches are still by all scenes."""
         return replace(self, wanted=self.wanted & frozenset(scenes))
 
 
 def view_index(segments: Sequence[Segment]) -> ViewIndex:
-    """An index of all scenes that count in some segments."""
+    """Return an index of all scenes in some segments."""
     return ViewIndex(segments, frozenset(m.scene for one in segments for m in one.members if m is not None))
 
 
 def index_recipe() -> str:
-    """What names the segments of an index of views; which features of a view they hold, the features' own key says."""
+    """Return the recipe of the segments; the features have a key of their own."""
     return RecipeKey("localize", "index", {"index": VERSION}).recipe
 
 
-def new_segment(scenes: Sequence[tuple[SceneFeatures, str]], indexed: int) -> InMemory:
-    """A segment of scenes that are not in any.
+def new_segment(scenes: Sequence[tuple[SceneFeatures, str]]) -> InMemory:
+    """Index the features of scenes as a new segment.
 
     Args:
-        scenes: features, and the key that they are kept under.
-        indexed: of a view, at most.
+        scenes: features, and the key that they are stored under.
     """
     rows, lists = [np.zeros((0, _WIDTH), np.uint8)], [np.zeros(0, np.int64)]
     for place, (found, _) in enumerate(scenes):
         starts = found.starts
-        first = [np.arange(a, min(b, a + indexed)) for a, b in pairwise(starts)]
+        first = [np.arange(a, min(b, a + INDEXED_FEATURES)) for a, b in pairwise(starts)]
         kept = np.concatenate([np.zeros(0, np.int64), *first])
         if not len(kept):
             continue
         view = np.repeat(np.arange(len(first)), [len(part) for part in first])
-        words = words_for(found.descriptors.shape[1])
-        short = words.shortened(found.descriptors[kept] / np.float32(UNIT))
-        word = words.nearest(short)[:, 0]
+        vocabulary = load_vocabulary(found.descriptors.shape[1])
+        reduced = vocabulary.reduce(found.descriptors[kept] / np.float32(UNIT))
+        word = vocabulary.nearest(reduced)[:, 0]
         part = np.empty((len(kept), _WIDTH), np.uint8)
-        part[:, _SIGNS] = words.signatures(short, word)[:, None].view(np.uint8)
-        part[:, _TURN] = _packed(turned.in_scene(found, kept, view)).view(np.uint8)
+        part[:, _SIGNS] = vocabulary.signatures(reduced, word)[:, None].view(np.uint8)
+        part[:, _TURN] = _pack_quats(feature_frames.scene_frames(found, kept, view)).view(np.uint8)
         part[:, _VIEW] = view.astype("<u2")[:, None].view(np.uint8)
         write_places(part, place)
         rows.append(part)
@@ -117,41 +107,39 @@ def new_segment(scenes: Sequence[tuple[SceneFeatures, str]], indexed: int) -> In
     return in_lists(members, np.concatenate(lists), np.concatenate(rows))
 
 
-def most_alike(
-    index: ViewIndex, found: Keypoints, intrinsics_px: np.ndarray, count: int, params: Params
-) -> list[tuple[str, int]]:
-    """The ``count`` views that most speaks for, best first: scenes and the numbers of their views.
+def retrieve_views(index: ViewIndex, found: Keypoints, intrinsics_px: np.ndarray, count: int) -> list[tuple[str, int]]:
+    """Return the ``count`` most similar views, best first, as scenes and numbers of their views.
 
     Args:
-        found: features of the photograph.
-        intrinsics_px: (4,) its own.
+        found: features of the photo.
+        intrinsics_px: (4,) of the photo.
 
     Raises:
         CorruptError: the index is damaged.
-        NotFoundError: others have changed it meanwhile.
+        NotFoundError: another process has replaced segments.
     """
     if not len(index) or not len(found):
         return []
-    matches = _matches(index, found, params)
-    photo = turned.in_camera(found, intrinsics_px)
+    matches = _match(index, found)
+    photo = feature_frames.camera_frames(found, intrinsics_px)
     scored = []
-    for scene in _best(_by_feature(matches), params.first):
-        mine = matches.of(scene, params.most)
-        cameras = turned.of_camera(mine.turn, photo[mine.feature]).astype(np.float32)
-        agree = turned.alike(cameras, cameras, params.max_turn_deg)
-        scored.append((float(_agreeing(agree, mine.feature, mine.worth)), scene, mine, agree))
+    for scene in _best(_score_scenes(matches), _VERIFIED_SCENES):
+        own = matches.of(scene)
+        cameras = feature_frames.camera_orientations(own.frame, photo[own.feature]).astype(np.float32)
+        agree = feature_frames.within_angle(cameras, cameras, MAX_TURN_DEG)
+        scored.append((float(_consistent_weight(agree, own.feature, own.weight)), scene, own, agree))
     scored.sort(key=lambda one: (-one[0], one[1]))
     views = []
-    for score, scene, mine, agree in scored[: params.scenes]:
-        for view in np.unique(mine.view):
-            rows = np.flatnonzero(mine.view == view)
-            own = _agreeing(agree[np.ix_(rows, rows)], mine.feature[rows], mine.worth[rows])
-            views.append((own + params.of_scene * score, matches.scenes[scene], int(view)))
+    for score, scene, own, agree in scored[:_RANKED_SCENES]:
+        for view in np.unique(own.view):
+            rows = np.flatnonzero(own.view == view)
+            weight = _consistent_weight(agree[np.ix_(rows, rows)], own.feature[rows], own.weight[rows])
+            views.append((weight + _SCENE_WEIGHT * score, matches.scenes[scene], int(view)))
     views.sort(key=lambda one: (-one[0], one[1], one[2]))
     return [(scene, view) for _, scene, view in views[:count]]
 
 
-# --- votes -----------------------------------------------------------------------------------------------------------
+# --- matches ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,38 +148,38 @@ class _Matches:
 
     Args:
         feature: (K,) of the photo.
-        scene: (K,) among ``scenes``, the wanted ones.
-        view: (K,) of the scene.
-        turn: (K, 4) of the frame of the view's feature in that of the scene.
-        worth: (K,).
+        scene: (K,) index of the scene in ``scenes``.
+        view: (K,) number of the view in its scene.
+        frame: (K, 4) of the view's feature in the scene.
+        weight: (K,).
         scenes: ids.
     """
 
     feature: np.ndarray
     scene: np.ndarray
     view: np.ndarray
-    turn: np.ndarray
-    worth: np.ndarray
+    frame: np.ndarray
+    weight: np.ndarray
     scenes: Sequence[str]
 
-    def of(self, scene: int, most: int) -> _Matches:
-        """Those with one scene, worth most first, features of equal worth in order."""
+    def of(self, scene: int) -> _Matches:
+        """Return the matches with one scene, at most `_MAX_MATCHES`, by decreasing weight and then by feature."""
         rows = np.flatnonzero(self.scene == scene)
-        rows = rows[np.lexsort((self.view[rows], self.feature[rows], -self.worth[rows]))][:most]
-        parts = (self.feature[rows], self.scene[rows], self.view[rows], self.turn[rows], self.worth[rows])
+        rows = rows[np.lexsort((self.view[rows], self.feature[rows], -self.weight[rows]))][:_MAX_MATCHES]
+        parts = (self.feature[rows], self.scene[rows], self.view[rows], self.frame[rows], self.weight[rows])
         return _Matches(*parts, self.scenes)
 
 
-def _matches(index: ViewIndex, found: Keypoints, params: Params) -> _Matches:
-    words = words_for(found.descriptors.shape[1])
-    probes = _probes(found, words, params)
+def _match(index: ViewIndex, found: Keypoints) -> _Matches:
+    vocabulary = load_vocabulary(found.descriptors.shape[1])
+    probes = _probe_lists(found, vocabulary)
     scenes = sorted(index.wanted)
     number = {scene: k for k, scene in enumerate(scenes)}
-    nearer = np.zeros((len(found), params.max_signs + 1), np.int64)  # features of the map, by signs that differ
+    nearer = np.zeros((len(found), MAX_HAMMING + 1), np.int64)  # features of the map, by Hamming distance
     parts = []
     for segment in index.segments:
         number_of = np.array([-2 if m is None else number.get(m.scene, -1) for m in segment.members], np.int64)
-        for feature, differ, rows in _near(segment, probes, params.max_signs):
+        for feature, differ, rows in _near(segment, probes):
             scene = number_of[places_of(rows, len(number_of))]
             np.add.at(nearer, (feature[scene > -2], differ[scene > -2]), 1)
             kept = scene >= 0
@@ -199,23 +187,23 @@ def _matches(index: ViewIndex, found: Keypoints, params: Params) -> _Matches:
     feature, differ, scene = (np.concatenate([np.zeros(0, np.int64), *(p[k] for p in parts)]) for k in range(3))
     rows = np.concatenate([np.zeros((0, _WIDTH), np.uint8), *(p[3] for p in parts)])
     count = sum(member is not None for segment in index.segments for member in segment.members)
-    expected = np.cumsum(nearer, axis=1) + params.scenes_beside * words.chance[: params.max_signs + 1]
-    worth = -np.log(np.minimum(expected[feature, differ] / (count + params.scenes_beside), 1.0))
-    kept = np.flatnonzero(worth > params.least)
+    expected = np.cumsum(nearer, axis=1) + PRIOR_SCENES * vocabulary.chance[: MAX_HAMMING + 1]
+    weight = -np.log(np.minimum(expected[feature, differ] / (count + PRIOR_SCENES), 1.0))
+    kept = np.flatnonzero(weight > MIN_WEIGHT)
     rows = rows[kept]
-    turn = _unpacked(np.ascontiguousarray(rows[:, _TURN]).view(np.int8))
+    frame = _unpack_quats(np.ascontiguousarray(rows[:, _TURN]).view(np.int8))
     view = np.ascontiguousarray(rows[:, _VIEW]).view("<u2")[:, 0].astype(np.int64)
-    return _Matches(feature[kept], scene[kept], view, turn, worth[kept], scenes)
+    return _Matches(feature[kept], scene[kept], view, frame, weight[kept], scenes)
 
 
 @dataclass(frozen=True, eq=False)
 class _Probes:
-    """Lists that the features of a photo look into, by list.
+    """Lists that the features of a photo are matched with.
 
     Args:
-        words: (P,) rising.
-        feature: (P,) who looks.
-        signs: (P,) uint64 its signature beside that word.
+        words: (P,) sorted.
+        feature: (P,) of the photo.
+        signs: (P,) uint64 signature of the feature relative to the word.
     """
 
     words: np.ndarray
@@ -223,16 +211,16 @@ class _Probes:
     signs: np.ndarray
 
 
-def _probes(found: Keypoints, words: Words, params: Params) -> _Probes:
-    short = words.shortened(found.descriptors)
-    probed = words.nearest(short, min(params.words, len(words.centres)))
+def _probe_lists(found: Keypoints, vocabulary: Vocabulary) -> _Probes:
+    reduced = vocabulary.reduce(found.descriptors)
+    probed = vocabulary.nearest(reduced, min(NUM_WORDS, len(vocabulary.centres)))
     feature, word = np.repeat(np.arange(len(found)), probed.shape[1]), probed.ravel()
     order = np.argsort(word, kind="stable")
-    return _Probes(word[order], feature[order], words.signatures(short[feature], word)[order])
+    return _Probes(word[order], feature[order], vocabulary.signatures(reduced[feature], word)[order])
 
 
-def _near(segment: Segment, probes: _Probes, max_signs: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Features of the photo (k,), signs (k,) by which they differ from those of a segment, and these, rows (k, B)."""
+def _near(segment: Segment, probes: _Probes) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield features of the photo (k,), Hamming distances (k,) to features of a segment, and rows (k, B) of these."""
     keys, starts = lists_of(segment)
     wanted, first = np.unique(probes.words, return_index=True)
     last = np.r_[first[1:], len(probes.words)]
@@ -241,23 +229,23 @@ def _near(segment: Segment, probes: _Probes, max_signs: int) -> Iterator[tuple[n
     there = there[keys[at[there]] == wanted[there]]
     block_of = starts[at[there]] // _BLOCK_ROWS
     for block in np.unique(block_of):
-        mine = there[block_of == block]
-        low, high = int(starts[at[mine[0]]]), int(starts[at[mine[-1]] + 1])
+        chosen = there[block_of == block]
+        low, high = int(starts[at[chosen[0]]]), int(starts[at[chosen[-1]] + 1])
         rows = np.ascontiguousarray(segment.rows(low, high))
-        theirs = np.ascontiguousarray(rows[:, _SIGNS]).view("<u8")[:, 0]
-        sizes = (last - first)[mine]
-        asking = np.concatenate([np.arange(first[k], last[k]) for k in mine])
-        begin, end = (np.repeat(starts[at[mine] + k], sizes) - low for k in range(2))
-        who, which, differ = near_signatures(probes.signs[asking], begin, end, theirs, max_signs)
-        yield probes.feature[asking[who]], differ, rows[which]
+        stored = np.ascontiguousarray(rows[:, _SIGNS]).view("<u8")[:, 0]
+        sizes = (last - first)[chosen]
+        probing = np.concatenate([np.arange(first[k], last[k]) for k in chosen])
+        begin, end = (np.repeat(starts[at[chosen] + k], sizes) - low for k in range(2))
+        probe, row, differ = near_signatures(probes.signs[probing], begin, end, stored, MAX_HAMMING)
+        yield probes.feature[probing[probe]], differ, rows[row]
 
 
-def _by_feature(matches: _Matches) -> np.ndarray:
-    """What speaks for each scene, each feature of the photo once."""
-    order = np.lexsort((-matches.worth, matches.feature, matches.scene))
+def _score_scenes(matches: _Matches) -> np.ndarray:
+    """Return the weight of the matches with each scene, each feature of the photo once."""
+    order = np.lexsort((-matches.weight, matches.feature, matches.scene))
     scene, feature = matches.scene[order], matches.feature[order]
     first = np.r_[True, (scene[1:] != scene[:-1]) | (feature[1:] != feature[:-1])][: len(order)]
-    return np.bincount(scene[first], matches.worth[order][first], minlength=len(matches.scenes))
+    return np.bincount(scene[first], matches.weight[order][first], minlength=len(matches.scenes))
 
 
 def _best(scores: np.ndarray, count: int) -> list[int]:
@@ -266,23 +254,23 @@ def _best(scores: np.ndarray, count: int) -> list[int]:
     return found
 
 
-def _agreeing(agree: np.ndarray, feature: np.ndarray, worth: np.ndarray) -> float:
-    """The most that matches are worth which agree with one of them, each feature of the photo once."""
+def _consistent_weight(agree: np.ndarray, feature: np.ndarray, weight: np.ndarray) -> float:
+    """Return the largest weight of matches that agree with one of them, each feature of the photo once."""
     order = np.argsort(feature, kind="stable")
     first = np.flatnonzero(np.r_[True, np.diff(feature[order]) > 0])
-    worths = np.where(agree[:, order], worth[order], 0.0)
-    return float(np.maximum.reduceat(worths, first, axis=1).sum(1).max())
+    weights = np.where(agree[:, order], weight[order], 0.0)
+    return float(np.maximum.reduceat(weights, first, axis=1).sum(1).max())
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
 
 
-def _packed(quats: np.ndarray) -> np.ndarray:
-    """(N, 4) int8 of unit quaternions: to half a degree."""
+def _pack_quats(quats: np.ndarray) -> np.ndarray:
+    """Return (N, 4) int8 of unit quaternions, to half a degree."""
     return np.round(quats * 127).astype(np.int8)
 
 
-def _unpacked(packed: np.ndarray) -> np.ndarray:
+def _unpack_quats(packed: np.ndarray) -> np.ndarray:
     quats = packed.astype(np.float64)
     out: np.ndarray = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-9)
     return out

@@ -1,4 +1,4 @@
-"""Where the patches of a render lie in a photograph, once both show a place from nearly the same standpoint."""
+"""Track patches of a render in a photo taken from nearly the same pose, by normalized cross-correlation."""
 
 from __future__ import annotations
 
@@ -7,41 +7,29 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from gsmap.localize.filters import blurred, highest, means, slopes
+from gsmap.localize.filters import blur, box_means, gradients, maximum
 
+MAX_PATCHES = 400
+"""Patches of one render, those with most structure."""
 
-@dataclass(frozen=True)
-class Params:
-    """How patches are chosen and found again.
-
-    Args:
-        half_px: a patch reaches so far from its middle.
-        cell_px: of each cell of this size one patch is taken at most: that with most structure.
-        max_patches: of one render.
-        min_structure: least contrast (standard deviation, grey in [0, 1]) along the direction that varies least.
-        min_correlation: normalised cross-correlation under which a patch is not found again.
-        min_margin: by which the best place must beat every other that is more than ``apart_px`` away.
-        apart_px: see there.
-    """
-
-    half_px: int = 7
-    cell_px: int = 14
-    max_patches: int = 400
-    min_structure: float = 0.012
-    min_correlation: float = 0.6
-    min_margin: float = 0.04
-    apart_px: int = 3
+_HALF_PX = 7  # half width of a patch
+_CELL_PX = 14  # each cell of this size yields one patch at most
+_MIN_STRUCTURE = 0.012  # standard deviation along the direction that varies least, grey in [0, 1]
+_MIN_CORRELATION = 0.6
+_MIN_MARGIN = 0.04  # of the best correlation over those farther away than ...
+_RIVAL_PX = 3  # ... this
+_SMOOTH_PX = 0.8  # blur before structure is measured
 
 
 @dataclass(frozen=True, eq=False)
-class Tracks:
-    """Patches of a render that were looked for in a photo.
+class PatchTracks:
+    """Patches of a render that were searched for in a photo.
 
     Args:
-        render_px: (K, 2) their middles in the render, ``column row`` with pixel centres at +0.5.
-        photo_px: (K, 2) where they were found.
-        correlation: (K,) how well, in [-1, 1].
-        found: (K,) bool: well enough, once only, and not at the edge of what was searched.
+        render_px: (K, 2) centres in the render, ``column row`` with pixel centres at +0.5.
+        photo_px: (K, 2) positions in the photo.
+        correlation: (K,) in [-1, 1].
+        found: (K,) bool: correlated, unique, and not at the border of the search window.
     """
 
     render_px: np.ndarray
@@ -50,19 +38,19 @@ class Tracks:
     found: np.ndarray
 
 
-def track(render: np.ndarray, usable: np.ndarray, photo: np.ndarray, reach_px: int, params: Params) -> Tracks:
-    """Look for patches of a render in a photo of the same size, within ``reach_px`` of where they lie in the render.
+def track(render: np.ndarray, valid: np.ndarray, photo: np.ndarray, reach_px: int) -> PatchTracks:
+    """Search for patches of a render in a photo of the same size, within ``reach_px`` of their position.
 
     Args:
         render, photo: (H, W) float32 grey in [0, 1].
-        usable: (H, W) bool: pixels of the render whose place is known.
+        valid: (H, W) bool: pixels of the render with a known position.
     """
-    half = params.half_px
-    row, column = _corners(render, usable, params)
+    half = _HALF_PX
+    row, column = _corners(render, valid)
     side = 2 * half + 1
     if not len(row):
         empty = np.zeros((0, 2))
-        return Tracks(empty, empty, np.zeros(0), np.zeros(0, bool))
+        return PatchTracks(empty, empty, np.zeros(0), np.zeros(0, bool))
     offsets = np.arange(-half, half + 1)
     patches = render[row[:, None, None] + offsets[:, None], column[:, None, None] + offsets]
     patches = patches - patches.mean((1, 2), keepdims=True)
@@ -75,8 +63,8 @@ def track(render: np.ndarray, usable: np.ndarray, photo: np.ndarray, reach_px: i
     products = irfft2(rfft2(windows, (length, length)) * np.conj(rfft2(patches, (length, length))), (length, length))
     span = 2 * reach_px + 1
     products = products[:, :span, :span]
-    mean = means(photo, side, reflect=False)
-    spread = np.sqrt(np.maximum(means(photo**2, side, reflect=False) - mean**2, 0)) * side
+    mean = box_means(photo, side, reflect=False)
+    spread = np.sqrt(np.maximum(box_means(photo**2, side, reflect=False) - mean**2, 0)) * side
     near = np.arange(-reach_px, reach_px + 1)
     spread = np.pad(spread, reach_px, mode="constant")[
         row[:, None, None] + reach_px + near[:, None], column[:, None, None] + reach_px + near
@@ -92,31 +80,31 @@ def track(render: np.ndarray, usable: np.ndarray, photo: np.ndarray, reach_px: i
     di = _vertex(scores[k, ci - 1, cj], scores[k, ci, cj], scores[k, ci + 1, cj])
     dj = _vertex(scores[k, ci, cj - 1], scores[k, ci, cj], scores[k, ci, cj + 1])
     apart = np.maximum(np.abs(np.arange(span) - i[:, None])[:, :, None], np.abs(np.arange(span) - j[:, None])[:, None])
-    rival = np.where(apart > params.apart_px, scores, -1.0).max((1, 2))
-    found = inside & (top >= params.min_correlation) & (top - rival >= params.min_margin)
+    rival = np.where(apart > _RIVAL_PX, scores, -1.0).max((1, 2))
+    found = inside & (top >= _MIN_CORRELATION) & (top - rival >= _MIN_MARGIN)
     at = np.stack([column + 0.5, row + 0.5], axis=1)
-    return Tracks(at, at + np.stack([j + dj - reach_px, i + di - reach_px], axis=1), top, found)
+    return PatchTracks(at, at + np.stack([j + dj - reach_px, i + di - reach_px], axis=1), top, found)
 
 
-def _corners(grey: np.ndarray, usable: np.ndarray, params: Params) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the pixels around which most varies in every direction, one a cell."""
-    half = params.half_px
-    smooth = blurred(grey, 0.8)
-    gy, gx = np.moveaxis(slopes(smooth), 2, 0)
+def _corners(grey: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns of the strongest corners (Shi and Tomasi 1994), one per cell."""
+    half = _HALF_PX
+    smooth = blur(grey, _SMOOTH_PX)
+    gy, gx = np.moveaxis(gradients(smooth), 2, 0)
     size = 2 * half - 1
-    a, b, c = np.moveaxis(means(np.stack([gx * gx, gx * gy, gy * gy], axis=2), size), 2, 0)
+    a, b, c = np.moveaxis(box_means(np.stack([gx * gx, gx * gy, gy * gy], axis=2), size), 2, 0)
     weakest = (a + c) / 2 - np.sqrt(np.maximum(((a - c) / 2) ** 2 + b * b, 0))
-    weakest[~usable] = 0
+    weakest[~valid] = 0
     edge = half + 1
     weakest[:edge], weakest[-edge:], weakest[:, :edge], weakest[:, -edge:] = 0, 0, 0, 0
-    peak = (weakest == highest(weakest, params.cell_px)) & (weakest > (params.min_structure / half) ** 2)
+    peak = (weakest == maximum(weakest, _CELL_PX)) & (weakest > (_MIN_STRUCTURE / half) ** 2)
     row, column = np.nonzero(peak)
-    order = np.argsort(-weakest[row, column], kind="stable")[: params.max_patches]
+    order = np.argsort(-weakest[row, column], kind="stable")[:MAX_PATCHES]
     return row[order], column[order]
 
 
 def _vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Where the parabola through three values one apart is highest, from the middle, within half a step."""
+    """Return the vertex of the parabola through three values, relative to the middle one, within half a step."""
     bend = before - 2 * at + after
     safe = np.where(bend < -1e-9, bend, -1e-9)
     out: np.ndarray = np.where(bend < -1e-9, np.clip(0.5 * (before - after) / safe, -0.5, 0.5), 0.0)

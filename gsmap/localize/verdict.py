@@ -1,4 +1,4 @@
-"""Whether a photograph's pose is said, or the reason why not."""
+"""Accept a photo's pose, or give the reason for rejecting it."""
 
 from __future__ import annotations
 
@@ -8,64 +8,70 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.errors import ConfigError
-from gsmap.localize.probability import model
+from gsmap.localize.probability import PRIOR, load_model
 from gsmap.reason_codes import reason
+
+MIN_INLIERS = 1
+"""Tracked patches that must lie where the pose predicts them."""
 
 
 @dataclass(frozen=True)
 class Params:
-    """What a pose must show. A wrong place is worse than none.
+    """Thresholds of accepting a pose; a wrong pose is worse than none.
 
     Args:
-        min_probability: that it is right, of all evidence together.
-        prior: share of the poses that are looked into that are right before anything is known of them ...
-        alike: ... and of those that are of a room that looks like one of the map, and is not in it: more in a hotel or
-            a school, less where no two rooms are alike (``docs/how-to/localize.md`` says what either costs).
-        min_inliers: patches of renders that are found again in the photo where the pose predicts them.
-        max_rival: another place may be this probable at most: what looks alike twice is not told apart.
-        max_rotation_sigma_deg: a pose that is known less well is not said ...
-        max_translation_sigma_m: ... nor one whose place is.
+        min_probability: Probability, in [0, 1], that a pose must have from all evidence together; larger accepts fewer
+            poses, and fewer wrong ones.
+        aliased_prior: Share of the candidate poses, in [0, 0.7), that are of a room which only looks like one of the
+            map; larger accepts fewer poses, as hotels and schools need (``docs/how-to/localize.md``).
+        max_rival_probability: Probability, in [0, 1], up to which another place of the map may explain the photo;
+            larger accepts more poses, and more of similar rooms.
+        max_rotation_sigma_deg: Standard deviation in degrees, positive, that the rotation may have; larger accepts less
+            accurate poses.
+        max_translation_sigma_m: Standard deviation in metres, positive, that the position may have; larger accepts less
+            accurate poses.
     """
 
     min_probability: float = 0.95
-    prior: float = 0.3
-    alike: float = 0.1
-    min_inliers: int = 1
-    max_rival: float = 0.2
+    aliased_prior: float = 0.1
+    max_rival_probability: float = 0.2
     max_rotation_sigma_deg: float = 3.0
     max_translation_sigma_m: float = 0.25
 
     def __post_init__(self) -> None:
-        if not (self.prior > 0 and self.alike >= 0 and self.prior + self.alike < 1):
+        if not 0 <= self.aliased_prior < 1 - PRIOR:
             raise ConfigError(
-                "prior and alike are shares of the poses that are looked into: prior above 0, alike 0 or more, "
-                f"together less than 1; got prior={self.prior}, alike={self.alike}",
-                code="out_of_range",
+                f"aliased_prior must lie in [0, {1 - PRIOR:g}), got {self.aliased_prior}", code="out_of_range"
             )
 
 
-def judge(
-    evidence: Mapping[str, float], probability: float, sigmas: tuple[float, float], rival: float, params: Params
+def rejection_reason(
+    evidence: Mapping[str, float],
+    probability: float,
+    sigmas: tuple[float, float],
+    rival: float,
+    params: Params,
+    min_inliers: int = MIN_INLIERS,
 ) -> str:
-    """Empty when the pose is said, else the reason why not.
+    """Return why a pose is rejected; empty where it is accepted.
 
     Args:
-        evidence: by name (`gsmap.localize.localizing.judged_pose`).
+        evidence: by name (`gsmap.localize.probability`).
         sigmas: largest standard deviation of rotation (rad) and translation (metres).
         rival: probability of the best pose at another place.
     """
     inliers = round(10 ** evidence["inliers"] - 1)
-    if inliers < params.min_inliers or not np.isfinite(sigmas).all():
+    if inliers < min_inliers or not np.isfinite(sigmas).all():
         return reason(
             "not_confirmed",
-            f"what the map shows there is not in the picture: {inliers} patches found, needs {params.min_inliers}",
+            f"what the map shows there is not in the picture: {inliers} patches found, needs {min_inliers}",
         )
     if probability < params.min_probability:
         return reason(
             "not_probable",
             f"not probable enough: {probability:.1%}, needs {params.min_probability:.0%}: {_weakest(evidence)}",
         )
-    if rival > params.max_rival:
+    if rival > params.max_rival_probability:
         return reason("ambiguous", f"ambiguous: another place of the map shows the same ({rival:.0%} probable)")
     degrees = np.degrees(sigmas[0])
     if degrees > params.max_rotation_sigma_deg or sigmas[1] > params.max_translation_sigma_m:
@@ -76,7 +82,7 @@ def judge(
 
 
 def _weakest(evidence: Mapping[str, float]) -> str:
-    """The two pieces of evidence that a sure pose would show otherwise, in words."""
+    """Describe the two pieces of evidence that lack most."""
     words = {
         "matches": f"{round(10 ** evidence['matches'] - 1)} features agree",
         "inliers": f"{round(10 ** evidence['inliers'] - 1)} patches are found again",
@@ -97,4 +103,4 @@ def _weakest(evidence: Mapping[str, float]) -> str:
         "blocked": f"{evidence['blocked']:.0%} of the picture would be blocked",
         "sigma_m": f"its place is known to {10 ** evidence['sigma_m']:.2g} m",
     }
-    return ", ".join(words[name] for name in model().shortfalls(evidence)[:2])
+    return ", ".join(words[name] for name in load_model().shortfalls(evidence)[:2])

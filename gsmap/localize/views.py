@@ -1,4 +1,4 @@
-"""Which views of a scene are rendered to find photographs by: some of its own cameras, and some off their path."""
+"""Select the views of a scene that photos are matched with: its own cameras, and synthetic ones off their path."""
 
 from __future__ import annotations
 
@@ -10,45 +10,51 @@ from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.projection import in_image, project
 from gsmap.types import Cameras, Gaussians
 
+_TURN_FRACTION = 0.6  # distance, per median distance of the content, that changes a view as much as a radian
+_MAX_POINTS = 4000  # opaque Gaussians that represent the scene
+_MIN_GAIN = 0.01  # mean gain in resolution below which no more synthetic views are added
+_OCCLUSION = 1.15  # depth relative to the nearest point of a pixel, up to which a point is visible
+
 
 @dataclass(frozen=True)
 class Params:
-    """How many views of a scene, and of what size.
+    """Settings of the views of a scene.
 
     Args:
-        image_size_px: longer side of the renders, and of photographs while features are looked for in them.
-        own: of the scene's cameras, at most.
-        made: views off their path, at most, where there is free space.
-        turn: how far to move is as much of another view as to turn by a radian, as a share of the distance of what is
-            seen.
-        sample: opaque centres that stand for the scene while made views are chosen.
+        image_size_px: Longer side in pixels, at least 64, of the renders and of the photos that are matched with them;
+            larger is more accurate and slower.
+        max_own_views: Number of the scene's own cameras, at least 0, that are rendered; larger finds more photos and
+            takes more space.
+        max_synthetic_views: Number of synthetic views, at least 0, in free space off the cameras' path; larger finds
+            more photos from unusual positions and takes more space.
+        max_features: Number of features, at least 1, that are stored of each view; larger finds more photos and takes
+            more space.
     """
 
     image_size_px: int = 480
-    own: int = 24
-    made: int = 8
-    turn: float = 0.6
-    sample: int = 4000
+    max_own_views: int = 24
+    max_synthetic_views: int = 8
+    max_features: int = 600
 
 
-def choose_views(gaussians: Gaussians, cameras: Cameras, params: Params | None = None) -> Cameras:
-    """Cameras from which the scene is rendered; first its own, then made ones.
+def select_views(gaussians: Gaussians, cameras: Cameras, params: Params | None = None) -> Cameras:
+    """Select cameras from which a scene is rendered: first its own, then synthetic ones.
 
-    Its own are thinned to those that are farthest from each other in place and direction, so that a standstill does
-    not use them up. Made ones stand in its free space, and are taken for the surface that the chosen own ones do not
-    see from the front or from near: what somebody photographs who did not walk along.
+    Of its own cameras those farthest from each other in position and direction are taken, so that a standstill does not
+    use them up. Synthetic ones stand in free space and see surfaces that the own ones do not see from the front or from
+    near.
 
     Returns:
-        At most ``own + made`` cameras, resized to the size of the renders.
+        At most ``max_own_views + max_synthetic_views`` cameras, resized to the size of the renders.
     """
     params = params or Params()
-    points = _sample(gaussians, params.sample)
-    made = cameras if cameras.synthesised else synthesise_cameras(gaussians)
+    points = _sample_points(gaussians)
+    synthetic = cameras if cameras.synthesised else synthesise_cameras(gaussians)
     if cameras.synthesised:
-        chosen = cameras[_spread(cameras, points, params.own + params.made, params.turn)]
+        chosen = cameras[_farthest_points(cameras, points, params.max_own_views + params.max_synthetic_views)]
     else:
-        chosen = cameras[_spread(cameras, points, params.own, params.turn)]
-        more = made[_adding(points, chosen, made, params)]
+        chosen = cameras[_farthest_points(cameras, points, params.max_own_views)]
+        more = synthetic[_complement(points, chosen, synthetic, params.max_synthetic_views)]
         chosen = Cameras(
             np.concatenate([chosen.T_frame_camera, more.T_frame_camera]),
             np.concatenate([chosen.intrinsics_px, more.intrinsics_px]),
@@ -57,19 +63,19 @@ def choose_views(gaussians: Gaussians, cameras: Cameras, params: Params | None =
     return chosen.resized(params.image_size_px)
 
 
-def _sample(gaussians: Gaussians, count: int) -> np.ndarray:
-    """(P, 3) opaque centres that stand for the scene."""
+def _sample_points(gaussians: Gaussians) -> np.ndarray:
+    """Return (P, 3) means of opaque Gaussians, at most `_MAX_POINTS`."""
     solid = np.flatnonzero(gaussians.logit_opacities > 0.0)
-    rows = np.linspace(0, len(solid) - 1, min(len(solid), count)).astype(int)
+    rows = np.linspace(0, len(solid) - 1, min(len(solid), _MAX_POINTS)).astype(int)
     return gaussians.means[solid[rows]].astype(np.float32)
 
 
-def _spread(cameras: Cameras, points: np.ndarray, count: int, turn: float) -> np.ndarray:
-    """Rows of the cameras that are farthest from each other, in their order."""
+def _farthest_points(cameras: Cameras, points: np.ndarray, count: int) -> np.ndarray:
+    """Return rows of the cameras that are farthest from each other in position and direction, in their order."""
     if len(cameras) <= count or not len(points):
         return np.arange(len(cameras))[:count]
     from_middle = np.linalg.norm(points - np.median(cameras.centers, axis=0), axis=1)
-    lever = turn * float(np.median(from_middle))
+    lever = _TURN_FRACTION * float(np.median(from_middle))
     features = np.concatenate([cameras.centers, lever * cameras.T_frame_camera[:, :3, 2]], axis=1)
     chosen = [0]
     apart = np.linalg.norm(features - features[0], axis=1)
@@ -79,26 +85,26 @@ def _spread(cameras: Cameras, points: np.ndarray, count: int, turn: float) -> np
     return np.sort(chosen)
 
 
-def _adding(points: np.ndarray, own: Cameras, made: Cameras, params: Params) -> list[int]:
-    """Rows of the made cameras that see most of what those before see badly, or not at all."""
+def _complement(points: np.ndarray, own: Cameras, synthetic: Cameras, count: int) -> list[int]:
+    """Return rows of the synthetic cameras that add most resolution to what the own cameras see."""
     best = np.zeros(len(points))
     for camera in range(len(own)):
-        best = np.maximum(best, _detail(points, own, camera))
-    details = [_detail(points, made, camera) for camera in range(len(made))]
+        best = np.maximum(best, _resolution(points, own, camera))
+    details = [_resolution(points, synthetic, camera) for camera in range(len(synthetic))]
     chosen: list[int] = []
-    while len(chosen) < params.made:
-        # How much larger it is seen than before, at most twice: nearer still shows no more than the splats hold.
+    while len(chosen) < count:
+        # At most a factor of two counts: splats have no finer detail.
         gains = [np.log2(np.maximum(d, 1e-9) / np.maximum(best, d / 2 + 1e-9)).clip(0, 1).sum() for d in details]
         pick = int(np.argmax(gains)) if gains else -1
-        if pick < 0 or gains[pick] < 0.01 * len(points):
+        if pick < 0 or gains[pick] < _MIN_GAIN * len(points):
             break
         chosen.append(pick)
         best = np.maximum(best, details[pick])
     return chosen
 
 
-def _detail(points: np.ndarray, cameras: Cameras, row: int) -> np.ndarray:
-    """(P,) pixels per unit with which a camera sees each point; 0 where something stands before it, or outside."""
+def _resolution(points: np.ndarray, cameras: Cameras, row: int) -> np.ndarray:
+    """Return (P,) resolution with which a camera sees each point, per image size; 0 for hidden points."""
     coarse = cameras[[row]].resized(24)
     width, height = (int(v) for v in coarse.sizes_px[0])
     pixels, depth = project(points, coarse.T_camera_frame[0], coarse.intrinsics_px[0])
@@ -106,7 +112,7 @@ def _detail(points: np.ndarray, cameras: Cameras, row: int) -> np.ndarray:
     column, line = pixels[seen].astype(np.int64).T
     nearest = np.full(width * height, np.inf, np.float32)
     np.minimum.at(nearest, line * width + column, depth[seen])
-    front = seen[depth[seen] <= 1.15 * nearest[line * width + column]]
+    front = seen[depth[seen] <= _OCCLUSION * nearest[line * width + column]]
     out = np.zeros(len(points))
     out[front] = cameras.intrinsics_px[row, 0] / cameras.sizes_px[row].max() / depth[front]
     return out

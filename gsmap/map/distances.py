@@ -259,11 +259,11 @@ def _moves(point: np.ndarray) -> np.ndarray:
 
 
 def _row(solved: _PoseUncertainty, end: _LocatedPoint, frame: WorldFrame | None, crs: str | None) -> PointRow:
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     scene = end.place.scene
     covariance = None if end.metric is None else _world_covariance(solved, end)
-    world = None if end.metric is None or frame is None else of_frame(frame, end.metric[None], crs)[0]
+    world = None if end.metric is None or frame is None else from_frame(frame, end.metric[None], crs)[0]
     return PointRow(
         said=end.place.said,
         scene=scene,

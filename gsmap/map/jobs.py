@@ -97,7 +97,7 @@ def features_of_scene(
     scenes = _store(path).scenes
     extractor = family("extractor").get(params.extractor).make(models, params.extractors[params.extractor])
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
-    return localizing.scene_features(scene_id, gaussians, cameras, extractor, params.views, params.features)
+    return localizing.scene_features(scene_id, gaussians, cameras, extractor, params.views)
 
 
 def register_scenes(
@@ -155,11 +155,11 @@ def _without(path: str, scene_id: str, passing: DynamicContent) -> np.ndarray:
 
 def _kept(path: str, photo: StoredPhoto) -> ReferencePhoto:
     """Return a stored photo in the frame of its scene."""
-    from gsmap.localize.localizing import sigmas_of
+    from gsmap.localize.localization import max_sigmas
 
     one = photo.sighting
     camera = Cameras(one.T_scene_camera[None], one.intrinsics_px[None], np.array([one.size_px]))
-    return ReferencePhoto(camera, partial(_picture, path, photo.number), *sigmas_of(one.covariance))
+    return ReferencePhoto(camera, partial(_picture, path, photo.number), *max_sigmas(one.covariance))
 
 
 def _picture(path: str, number: int) -> np.ndarray:

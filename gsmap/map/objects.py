@@ -172,7 +172,7 @@ def compute_objects(
     if kept:
         at = {scene: pose.S_map_scene for scene, pose in placed.poses.items()}
         components = {scene: pose.component for scene, pose in placed.poses.items()}
-        objects = add_photo_observations(objects, kept, scenes, at, metres, components, settings.localize.sighted)
+        objects = add_photo_observations(objects, kept, scenes, at, metres, components)
     progress("objects", 1.0, f"{len(objects)} objects")
     photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
     return MapObjects(

@@ -12,8 +12,9 @@ from PIL import Image, ImageDraw
 
 from gsmap.durable import make_folder, write_whole
 from gsmap.errors import NotFoundError
-from gsmap.localize import Region, compare_photo
-from gsmap.localize.localizing import prepared
+from gsmap.localize import ChangedRegion, compare_photo
+from gsmap.localize.localization import scale_photo
+from gsmap.localize.refinement import MAX_SCENES
 from gsmap.map.objects import MapObjects, compute_objects
 from gsmap.map.photos import PhotoObservation, objects_in_photo
 from gsmap.map.stages.localize import Localizer
@@ -61,22 +62,23 @@ class PhotoReporter:
         pose = where.T_map_camera.copy()
         pose[:3, 3] *= unit
         in_metres = np.r_[np.ones(3), np.full(3, unit)]
-        support = [held.placed[scene] for scene in where.scenes[: held.params.settling.max_scenes]]
+        support = [held.placed[scene] for scene in where.scenes[:MAX_SCENES]]
         found = compare_photo(
             photo,
             pose,
             where.covariance * np.outer(in_metres, in_metres),
             where.intrinsics_px,
             support,
-            {one.scene: held.reference_views(one.scene) for one in support},
-            held.params,
+            {one.scene: held.capture_views(one.scene) for one in support},
+            held.params.views.image_size_px,
+            held.params.min_change_fraction,
         )
         rows = tuple(self._row(region, where.component, unit) for region in found.regions)
         notes = []
-        if found.judged < _LITTLE:
+        if found.compared_fraction < _LITTLE:
             notes.append(
-                f"{photo.name}: only {found.judged:.0%} of it could be compared: no capture observed the rest from a "
-                "similar direction"
+                f"{photo.name}: only {found.compared_fraction:.0%} of it could be compared: no capture observed the "
+                "rest from a similar direction"
             )
         return PhotoObservation(found, rows, tuple(notes))
 
@@ -87,14 +89,14 @@ class PhotoReporter:
         held = self._localizer
         poses = {scene: pose.S_map_scene for scene, pose in held.store.revisions.poses().items()}
         unit = held.metres.get(row.component, 1.0)
-        return objects_in_photo(told, row, unit, self.known.objects, self._graph, poses, held.params.sighted)
+        return objects_in_photo(told, row, unit, self.known.objects, self._graph, poses)
 
     def _graph(self, scene: str) -> SceneGraph | None:
         if scene not in self._graphs:
             self._graphs[scene] = self._localizer.store.graphs.load(scene)
         return self._graphs[scene]
 
-    def _row(self, region: Region, component: int, unit: float) -> PhotoChangeRow:
+    def _row(self, region: ChangedRegion, component: int, unit: float) -> PhotoChangeRow:
         position = region.point / unit
         thing = nearest_object(self.known, component, position, unit)
         return PhotoChangeRow(
@@ -140,7 +142,7 @@ def write_picture(
     Returns:
         The file, named by the photo's name and content, so that two of one name do not meet.
     """
-    picture, _ = prepared(photo, localizer.params)
+    picture, _ = scale_photo(photo, localizer.params.views.image_size_px)
     rgb = picture.rgb.copy()
     dim = ~told.found.compared
     rgb[dim] = 0.25 * rgb[dim] + 0.75 * 0.5 * (rgb[dim].mean(-1, keepdims=True) + 0.35)

@@ -192,7 +192,7 @@ def _with_what_they_tell(
         )
         shown = None if picture is None else os.fspath(picture)
         if options.changes:
-            row = replace(row, changes=observation.rows, compared=observation.found.judged, picture=shown)
+            row = replace(row, changes=observation.rows, compared=observation.found.compared_fraction, picture=shown)
             notes += observation.notes
         if options.add:
             added, more = _add(localizer.store, reporter, photo, row, observation, options.captured_at)
@@ -247,7 +247,7 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
     if focal is None:
         return Lens()
     if focal == "auto":
-        return Lens(ask_file=False)
+        return Lens(use_exif=False)
     try:
         return Lens(focal_px=float(focal))
     except ValueError:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.transforms import transform_poses
-from gsmap.localize import Differences, sighted
+from gsmap.localize import PhotoComparison
 from gsmap.map.date_filter import parse_moment
 from gsmap.map.photo_poses import photo_pose_of
 from gsmap.store import Store
@@ -24,6 +24,11 @@ from gsmap.types.localization import Photo
 from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 from gsmap.types.rows.localize import LocalizeRow, PhotoChangeRow, PhotoRow
 
+_ON_SURFACE_M = 0.12  # distance of a sample of an object from the rendered surface, up to which it is visible
+_MIN_SAMPLES, _MIN_VISIBLE_FRACTION = 8, 0.1  # of an object that must be visible for it to be judged
+_MIN_SEEN_FRACTION = 0.6  # of the visible samples that must agree with the map for the object to be seen
+_MIN_GONE_FRACTION = 0.5  # of the visible samples that must lie in changed regions for it to be absent
+_SAME_PLACE_M = 0.15  # distance of an observation from the box of its object
 _SIDE_PX = 960  # of the picture that is kept: as large as captures are rendered for the merged map to look like
 
 
@@ -37,7 +42,7 @@ class PhotoObservation:
         notes: remarks for the user.
     """
 
-    found: Differences
+    found: PhotoComparison
     rows: tuple[PhotoChangeRow, ...]
     notes: tuple[str, ...]
 
@@ -101,7 +106,6 @@ def objects_in_photo(
     objects: Sequence[MapObject],
     graph_of: Callable[[str], SceneGraph | None],
     poses: Mapping[str, Sim3],
-    params: sighted.Params,
 ) -> list[PhotoObjectObservation]:
     """Return which objects of its component a localized photo shows, and which it shows to be absent.
 
@@ -131,14 +135,14 @@ def objects_in_photo(
         column, line = pixels[rows].astype(np.int64).T
         surface = told.found.points[line, column]
         far = np.linalg.norm(surface - points[rows] * unit, axis=1)  # NaN where nothing was compared
-        on = far < params.on_m
+        on = far < _ON_SURFACE_M
         column, line = column[on], line[on]
         share = len(column) / len(points)
-        if len(column) < params.min_samples or share < params.min_share:
+        if len(column) < _MIN_SAMPLES or share < _MIN_VISIBLE_FRACTION:
             continue
-        if gone[line, column].mean() >= params.gone:
+        if gone[line, column].mean() >= _MIN_GONE_FRACTION:
             out.append(PhotoObjectObservation(thing.position, "absent", share))
-        elif (told.found.agrees & ~hidden)[line, column].mean() >= params.seen:
+        elif (told.found.agrees & ~hidden)[line, column].mean() >= _MIN_SEEN_FRACTION:
             out.append(PhotoObjectObservation(thing.position, "seen", share))
     return out
 
@@ -165,7 +169,6 @@ def add_photo_observations(
     poses: Mapping[str, Sim3],
     metres: Mapping[int, float],
     components: Mapping[str, int],
-    params: sighted.Params,
 ) -> list[MapObject]:
     """Add the observations of stored photos to objects, in the order of dates.
 
@@ -183,7 +186,7 @@ def add_photo_observations(
         component = components[one.scene]
         for thing in one.things:
             at = poses[one.scene].apply(thing.position)
-            number = _at(objects, component, at, params.same_place_m / metres[component])
+            number = _at(objects, component, at, _SAME_PLACE_M / metres[component])
             if number is not None:
                 sighting = ObjectObservation(one.digest, thing.state, -1, None, thing.share)
                 said.setdefault(number, {}).setdefault(one.digest, sighting)

@@ -369,17 +369,17 @@ def _by_likeness(
     index: _SearchIndex, query: Sequence[ObjectObservation], top: int
 ) -> tuple[list[FindHit], list[MapObject | None]]:
     """Rank objects by their similarity to one object, itself first."""
-    looks: dict[str, list[find.Look]] = {}
+    looks: dict[str, list[find.SegmentDescriptor]] = {}
     for scene, graph in index.graphs.items():
         if graph.things is not None and graph.up is not None:
-            looks[scene] = find.looks_of(graph.things, graph.up)
+            looks[scene] = find.describe_segments(graph.things, graph.up)
 
-    def shown(sightings: Sequence[ObjectObservation]) -> list[tuple[ObjectObservation, find.Look]]:
+    def shown(sightings: Sequence[ObjectObservation]) -> list[tuple[ObjectObservation, find.SegmentDescriptor]]:
         return [(s, looks[s.scene][s.thing]) for s in sightings if s.thing >= 0 and s.scene in looks]
 
     theirs = [shown(thing.sightings) for thing in index.objects]
     asked = [look for _, look in shown(query)]
-    scores, which = find.by_likeness(asked, [[look for _, look in one] for one in theirs])
+    scores, which = find.rank_by_similarity(asked, [[look for _, look in one] for one in theirs])
     order = [int(i) for i in np.argsort(-scores, kind="stable")[:top] if which[i] >= 0]
     hits = [
         _hit(index, rank, float(scores[i]), index.objects[i], theirs[i][int(which[i])][0].scene)
@@ -406,7 +406,7 @@ def _by_embedding(index: _SearchIndex, asked: _QueryVector, top: int) -> tuple[l
                 f"{layer.embeddings.shape[1]}: the text tower and the image encoder are not of one pack",
                 code="embedding_mismatch",
             )
-        scores.append(find.cosines(asked.features, asked.told, layer.embeddings))
+        scores.append(find.cosine_similarities(asked.features, asked.told, layer.embeddings))
         for row in range(len(layer)):
             scenes.append(scene)
             rows.append(row)
@@ -428,7 +428,7 @@ def _by_embedding(index: _SearchIndex, asked: _QueryVector, top: int) -> tuple[l
         if len(places) - len(index.objects) > top:
             break
     told_of = owner >= 0
-    best, which = find.best_of(every[told_of], owner[told_of], len(places))
+    best, which = find.best_per_owner(every[told_of], owner[told_of], len(places))
     of = np.flatnonzero(told_of)
     hits: list[FindHit] = []
     things: list[MapObject | None] = []

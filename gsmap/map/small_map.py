@@ -27,14 +27,15 @@ from gsmap.export.levels import make_level
 from gsmap.formats.quantise import check_size
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.localize import (
-    PlacedFeatures,
+    MapScene,
     ViewIndex,
     new_segment,
     packed_features,
     packed_gaussians,
-    packing,
+    reduction,
     view_index,
 )
+from gsmap.localize.features import INDEXED_FEATURES
 from gsmap.map import static_filter
 from gsmap.map.objects import MapObjects
 from gsmap.map.settings import Settings, settings_of
@@ -110,7 +111,6 @@ def export_small(
             code="small_map_extractor",
         )
     localizer = Localizer(store, settings, progress)
-    params = settings.localize.small
     scenes = sorted(localizer.placed)
     passing = {} if known is None else find_dynamic_content(store, known)
     wanted: dict[str, int] = {}
@@ -129,14 +129,14 @@ def export_small(
         for number, scene in enumerate(scenes):
             progress("export", 0.4 + 0.5 * number / len(scenes), f"packing {localizer.scenes[scene].name}")
             whole = _scene_content(localizer, scene, passing.get(scene))
-            content, row = _packed(localizer, whole, factor * wanted[scene], params)
+            content, row = _packed(localizer, whole, factor * wanted[scene])
             files[scene] = content
             rows.append(row)
         total = sum(map(len, files.values())) + _HEADER_BYTES * len(scenes) + 500
         if total <= budget_bytes:
             break
         factor *= 0.97 * free / max(total - (budget_bytes - free), 1)
-    _require_enough(rows, shown, params, budget_bytes, total)
+    _require_enough(rows, shown, budget_bytes, total)
     header = _header(store, localizer, files, settings)
     out.parent.mkdir(parents=True, exist_ok=True)
     with staging.beside(out.absolute()) as staged:
@@ -187,7 +187,7 @@ def _scene_content(localizer: Localizer, scene: str, passing: static_filter.Dyna
     Args:
         passing: dynamic content to leave out; None leaves out what changes show to be gone.
     """
-    store, params, placed = localizer.store, localizer.params.small, localizer.placed[scene]
+    store, placed = localizer.store, localizer.placed[scene]
     held = store.scenes.cameras(scene)
     own = None if held is None or held.synthesised else held
     features = placed.features
@@ -195,11 +195,11 @@ def _scene_content(localizer: Localizer, scene: str, passing: static_filter.Dyna
         gone = _removed(store, scene)
     else:
         gone = static_filter.dynamic_rows(store, scene, passing)
-        features = packing.without(features, placed.gaussians.means, gone)
-    weights, coloured = packing.shown(placed, own, params)
-    kept = coloured[np.flatnonzero((weights >= params.min_weight) & ~np.asarray(gone))]
+        features = reduction.remove_features(features, placed.gaussians.means, gone)
+    weights, coloured = reduction.measure_visibility(placed, own)
+    kept = coloured[np.flatnonzero((weights >= reduction.MIN_BLENDING_WEIGHT) & ~np.asarray(gone))]
     placed.drop()
-    return _SceneContent(scene, features, kept, own, localizer.params.features.indexed)
+    return _SceneContent(scene, features, kept, own, INDEXED_FEATURES)
 
 
 def _removed(store: Store, scene: str) -> np.ndarray | bool:
@@ -217,14 +217,12 @@ def _removed(store: Store, scene: str) -> np.ndarray | bool:
     return out
 
 
-def _packed(
-    localizer: Localizer, whole: _SceneContent, num_bytes: float, params: packing.Params
-) -> tuple[bytes, SmallSceneRow]:
+def _packed(localizer: Localizer, whole: _SceneContent, num_bytes: float) -> tuple[bytes, SmallSceneRow]:
     """Pack a scene into about ``num_bytes``: round more coarsely first, then merge Gaussians."""
     shown = whole.gaussians
     all_features = _npz(packed_features.pack(whole.features, whole.step, whole.first))
-    part = params.features_share * num_bytes / len(all_features)
-    kept = packing.fewer(whole.features, int(part * whole.features.num_features))
+    part = reduction.FEATURES_FRACTION * num_bytes / len(all_features)
+    kept = reduction.limit_features(whole.features, int(part * whole.features.num_features))
     arrays = packed_features.pack(kept, whole.step, whole.first)
     free = max(num_bytes - len(_npz(arrays)), 1)
     for coarse in _COARSE:
@@ -234,8 +232,8 @@ def _packed(
             break
     else:
         count = max(int(len(shown) * (free / taken) ** (1 / (1 - _SPARSER))), 1)
-        views = params.refine_views if count < params.refine_below * len(shown) else 0
-        told = LevelParams(views=views, steps=params.refine_steps)
+        views = reduction.REFINE_VIEWS if count < reduction.REFINE_BELOW_FRACTION * len(shown) else 0
+        told = LevelParams(views=views, steps=reduction.REFINE_STEPS)
         shown = make_level(shown, count, whole.cameras, told, deviation_px=_DEVIATION_PX).gaussians
         packed = packed_gaussians.pack(shown, coarse)
     content = _npz(arrays | packed)
@@ -259,16 +257,14 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     return made.getvalue()
 
 
-def _require_enough(
-    rows: Sequence[SmallSceneRow], shown: Mapping[str, int], params: packing.Params, budget: int, total: int
-) -> None:
+def _require_enough(rows: Sequence[SmallSceneRow], shown: Mapping[str, int], budget: int, total: int) -> None:
     for row in rows:
         per_view = min(row.num_features, row.features_of) / max(row.num_views, 1)
         whole = row.features_of / max(row.num_views, 1)
         part = row.num_gaussians / max(shown[row.scene], 1)
         lacks = max(
-            min(params.min_features, whole) / max(per_view, 1e-9),
-            params.min_gaussians / max(part, 1e-9),
+            min(reduction.MIN_FEATURES, whole) / max(per_view, 1e-9),
+            reduction.MIN_GAUSSIANS_FRACTION / max(part, 1e-9),
             total / budget,
         )
         if lacks > 1:
@@ -353,7 +349,7 @@ class SmallLocalizer(Localizer):
         self.scenes = self.small  # type: ignore[assignment]
         self.placed = {}
         for one in small:
-            self.placed[one.id] = PlacedFeatures(
+            self.placed[one.id] = MapScene(
                 one.id,
                 in_metres(one.S_map_scene, self.metres.get(one.component, 1.0)),
                 one.component,
@@ -361,9 +357,9 @@ class SmallLocalizer(Localizer):
                 partial(self._small_gaussians, one.id),
                 partial(self._small_features, one.id),
             )
-        self._used, self._views = [], {}
+        self._used, self._capture_views = [], {}
         held = [(placed.features, one) for one, placed in self.placed.items()]
-        self.index = view_index([new_segment(held, self.params.features.indexed)])
+        self.index = view_index([new_segment(held)])
         for placed in self.placed.values():
             placed.drop()
         method = family("extractor").get(self.params.extractor)

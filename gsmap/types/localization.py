@@ -86,7 +86,7 @@ class SceneFeatures:
         cameras: V cameras of the rendered views, scene frame and unit.
         starts: (V + 1,) int64 start of each view's features.
         points: (N, 3) float32 points of the features, scene frame and unit.
-        descriptors: (N, D) int8 quantized unit vectors (`gsmap.localize.quantised`).
+        descriptors: (N, D) int8 quantized unit vectors (`gsmap.localize.features.quantize`).
         angles: (N,) uint8 orientation, 256 per full turn; zeros without orientations.
     """
 

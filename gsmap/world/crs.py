@@ -1,4 +1,4 @@
-"""Coordinate reference systems by PROJ: named, checked, and turned into Earth-centred metres and back."""
+"""Coordinate reference systems by PROJ: parse, check, and convert to geodetic coordinates and back."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ WGS84 = "EPSG:4979"
 
 @dataclass(frozen=True)
 class Crs:
-    """A coordinate reference system as people give coordinates in it.
+    """A coordinate reference system, with axes in the order easting, northing, height.
 
     Args:
-        text: ``EPSG:N``, ``EPSG:N+M`` (with a height system), a PROJ string or WKT, as told.
+        text: ``EPSG:N``, ``EPSG:N+M`` (with a height system), a PROJ string or WKT, as specified.
     """
 
     text: str
 
     @cached_property
     def named(self) -> Any:
-        """As PROJ has it, as it was named."""
+        """The specified system as a pyproj CRS."""
         from pyproj import CRS
         from pyproj.exceptions import CRSError
 
@@ -52,7 +52,7 @@ class Crs:
 
     @cached_property
     def full(self) -> Any:
-        """With a height: ellipsoidal, in metres, where the system has none of its own; see `z_to_full`."""
+        """The system with heights, ellipsoidal in metres if it has none of its own; see `z_to_full`."""
         return self.named.to_3d()
 
     @cached_property
@@ -60,12 +60,12 @@ class Crs:
         """Longitude, latitude (deg) and ellipsoidal height (m) on the system's own datum and prime meridian."""
         from pyproj import CRS
 
-        if self.named.is_geocentric:  # of whose datum PROJ gives no geographic system, so the ellipsoid alone
+        if self.named.is_geocentric:  # PROJ gives no geographic system of its datum
             return CRS.from_user_input(WGS84) if self.named.to_epsg() == 4978 else self._bare
         found = self.named.geodetic_crs.to_3d()
         if [axis.unit_name for axis in found.axis_info] == ["degree", "degree", "metre"]:
             return found
-        # Grads (NTF Paris), or feet (+vunits): the same datum, in the units that are promised here.
+        # Systems in grads (NTF Paris) or feet (+vunits): the same datum in degrees and metres.
         system = CRS.from_user_input(WGS84).to_json_dict()["coordinate_system"]
         json = found.to_json_dict() | {"coordinate_system": system}
         json.pop("id", None)
@@ -80,17 +80,17 @@ class Crs:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name of the system."""
         return str(self.named.name)
 
     @property
     def has_own_heights(self) -> bool:
-        """Whether heights are in a system of the CRS (a geoid, a tide), not on the ellipsoid."""
+        """True if heights are in a system of the CRS (a geoid, a tide), not on the ellipsoid."""
         return bool(self.named.is_compound or self.named.is_vertical)
 
     @property
     def axes(self) -> tuple[str, str, str]:
-        """Of a coordinate, in the order in which gsmap gives and takes it."""
+        """Names of the axes, in the order in which gsmap uses coordinates."""
         if self.named.is_geocentric:
             return "X", "Y", "Z"
         plan = ("longitude", "latitude") if self._horizontal.is_geographic else ("easting", "northing")
@@ -102,22 +102,22 @@ class Crs:
 
     @cached_property
     def z_to_full(self) -> float:
-        """Multiplies z as people give it into z of `full`.
+        """Factor from specified heights to those of `full`.
 
-        A projected system without a vertical axis of its own counts heights in the unit of its plan, as surveyors do:
-        in a state plane in feet. PROJ would take them as metres.
+        Heights of a projected system without a vertical axis are in the unit of its plan, as surveyors use them, for
+        example in feet; PROJ would take them as metres.
         """
         plan_only = len(self.named.axis_info) == 2 and self.named.is_projected
         return float(self.named.axis_info[0].unit_conversion_factor) if plan_only else 1.0
 
     @property
     def height_unit_m(self) -> float:
-        """Metres in a unit of z."""
+        """Metres per unit of height."""
         return float(self.full.axis_info[2].unit_conversion_factor) * self.z_to_full
 
     @property
     def heights(self) -> str:
-        """The unit and zero of z, for people: ``US survey feet (0.3048006 m) above the ellipsoid (GRS 1980)``."""
+        """Unit and zero of heights as text: ``US survey feet (0.3048006 m) above the ellipsoid (GRS 1980)``."""
         axis = self.named.axis_info[0] if self.z_to_full != 1 else self.full.axis_info[2]
         unit = axis.unit_name.replace("foot", "feet") if "foot" in axis.unit_name else f"{axis.unit_name}s"
         if axis.unit_conversion_factor != 1:
@@ -130,26 +130,26 @@ class Crs:
         return f"{unit} above the ellipsoid ({self.geodetic.ellipsoid.name})"
 
     def to_geodetic(self, points: np.ndarray) -> np.ndarray:
-        """Longitude and latitude (deg) and ellipsoidal height (m) on the system's own datum, of (N, 3) coordinates.
+        """Return longitude, latitude (deg) and ellipsoidal height (m) on the system's datum, of (N, 3) coordinates.
 
         Raises:
-            InputError: a coordinate outside the projection's domain.
+            InputError: a coordinate is outside the projection's domain.
             ConfigError: the height system needs a grid that PROJ does not have here.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3) * [1.0, 1.0, self.z_to_full]
         return _through(self.full, self.geodetic, points, self.text)
 
-    def of_geodetic(self, points: np.ndarray) -> np.ndarray:
-        """The reverse of `to_geodetic`."""
+    def from_geodetic(self, points: np.ndarray) -> np.ndarray:
+        """Invert `to_geodetic`."""
         return _through(self.geodetic, self.full, points, self.text) / [1.0, 1.0, self.z_to_full]
 
     def check_area(self, points: np.ndarray, names: list[str], margin_deg: float) -> None:
-        """Raise `InputError` naming the first of (N, 3) coordinates outside the area that the system is meant for."""
+        """Raise `InputError` for the first of (N, 3) coordinates outside the system's area of use."""
         area = self._horizontal.area_of_use or self.named.area_of_use
         lonlat = self.to_geodetic(points)[:, :2]
         if area is None:
             return
-        meridian = self.geodetic.prime_meridian  # areas are counted from Greenwich
+        meridian = self.geodetic.prime_meridian  # areas of use are relative to Greenwich
         lonlat[:, 0] += np.degrees(meridian.longitude * meridian.unit_conversion_factor)
         beyond_lat = np.maximum(area.south - lonlat[:, 1], lonlat[:, 1] - area.north)
         width = (area.east - area.west) % 360 or 360.0
@@ -167,10 +167,10 @@ class Crs:
 
 @lru_cache(maxsize=64)
 def crs(text: str) -> Crs:
-    """A coordinate reference system by its name.
+    """Parse a coordinate reference system.
 
     Raises:
-        ConfigError: PROJ knows none of that name, or it is none that places lie in.
+        ConfigError: PROJ does not know the system, or it has no horizontal coordinates.
     """
     if not isinstance(text, str) or not text.strip() or len(text) > 20_000:
         raise ConfigError("a coordinate reference system is EPSG:N, a PROJ string or WKT", code="invalid_crs")
@@ -179,11 +179,11 @@ def crs(text: str) -> Crs:
     return found
 
 
-def between(source: Crs, target: Crs, points: np.ndarray) -> np.ndarray:
-    """(N, 3) geodetic coordinates (`Crs.to_geodetic`) on the datum of one system as those on the datum of another.
+def transform_datum(source: Crs, target: Crs, points: np.ndarray) -> np.ndarray:
+    """Transform (N, 3) geodetic coordinates (`Crs.to_geodetic`) from the datum of one system to that of another.
 
     Raises:
-        ConfigError: PROJ knows no way, or lacks its grid: one that is off by metres is never taken in its place.
+        ConfigError: PROJ knows no transformation, or lacks its grid; less accurate ones are never used instead.
     """
     if source.geodetic == target.geodetic:
         return np.array(points, dtype=np.float64)
@@ -197,7 +197,7 @@ def _transformer(source: str, target: str, text: str) -> Any:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is not best is refused below
+            warnings.simplefilter("ignore")  # less accurate transformations are rejected below
             return Transformer.from_crs(
                 CRS.from_wkt(source), CRS.from_wkt(target), always_xy=True, allow_ballpark=False, only_best=True
             )
@@ -240,10 +240,10 @@ def _missing_grid(source: Any, target: Any) -> str | None:
 
 
 def _no_way(text: str, error: Exception) -> ConfigError:
-    said = str(error)
-    if "Grid " in said:
-        return _needs(text, said.split("Grid ", 1)[1].split(" ", 1)[0])
-    return ConfigError(f"PROJ knows no exact way from {_short(text)}: {said}", code="no_exact_transform")
+    message = str(error)
+    if "Grid " in message:
+        return _needs(text, message.split("Grid ", 1)[1].split(" ", 1)[0])
+    return ConfigError(f"PROJ knows no exact way from {_short(text)}: {message}", code="no_exact_transform")
 
 
 def _needs(text: str, grid: str) -> ConfigError:

@@ -1,4 +1,4 @@
-"""Positions of photos from their EXIF, read by Pillow."""
+"""Read the positions of photos from EXIF."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 
 @dataclass(frozen=True)
 class PhotoPosition:
-    """Where a photo says that it was taken.
+    """The position of a photo from EXIF.
 
     Args:
-        image: its path as it was read.
+        image: path of the photo.
         longitude_deg, latitude_deg: on WGS 84.
-        height_m: as EXIF has it; None where it has none.
-        above_ellipsoid: whether that is above the ellipsoid (EXIF 3), not above sea level.
-        sigma_m: horizontal positioning error as the receiver says; None where it does not.
+        height_m: as in EXIF, or None.
+        above_ellipsoid: the height is above the ellipsoid (EXIF 3), not above sea level.
+        sigma_m: horizontal positioning error of the receiver, or None.
     """
 
     image: str
@@ -39,8 +39,8 @@ class PhotoPosition:
     sigma_m: float | None
 
     def sigmas(self, params: Params) -> tuple[tuple[float, float], tuple[float, float], float]:
-        """Standard deviations, horizontal and vertical, of this photo by itself and common to a capture's photos; and
-        that of the sea level."""
+        """Return standard deviations (horizontal, vertical) of this photo alone, of the error common to the capture,
+        and of the sea level."""
         own = self.sigma_m or params.gnss_sigma_m
         common = max(params.gnss_common_sigma_m, self.sigma_m or 0.0)
         if self.sigma_m is not None and self.sigma_m < CORRECTED_SIGMA_M:
@@ -50,12 +50,12 @@ class PhotoPosition:
 
 
 def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | None]:
-    """The positions of all photos below a folder by path, in the order of paths; None for those without one.
+    """Read the positions of all photos below a folder by path, sorted; None for photos without one.
 
     Raises:
-        InputError: no folder, or no photo in it has a position.
+        InputError: the folder does not exist, or no photo in it has a position.
     """
-    folder = Path(os.path.abspath(folder))  # whose own name, and those above, may be that of a scene
+    folder = Path(os.path.abspath(folder))  # absolute, for folder names may name a scene
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of photos", code="folder_not_found")
     photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
@@ -68,7 +68,7 @@ def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | Non
 
 
 def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
-    """Where a photo was taken; None where it does not say, or says what cannot be."""
+    """Read the position of a photo; None if EXIF has none, or an invalid one."""
     try:
         with open_picture(path) as picture:
             gps = picture.getexif().get_ifd(_GPS)
@@ -92,7 +92,7 @@ def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
 
 
 def _degrees(value: Any, reference: Any, letters: str) -> float | None:
-    """Of degrees, minutes and seconds and their letter."""
+    """Parse degrees, minutes and seconds with their hemisphere."""
     try:
         parts = [float(part) for part in value]
         letter = str(reference).strip("\0 ").upper()[:1]

@@ -1,9 +1,8 @@
-"""The world frame: metres along east, north and up at an origin, and its way to coordinates of a CRS.
+"""Convert coordinates of a CRS to the world frame (east, north, up in metres at an origin) and back.
 
-Euclidean throughout: a point goes from a CRS to longitude, latitude and height on that CRS's datum, from there to
-Earth-centred coordinates of the same ellipsoid, and from there by one rotation and shift into the frame, each exactly
-and each point by itself. Grid convergence, scale factor and the Earth's curvature are thus in the coordinates, where
-they belong, and not in the map. A quadrangle of 10 km in UTM would else be off by metres.
+The world frame is Euclidean: a point is converted from a CRS to geodetic coordinates, to Earth-centred coordinates of
+the same ellipsoid, and by a rigid transform to the frame, each exactly. Grid convergence, scale factor and the Earth's
+curvature thus do not distort the map; over 10 km of UTM they amount to metres.
 """
 
 from __future__ import annotations
@@ -12,66 +11,55 @@ import numpy as np
 
 from gsmap.types import Sim3
 from gsmap.types.world import WorldFrame
-from gsmap.world.crs import ECEF, between, crs
+from gsmap.world.crs import ECEF, crs, transform_datum
 
 
 def frame_at(crs_text: str, points: np.ndarray) -> WorldFrame:
-    """A frame for data at (N, 3) coordinates of a CRS: its origin is their middle, rounded."""
+    """Return a frame whose origin is the rounded median of (N, 3) coordinates of a CRS."""
     system = crs(crs_text)
     lon, lat, height = np.median(system.to_geodetic(points), axis=0)
     return WorldFrame(system.text, float(np.round(lat, 4)), float(np.round(lon, 4)), float(np.round(height)))
 
 
 def to_frame(frame: WorldFrame, points: np.ndarray, crs_text: str | None = None) -> np.ndarray:
-    """(N, 3) east, north, up in metres, of coordinates in a CRS (by default the frame's own)."""
+    """Convert (N, 3) coordinates of a CRS (by default the frame's own) to east, north, up in metres."""
     system, own = crs(crs_text or frame.crs), crs(frame.crs)
-    geodetic = between(system, own, system.to_geodetic(points))
+    geodetic = transform_datum(system, own, system.to_geodetic(points))
     out: np.ndarray = (_ecef(frame, geodetic) - _origin(frame)) @ _axes(frame)
     return out
 
 
-def of_frame(frame: WorldFrame, points: np.ndarray, crs_text: str | None = None) -> np.ndarray:
-    """The reverse of `to_frame`."""
+def from_frame(frame: WorldFrame, points: np.ndarray, crs_text: str | None = None) -> np.ndarray:
+    """Invert `to_frame`."""
     system, own = crs(crs_text or frame.crs), crs(frame.crs)
     ecef = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ _axes(frame).T + _origin(frame)
-    return system.of_geodetic(between(own, system, _geodetic(frame, ecef)))
-
-
-def moved(frame: WorldFrame, other: WorldFrame) -> Sim3:
-    """``T_frame_other``: the same places in another frame of the same datum, or nearly so in one of another.
-
-    Between datums it is that of the neighbourhood of the other's origin.
-    """
-    corners = np.array([[0.0, 0, 0], [1000, 0, 0], [0, 1000, 0], [0, 0, 1000]])
-    found = to_frame(frame, of_frame(other, corners), other.crs)
-    return _rigid(found, corners)
+    return system.from_geodetic(transform_datum(own, system, _geodetic(frame, ecef)))
 
 
 def T_ecef_frame(frame: WorldFrame) -> Sim3:
-    """Takes the frame to Earth-centred, Earth-fixed metres on WGS 84 (EPSG:4978), as 3D Tiles and globes want it.
+    """Return the transform from the frame to Earth-centred, Earth-fixed metres on WGS 84 (EPSG:4978), as for 3D Tiles.
 
-    Exact where the CRS's datum is a rigid motion or nearly from WGS 84 (all modern ones); else that of the
-    neighbourhood of the origin.
+    Exact for datums that are rigid transforms of WGS 84 (all modern ones nearly are); else valid near the origin.
     """
     corners = np.array([[0.0, 0, 0], [1000, 0, 0], [0, 1000, 0], [0, 0, 1000]])
-    return _rigid(of_frame(frame, corners, ECEF), corners)
+    return _rigid(from_frame(frame, corners, ECEF), corners)
 
 
 def _rigid(target: np.ndarray, corners: np.ndarray) -> Sim3:
-    """By what three axes of a kilometre become: on another datum they are a little skewed and longer."""
+    """Fit a rigid transform to axes of a kilometre, which other datums skew and stretch slightly."""
     u, _, vt = np.linalg.svd((target[1:] - target[0]).T @ (corners[1:] - corners[0]))
     return Sim3(u @ vt, target[0])
 
 
 def _ellipsoid(frame: WorldFrame) -> tuple[float, float]:
-    """Semi-major axis in metres and the square of the eccentricity."""
+    """Return the semi-major axis in metres and the squared eccentricity."""
     ellipsoid = crs(frame.crs).geodetic.ellipsoid
     a, b = ellipsoid.semi_major_metre, ellipsoid.semi_minor_metre
     return float(a), float(1 - (b / a) ** 2)
 
 
 def _axes(frame: WorldFrame) -> np.ndarray:
-    """(3, 3) whose columns are east, north and up in Earth-centred axes."""
+    """Return (3, 3) columns east, north and up in Earth-centred axes."""
     lat, lon = np.radians([frame.latitude_deg, frame.longitude_deg])
     return np.array(
         [
@@ -89,7 +77,7 @@ def _origin(frame: WorldFrame) -> np.ndarray:
 
 
 def _ecef(frame: WorldFrame, geodetic: np.ndarray) -> np.ndarray:
-    """(N, 3) Earth-centred metres on the frame's own datum, of longitude, latitude (deg) and ellipsoidal height."""
+    """Return (N, 3) Earth-centred metres on the frame's datum, of longitude, latitude (deg) and ellipsoidal height."""
     a, e2 = _ellipsoid(frame)
     lon, lat = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
     n = a / np.sqrt(1 - e2 * np.sin(lat) ** 2)
@@ -98,7 +86,7 @@ def _ecef(frame: WorldFrame, geodetic: np.ndarray) -> np.ndarray:
 
 
 def _geodetic(frame: WorldFrame, ecef: np.ndarray) -> np.ndarray:
-    """The reverse of `_ecef`, by Bowring 1976 and Newton: to 1e-9 m within thousands of kilometres of the ellipsoid."""
+    """Invert `_ecef` (Bowring 1976, then Newton), to 1e-9 m within thousands of kilometres of the ellipsoid."""
     a, e2 = _ellipsoid(frame)
     across = np.hypot(ecef[:, 0], ecef[:, 1])
     lat = np.arctan2(ecef[:, 2], across * (1 - e2))

@@ -1,4 +1,4 @@
-"""Observations of a map, brought into its world frame."""
+"""Convert the survey observations of a map to its world frame."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _T = TypeVar("_T", ControlPoint, PositionFix)
 
 
 def in_frame(survey: Survey) -> Survey:
-    """The same observations with all positions as east, north, up of the world frame, for the solver.
+    """Convert all positions to east, north, up of the world frame, for the solver.
 
     Raises:
-        ConfigError, InputError: a coordinate reference system, or a coordinate in it, that PROJ has no way for.
+        ConfigError, InputError: PROJ cannot convert a coordinate reference system or a coordinate.
     """
     if survey.frame is None:
         return replace(survey, points=(), images=(), fixes=())
@@ -30,10 +30,10 @@ def in_frame(survey: Survey) -> Survey:
 
 
 def frame_for(crs_text: str, survey: Survey) -> WorldFrame:
-    """A world frame near what was observed.
+    """Return a world frame near the observations.
 
     Raises:
-        InputError: nothing was observed that has a place.
+        InputError: no observation has a position.
     """
     system, found = crs(crs_text), []
     for group in _by_crs([*survey.points, *survey.fixes]).values():
@@ -44,13 +44,13 @@ def frame_for(crs_text: str, survey: Survey) -> WorldFrame:
             f"nothing lies in {system.text} yet: give control points, photos with GNSS, or a position",
             code="not_georeferenced",
         )
-    # To four digits of a degree: a shift between datums is next to nothing here.
-    near = system.of_geodetic(np.median(np.concatenate(found), axis=0)[None])
+    # Rounded to four digits of a degree, so the shift between datums does not matter.
+    near = system.from_geodetic(np.median(np.concatenate(found), axis=0)[None])
     return frame_at(system.text, near)
 
 
 def check_area(items: Sequence[ControlPoint | PositionFix], margin_deg: float) -> None:
-    """Raise `InputError` for the first of observations outside of where its system is meant for."""
+    """Raise `InputError` for the first observation outside its system's area of use."""
     for group in _by_crs(items).values():
         names = [f"control point {one.name}" if isinstance(one, ControlPoint) else one.name for one in group]
         crs(group[0].crs).check_area(np.array([one.position for one in group]), names, margin_deg)

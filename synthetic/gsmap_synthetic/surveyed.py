@@ -190,7 +190,7 @@ def _marks(
     rng: np.random.Generator,
     frame: WorldFrame,
 ) -> list[Mark]:
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     controls = _spread(p)[: p.num_control]
     checks = rng.choice([k for k in range(len(names)) if k not in controls], p.num_check, replace=False).tolist()
@@ -198,7 +198,7 @@ def _marks(
     for name, k in [(f"G{i}", k) for i, k in enumerate(controls)] + [(f"C{i}", k) for i, k in enumerate(checks)]:
         local = np.r_[rng.uniform(-1, 1, 2), 0.0] / p.unit_m
         true_m = truth[k].apply(local)
-        surveyed = of_frame(frame, (true_m + rng.normal(size=3) * p.survey_m)[None])[0]
+        surveyed = from_frame(frame, (true_m + rng.normal(size=3) * p.survey_m)[None])[0]
         pixels = {}
         for c in rng.choice(len(cameras[k]), p.num_views, replace=False).tolist():
             at, _ = project(local[None], cameras[k].T_camera_frame[c], cameras[k].intrinsics_px[c])

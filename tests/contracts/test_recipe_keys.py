@@ -49,9 +49,7 @@ ALTERNATIVES: dict[str, Any] = {
 """Another value of a setting that takes only certain words."""
 
 JUDGING = tuple(
-    field.name
-    for field in fields(localize.Params)
-    if field.name not in ("extractor", "extractors", "views", "features")
+    field.name for field in fields(localize.Params) if field.name not in ("extractor", "extractors", "views")
 )
 """What photographs are judged by; what is kept is what views show."""
 
@@ -226,7 +224,7 @@ def _versions() -> list[Any]:
         "gsmap.engine.",
         "gsmap.export.levels",
         "gsmap.formats.",
-        "gsmap.localize.words",  # segments of an index, which are losable
+        "gsmap.localize.vocabulary",  # segments of an index, which are losable
         "gsmap.retrieve.",
         "gsmap.view.trees",
     )

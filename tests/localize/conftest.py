@@ -12,7 +12,7 @@ from scanned_flat import SEED, SIZE_PX, Flat, Scanned, scanned
 
 import gsmap
 from gsmap.geometry.rotations import exp_so3
-from gsmap.localize import Params, PlacedFeatures, ViewIndex, new_segment, scene_features, view_index
+from gsmap.localize import MapScene, Params, ViewIndex, new_segment, scene_features, view_index
 from gsmap.localize.extractors import sift
 from gsmap.types import Sim3
 from gsmap.types.localization import Photo
@@ -47,15 +47,15 @@ class World:
         return Sim3.from_matrix(self.capture.T_scene_world).inverse()
 
     @cached_property
-    def placed(self) -> PlacedFeatures:
+    def placed(self) -> MapScene:
         found = scene_features(
             "scene", self.capture.gaussians, self.capture.cameras, sift.make({}, sift.Params()), Params().views
         )
-        return PlacedFeatures("scene", self.S_world_scene, 0, None, lambda: self.capture.gaussians, lambda: found)
+        return MapScene("scene", self.S_world_scene, 0, None, lambda: self.capture.gaussians, lambda: found)
 
     @cached_property
     def index(self) -> ViewIndex:
-        return view_index([new_segment([(self.placed.features, "0" * 32)], Params().features.indexed)])
+        return view_index([new_segment([(self.placed.features, "0" * 32)])])
 
     @cached_property
     def poses(self) -> np.ndarray:

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from raising import raises
 
-from gsmap.errors import ConfigError
 from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3
-from gsmap.localize import Params, localizing
-from gsmap.localize.candidates import Candidate
-from gsmap.localize.displacing import Params as Displacing
-from gsmap.localize.displacing import displacement
-from gsmap.localize.features import Params as Features
-from gsmap.localize.looks import look
-from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize import MapScene, displacement
+from gsmap.localize.candidate_renders import render_scenes
+from gsmap.localize.localization import scale_photo
+from gsmap.localize.refinement import refine_pose
 from gsmap.types import Gaussians, Sim3
 
 LENS, SIZE = np.array([240.0, 240, 120, 90]), (240, 180)
-PLAIN = Displacing(share=1.0, most_px=50.0, around_px=1.0, longest_side_px=240)  # every pixel alone, nothing cut off
+PLAIN = {"FRACTION": 1.0, "MAX_PX": 50.0, "WINDOW_PX": 1.0, "RENDER_SIDE_PX": 240}  # each pixel alone, no limit
 
 
-def _plane(slant_rad: float, S: Sim3) -> PlacedFeatures:
+def _displacement(scene, lens=LENS, size=SIZE, **constants) -> np.ndarray:
+    """The displacement map with other constants, those of `PLAIN` by default."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (PLAIN | constants).items():
+            patch.setattr(displacement, name, value)
+        return displacement.displacement_map(scene, np.eye(4), lens, size)
+
+
+def _plane(slant_rad: float, S: Sim3) -> MapScene:
     """A plane of overlapping balls before the camera, nearer at its top the more it slants, in a frame of its own."""
     u, v = np.random.default_rng(0).uniform(-3, 3, (2, 14_000))
     turn = exp_so3(np.array([slant_rad, 0, 0]))
@@ -35,7 +36,7 @@ def _plane(slant_rad: float, S: Sim3) -> PlacedFeatures:
     size = np.full((n, 3), np.log(0.05 / S.scale), np.float32)
     opacity = np.full(n, 1.5, np.float32)
     gaussians = Gaussians(means, quats, size, opacity, np.zeros((n, 1, 3), np.float32))
-    return PlacedFeatures("plane", S, 0, None, lambda: gaussians, lambda: None)
+    return MapScene("plane", S, 0, None, lambda: gaussians, lambda: None)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def frame() -> Sim3:
     return Sim3(exp_so3(np.array([0.3, -1.0, 0.5])), np.array([4.0, -2.0, 1.0]), 2.5)
 
 
-def _mean_of_middles(scene: PlacedFeatures, pixel: np.ndarray) -> np.ndarray:
+def _mean_of_middles(scene: MapScene, pixel: np.ndarray) -> np.ndarray:
     """(2,) where the mean of the Gaussians' middles lies that a pixel shows, one after the other, front to back."""
     at = scene.S_metric_scene.apply(scene.gaussians.means.astype(np.float64))
     middles, z = project(at, np.eye(4), LENS)
@@ -66,7 +67,7 @@ def _mean_of_middles(scene: PlacedFeatures, pixel: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("slant_rad", [0.02, 0.9, -0.7])
 def test_it_is_how_far_the_middles_are_of_what_a_pixel_shows(frame, slant_rad):
     scene = _plane(slant_rad, frame)
-    found = displacement(scene, np.eye(4), LENS, SIZE, PLAIN)
+    found = _displacement(scene)
     for column, row in ((120, 90), (60, 40), (200, 130), (150, 20)):
         pixel = np.array([column, row]) + 0.5
         assert found[row, column] == pytest.approx(_mean_of_middles(scene, pixel) - pixel, abs=0.02)
@@ -74,7 +75,7 @@ def test_it_is_how_far_the_middles_are_of_what_a_pixel_shows(frame, slant_rad):
 
 def test_what_is_shown_belongs_on_the_nearer_side(frame):
     """Nearer is lower on a floor: what is shown there lies further down; of a wall head on, nowhere else."""
-    wall, floor = (displacement(_plane(slant, frame), np.eye(4), LENS, SIZE, PLAIN) for slant in (0.0, -0.9))
+    wall, floor = (_displacement(_plane(slant, frame)) for slant in (0.0, -0.9))
     assert np.abs(wall[60:120, 80:160].mean((0, 1))).max() < 0.3
     assert floor[60:120, 80:160, 1].mean() > 3
     assert abs(floor[60:120, 80:160, 0].mean()) < 0.3
@@ -82,27 +83,21 @@ def test_what_is_shown_belongs_on_the_nearer_side(frame):
 
 def test_it_is_a_share_is_cut_off_and_is_asked_of_a_small_render(frame):
     scene = _plane(0.9, frame)
-    whole = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0))
-    half = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0, share=0.5))
-    small = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0, longest_side_px=60))
-    least = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, most_px=0.4))
+    whole = _displacement(scene, WINDOW_PX=61.0)
+    half = _displacement(scene, WINDOW_PX=61.0, FRACTION=0.5)
+    small = _displacement(scene, WINDOW_PX=61.0, RENDER_SIDE_PX=60)
+    least = _displacement(scene, MAX_PX=0.4)
     assert np.allclose(half, whole / 2, atol=1e-6)
     assert np.abs(least).max() == pytest.approx(0.4 * SIZE[0] / 480, rel=1e-5)
     assert small.shape == (45, 60, 2)
     assert small[20:25, 25:35].mean((0, 1)) == pytest.approx(whole[80:100, 100:140].mean((0, 1)), rel=0.25, abs=0.3)
 
 
-@pytest.mark.parametrize("wrong", [{"share": -0.1}, {"share": 1.5}, {"share": float("nan")}, {"longest_side_px": 0}])
-def test_settings_that_mean_nothing_are_refused(wrong) -> None:
-    with raises(ConfigError, code="out_of_range"):
-        Displacing(**wrong)
-
-
 def test_a_portrait_is_asked_as_a_landscape_is(frame) -> None:
     """What is told for 480 pixels is so of the longer side."""
-    scene, asked = _plane(0.9, frame), Displacing(share=1.0, around_px=1.0)
-    wide = displacement(scene, np.eye(4), LENS, SIZE, asked)
-    tall = displacement(scene, np.eye(4), LENS[[1, 0, 3, 2]], SIZE[::-1], asked)
+    scene, small = _plane(0.9, frame), {"MAX_PX": displacement.MAX_PX, "RENDER_SIDE_PX": 120}
+    wide = _displacement(scene, **small)
+    tall = _displacement(scene, LENS[[1, 0, 3, 2]], SIZE[::-1], **small)
     assert wide.shape == (90, 120, 2)
     assert tall.shape == (120, 90, 2)
     assert np.abs(tall).max() == np.abs(wide).max() == pytest.approx(2.0 * SIZE[0] / 480)
@@ -111,28 +106,26 @@ def test_a_portrait_is_asked_as_a_landscape_is(frame) -> None:
 def test_a_look_says_where_what_it_shows_lies(frame):
     scene = _plane(0.9, frame)
     plain, displaced = (
-        look([scene], np.eye(4), LENS, SIZE, Features(), displaced=asked)[0] for asked in (None, Displacing(share=0.5))
+        render_scenes([scene], np.eye(4), LENS, SIZE, with_displacement=asked)[0] for asked in (False, True)
     )
     pixels = np.array([[60.5, 40.5], [120.5, 90.5], [200.5, 150.5]])
-    assert np.array_equal(plain.places(pixels), plain.points(pixels))
+    assert np.array_equal(plain.corrected_points(pixels), plain.points(pixels))
     assert np.array_equal(displaced.points(pixels), plain.points(pixels))
     way = displaced.displaced_px(pixels)
     assert np.abs(way).max() > 0.05
-    at, _ = project(displaced.places(pixels), np.eye(4), LENS)
+    at, _ = project(displaced.corrected_points(pixels), np.eye(4), LENS)
     assert np.allclose(at, pixels + way, atol=1e-6)
-    assert look([scene], np.eye(4), LENS, SIZE, Features(), displaced=Displacing(share=0.0))[0].displacement is None
+    assert plain.displacement is None
 
 
-def test_poses_lie_further_back_by_it(world):
+def test_poses_lie_further_back_by_it(world, monkeypatch):
     """By both that are found: what is laid over whole and patches; as much as what is seen lies further out."""
-    picture, _ = localizing.prepared(world.photos[1], Params())
-    candidate = Candidate(0, world.poses[1], picture.intrinsics_px, 40, ("scene",))
-    without, twice = (
-        localizing.settled_pose(
-            picture, candidate, {"scene": world.placed}, replace(Params(), displacing=Displacing(share=share))
-        )
-        for share in (0.0, 0.4)
-    )
+    photo, _ = scale_photo(world.photos[1], 480)
+    found = []
+    for fraction in (0.0, 0.4):
+        monkeypatch.setattr(displacement, "FRACTION", fraction)
+        found.append(refine_pose(photo, world.poses[1], photo.intrinsics_px, [world.placed]))
+    without, twice = found
     back = (np.linalg.inv(without.T_metric_camera) @ twice.T_metric_camera)[2, 3]
-    depth = np.median(without.looks[0].depth_m[without.looks[0].alpha > 0.9])
+    depth = np.median(without.renders[0].depth_m[without.renders[0].alpha > 0.9])
     assert -0.01 * depth < back < -0.0002 * depth

@@ -10,12 +10,11 @@ from scipy.ndimage import gaussian_filter
 
 from gsmap.geometry.rotations import angle_between, exp_so3
 from gsmap.geometry.similarities import rotation_vectors
-from gsmap.localize import aligning, covariance, evidence, resection, settling
-from gsmap.localize.looks import GREY, Look
+from gsmap.localize import covariance, direct_alignment, evidence, refinement, resection
+from gsmap.localize.candidate_renders import GREY, SceneRender
 
 SIZE = (240, 180)
 LENS = np.array([200.0, 200.0, 120.0, 90.0])
-PARAMS = aligning.Params()
 
 
 def _texture(points: np.ndarray) -> np.ndarray:
@@ -46,10 +45,10 @@ def _seen(pose: np.ndarray, lens: np.ndarray = LENS) -> tuple[np.ndarray, np.nda
     return _texture(centre + depth[..., None] * rays).astype(np.float32), depth.astype(np.float32)
 
 
-def _look(pose: np.ndarray, blur: float = 0.0, lens: np.ndarray = LENS) -> Look:
+def _look(pose: np.ndarray, blur: float = 0.0, lens: np.ndarray = LENS) -> SceneRender:
     rgb, depth = _seen(pose, lens)
     rgb = gaussian_filter(rgb, (blur, blur, 0)) if blur else rgb
-    return Look("a", rgb, rgb @ GREY, np.ones_like(depth), depth, depth > 0, pose, lens)
+    return SceneRender("a", rgb, rgb @ GREY, np.ones_like(depth), depth, depth > 0, pose, lens)
 
 
 def _pose(turn_deg: list[float], at: list[float]) -> np.ndarray:
@@ -61,8 +60,8 @@ def _pose(turn_deg: list[float], at: list[float]) -> np.ndarray:
 
 def _laid(photo: np.ndarray, start: np.ndarray, focal: tuple[float, float] | None = None, blur: float = 0.0):
     pose, lens, laid = start, LENS, None
-    for width in PARAMS.blur_px:
-        laid = aligning.align(photo, _look(pose, blur, lens), pose, lens, width / 2, PARAMS, focal)
+    for width in direct_alignment.BLUR_PX:
+        laid = direct_alignment.align(photo, _look(pose, blur, lens), pose, lens, width / 2, focal)
         pose, lens = laid.T_metric_camera, laid.intrinsics_px
     assert laid is not None
     return laid
@@ -101,18 +100,18 @@ def test_the_information_says_what_moves_a_pose_that_is_one_sigma_off():
         noise = gaussian_filter(rng.normal(size=(*SIZE[::-1], 3)), (2, 2, 0)).astype(np.float32)
         found = _laid(_seen(TRUE)[0] + 0.02 * noise / noise.std(), TRUE)
         truth.append(found.T_metric_camera[:3, 3] - TRUE[:3, 3])
-    told = covariance.of_aligned(found, SIZE, covariance.Params(swell_aligned=1.0), 0.0)
+    told = covariance.alignment_covariance(found, SIZE, 0.0) / covariance.ALIGNMENT_SCALE**2
     spread = np.sqrt(np.mean(np.square(truth), axis=0).sum())
     assert 0.3 < spread / np.sqrt(np.trace(told[3:6, 3:6])) < 2.0
 
 
 def test_a_slanted_floor_is_smooth_and_a_step_is_an_edge():
     look = _look(TRUE)
-    smooth = aligning._smooth(look, PARAMS)
+    smooth = direct_alignment._smooth_surface(look)
     assert smooth[5:-5, 5:-5].mean() > 0.97  # all but the line where floor and wall meet
     stepped = look.depth_m.copy()
     stepped[:, :100] *= 0.7  # nearer
-    smooth = aligning._smooth(replace(look, depth_m=stepped), PARAMS)
+    smooth = direct_alignment._smooth_surface(replace(look, depth_m=stepped))
     assert not smooth[20:60, 98:102].any()
     assert smooth[20:60, 10:90].all()
 
@@ -120,20 +119,21 @@ def test_a_slanted_floor_is_smooth_and_a_step_is_an_edge():
 def test_where_little_is_known_the_pose_stays_as_it_was():
     look = _look(START)
     bare = replace(look, alpha=np.zeros_like(look.alpha))
-    laid = aligning.align(_seen(TRUE)[0], bare, START, LENS, 4.0, PARAMS)
+    laid = direct_alignment.align(_seen(TRUE)[0], bare, START, LENS, 4.0)
     assert not len(laid.pixels)
     assert np.array_equal(laid.T_metric_camera, START)
-    known, unknown = aligning.agreements(_seen(TRUE)[0], [look, bare], 4.0, PARAMS)
+    known, unknown = direct_alignment.measure_agreements(_seen(TRUE)[0], [look, bare], 4.0)
     assert known > unknown
 
 
 @pytest.mark.parametrize(("mine", "theirs", "share"), [(1.0, 1.0, 0.5), (1.0, 9.0, 0.1), (9.0, 1.0, 0.9)])
-def test_two_poses_become_one_by_what_is_known_of_each(mine, theirs, share):
-    other = resection.moved(TRUE, np.array([0.01, -0.02, 0.005, 0.03, 0.01, -0.02]))
+def test_two_poses_become_one_by_what_is_known_of_each(mine, theirs, share, monkeypatch):
+    other = resection.retract_pose(TRUE, np.array([0.01, -0.02, 0.005, 0.03, 0.01, -0.02]))
     none = np.zeros((0, 2))
-    fit = resection.Refined(other, LENS, none, none[:, 0], np.zeros((0, 2, 6)))
+    fit = resection.LeastSquaresPose(other, LENS, none, none[:, 0], np.zeros((0, 2, 6)))
     sigmas = np.diag([0.01**2] * 3 + [0.02**2] * 3)
-    pose, lens, told = settling._between(TRUE, LENS, mine * sigmas, fit, theirs * sigmas, 0.0)
+    monkeypatch.setattr(covariance, "DIFFERENCE_WEIGHT", 0.0)
+    pose, lens, told = refinement._fuse(TRUE, LENS, mine * sigmas, fit, theirs * sigmas)
     between = TRUE[:3, 3] + share * (other[:3, 3] - TRUE[:3, 3])
     assert np.allclose(pose[:3, 3], between, atol=1e-9)
     whole = angle_between(TRUE[:3, :3], other[:3, :3])
@@ -143,7 +143,8 @@ def test_two_poses_become_one_by_what_is_known_of_each(mine, theirs, share):
     assert np.allclose(told, 2 * mine * theirs / (mine + theirs) * sigmas)
     # By how much they differ neither knows; half of it, if half of what they differ by is not known.
     xi = np.r_[rotation_vectors(TRUE[:3, :3].T @ other[:3, :3])[0], TRUE[:3, :3].T @ (other[:3, 3] - TRUE[:3, 3])]
-    *_, doubted = settling._between(TRUE, LENS, mine * sigmas, fit, theirs * sigmas, 0.5)
+    monkeypatch.setattr(covariance, "DIFFERENCE_WEIGHT", 0.5)
+    *_, doubted = refinement._fuse(TRUE, LENS, mine * sigmas, fit, theirs * sigmas)
     assert np.allclose(doubted - told, 0.5 * np.outer(xi, xi))
 
 
@@ -153,12 +154,9 @@ def test_a_blurred_render_explains_the_coarse_picture_and_little_else():
     photo = (0.5 + 0.1 * fine / fine.std() + 0.1 * coarse / coarse.std()).clip(0, 1)
     shown = gaussian_filter(photo, (5, 5, 0))
     flat = np.full(shown.shape[:2], 2.0, np.float32)
-    look, params = (
-        Look("a", shown, shown @ GREY, np.ones_like(flat), flat, flat > 0, np.eye(4), LENS),
-        evidence.Params(),
-    )
-    assert evidence.compare_coarsely(photo, [look], params).explained(params.agree) > 0.95
-    assert evidence.compare(photo, [look], params).explained(0.8) < 0.5
+    look = SceneRender("a", shown, shown @ GREY, np.ones_like(flat), flat, flat > 0, np.eye(4), LENS)
+    assert evidence.compare_coarsely(photo, [look]).explained() > 0.95
+    assert evidence.compare(photo, [look]).explained(0.8) < 0.5
     other = np.ascontiguousarray(shown[::-1, ::-1])
     elsewhere = replace(look, rgb=other, grey=other @ GREY)
-    assert evidence.compare_coarsely(photo, [elsewhere], params).explained(params.agree) < 0.4
+    assert evidence.compare_coarsely(photo, [elsewhere]).explained() < 0.4

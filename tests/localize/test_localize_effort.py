@@ -9,32 +9,31 @@ import pytest
 
 from gsmap import _native
 from gsmap.geometry.projection import project
-from gsmap.localize import Params, localizing, looks, settling
-from gsmap.localize.candidates import Candidate
-from gsmap.localize.features import Params as Features
-from gsmap.localize.resection import moved
+from gsmap.localize import candidate_renders, localization, refinement
+from gsmap.localize.candidates import PoseCandidate
+from gsmap.localize.resection import retract_pose
 
-PARAMS = Params()
+ALIASED_PRIOR = 0.1
 
 
 @pytest.fixture(scope="module")
 def judged(world):
     """A photograph's picture, its true pose (metres), and what is found from nearly there."""
-    picture, _ = localizing.prepared(world.photos[1], PARAMS)
-    start = moved(world.poses[1], np.array([0.01, -0.01, 0.0, 0.03, 0.0, -0.02]))
-    candidate = Candidate(0, start, picture.intrinsics_px, 40, ("scene",))
-    return picture, localizing.judged_pose(picture, candidate, {"scene": world.placed}, PARAMS)
+    picture, _ = localization.scale_photo(world.photos[1], 480)
+    start = retract_pose(world.poses[1], np.array([0.01, -0.01, 0.0, 0.03, 0.0, -0.02]))
+    candidate = PoseCandidate(0, start, picture.intrinsics_px, 40, ("scene",))
+    return picture, localization.evaluate_pose(picture, candidate, {"scene": world.placed}, ALIASED_PRIOR)
 
 
 def test_a_render_is_made_again_once_it_has_moved(world, judged):
     picture, found = judged
-    pose, lens, size = found.settled.T_metric_camera, picture.intrinsics_px, picture.size_px
-    (one,) = looks.look([world.placed], pose, lens, size, Features())
-    assert one.moved_px(pose, lens) < 0.01
-    turned = moved(pose, np.array([0.0, 2 / lens[0], 0, 0, 0, 0]))  # two pixels to the side
-    assert one.moved_px(turned, lens) == pytest.approx(2, rel=0.5)
-    (same,) = looks.look([world.placed], turned, lens, size, Features(), [one], 4.0)
-    (other,) = looks.look([world.placed], turned, lens, size, Features(), [one], 1.0)
+    pose, lens, size = found.refined.T_metric_camera, picture.intrinsics_px, picture.size_px
+    (one,) = candidate_renders.render_scenes([world.placed], pose, lens, size)
+    assert one.motion_px(pose, lens) < 0.01
+    turned = retract_pose(pose, np.array([0.0, 2 / lens[0], 0, 0, 0, 0]))  # two pixels to the side
+    assert one.motion_px(turned, lens) == pytest.approx(2, rel=0.5)
+    (same,) = candidate_renders.render_scenes([world.placed], turned, lens, size, [one], 4.0)
+    (other,) = candidate_renders.render_scenes([world.placed], turned, lens, size, [one], 1.0)
     assert same is one
     assert other is not one
     assert np.array_equal(other.T_metric_camera, turned)
@@ -42,10 +41,10 @@ def test_a_render_is_made_again_once_it_has_moved(world, judged):
 
 def test_a_look_knows_where_its_pixels_lie(world, judged):
     picture, found = judged
-    (one,) = looks.look(
-        [world.placed], found.settled.T_metric_camera, picture.intrinsics_px, picture.size_px, Features()
+    (one,) = candidate_renders.render_scenes(
+        [world.placed], found.refined.T_metric_camera, picture.intrinsics_px, picture.size_px
     )
-    row, column = np.nonzero(one.sound[::40, ::40])
+    row, column = np.nonzero(one.smooth[::40, ::40])
     pixels = np.stack([column, row], axis=1) * 40 + 0.5
     at, depth = project(one.points(pixels), np.linalg.inv(one.T_metric_camera), one.intrinsics_px)
     assert len(pixels) > 20
@@ -59,10 +58,10 @@ def test_where_the_map_shows_something_else_nothing_is_looked_into_further(world
     away = world.poses[1].copy()
     away[:3, :3] = away[:3, :3] @ np.diag([-1.0, 1.0, -1.0])  # it looks the other way
     sizes = []
-    look = localizing.settle.__globals__["look"]
-    monkeypatch.setitem(localizing.settle.__globals__, "look", lambda *a, **k: (sizes.append(a[3]), look(*a, **k))[1])
-    wrong = Candidate(0, away, picture.intrinsics_px, 8, ("scene",))
-    one = localizing.judged_pose(picture, wrong, {"scene": world.placed}, PARAMS)
+    render = refinement.render_scenes
+    monkeypatch.setattr(refinement, "render_scenes", lambda *a, **k: (sizes.append(a[3]), render(*a, **k))[1])
+    wrong = PoseCandidate(0, away, picture.intrinsics_px, 8, ("scene",))
+    one = localization.evaluate_pose(picture, wrong, {"scene": world.placed}, ALIASED_PRIOR)
     assert one.covariance is None
     assert one.probability < 0.05
     assert picture.size_px not in sizes  # never rendered in full
@@ -70,53 +69,54 @@ def test_where_the_map_shows_something_else_nothing_is_looked_into_further(world
 
 def test_matches_of_a_place_that_was_found_are_not_looked_into_again(judged):
     picture, found = judged
-    settled = found.settled
+    settled = found.refined
     pixels, _ = project(settled.points, np.linalg.inv(settled.T_metric_camera), settled.intrinsics_px)
-    rough = Candidate(0, moved(settled.T_metric_camera, np.full(6, 0.5)), picture.intrinsics_px, 20, ("scene",))
+    rough = PoseCandidate(
+        0, retract_pose(settled.T_metric_camera, np.full(6, 0.5)), picture.intrinsics_px, 20, ("scene",)
+    )
     same = replace(rough, pixels=pixels, points=settled.points)
     other = replace(rough, pixels=pixels, points=settled.points + np.array([3.0, 0, 0]))
-    assert localizing._settles_at(same, found, picture, PARAMS)
-    assert not localizing._settles_at(other, found, picture, PARAMS)
-    assert not localizing._settles_at(replace(same, component=1), found, picture, PARAMS)
-    assert not localizing._settles_at(same, replace(found, probability=0.4), picture, PARAMS)
+    assert localization._agrees_with(same, found, picture)
+    assert not localization._agrees_with(other, found, picture)
+    assert not localization._agrees_with(replace(same, component=1), found, picture)
+    assert not localization._agrees_with(same, replace(found, probability=0.4), picture)
 
 
-def test_what_is_hopeless_is_not_asked_what_it_shows_otherwise(world, judged):
+def test_what_is_hopeless_is_not_asked_what_it_shows_otherwise(world, judged, monkeypatch):
     picture, found = judged
-    never = replace(PARAMS, evidence=replace(PARAMS.evidence, ask_from=1.0))
-    asked, spared = (
-        localizing.judged_pose(picture, found.candidate, {"scene": world.placed}, params) for params in (PARAMS, never)
-    )
+    asked = localization.evaluate_pose(picture, found.candidate, {"scene": world.placed}, ALIASED_PRIOR)
+    monkeypatch.setattr(localization, "MIN_COMPARED_PROBABILITY", 1.0)
+    spared = localization.evaluate_pose(picture, found.candidate, {"scene": world.placed}, ALIASED_PRIOR)
     assert np.isfinite(asked.evidence["unlike_part"])
     assert np.isnan(spared.evidence["unlike_part"])
-    assert np.array_equal(asked.settled.T_metric_camera, spared.settled.T_metric_camera)
+    assert np.array_equal(asked.refined.T_metric_camera, spared.refined.T_metric_camera)
 
 
 @pytest.mark.parametrize(("first", "second", "kept"), [(0.6, 0.7, "first"), (0.3, 0.4, "second"), (0.3, 0.2, "first")])
 def test_where_a_render_agrees_little_its_pose_is_settled_once_more(judged, monkeypatch, first, second, kept):
     picture, found = judged
-    told = iter([replace(found.settled, agreement=first), replace(found.settled, agreement=second)])
+    told = iter([replace(found.refined, agreement=first), replace(found.refined, agreement=second)])
     starts = []
 
     def settled(picture, pose, *rest):
         starts.append(pose)
         return next(told)
 
-    monkeypatch.setattr(settling, "_settled", settled)
-    rough = moved(found.settled.T_metric_camera, np.full(6, 0.1))
-    answer = settling.settle(picture, rough, picture.intrinsics_px, (), PARAMS.settling, *[None] * 6)
+    monkeypatch.setattr(refinement, "_refine_once", settled)
+    rough = retract_pose(found.refined.T_metric_camera, np.full(6, 0.1))
+    answer = refinement.refine_pose(picture, rough, picture.intrinsics_px, ())
     assert answer.agreement == {"first": first, "second": second}[kept]
-    assert len(starts) == (1 if first > PARAMS.settling.settle_again_under else 2)
-    assert np.array_equal(starts[-1], rough if len(starts) == 1 else found.settled.T_metric_camera)
+    assert len(starts) == (1 if first > refinement.REPEAT_BELOW_AGREEMENT else 2)
+    assert np.array_equal(starts[-1], rough if len(starts) == 1 else found.refined.T_metric_camera)
 
 
 def test_how_well_a_render_agrees_that_is_laid_over_is_evidence(world, judged):
-    """Of the last time, before it moved: high where the pose is right, low where it is not."""
+    """Of the last time, before it retract_pose: high where the pose is right, low where it is not."""
     picture, found = judged
-    assert found.evidence["laid"] == found.settled.agreement > 0.4
-    start = moved(found.settled.T_metric_camera, np.array([0.0, np.radians(25), 0, 0, 0, 0]))
-    wrong = Candidate(0, start, picture.intrinsics_px, 8, ("scene",))
-    other = localizing.judged_pose(picture, wrong, {"scene": world.placed}, PARAMS)
+    assert found.evidence["laid"] == found.refined.agreement > 0.4
+    start = retract_pose(found.refined.T_metric_camera, np.array([0.0, np.radians(25), 0, 0, 0, 0]))
+    wrong = PoseCandidate(0, start, picture.intrinsics_px, 8, ("scene",))
+    other = localization.evaluate_pose(picture, wrong, {"scene": world.placed}, ALIASED_PRIOR)
     assert other.evidence["laid"] < 0.2
 
 

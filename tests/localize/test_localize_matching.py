@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gsmap import _native
 from gsmap.localize import matching
-from gsmap.localize.features import quantised
+from gsmap.localize.features import quantize
 
 
 def by_all_products(mine: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -61,6 +61,6 @@ def test_what_does_not_stand_out_or_is_far_is_no_match() -> None:
     view[2] = np.sqrt(0.75) * near[2] + 0.5 * axes[21]
     view = np.concatenate([view, near[:1]])
     angles = np.zeros(11, np.uint8)
-    photo = matching.Described(quantised(near), angles[:10])
-    rows, columns = matching.matched(photo, matching.Described(quantised(view), angles), matching.Params())
+    photo = matching.FeatureSet(quantize(near), angles[:10])
+    rows, columns = matching.match_features(photo, matching.FeatureSet(quantize(view), angles))
     assert rows.tolist() == columns.tolist() == [2, 3, 4, 5, 6, 7, 8, 9]

@@ -15,8 +15,8 @@ from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3
 from gsmap.localize import Lens, covariance, matching, read_photo, resection, tracking, views
 from gsmap.localize.extractors import sift
-from gsmap.localize.features import lifted, picture, quantised, scene_features
-from gsmap.localize.resection import moved
+from gsmap.localize.features import lift, quantize, scene_features, to_uint8
+from gsmap.localize.resection import retract_pose
 from gsmap.render import render
 from gsmap.types.localization import Keypoints
 
@@ -38,26 +38,26 @@ def test_a_pose_is_found_among_wrong_matches() -> None:
     pose, points, pixels = points_seen(80)
     rng = np.random.default_rng(1)
     pixels[:40] = rng.uniform(0, 480, (40, 2))
-    found = resection.resect(pixels, points, LENS, (480, 360), 0.0, resection.Params())
+    found = resection.resect(pixels, points, LENS, (480, 360), 0.0)
     assert found is not None
     assert found.inliers[40:].all()
-    refined = resection.refine(pixels, points, found.T_map_camera, LENS, resection.Params())
+    refined = resection.refine(pixels, points, found.T_map_camera, LENS)
     assert np.allclose(refined.T_map_camera, pose, atol=1e-3)
 
 
 def test_the_focal_length_is_found_with_the_pose() -> None:
     pose, points, pixels = points_seen(60)
-    start = moved(pose, np.full(6, 0.01))
+    start = retract_pose(pose, np.full(6, 0.01))
     lens = np.array([430.0, 430.0, 240.0, 180.0]) * [1, 390 / 400, 1, 1]
-    refined = resection.refine(pixels, points, start, lens, resection.Params(), focal=(430.0, np.inf))
+    refined = resection.refine(pixels, points, start, lens, focal=(430.0, np.inf))
     assert refined.intrinsics_px[0] == pytest.approx(400, abs=0.01)
     assert np.allclose(refined.T_map_camera, pose, atol=1e-5)
 
 
-def test_the_jacobian_is_that_of_differences() -> None:
+def test_the_jacobian_is_that_of_differences(monkeypatch) -> None:
     pose, points, pixels = points_seen(5)
-    still = resection.Params(iterations=0)
-    at = resection.refine(pixels, points, pose, LENS, still, focal=(400.0, np.inf))
+    monkeypatch.setattr(resection, "ITERATIONS", 0)
+    at = resection.refine(pixels, points, pose, LENS, focal=(400.0, np.inf))
     for k in range(7):
         step = np.zeros(6)
         lens = LENS.copy()
@@ -65,31 +65,34 @@ def test_the_jacobian_is_that_of_differences() -> None:
             step[k] = 1e-6
         else:
             lens[:2] *= np.exp(1e-6)
-        after = resection.refine(pixels, points, moved(pose, step), lens, still)
+        after = resection.refine(pixels, points, retract_pose(pose, step), lens)
         numeric = (at.residuals_px - after.residuals_px) / 1e-6
         assert np.allclose(numeric, at.jacobian[:, :, k], rtol=1e-3, atol=1e-2)
 
 
 def test_a_render_that_agrees_less_is_less_sure() -> None:
     """The median error of poses on made places falls fourfold from an agreement of .35 to one of .75."""
-    params = covariance.Params()
-    sure, unsure = (float(covariance.doubt_of(agreement, params.disagreeing)) for agreement in (0.75, 0.35))
+    sure, unsure = (float(covariance.agreement_scale(agreement)) for agreement in (0.75, 0.35))
     assert sure < 1 < unsure
     assert 1.5 < unsure / sure < 6
-    assert covariance.doubt_of(0.1, 0.0) == 1
+    assert covariance.agreement_scale(0.1, 0.0) == 1
 
 
-def test_the_covariance_is_that_of_repeated_noise() -> None:
+def test_the_covariance_is_that_of_repeated_noise(monkeypatch) -> None:
     """Independent noise of a pixel: what the residuals tell is what repetitions show, within a factor."""
     pose, points, clean = points_seen(300)
-    rng, params = np.random.default_rng(2), covariance.Params(hidden_m=0, hidden_rad=0, swell=1.0)
+    rng = np.random.default_rng(2)
+    monkeypatch.setattr(covariance, "PATCH_SCALE", 1.0)
+    monkeypatch.setattr(covariance, "MODEL_SIGMA_M", 0.0)
+    monkeypatch.setattr(covariance, "MODEL_SIGMA_RAD", 0.0)
+    monkeypatch.setattr(resection, "ROBUST_SCALE_PX", 10.0)
     errors, told = [], []
     for _ in range(60):
         pixels = clean + rng.normal(size=clean.shape)
-        fit = resection.refine(pixels, points, pose, LENS, resection.Params(doubt_px=10.0))
+        fit = resection.refine(pixels, points, pose, LENS)
         errors.append(np.linalg.inv(pose)[:3] @ fit.T_map_camera[:, 3])
-        residual = covariance.of_patches(fit, pixels, (480, 360), params, 0.0)
-        told.append(np.diag(covariance.with_hidden(residual, params))[3:])
+        residual = covariance.patch_covariance(fit, pixels, (480, 360), 0.0)
+        told.append(np.diag(covariance.add_model_error(residual))[3:])
     ratio = np.mean(told, axis=0) / np.mean(np.square(errors), axis=0)
     assert (ratio > 0.7).all()
     assert (ratio < 4.0).all()
@@ -100,7 +103,7 @@ def test_patches_are_found_again_to_a_tenth_of_a_pixel() -> None:
     picture = gaussian_filter(rng.random((120, 160)), 2.0).astype(np.float32)
     picture = (picture - picture.min()) / (picture.max() - picture.min())
     there = shift(picture, (3.3, -2.6), order=3, mode="nearest").astype(np.float32)
-    found = tracking.track(picture, np.ones(picture.shape, bool), 0.5 * there + 0.2, 6, tracking.Params())
+    found = tracking.track(picture, np.ones(picture.shape, bool), 0.5 * there + 0.2, 6)
     assert found.found.sum() > 20
     moved_by = (found.photo_px - found.render_px)[found.found]
     assert np.abs(np.median(moved_by, axis=0) - [-2.6, 3.3]).max() < 0.1
@@ -110,7 +113,7 @@ def test_what_is_farther_than_the_reach_is_not_found() -> None:
     rng = np.random.default_rng(0)
     picture = gaussian_filter(rng.random((120, 160)), 2.0).astype(np.float32) * 5 - 2
     there = np.roll(picture, 15, axis=1)
-    found = tracking.track(picture, np.ones(picture.shape, bool), there, 5, tracking.Params())
+    found = tracking.track(picture, np.ones(picture.shape, bool), there, 5)
     assert found.found.mean() < 0.1
 
 
@@ -122,15 +125,15 @@ def test_matches_agree_both_ways_and_in_how_the_camera_was_held() -> None:
     order = rng.permutation(50)
     turned = (angles[order] + np.uint8(40)).astype(np.uint8)
     turned[:5] += np.uint8(100)
-    photo = matching.Described(quantised(vectors), angles)
-    rows, columns = matching.matched(photo, matching.Described(quantised(vectors[order]), turned), matching.Params())
+    photo = matching.FeatureSet(quantize(vectors), angles)
+    rows, columns = matching.match_features(photo, matching.FeatureSet(quantize(vectors[order]), turned))
     assert (order[columns] == rows).all()
     assert sorted(columns) == list(range(5, 50))
 
 
 def test_views_are_few_and_some_stand_off_the_path(world) -> None:
-    params = views.Params(own=10, made=4)
-    chosen = views.choose_views(world.capture.gaussians, world.capture.cameras, params)
+    params = views.Params(max_own_views=10, max_synthetic_views=4)
+    chosen = views.select_views(world.capture.gaussians, world.capture.cameras, params)
     own = {tuple(c) for c in np.round(world.capture.cameras.centers, 6)}
     stand = [tuple(c) in own for c in np.round(chosen.centers, 6)]
     assert sum(stand) == 10
@@ -161,20 +164,21 @@ class Sized:
 
 def test_the_largest_features_of_a_view_come_first(world) -> None:
     """Photographs are looked for by the first ones; where an extractor says no sizes its order stays."""
-    few = views.Params(own=1, made=0)
+    few = views.Params(max_own_views=1, max_synthetic_views=0)
     given = (world.capture.gaussians, world.capture.cameras)
     sizes = np.random.default_rng(0).permutation(2000).astype(np.float32)
     as_found = scene_features("scene", *given, Sized(None), few)
     by_size = scene_features("scene", *given, Sized(sizes), few)
     shown = render(given[0], as_found.cameras[[0]], dominant_id=False, backend="native")
-    found = SIFT.extract(picture(shown))
-    rows, places = lifted(found, shown, as_found.cameras[[0]])
+    found = SIFT.extract(to_uint8(shown))
+    rows, places = lift(found, shown, as_found.cameras[[0]])
     order = np.argsort(-sizes[rows])
     assert len(rows) > 50
     assert np.array_equal(as_found.points, places.astype(np.float32))
     assert np.array_equal(by_size.points, places[order].astype(np.float32))
     assert np.array_equal(by_size.descriptors, as_found.descriptors[order])
     assert np.array_equal(by_size.angles, as_found.angles[order])
+    assert scene_features("scene", *given, Sized(None), replace(few, max_features=20)).num_features == 20
 
 
 def exif_file(path, focal_mm: int, orientation: int = 1, size: tuple[int, int] = (400, 300)) -> None:
@@ -189,7 +193,7 @@ def test_focal_lengths_come_from_whoever_tells(tmp_path) -> None:
     told = read_photo(tmp_path / "a.jpg")
     assert told.intrinsics_px[0] == pytest.approx(26 / 43.267 * 500)
     assert 0 < told.focal_sigma < 0.2
-    assert np.isinf(read_photo(tmp_path / "a.jpg", Lens(ask_file=False)).focal_sigma)
+    assert np.isinf(read_photo(tmp_path / "a.jpg", Lens(use_exif=False)).focal_sigma)
     assert read_photo(tmp_path / "a.jpg", Lens(focal_px=333.0)).intrinsics_px.tolist() == [333, 333, 200, 150]
     assert read_photo(tmp_path / "a.jpg", Lens((300, 301, 199, 151))).focal_sigma == 0
 

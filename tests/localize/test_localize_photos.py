@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from PIL import Image
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.rotations import angle_between
-from gsmap.localize import Params, covariance, localize_photo, localizing
-from gsmap.localize.candidates import Candidate
+from gsmap.localize import Params, covariance, localization, localize_photo
+from gsmap.localize.candidates import PoseCandidate
 from gsmap.localize.extractors import sift
 from gsmap.types.localization import LocalizationResult, Photo
 
@@ -85,27 +84,34 @@ def test_small_photos_are_enlarged_twice_at_most(width: int, height: int, size: 
     photo = Photo(
         rng.integers(0, 256, (height, width, 3)).astype(np.uint8), np.array([300.0, 310, 50, 70]), known=known
     )
-    picture, scale = localizing.prepared(photo, Params())
+    picture, scale = localization.scale_photo(photo, 480)
     assert picture.size_px == size
     assert np.allclose(picture.intrinsics_px / photo.intrinsics_px, scale)
     assert np.allclose(scale[:2] * [width, height], size)
-    assert picture.known is not None
-    assert not picture.known[: size[1] // 2].any()
-    assert picture.known[size[1] // 2 + 1 :].all()
+    assert picture.mask is not None
+    assert not picture.mask[: size[1] // 2].any()
+    assert picture.mask[size[1] // 2 + 1 :].all()
     assert picture.rgb.mean() == pytest.approx(photo.rgb.mean() / 255, abs=0.01)
 
 
-def test_a_small_photo_is_placed_as_exactly_as_what_it_shows(world) -> None:
+def test_a_small_photo_is_placed_as_exactly_as_what_it_shows(world, monkeypatch) -> None:
     """Half of the width and height: the answer is in its own pixels, and enlarging it makes it more exact."""
     photo = world.photos[1]
     small = np.asarray(Image.fromarray(photo.rgb).resize([side // 2 for side in photo.size_px], Image.Resampling.BOX))
     errors = []
-    for params in (Params(), replace(Params(), max_enlarged=1.0)):
+    for enlargement in (localization.MAX_ENLARGEMENT, 1.0):
+        monkeypatch.setattr(localization, "MAX_ENLARGEMENT", enlargement)
         given = Photo(small, photo.intrinsics_px / 2)
-        found = localize_photo(given, world.index, {"scene": world.placed}, SIFT, params)
+        found = localize_photo(given, world.index, {"scene": world.placed}, SIFT, Params())
         assert np.allclose(found.intrinsics_px, given.intrinsics_px)
         errors.append(np.linalg.norm(found.T_map_camera[:3, 3] - world.poses[1][:3, 3]))
     assert errors[0] < min(0.02, errors[1])
+
+
+@pytest.mark.parametrize("name", ["max_views", "max_candidates"])
+def test_counts_are_at_least_one(name: str) -> None:
+    with pytest.raises(ConfigError):
+        Params(**{name: 0})
 
 
 def test_an_empty_picture_says_so(world) -> None:
@@ -120,14 +126,14 @@ def test_the_same_photo_gives_the_same_bits(world) -> None:
     assert one.probability == two.probability
 
 
-def test_what_residuals_tell_counts_by_how_well_the_render_agrees(world) -> None:
-    params = Params()
-    blind = replace(params, covariance=replace(params.covariance, disagreeing=0.0))
-    picture, _ = localizing.prepared(world.photos[1], params)
-    start = Candidate(0, world.poses[1], picture.intrinsics_px, 40, ("scene",))
-    one, other = (localizing.judged_pose(picture, start, {"scene": world.placed}, p) for p in (params, blind))
-    assert np.array_equal(one.settled.T_metric_camera, other.settled.T_metric_camera)
-    assert one.settled.agreement > 0.5
-    hidden = covariance.with_hidden(np.zeros((6, 6)), params.covariance)
-    doubt = np.exp(2 * params.covariance.disagreeing * (0.5 - one.settled.agreement))
+def test_what_residuals_tell_counts_by_how_well_the_render_agrees(world, monkeypatch) -> None:
+    picture, _ = localization.scale_photo(world.photos[1], 480)
+    start = PoseCandidate(0, world.poses[1], picture.intrinsics_px, 40, ("scene",))
+    one = localization.evaluate_pose(picture, start, {"scene": world.placed}, 0.1)
+    doubt = np.exp(2 * covariance.AGREEMENT_SLOPE * (0.5 - one.refined.agreement))
+    monkeypatch.setattr(covariance, "AGREEMENT_SLOPE", 0.0)
+    other = localization.evaluate_pose(picture, start, {"scene": world.placed}, 0.1)
+    assert np.array_equal(one.refined.T_metric_camera, other.refined.T_metric_camera)
+    assert one.refined.agreement > 0.5
+    hidden = covariance.add_model_error(np.zeros((6, 6)))
     np.testing.assert_allclose(one.covariance - hidden, doubt * (other.covariance - hidden), rtol=1e-6, atol=1e-12)

@@ -8,14 +8,13 @@ from raising import raises
 
 from gsmap.errors import CorruptError
 from gsmap.geometry.rotations import exp_so3, matrices_to_quats, multiply_quats
-from gsmap.localize import Params, retrieval, together, words
-from gsmap.localize.features import quantised
-from gsmap.localize.turned import frames
+from gsmap.localize import joint_localization, retrieval, vocabulary
+from gsmap.localize.feature_frames import feature_frames
+from gsmap.localize.features import quantize
 from gsmap.types import Cameras
 from gsmap.types.localization import Keypoints, SceneFeatures
 from gsmap.types.segments import InMemory, merged
 
-PARAMS = Params().retrieval
 LENS = np.array([300.0, 300.0, 240.0, 180.0])
 VIEWS, OF_VIEW = 3, 40
 
@@ -52,7 +51,7 @@ def _scene(rng: np.random.Generator, name: str) -> tuple[SceneFeatures, np.ndarr
         Cameras(np.stack(poses), np.tile(LENS, (VIEWS, 1)), np.tile([480, 360], (VIEWS, 1))),
         np.arange(VIEWS + 1) * OF_VIEW,
         np.concatenate(points).astype(np.float32),
-        quantised(_descriptors(rng, count)),
+        quantize(_descriptors(rng, count)),
         np.round(_angles(rng, count) * 128 / np.pi).astype(np.int64).astype(np.uint8),
     ), np.concatenate(all_pixels)
 
@@ -85,7 +84,7 @@ def scenes() -> list[tuple[SceneFeatures, np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def segment(scenes) -> InMemory:
-    return retrieval.new_segment([(found, "f" * 32) for found, _ in scenes], OF_VIEW)
+    return retrieval.new_segment([(found, "f" * 32) for found, _ in scenes])
 
 
 def test_the_view_that_shows_the_same_comes_first(scenes, segment) -> None:
@@ -95,7 +94,7 @@ def test_the_view_that_shows_the_same_comes_first(scenes, segment) -> None:
     for number in (3, 50, 119):
         found, pixels = scenes[number]
         photo = _photo(rng, found, pixels, OF_VIEW + rng.permutation(OF_VIEW)[:6])
-        views = retrieval.most_alike(index, photo, LENS, 24, PARAMS)
+        views = retrieval.retrieve_views(index, photo, LENS, 24)
         assert views[0] == (found.scene, 1)
         assert len(views) <= 24
 
@@ -112,7 +111,7 @@ def test_matches_count_as_far_as_they_turn_the_camera_alike(scenes, segment) -> 
         np.concatenate([good.angles_rad, bad.angles_rad]),
     )
     index = retrieval.view_index([segment])
-    (first, _), *_ = retrieval.most_alike(index, both, LENS, 1, PARAMS)
+    (first, _), *_ = retrieval.retrieve_views(index, both, LENS, 1)
     assert first == right.scene
 
 
@@ -121,10 +120,10 @@ def test_a_match_says_how_the_camera_was_turned(scenes) -> None:
     found, pixels = scenes[0]
     rng = np.random.default_rng(3)
     photo = _photo(rng, found, pixels, np.arange(OF_VIEW))
-    in_photo = frames(photo.pixels[:OF_VIEW], photo.angles_rad[:OF_VIEW], LENS)
+    in_photo = feature_frames(photo.pixels[:OF_VIEW], photo.angles_rad[:OF_VIEW], LENS)
     in_scene = multiply_quats(
         matrices_to_quats(found.cameras.T_frame_camera[0, :3, :3]),
-        frames(pixels[:OF_VIEW], found.angles[:OF_VIEW] * (np.pi / 128), LENS),
+        feature_frames(pixels[:OF_VIEW], found.angles[:OF_VIEW] * (np.pi / 128), LENS),
     )
     turn = np.eye(3)
     roll = np.radians(-50)
@@ -137,13 +136,13 @@ def test_a_match_says_how_the_camera_was_turned(scenes) -> None:
 def test_what_is_everywhere_says_nothing(scenes) -> None:
     """The same features in every scene do not hide the few that one scene alone has."""
     rng = np.random.default_rng(4)
-    common = quantised(_descriptors(rng, 20))
+    common = quantize(_descriptors(rng, 20))
     shared = []
     for found, _ in scenes:
         descriptors = found.descriptors.copy()
         descriptors[OF_VIEW - 20 : OF_VIEW] = common
         shared.append(SceneFeatures(found.scene, found.cameras, found.starts, found.points, descriptors, found.angles))
-    index = retrieval.view_index([retrieval.new_segment([(found, "f" * 32) for found in shared], OF_VIEW)])
+    index = retrieval.view_index([retrieval.new_segment([(found, "f" * 32) for found in shared])])
     of_all, alone = np.arange(OF_VIEW - 20, OF_VIEW), OF_VIEW + np.arange(6)
     wallpaper = _photo(rng, shared[5], scenes[5][1], of_all)
     planted = _photo(rng, shared[70], scenes[70][1], alone)
@@ -152,7 +151,7 @@ def test_what_is_everywhere_says_nothing(scenes) -> None:
         np.concatenate([wallpaper.descriptors, planted.descriptors]),
         np.concatenate([wallpaper.angles_rad, planted.angles_rad]),
     )
-    assert retrieval.most_alike(index, both, LENS, 1, PARAMS) == [(shared[70].scene, 1)]
+    assert retrieval.retrieve_views(index, both, LENS, 1) == [(shared[70].scene, 1)]
 
 
 def test_only_the_scenes_that_are_wanted_are_named(scenes, segment) -> None:
@@ -161,22 +160,22 @@ def test_only_the_scenes_that_are_wanted_are_named(scenes, segment) -> None:
     photo = _photo(rng, found, pixels, np.arange(12))
     index = retrieval.view_index([segment])
     others = {scene for scene in index.wanted if scene != found.scene}
-    named = {scene for scene, _ in retrieval.most_alike(index.only(others), photo, LENS, 24, PARAMS)}
+    named = {scene for scene, _ in retrieval.retrieve_views(index.only(others), photo, LENS, 24)}
     assert named
     assert named <= others
     assert len(index.only({found.scene, "nobody"})) == 1
-    assert retrieval.most_alike(index.only(()), photo, LENS, 24, PARAMS) == []
+    assert retrieval.retrieve_views(index.only(()), photo, LENS, 24) == []
 
 
 def test_the_same_is_said_in_however_many_segments_scenes_lie(scenes, segment) -> None:
     rng = np.random.default_rng(6)
     features = [(found, "f" * 32) for found, _ in scenes]
-    parts = [retrieval.new_segment(features[a:b], OF_VIEW) for a, b in ((80, 120), (0, 79), (79, 80))]
+    parts = [retrieval.new_segment(features[a:b]) for a, b in ((80, 120), (0, 79), (79, 80))]
     photo = _photo(rng, *scenes[44], np.arange(15))
-    asked = (photo, LENS, 24, PARAMS)
-    whole = retrieval.most_alike(retrieval.view_index([segment]), *asked)
-    assert retrieval.most_alike(retrieval.view_index(parts), *asked) == whole
-    assert retrieval.most_alike(retrieval.view_index([merged(parts)]), *asked) == whole
+    asked = (photo, LENS, 24)
+    whole = retrieval.retrieve_views(retrieval.view_index([segment]), *asked)
+    assert retrieval.retrieve_views(retrieval.view_index(parts), *asked) == whole
+    assert retrieval.retrieve_views(retrieval.view_index([merged(parts)]), *asked) == whole
 
 
 def test_an_index_of_a_stranger_is_refused(scenes, segment) -> None:
@@ -184,12 +183,12 @@ def test_an_index_of_a_stranger_is_refused(scenes, segment) -> None:
     photo = _photo(rng, *scenes[0], np.arange(15))
     fewer = InMemory(segment.members[:3], segment.arrays)
     with raises(CorruptError, code="index_damaged"):
-        retrieval.most_alike(retrieval.view_index([fewer]), photo, LENS, 24, PARAMS)
+        retrieval.retrieve_views(retrieval.view_index([fewer]), photo, LENS, 24)
 
 
 def test_nothing_to_look_for_finds_nothing(segment) -> None:
     nothing = Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
-    assert retrieval.most_alike(retrieval.view_index([segment]), nothing, LENS, 24, PARAMS) == []
+    assert retrieval.retrieve_views(retrieval.view_index([segment]), nothing, LENS, 24) == []
     empty = SceneFeatures(
         "0" * 32,
         Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2), int)),
@@ -198,17 +197,17 @@ def test_nothing_to_look_for_finds_nothing(segment) -> None:
         np.zeros((0, 0), np.int8),
         np.zeros(0, np.uint8),
     )
-    assert len(retrieval.new_segment([(empty, "f" * 32)], OF_VIEW).arrays.nodes) == 0
+    assert len(retrieval.new_segment([(empty, "f" * 32)]).arrays.nodes) == 0
 
 
 @pytest.mark.parametrize("width", [32, 64, 256])
 def test_words_that_nobody_fitted_know_a_feature_again(width) -> None:
     rng = np.random.default_rng(8)
-    held = words.words_for(width)
+    held = vocabulary.load_vocabulary(width)
     one = _unit(rng.normal(size=(200, width)))
     two = _unit(one + 0.1 * _unit(rng.normal(size=(200, width))))
     other = _unit(rng.normal(size=(200, width)))
-    a, b, c = (held.shortened(x) for x in (one, two, other))
+    a, b, c = (held.reduce(x) for x in (one, two, other))
     word = held.nearest(a)[:, 0]
     assert (held.nearest(b, 4) == word[:, None]).any(1).mean() > 0.8
     same = np.bitwise_count(held.signatures(a, word) ^ held.signatures(b, word))
@@ -219,9 +218,9 @@ def test_words_that_nobody_fitted_know_a_feature_again(width) -> None:
 def test_photographs_of_one_place_have_words_in_common(world) -> None:
     one, two = (world_features(photo) for photo in world.photos[:2])
     some = Keypoints(one.pixels[::2], one.descriptors[::2])
-    a, b, c = (together.words_of(found) for found in (one, some, two))
+    a, b, c = (joint_localization.word_histogram(found) for found in (one, some, two))
     assert a @ b > 0.6 > 0.5 > a @ c
-    assert together.words_of(Keypoints(one.pixels[:0], one.descriptors[:0])).shape == a.shape
+    assert joint_localization.word_histogram(Keypoints(one.pixels[:0], one.descriptors[:0])).shape == a.shape
 
 
 def world_features(photo) -> Keypoints:

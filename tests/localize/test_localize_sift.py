@@ -27,9 +27,9 @@ def _reference(grey: np.ndarray, params: sift.Params) -> tuple[np.ndarray, np.nd
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu, options.num_threads = False, 1
     options.sift.max_num_features = params.max_features
-    options.sift.peak_threshold = params.peak_threshold
-    options.sift.edge_threshold = params.edge_threshold
-    options.sift.first_octave = -1 if params.doubled else 0
+    options.sift.peak_threshold = sift.PEAK_THRESHOLD
+    options.sift.edge_threshold = sift.EDGE_THRESHOLD
+    options.sift.first_octave = -1 if params.upsampled else 0
     options.sift.normalization = pycolmap.Normalization.L1_ROOT
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -37,7 +37,7 @@ def _reference(grey: np.ndarray, params: sift.Params) -> tuple[np.ndarray, np.nd
 
 
 @pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("params", [sift.Params(), sift.Params(max_features=150), sift.Params(doubled=False)])
+@pytest.mark.parametrize("params", [sift.Params(), sift.Params(max_features=150), sift.Params(upsampled=False)])
 def test_features_are_those_of_colmap(params):
     grey = _picture()
     found = sift.make({}, params).extract(np.repeat(grey[..., None], 3, axis=2))

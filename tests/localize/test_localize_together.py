@@ -16,9 +16,9 @@ from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.localize import Params, localize_together, probability, read_clip, verdict
 from gsmap.localize import clips as reading
-from gsmap.localize import together as together_module
+from gsmap.localize import joint_localization as together_module
 from gsmap.localize.extractors import sift
-from gsmap.localize.resection import moved
+from gsmap.localize.resection import retract_pose
 from gsmap_synthetic import film
 
 SIFT = sift.make({}, sift.Params())
@@ -39,42 +39,46 @@ def test_whoever_is_placed_helps_the_others(world) -> None:
 
 def test_another_photos_features_alone_are_not_enough(world, monkeypatch) -> None:
     """Where the map leads away from the pose that a neighbour lends, what was found before stays."""
-    scenes, params = {"scene": world.placed}, Params()
-    shots = [together_module._shot(photo, world.index, scenes, SIFT, params) for photo in [world.photos[1]] * 2]
-    shots[1].judged = []  # so that only its neighbour may place it
+    scenes = {"scene": world.placed}
+    shots = [
+        together_module._evaluate_photo(photo, world.index, scenes, SIFT, Params()) for photo in [world.photos[1]] * 2
+    ]
+    shots[1].poses = []  # so that only its neighbour may place it
     ties: dict[tuple[int, int], bool] = {}
-    judge = together_module.judged_pose
+    judge = together_module.evaluate_pose
 
     def away(*given):
         one = judge(*given)
-        pose = one.settled.T_metric_camera.copy()
+        pose = one.refined.T_metric_camera.copy()
         pose[:3, 3] += 1.0
-        return replace(one, settled=replace(one.settled, T_metric_camera=pose))
+        return replace(one, refined=replace(one.refined, T_metric_camera=pose))
 
-    monkeypatch.setattr(together_module, "judged_pose", away)
-    together_module._help(0, shots, [1], scenes, params, ties)
-    assert not shots[1].judged
+    monkeypatch.setattr(together_module, "evaluate_pose", away)
+    together_module._propose_to_neighbours(0, shots, [1], scenes, 0.1, ties)
+    assert not shots[1].poses
     assert not ties
-    monkeypatch.setattr(together_module, "judged_pose", judge)
-    together_module._help(0, shots, [1], scenes, params, ties)
+    monkeypatch.setattr(together_module, "evaluate_pose", judge)
+    together_module._propose_to_neighbours(0, shots, [1], scenes, 0.1, ties)
     assert shots[1].probability > 0.9
     assert ties == {(0, 1): True}
 
 
 def test_a_lent_pose_is_adjusted_before_it_is_settled(world, monkeypatch) -> None:
     """What agreed on a sample's pose tells a better one."""
-    scenes, params = {"scene": world.placed}, Params()
-    shots = [together_module._shot(photo, world.index, scenes, SIFT, params) for photo in [world.photos[1]] * 2]
-    shots[1].judged, starts = [], []
-    judge, resect = together_module.judged_pose, together_module.resection.resect
+    scenes = {"scene": world.placed}
+    shots = [
+        together_module._evaluate_photo(photo, world.index, scenes, SIFT, Params()) for photo in [world.photos[1]] * 2
+    ]
+    shots[1].poses, starts = [], []
+    judge, resect = together_module.evaluate_pose, together_module.resection.resect
 
-    def rough(*given):
-        found = resect(*given)
-        return replace(found, T_map_camera=moved(found.T_map_camera, np.array([0.01, 0, 0, 0.05, 0, 0])))
+    def rough(*given, **more):
+        found = resect(*given, **more)
+        return replace(found, T_map_camera=retract_pose(found.T_map_camera, np.array([0.01, 0, 0, 0.05, 0, 0])))
 
     monkeypatch.setattr(together_module.resection, "resect", rough)
-    monkeypatch.setattr(together_module, "judged_pose", lambda *given: (starts.append(given[1]), judge(*given))[1])
-    together_module._help(0, shots, [1], scenes, params, {})
+    monkeypatch.setattr(together_module, "evaluate_pose", lambda *given: (starts.append(given[1]), judge(*given))[1])
+    together_module._propose_to_neighbours(0, shots, [1], scenes, 0.1, {})
     far = [np.linalg.norm(one.T_metric_camera[:3, 3] - world.poses[1][:3, 3]) for one in starts]
     assert len(far) == 1
     assert far[0] < 0.03
@@ -96,20 +100,20 @@ def beside_each_other(world):
 def test_a_photo_is_found_by_two_that_the_map_places(world, beside_each_other, monkeypatch, map_shows_it) -> None:
     """The map finds nothing of the last one; whether it shows anything of it where the others lead does not matter."""
     photos, poses = beside_each_other
-    find, judge = together_module.judged_poses, together_module.judged_pose
+    find, judge = together_module.evaluate_candidates, together_module.evaluate_pose
     monkeypatch.setattr(
         together_module,
-        "judged_poses",
+        "evaluate_candidates",
         lambda picture, *rest: find(picture, *rest) if len(asked.append(0) or asked) < 4 else ([], "forbidden"),
     )
-    monkeypatch.setattr(together_module, "_help", lambda *given: None)
+    monkeypatch.setattr(together_module, "_propose_to_neighbours", lambda *given: None)
 
     def hidden(*given):
         one = judge(*given)
-        return replace(one, settled=replace(one.settled, covariance=None, looks=[]), covariance=None)
+        return replace(one, refined=replace(one.refined, covariance=None, renders=[]), covariance=None)
 
     if not map_shows_it:
-        monkeypatch.setattr(together_module, "judged_pose", hidden)
+        monkeypatch.setattr(together_module, "evaluate_pose", hidden)
     asked: list[int] = []
     *others, last = localize_together(photos, world.index, {"scene": world.placed}, SIFT, Params())
     assert all(one.is_placed for one in others)
@@ -155,9 +159,11 @@ def test_a_clip_gives_the_sharpest_frame_of_each_stretch(tmp_path) -> None:
     for sharp in (3, 12):
         images[sharp] = rng.integers(0, 255, (64, 96, 3))
     clip(tmp_path / "a.mp4", images)
-    frames = read_clip(tmp_path / "a.mp4", params=reading.Params(every_s=1.0))
+    frames = read_clip(tmp_path / "a.mp4", params=reading.Params(interval_s=1.0))
     assert [round(10 * at) for at, _ in frames] == [3, 12]
     assert frames[0][1].size_px == (96, 64)
+    small = read_clip(tmp_path / "a.mp4", params=reading.Params(interval_s=1.0, max_side_px=48))
+    assert small[0][1].size_px == (48, 32)
 
 
 @pytest.mark.parametrize(("name", "codec"), [("a.mp4", "mpeg4"), ("a.m4v", "mpeg4"), ("a.h264", "libx264")])
@@ -180,7 +186,7 @@ def test_a_clip_is_thinned_as_it_is_read(tmp_path, monkeypatch, name: str, codec
         return out
 
     monkeypatch.setattr(reading.np, "ascontiguousarray", counted)
-    frames = read_clip(tmp_path / name, params=reading.Params(every_s=0.1, max_frames=10))
+    frames = read_clip(tmp_path / name, params=reading.Params(interval_s=0.1, max_frames=10))
     assert peak <= 13
     assert 5 <= len(frames) <= 10
     numbers = np.array([3 * photo.rgb.mean() for _, photo in frames])  # each frame is as bright as its number says
@@ -195,7 +201,7 @@ def test_the_sharpest_of_a_long_stretch_stays(tmp_path) -> None:
     images = np.full((320, 64, 96, 3), 128, np.uint8)
     images[[37, 250]] = rng.integers(0, 255, (2, 64, 96, 3))
     clip(tmp_path / "a.m4v", images, "mpeg4", "m4v")
-    frames = read_clip(tmp_path / "a.m4v", params=reading.Params(every_s=0.1, max_frames=4))
+    frames = read_clip(tmp_path / "a.m4v", params=reading.Params(interval_s=0.1, max_frames=4))
     number = [round(10 * at) for at, _ in frames]
     assert {37, 250} <= set(number)
 
@@ -218,10 +224,10 @@ def test_what_is_no_clip_is_refused(tmp_path) -> None:
 
 def shots_of(*told: dict[str, float]) -> list[SimpleNamespace]:
     """Photos of which nothing is known but their evidence."""
-    bars = verdict.Params()
-    found = [probability.model().probability(one, bars.prior, bars.alike) for one in told]
+    aliased_prior = verdict.Params().aliased_prior
+    found = [probability.load_model().probability(one, aliased_prior) for one in told]
     return [
-        SimpleNamespace(best=SimpleNamespace(evidence=one), probability=p, led=False)
+        SimpleNamespace(best=SimpleNamespace(evidence=one), probability=p, unsupported=False)
         for one, p in zip(told, found, strict=True)
     ]
 
@@ -235,30 +241,30 @@ def test_frames_of_a_room_that_looks_alike_do_not_make_each_other_sure() -> None
     half |= {"contradicted": 0.12, "explained_coarsely": 0.85, "colour": 0.7, "laid": 0.55}
     elsewhere = half | {"unlike_likely": 0.12, "unlike_surely": 0.08, "unlike": 0.2, "colour": 0.4, "explained": 0.5}
     alone = shots_of(half, elsewhere, elsewhere)
-    together = together_module.probabilities(alone, ties, Params())
+    together = together_module.combine_probabilities(alone, ties, 0.1)
     assert 0.3 < alone[0].probability < 0.95
     assert together[0] < alone[0].probability
     assert max(together) < 0.95
     good = shots_of(half, GOOD, GOOD)
-    assert together_module.probabilities(good, ties, Params())[0] > 0.95 > good[0].probability
-    assert together_module.probabilities(good, {}, Params())[0] > good[0].probability, "tied or not"
-    assert together_module.probabilities(alone, {}, Params())[0] < alone[0].probability
+    assert together_module.combine_probabilities(good, ties, 0.1)[0] > 0.95 > good[0].probability
+    assert together_module.combine_probabilities(good, {}, 0.1)[0] > good[0].probability, "tied or not"
+    assert together_module.combine_probabilities(alone, {}, 0.1)[0] < alone[0].probability
 
 
 def test_a_photo_alone_is_as_probable_together() -> None:
     half = GOOD | {"unlike_part": 0.2, "unlike": 0.06, "colour": 0.7, "laid": 0.3, "matches": 0.9}
     (one,) = shots_of(half)
-    assert together_module.probabilities([one], {}, Params())[0] == pytest.approx(one.probability, abs=1e-6)
+    assert together_module.combine_probabilities([one], {}, 0.1)[0] == pytest.approx(one.probability, abs=1e-6)
 
 
 def test_a_photo_of_another_place_says_nothing_of_rooms() -> None:
     """It is there by chance, whatever it would show of a room."""
     half = GOOD | {"unlike_part": 0.2, "unlike": 0.06, "unlike_likely": 0.03, "unlike_surely": 0.015, "explained": 0.7}
-    few, more = (together_module.probabilities(shots_of(half, GOOD, *[BAD] * n), {}, Params()) for n in (0, 8))
+    few, more = (together_module.combine_probabilities(shots_of(half, GOOD, *[BAD] * n), {}, 0.1) for n in (0, 8))
     assert few[0] == pytest.approx(more[0], abs=0.01)
     assert max(more[2:]) < 0.05
-    nothing = SimpleNamespace(best=None, probability=0.0, led=False)
-    assert together_module.probabilities([*shots_of(half, GOOD), nothing], {}, Params())[2] == 0.0
+    nothing = SimpleNamespace(best=None, probability=0.0, unsupported=False)
+    assert together_module.combine_probabilities([*shots_of(half, GOOD), nothing], {}, 0.1)[2] == 0.0
 
 
 def test_what_chance_explains_it_does_not_for_two() -> None:
@@ -266,14 +272,14 @@ def test_what_chance_explains_it_does_not_for_two() -> None:
     few = GOOD | {"matches": 0.9, "inliers": 0.9, "found_again": 0.03, "spread": 0.06, "laid": 0.3, "compared": 2.3}
     few |= {"explained": 0.55, "explained_coarsely": 0.6, "seen": 0.4, "sigma_m": -1.3}
     shots = shots_of(few, GOOD)
-    together = together_module.probabilities(shots, {(0, 1): True}, Params())
+    together = together_module.combine_probabilities(shots, {(0, 1): True}, 0.1)
     assert shots[0].probability < 0.95 < together[0]
 
 
 def test_a_photo_that_others_lead_elsewhere_is_not_said(world, beside_each_other, monkeypatch) -> None:
     photos, _ = beside_each_other
-    adjust = together_module.bundle.adjusted
-    monkeypatch.setattr(together_module.bundle, "adjusted", lambda *given: (adjust(*given)[0], [2]))
+    adjust = together_module.bundle_adjustment.adjust_photos
+    monkeypatch.setattr(together_module.bundle_adjustment, "adjust_photos", lambda *given: (adjust(*given)[0], [2]))
     placed = localize_together(photos, world.index, {"scene": world.placed}, SIFT, Params())
     assert [one.is_placed for one in placed] == [True, True, False, True]
     assert "lead it elsewhere" in placed[2].reason
@@ -284,14 +290,14 @@ def test_a_rival_is_one_only_where_those_tied_to_it_may_be_elsewhere_as_well() -
     """Neighbours that are sure of this place, and have no rival, leave a photo no other one; a map that shows the same
     twice gives all of them rivals."""
     ties = {(0, 1): True, (1, 2): True}
-    tie = Params().together.tie
-    told = together_module.elsewhere([0.5, 0.9, 0.8, 0.9], ties, Params())
+    tie = together_module.LINK_PROBABILITY
+    told = together_module.rival_factors([0.5, 0.9, 0.8, 0.9], ties)
     assert told[0] == pytest.approx((1 - tie * 0.9) * (1 - tie**2 * 0.8))
     assert told[1] == pytest.approx((1 - tie * 0.8) * (1 - tie * 0.5))
     assert told[3] == 1.0, "tied to nobody"
-    twins = together_module.elsewhere([0.02, 0.0, -0.01], ties, Params())
+    twins = together_module.rival_factors([0.02, 0.0, -0.01], ties)
     assert min(twins) > 0.97
-    assert together_module.elsewhere([0.9, 0.9], {(0, 1): False}, Params()) == [1.0, 1.0]
+    assert together_module.rival_factors([0.9, 0.9], {(0, 1): False}) == [1.0, 1.0]
 
 
 @pytest.mark.parametrize(
@@ -302,18 +308,18 @@ def test_a_map_that_shows_the_same_twice_tells_no_photo_where_it_is(
 ) -> None:
     """Where all have rivals nobody is placed; a single one that has a rival is, for the others cannot be there."""
     photos, _ = beside_each_other
-    looked, rival_by_candidate = together_module.looked_into, {}
+    looked, rival_by_candidate = together_module.evaluate_photos, {}
 
     def noted(*given):
         shots, near, ties = looked(*given)
         rival_by_candidate.update(
-            {id(shot.judged[0].candidate): rival for shot, rival in zip(shots, rivals, strict=True)}
+            {id(shot.poses[0].candidate): rival for shot, rival in zip(shots, rivals, strict=True)}
         )
         return shots, near, ties
 
-    monkeypatch.setattr(together_module, "looked_into", noted)
+    monkeypatch.setattr(together_module, "evaluate_photos", noted)
     monkeypatch.setattr(
-        together_module, "rival_of", lambda judged, params: rival_by_candidate.get(id(judged[0].candidate), 0.0)
+        together_module, "rival_probability", lambda judged: rival_by_candidate.get(id(judged[0].candidate), 0.0)
     )
     said = localize_together(photos, world.index, {"scene": world.placed}, SIFT, Params())
     assert [one.is_placed for one in said] == placed, [one.reason for one in said]

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from raising import raises
 
 from gsmap.errors import ConfigError
 from gsmap.geometry.rotations import exp_so3, retract
-from gsmap.localize import verdict
-from gsmap.localize.covariance import with_scene
-from gsmap.localize.features import sound_depth
-from gsmap.localize.placed import PlacedFeatures
-from gsmap.localize.probability import model
+from gsmap.localize import MapScene, verdict
+from gsmap.localize.covariance import add_scene_covariance
+from gsmap.localize.features import smooth_depth
+from gsmap.localize.probability import load_model
 from gsmap.render import Rendering
 from gsmap.types import Sim3
 
@@ -44,9 +41,8 @@ BAD |= {"unlike_part": 0.3, "unlike": 0.25, "unlike_likely": 0.15, "unlike_surel
 SURE = (0.003, 0.005)
 
 
-def probability(told: dict[str, float], **settings: float) -> float:
-    params = replace(verdict.Params(), **settings)
-    return model().probability(told, params.prior, params.alike)
+def probability(evidence: dict[str, float], aliased_prior: float = verdict.Params().aliased_prior) -> float:
+    return load_model().probability(evidence, aliased_prior)
 
 
 @pytest.mark.guards("answers")
@@ -63,33 +59,33 @@ def test_a_room_that_looks_alike_is_as_improbable_as_it_is_rare() -> None:
     alike = GOOD | {"unlike_part": 0.2, "unlike": 0.15, "unlike_likely": 0.12, "unlike_surely": 0.1, "explained": 0.7}
     alike |= {"contradicted": 0.15, "colour": 0.6, "laid": 0.5}
     somebody = GOOD | {"unlike_part": 0.1}
-    never, seldom, often = (probability(alike, alike=share) for share in (0.0, 0.02, 0.35))
+    never, seldom, often = (probability(alike, share) for share in (0.0, 0.02, 0.35))
     assert never > 0.95
     assert often < seldom < never
     assert often < 0.5
     assert probability(somebody) > 0.95
 
 
-@pytest.mark.parametrize("settings", [{"prior": 0.0}, {"alike": -0.1}, {"prior": 0.6, "alike": 0.4}])
-def test_shares_of_what_may_be_are_shares(settings: dict[str, float]) -> None:
+@pytest.mark.parametrize("aliased_prior", [-0.1, 0.7])
+def test_the_priors_sum_to_less_than_one(aliased_prior: float) -> None:
     with raises(ConfigError, code="out_of_range"):
-        verdict.Params(**settings)
+        verdict.Params(aliased_prior=aliased_prior)
 
 
 def test_all_that_is_not_asked_yet_may_be_as_good_as_can_be() -> None:
     """So a pose is hopeless only where no answer to the rest could save it."""
     settling = {name: GOOD[name] for name in ("matches", "inliers", "found_again", "laid", "spread", "sigma_m")}
-    bars = verdict.Params()
-    best = model().probability(settling, bars.prior, bars.alike, at_best=True)
+    aliased_prior = verdict.Params().aliased_prior
+    best = load_model().probability(settling, aliased_prior, optimistic=True)
     assert best >= probability(GOOD)
     poor = {name: BAD[name] for name in settling}
-    assert model().probability(poor, bars.prior, bars.alike, at_best=True) >= probability(BAD)
+    assert load_model().probability(poor, aliased_prior, optimistic=True) >= probability(BAD)
 
 
-@pytest.mark.parametrize("odds", ["other", "alike"])
+@pytest.mark.parametrize("odds", ["other", "aliased"])
 @pytest.mark.parametrize("name", GOOD)
 def test_every_piece_counts_in_one_direction(name: str, odds: str) -> None:
-    worth = np.diff(getattr(model(), odds).curves[name].worth)
+    worth = np.diff(getattr(load_model(), odds).curves[name].worth)
     falls = name in ("contradicted", "contradicted_coarsely", "blocked", "sigma_m") or name.startswith("unlike")
     assert (worth <= 1e-9).all() if falls else (worth >= -1e-9).all()
 
@@ -97,23 +93,30 @@ def test_every_piece_counts_in_one_direction(name: str, odds: str) -> None:
 @pytest.mark.guards("answers")
 def test_what_is_not_probable_is_refused_with_its_weakest_evidence() -> None:
     params = verdict.Params()
-    assert verdict.judge(GOOD, 0.99, SURE, 0.0, params) == ""
-    refused = verdict.judge(GOOD | {"explained": 0.2}, 0.5, SURE, 0.0, params)
+    assert verdict.rejection_reason(GOOD, 0.99, SURE, 0.0, params) == ""
+    refused = verdict.rejection_reason(GOOD | {"explained": 0.2}, 0.5, SURE, 0.0, params)
     assert "not probable enough: 50.0%" in refused
     assert "explains 20%" in refused
 
 
 @pytest.mark.guards("answers")
 def test_a_twin_is_told_as_ambiguous() -> None:
-    assert "ambiguous" in verdict.judge(GOOD, 0.99, SURE, 0.6, verdict.Params())
+    assert "ambiguous" in verdict.rejection_reason(GOOD, 0.99, SURE, 0.6, verdict.Params())
 
 
 def test_a_pose_that_is_hardly_known_is_not_said() -> None:
-    assert "only to" in verdict.judge(GOOD, 0.99, (0.2, 0.01), 0.0, verdict.Params())
-    assert "only to" in verdict.judge(GOOD, 0.99, (0.01, 2.0), 0.0, verdict.Params())
-    assert "0 patches" in verdict.judge(GOOD | {"inliers": 0.0}, 0.99, SURE, 0.0, verdict.Params())
-    strict = verdict.Params(min_inliers=6)
-    assert "3 patches" in verdict.judge(GOOD | {"inliers": np.log10(4)}, 0.99, SURE, 0.0, strict)
+    assert "only to" in verdict.rejection_reason(GOOD, 0.99, (0.2, 0.01), 0.0, verdict.Params())
+    assert "only to" in verdict.rejection_reason(GOOD, 0.99, (0.01, 2.0), 0.0, verdict.Params())
+    assert "0 patches" in verdict.rejection_reason(GOOD | {"inliers": 0.0}, 0.99, SURE, 0.0, verdict.Params())
+    few = GOOD | {"inliers": np.log10(4)}
+    assert "3 patches" in verdict.rejection_reason(few, 0.99, SURE, 0.0, verdict.Params(), min_inliers=6)
+
+
+def test_thresholds_are_settings() -> None:
+    assert not verdict.rejection_reason(GOOD, 0.99, SURE, 0.6, verdict.Params(max_rival_probability=0.7))
+    assert not verdict.rejection_reason(GOOD, 0.99, (0.2, 0.01), 0.0, verdict.Params(max_rotation_sigma_deg=20.0))
+    assert not verdict.rejection_reason(GOOD, 0.99, (0.01, 2.0), 0.0, verdict.Params(max_translation_sigma_m=3.0))
+    assert verdict.rejection_reason(GOOD, 0.99, SURE, 0.0, verdict.Params(min_probability=0.995))
 
 
 @pytest.mark.guards("answers")
@@ -122,10 +125,10 @@ def test_what_scenes_err_is_carried_to_the_camera() -> None:
     rng = np.random.default_rng(0)
     S = Sim3(exp_so3(rng.normal(size=3)), rng.normal(size=3), 0.7)
     A = rng.normal(size=(7, 7)) * 0.002
-    scene = PlacedFeatures("s", S, 0, A @ A.T, None, None)
+    scene = MapScene("s", S, 0, A @ A.T, None, None)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = exp_so3(rng.normal(size=3)), rng.normal(size=3) * 3
-    told = with_scene(np.zeros((6, 6)), T, [(scene, 1.0)])
+    told = add_scene_covariance(np.zeros((6, 6)), T, [(scene, 1.0)])
     errors = []
     for _ in range(4000):
         moved = retract(S, A @ rng.normal(size=7)) @ S.inverse()
@@ -134,11 +137,11 @@ def test_what_scenes_err_is_carried_to_the_camera() -> None:
         turn = np.array([chord[2, 1] - chord[1, 2], chord[0, 2] - chord[2, 0], chord[1, 0] - chord[0, 1]]) / 2
         errors.append(np.r_[turn, T[:3, :3].T @ (at - T[:3, 3])])
     assert np.allclose(np.cov(np.array(errors).T), told, atol=0.12 * np.abs(told).max())
-    assert np.array_equal(with_scene(told, T, [(replace_covariance(scene), 1.0)]), told)
+    assert np.array_equal(add_scene_covariance(told, T, [(replace_covariance(scene), 1.0)]), told)
 
 
-def replace_covariance(scene: PlacedFeatures) -> PlacedFeatures:
-    return PlacedFeatures(scene.scene, scene.S_metric_scene, 0, None, scene.read_gaussians, scene.read_features)
+def replace_covariance(scene: MapScene) -> MapScene:
+    return MapScene(scene.scene, scene.S_metric_scene, 0, None, scene.read_gaussians, scene.read_features)
 
 
 def test_depth_at_an_edge_is_not_sound() -> None:
@@ -146,7 +149,7 @@ def test_depth_at_an_edge_is_not_sound() -> None:
     depth[:, :, 10:] = 3.0
     alpha = np.ones_like(depth)
     alpha[:, 15:] = 0.5
-    sound = sound_depth(Rendering(np.zeros((1, 20, 20, 3), np.float32), alpha, depth)) > 0
+    sound = smooth_depth(Rendering(np.zeros((1, 20, 20, 3), np.float32), alpha, depth)) > 0
     assert sound[5, 2]
     assert sound[5, 17]
     assert not sound[5, 8:12].any()

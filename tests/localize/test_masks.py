@@ -13,11 +13,18 @@ from raising import raises
 import gsmap.map
 from gsmap.cli.app import run
 from gsmap.errors import ConfigError, InputError, NotFoundError
-from gsmap.localize import Params, aligning, evidence, localize_photo, localizing, read_photo, settling, unlike
-from gsmap.localize.candidates import Candidate
+from gsmap.localize import (
+    Params,
+    direct_alignment,
+    evidence,
+    localization,
+    localize_photo,
+    mismatch,
+    read_photo,
+    refinement,
+)
+from gsmap.localize.candidate_renders import render_scenes
 from gsmap.localize.extractors import sift
-from gsmap.localize.features import Params as Features
-from gsmap.localize.looks import look
 from gsmap.types.localization import Photo
 
 SIFT = sift.make({}, sift.Params())
@@ -60,36 +67,35 @@ def test_what_is_hidden_does_not_matter(world, crowds) -> None:
 
 
 def test_no_step_looks_at_what_is_hidden(world, crowds) -> None:
-    picture, _ = localizing.prepared(crowds[0], PARAMS)
-    looks = look([world.placed], world.poses[1], picture.intrinsics_px, picture.size_px, Features())
-    here = picture.known
-    found = localizing.photo_features(picture, SIFT, 0.0)
+    picture, _ = localization.scale_photo(crowds[0], 480)
+    looks = render_scenes([world.placed], world.poses[1], picture.intrinsics_px, picture.size_px)
+    here = picture.mask
+    found = localization.extract_features(picture, SIFT, 0.0)
     column, row = found.pixels.astype(int).T
     assert here[row, column].all()
     assert len(found.angles_rad) == len(found.sizes_px) == len(found) > 50
-    patches = settling._found_again(picture, 1.0, looks, 6, PARAMS.tracking)
+    patches = refinement._track_patches(picture, 1.0, looks, 6)
     column, row = patches.pixels.astype(int).T
     assert here[row, column].all()
-    assert patches.tried < settling._found_again(replace(picture, known=None), 1.0, looks, 6, PARAMS.tracking).tried
+    unmasked = refinement._track_patches(replace(picture, mask=None), 1.0, looks, 6)
+    assert patches.num_tracked < unmasked.num_tracked
     half = picture.halved()
-    small = look([world.placed], world.poses[1], half.intrinsics_px, half.size_px, Features())
-    laid = aligning.align(
-        half.rgb, small[0], world.poses[1], half.intrinsics_px, 2.0, PARAMS.aligning, None, half.known
-    )
+    small = render_scenes([world.placed], world.poses[1], half.intrinsics_px, half.size_px)
+    laid = direct_alignment.align(half.rgb, small[0], world.poses[1], half.intrinsics_px, 2.0, None, half.mask)
     column, row = np.clip(laid.pixels, 0, np.array(half.size_px) - 1).astype(int).T
-    assert half.known[row, column].mean() > 0.98  # points move with the pose, and some come to lie behind its edge
-    cells = unlike.unlike(picture.rgb, looks, 0.5, here).probability
+    assert half.mask[row, column].mean() > 0.98  # points move with the pose, and some come to lie behind its edge
+    cells = mismatch.mismatch_map(picture.rgb, looks, here).probability
     assert np.isnan(cells[15:, 9:21]).all()
     assert np.isfinite(cells).mean() > 0.2
-    other, _ = localizing.prepared(crowds[1], PARAMS)
-    apart = np.abs(cells - unlike.unlike(other.rgb, looks, 0.5, here).probability)
+    other, _ = localization.scale_photo(crowds[1], 480)
+    apart = np.abs(cells - mismatch.mismatch_map(other.rgb, looks, here).probability)
     assert np.nanmax(apart) < 1e-3  # the light as well is that of the place
     for compared, patch in (
-        (evidence.compare(picture.rgb, looks, PARAMS.evidence, known=here), (slice(14, None), slice(8, 21))),
-        (evidence.compare_coarsely(picture.rgb, looks, PARAMS.evidence, known=here), (slice(6, None), slice(4, 9))),
+        (evidence.compare(picture.rgb, looks, mask=here), (slice(14, None), slice(8, 21))),
+        (evidence.compare_coarsely(picture.rgb, looks, mask=here), (slice(6, None), slice(4, 9))),
     ):
         assert np.isnan(compared.correlation[patch]).all()
-        assert compared.num_judged > 20
+        assert compared.num_compared > 20
         assert compared.seen > 0.9
 
 
@@ -97,19 +103,18 @@ def test_a_mask_is_halved_and_made_smaller_to_what_is_wholly_seen() -> None:
     rgb = np.zeros((720, 960, 3), np.uint8)
     known = np.ones((720, 960), bool)
     known[101, 201] = False
-    picture, _ = localizing.prepared(Photo(rgb, np.array([700.0, 700, 480, 360]), known=known), PARAMS)
-    assert picture.known.shape == picture.grey.shape == (360, 480)
-    assert np.argwhere(~picture.known).tolist() == [[50, 100]]
-    assert np.argwhere(~picture.halved().known).tolist() == [[25, 50]]
+    picture, _ = localization.scale_photo(Photo(rgb, np.array([700.0, 700, 480, 360]), known=known), 480)
+    assert picture.mask.shape == picture.grey.shape == (360, 480)
+    assert np.argwhere(~picture.mask).tolist() == [[50, 100]]
+    assert np.argwhere(~picture.halved().mask).tolist() == [[25, 50]]
 
 
 def test_a_pose_that_is_settled_by_half_a_photo_is_that_of_all_of_it(world) -> None:
     photo = world.photos[0]
     known = np.zeros(photo.rgb.shape[:2], bool)
     known[:, : known.shape[1] * 2 // 3] = True
-    picture, _ = localizing.prepared(replace(photo, known=known), PARAMS)
-    start = Candidate(0, world.poses[0], picture.intrinsics_px, 20, ("scene",))
-    settled = localizing.settled_pose(picture, start, {"scene": world.placed}, PARAMS)
+    picture, _ = localization.scale_photo(replace(photo, known=known), 480)
+    settled = refinement.refine_pose(picture, world.poses[0], picture.intrinsics_px, [world.placed])
     assert np.linalg.norm(settled.T_metric_camera[:3, 3] - world.poses[0][:3, 3]) < 0.05
     assert (settled.pixels[:, 0] < 320).all()
 

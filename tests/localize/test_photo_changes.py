@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmap.localize import Params, compare_photo, open_eyes
+from gsmap.localize import compare_photo, render_capture_views
 from gsmap.types.localization import Photo
 from gsmap_synthetic import film
 from gsmap_synthetic.capture import unused_doors
@@ -18,24 +18,35 @@ WHERE = (300, 200)  # in its picture, where the map is known
 
 @pytest.fixture(scope="module")
 def eyes(world):
-    return {"scene": open_eyes(world.placed, world.capture.cameras, Params().differences)}
+    return {"scene": render_capture_views(world.placed, world.capture.cameras)}
 
 
-def told(world, eyes, place, *, view=VIEW, off_m=0.0, covariance=None, change=lambda rgb: rgb, **light):
+def told(
+    world,
+    eyes,
+    place,
+    *,
+    view=VIEW,
+    off_m=0.0,
+    covariance=None,
+    change=lambda rgb: rgb,
+    min_change_fraction=0.003,
+    **light,
+):
     shut = unused_doors(world.place, (0,))  # as they were when it was captured
     frames = film(place, world.poses[view][None], size_px=(480, 360), shut=shut, focal=world.focal, **light)
     photo = Photo(change(frames.images[0]), frames.cameras.intrinsics_px[0])
     pose = world.poses[view].copy()
     pose[:3, 3] += off_m * pose[:3, 0]
     known = np.diag([0.002**2] * 3 + [0.01**2] * 3) if covariance is None else covariance
-    return compare_photo(photo, pose, known, photo.intrinsics_px, [world.placed], eyes, Params())
+    return compare_photo(photo, pose, known, photo.intrinsics_px, [world.placed], eyes, 480, min_change_fraction)
 
 
 @pytest.mark.parametrize("light", [{}, {"gain": 0.6}, {"gain": np.array([1.25, 1.1, 0.95]), "gamma": 1.15}])
 def test_an_unchanged_place_differs_nowhere_in_any_exposure(world, eyes, light) -> None:
     found = told(world, eyes, world.place, **light)
     assert found.regions == ()
-    assert found.judged > 0.25
+    assert found.compared_fraction > 0.25
 
 
 @pytest.mark.slow
@@ -87,6 +98,7 @@ def test_another_colour_is_told_as_one(world, eyes) -> None:
 
     found = told(world, eyes, world.place, change=paint)
     assert found.regions
+    assert not told(world, eyes, world.place, change=paint, min_change_fraction=0.5).regions
     assert where[found.regions[0].mask].mean() > 0.5
 
 
@@ -107,7 +119,7 @@ def test_a_thing_that_was_taken_away_is_found_where_it_stood(world, eyes) -> Non
 
 
 def test_what_no_camera_of_a_capture_looked_at_is_not_judged(world) -> None:
-    blind = {"scene": open_eyes(world.placed, None, Params().differences)}
+    blind = {"scene": render_capture_views(world.placed, None)}
     found = told(world, blind, world.place, change=lambda rgb: somebody(rgb)[0])
     assert found.regions == ()
-    assert found.judged == 0.0
+    assert found.compared_fraction == 0.0

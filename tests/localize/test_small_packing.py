@@ -9,7 +9,7 @@ import pytest
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.sh import SH_C0, rgb_of_sh0
 from gsmap.geometry.transforms import sh_basis
-from gsmap.localize import packed_features, packed_gaussians, packing, streams
+from gsmap.localize import compression, packed_features, packed_gaussians, reduction
 from gsmap.types import Cameras, Gaussians
 
 
@@ -48,42 +48,42 @@ def _bytes(arrays: dict[str, np.ndarray]) -> int:
 
 def test_bytes_come_back_and_others_are_told() -> None:
     values = np.random.default_rng(1).integers(0, 7, (3, 500)).astype(np.uint8)
-    stream = streams.squeezed(values)
+    stream = compression.compress(values)
     assert len(stream) < values.nbytes / 2
-    assert np.array_equal(streams.expanded(stream, (3, 500), np.uint8), values)
+    assert np.array_equal(compression.decompress(stream, (3, 500), np.uint8), values)
     for wrong in (stream[: len(stream) // 2], stream.astype(np.int64), np.full(40, 255, np.uint8)):
-        with pytest.raises(ValueError, match="bytes"):
-            streams.expanded(wrong, (3, 500), np.uint8)
+        with pytest.raises(ValueError, match="LZMA stream"):
+            compression.decompress(wrong, (3, 500), np.uint8)
     for shape in ((3, 499), (3, 501)):
-        with pytest.raises(ValueError, match="do not fit"):
-            streams.expanded(stream, shape, np.uint8)
+        with pytest.raises(ValueError, match="another size"):
+            compression.decompress(stream, shape, np.uint8)
 
 
 def test_bytes_are_not_expanded_beyond_what_is_asked_for() -> None:
-    bomb = streams.squeezed(np.zeros(1 << 24, np.uint8))
+    bomb = compression.compress(np.zeros(1 << 24, np.uint8))
     assert len(bomb) < 1 << 15
-    with pytest.raises(ValueError, match="do not fit"):
-        streams.expanded(bomb, (10,), np.uint8)
+    with pytest.raises(ValueError, match="another size"):
+        compression.decompress(bomb, (10,), np.uint8)
 
 
 def test_places_are_steps_along_a_curve_within_each_run() -> None:
     points = np.random.default_rng(2).uniform(-40, 60, (300, 3))
     low, step = points.min(0), 0.01
     starts = np.array([0, 0, 120, 300, 300])  # runs without places as well
-    codes = streams.codes_of(points, low, step)
+    codes = compression.encode_points(points, low, step)
     for a, b in ((0, 120), (120, 300)):
         codes[a:b].sort()
-    again = streams.codes_between(streams.steps_between(codes, starts), starts)
+    again = compression.codes_from_steps(compression.code_steps(codes, starts), starts)
     assert np.array_equal(again, codes)
-    places = streams.places_of(streams.codes_of(points, low, step), low, step)
+    places = compression.decode_points(compression.encode_points(points, low, step), low, step)
     assert np.abs(places - points).max() <= step / 2 * 1.0001
 
 
 def test_a_step_that_the_curve_cannot_count_is_made_larger() -> None:
     points = np.array([[0.0, 0, 0], [4e6, 1, 2]])
-    step = streams.finest_step(points, 1e-3)
+    step = compression.finest_step(points, 1e-3)
     assert step > 1e-3
-    places = streams.places_of(streams.codes_of(points, points[0], step), points[0], step)
+    places = compression.decode_points(compression.encode_points(points, points[0], step), points[0], step)
     assert np.abs(places - points).max() <= step
 
 
@@ -183,8 +183,8 @@ def test_descriptors_with_both_signs_are_packed(world) -> None:
 
 
 def test_a_scene_without_features_is_packed_as_well(world) -> None:
-    none = packing.fewer(world.placed.features, 0)
-    few = packing.fewer(none, 0)
+    none = reduction.limit_features(world.placed.features, 0)
+    few = reduction.limit_features(none, 0)
     empty = replace(
         few,
         starts=np.zeros(len(few.starts), np.int64),
@@ -213,7 +213,7 @@ def test_as_many_features_of_every_view_as_there_may_be(world) -> None:
     features = world.placed.features
     counts = np.diff(features.starts)
     for total in (len(counts) * 10, features.num_features // 2, features.num_features - 1, features.num_features):
-        fewer = packing.fewer(features, total)
+        fewer = reduction.limit_features(features, total)
         kept = np.diff(fewer.starts)
         assert total - len(counts) < fewer.num_features <= total
         assert np.array_equal(kept, np.minimum(counts, kept.max()))
@@ -234,7 +234,7 @@ def test_a_gaussian_gets_the_colour_that_it_shows_and_a_hidden_one_no_weight() -
     )
     cameras = Cameras(np.eye(4)[None], np.array([[200.0, 200, 120, 90]]), np.array([[240, 180]]))
     scene = SimpleNamespace(gaussians=placed)
-    weights, coloured = packing.shown(scene, cameras, packing.Params())  # type: ignore[arg-type]
+    weights, coloured = reduction.measure_visibility(scene, cameras)  # type: ignore[arg-type]
     assert weights[:2].min() > 0.5
     assert weights[2] < 0.02
     assert coloured.sh_degree == 0

@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsmap.localize import Params, evidence, unlike
-from gsmap.localize.localizing import prepared
-from gsmap.localize.looks import look
+from gsmap.localize import evidence, mismatch
+from gsmap.localize.candidate_renders import render_scenes
+from gsmap.localize.localization import scale_photo
 
 
 @pytest.fixture(scope="module")
 def seen(world):
     """A photo of the place (H, W, 3), and what the map shows there."""
-    picture, _ = prepared(world.photos[0], Params())
-    return picture.rgb, look([world.placed], world.poses[0], picture.intrinsics_px, picture.size_px, Params().features)
+    picture, _ = scale_photo(world.photos[0], 480)
+    return picture.rgb, render_scenes([world.placed], world.poses[0], picture.intrinsics_px, picture.size_px)
 
 
 @pytest.fixture(scope="module")
 def other(elsewhere) -> np.ndarray:
-    return prepared(elsewhere.photos[1], Params())[0].rgb
+    return scale_photo(elsewhere.photos[1], 480)[0].rgb
 
 
 def pasted(rgb: np.ndarray, other: np.ndarray, *places: tuple[int, int]) -> np.ndarray:
@@ -34,13 +34,13 @@ def pasted(rgb: np.ndarray, other: np.ndarray, *places: tuple[int, int]) -> np.n
 
 def share(rgb: np.ndarray, looks) -> float:
     """Of what can be compared, that is expected to be something else."""
-    return float(np.nanmean(unlike.unlike(rgb, looks, 0.5).probability))
+    return float(np.nanmean(mismatch.mismatch_map(rgb, looks).probability))
 
 
 def test_a_photo_of_the_place_shows_little_else(seen) -> None:
     rgb, looks = seen
     assert share(rgb, looks) < 0.12
-    assert unlike.unlike(rgb, looks, 0.5).surely_outside(0.8) < 0.04
+    assert mismatch.mismatch_map(rgb, looks).share_outside(0.8) < 0.04
 
 
 def test_a_photo_of_another_place_does(seen, other) -> None:
@@ -58,8 +58,8 @@ def test_colours_that_are_clipped_tell_nothing(seen) -> None:
     rgb, looks = seen
     white = rgb.copy()
     white[120:240, 200:320] = 1.0
-    probability = unlike.unlike(white, looks, 0.5).probability
-    step = unlike.EVERY_PX
+    probability = mismatch.mismatch_map(white, looks).probability
+    step = mismatch.STEP_PX
     assert np.isnan(probability[144 // step : 216 // step, 224 // step : 296 // step]).all()
     assert share(white, looks) < share(rgb, looks) + 0.04
 
@@ -77,32 +77,31 @@ def test_one_connected_part_may_be_one_thing() -> None:
     probability = np.zeros((10, 12))
     probability[1:4, 1:5] = 0.9
     probability[:, 10:] = np.nan
-    one = unlike.Unlike.of(probability, 0.5)
-    assert one.in_part() == pytest.approx(12 / 100)
-    assert one.outside() == one.surely_outside(0.5) == 0
+    one = mismatch.MismatchMap.from_probability(probability)
+    assert one.part_share() == pytest.approx(12 / 100)
+    assert one.mean_outside() == one.share_outside(0.5) == 0
     probability[6:8, 2:4] = 0.6
-    two = unlike.Unlike.of(probability, 0.5)
+    two = mismatch.MismatchMap.from_probability(probability)
     assert np.array_equal(two.part, one.part)
-    assert two.surely_outside(0.5) == pytest.approx(4 / 100)
-    assert two.surely_outside(0.8) == 0
+    assert two.share_outside(0.5) == pytest.approx(4 / 100)
+    assert two.share_outside(0.8) == 0
     around = 3 * 4 + 2 * 3 + 2 * 4  # the part and the cells beside it
-    assert two.outside() == pytest.approx(0.6 * 4 / (100 - around))
+    assert two.mean_outside() == pytest.approx(0.6 * 4 / (100 - around))
 
 
 def test_what_the_part_covers_is_not_compared(seen, other) -> None:
     """Somebody before a wall takes nothing from how well the rest agrees."""
     rgb, looks = seen
-    params = Params().evidence
     hidden = pasted(rgb, other, (120, 200))
-    found = unlike.unlike(hidden, looks, params.likely)
+    found = mismatch.mismatch_map(hidden, looks)
     row, column = np.nonzero(found.part)
-    assert abs(np.median(row) - 180 / unlike.EVERY_PX) < 4
-    assert abs(np.median(column) - 260 / unlike.EVERY_PX) < 4
+    assert abs(np.median(row) - 180 / mismatch.STEP_PX) < 4
+    assert abs(np.median(column) - 260 / mismatch.STEP_PX) < 4
     for compare in (evidence.compare, evidence.compare_coarsely):
-        free, whole, less = (compare(x, looks, params, y) for x, y in ((rgb, None), (hidden, None), (hidden, found)))
-        assert less.num_judged < whole.num_judged
-        assert less.explained(params.agree) > whole.explained(params.agree) + 0.02
-        assert less.explained(params.agree) == pytest.approx(free.explained(params.agree), abs=0.08)
+        free, whole, less = (compare(x, looks, y) for x, y in ((rgb, None), (hidden, None), (hidden, found)))
+        assert less.num_compared < whole.num_compared
+        assert less.explained() > whole.explained() + 0.02
+        assert less.explained() == pytest.approx(free.explained(), abs=0.08)
 
 
 def test_the_scene_that_shows_it_is_believed(seen, other) -> None:
@@ -115,7 +114,7 @@ def test_the_scene_that_shows_it_is_believed(seen, other) -> None:
 
 
 def test_nothing_known_is_nothing_said() -> None:
-    found = unlike.unlike(np.zeros((48, 64, 3), np.float32), [], 0.5)
-    assert np.isnan(found.in_part())
-    assert np.isnan(found.outside())
-    assert np.isnan(found.surely_outside(0.5))
+    found = mismatch.mismatch_map(np.zeros((48, 64, 3), np.float32), [])
+    assert np.isnan(found.part_share())
+    assert np.isnan(found.mean_outside())
+    assert np.isnan(found.share_outside(0.5))

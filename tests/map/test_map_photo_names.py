@@ -18,7 +18,7 @@ from gsmap.map.photo_names import match_photos, rows_of_photo
 from gsmap.map.stages.georeference import Request
 from gsmap.optimize.survey_system import System
 from gsmap.types import Cameras
-from gsmap.world.frame import of_frame
+from gsmap.world.frame import from_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, ground, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
@@ -151,7 +151,7 @@ def flights(path: Path, site: Site, names: list[tuple[str, ...]], scenes: list[s
 
 def places(site: Site, k: int) -> np.ndarray:
     """(8, 3) longitude, latitude and height of a capture's cameras."""
-    return of_frame(site.frame, site.truth[k].apply(site.cameras[k].centers), "EPSG:4979")
+    return from_frame(site.frame, site.truth[k].apply(site.cameras[k].centers), "EPSG:4979")
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +197,7 @@ def test_a_flight_that_is_not_in_the_map_does_not_tie_it_elsewhere(site: Site, t
         assert any("8 photos" in note and "stranger" in note for note in report.notes)
         assert report.components[0].problem == ""
         (row,) = m.pose_rows("EPSG:4979")
-        want = of_frame(site.frame, site.truth[0].translation[None], "EPSG:4979")[0]
+        want = from_frame(site.frame, site.truth[0].translation[None], "EPSG:4979")[0]
         assert np.abs((row.world - want) * [7e4, 1.1e5, 1]).max() < 0.1
         with raises(InputError, code="photo_ambiguous"):
             m.georeference(Request(exif=tmp_path / "unclear" / "card1"))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsmap.localize import Differences, Region, sighted
+from gsmap.localize import ChangedRegion, PhotoComparison
 from gsmap.map.objects import MapObjects, history_report, objects_report
 from gsmap.map.photos import add_photo_observations, objects_in_photo
 from gsmap.objects import estimate_persistence
@@ -32,9 +32,11 @@ class Sketch:
         points = np.stack([(u - 50) / 100 * DEPTH, (v - 40) / 100 * DEPTH, np.full(u.shape, DEPTH)], -1)
         compared = np.ones((HEIGHT, WIDTH), bool)
         mask = np.zeros((HEIGHT, WIDTH), bool) if mask is None else mask
-        region = Region(np.zeros(4), float(mask.mean()), 2.0, kind, mask, np.zeros(3), "a")
+        region = ChangedRegion(np.zeros(4), float(mask.mean()), 2.0, kind, mask, np.zeros(3), "a")
         regions = (region,) if mask.any() else ()
-        return Differences(regions, 1.0, compared, compared & ~mask, np.zeros((HEIGHT, WIDTH, 3)), points, np.ones(4))
+        return PhotoComparison(
+            regions, 1.0, compared, compared & ~mask, np.zeros((HEIGHT, WIDTH, 3)), points, np.ones(4)
+        )
 
 
 @dataclass
@@ -60,20 +62,12 @@ def seen(scene: str, at=(0.0, 0.0, DEPTH)) -> ObjectObservation:
     return ObjectObservation(scene, "seen", 0, np.array([np.array(at) - 0.25, np.array(at) + 0.25]))
 
 
-def said(found: Differences, samples: np.ndarray, params: sighted.Params | None = None) -> list[PhotoObjectObservation]:
-    params = params or sighted.Params()
+def said(found: PhotoComparison, samples: np.ndarray) -> list[PhotoObjectObservation]:
     things = OneThing(samples, np.array([len(samples)]))
     row = SimpleNamespace(T_map_camera=np.eye(4), intrinsics_px=LENS, component=0)
     graph = SimpleNamespace(things=things)
     poses = {"a": Sim3.identity()}
-    return objects_in_photo(
-        SimpleNamespace(found=found), row, 1.0, [an_object(seen("a"))], lambda scene: graph, poses, params
-    )
-
-
-def test_how_much_must_be_in_sight_is_a_setting():
-    assert not said(Sketch().found(), Sketch().thing(), sighted.Params(min_samples=10_000))
-    assert not said(Sketch().found(), Sketch().thing(), sighted.Params(seen=1.1))
+    return objects_in_photo(SimpleNamespace(found=found), row, 1.0, [an_object(seen("a"))], lambda scene: graph, poses)
 
 
 def test_a_thing_that_the_photo_shows_is_seen():
@@ -113,7 +107,7 @@ SCENES = {"a": scene("a", "2026-01-01T00:00:00+00:00"), "b": scene("b", "2026-06
 def known(*photos: StoredPhoto, S: Sim3 | None = None) -> MapObjects:
     thing = an_object(seen("a"), seen("b"))
     at = {"a": S or Sim3.identity(), "b": Sim3.identity()}
-    objects = add_photo_observations([thing], photos, SCENES, at, {0: 1.0}, {"a": 0, "b": 0}, sighted.Params())
+    objects = add_photo_observations([thing], photos, SCENES, at, {0: 1.0}, {"a": 0, "b": 0})
     names = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in photos}
     return MapObjects(objects, SCENES, (), {0: 1.0}, names)
 

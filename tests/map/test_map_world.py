@@ -47,10 +47,10 @@ def world_of(path: Path) -> dict[str, np.ndarray]:
 
 def test_world_coordinates_are_right_and_last(tied: Path, site: Site, tmp_path: Path) -> None:
     """Eight digits before the point, to a centimetre by the survey and to a thousandth through store and export."""
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     found = world_of(tied)
-    truth = dict(zip(site.names, of_frame(site.frame, np.array([S.translation for S in site.truth])), strict=True))
+    truth = dict(zip(site.names, from_frame(site.frame, np.array([S.translation for S in site.truth])), strict=True))
     off = np.array([found[name] - truth[name] for name in site.names])
     assert np.sqrt((off**2).sum(1).mean()) < 0.02
     with gsmap.map.open(tied) as m:
@@ -61,7 +61,7 @@ def test_world_coordinates_are_right_and_last(tied: Path, site: Site, tmp_path: 
     back = np.array([row.world for row in here])
     from gsmap.world.frame import to_frame
 
-    again = of_frame(site.frame, to_frame(site.frame, back, "EPSG:4326"))
+    again = from_frame(site.frame, to_frame(site.frame, back, "EPSG:4326"))
     assert np.abs(again - np.array([found[row.scene_name] for row in here])).max() < 1e-3
 
 
@@ -79,7 +79,7 @@ def test_a_surveyed_map_is_reported(tied: Path, tmp_path: Path) -> None:
 
 
 def test_measuring(tied: Path, site: Site) -> None:
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     true = float(np.linalg.norm(site.truth[0].translation - site.truth[8].translation))
     with gsmap.map.open(tied) as m:
@@ -101,7 +101,7 @@ def test_measuring(tied: Path, site: Site) -> None:
         assert 1e-4 < lone.sigma_m < 0.05
         assert lone.sigma_m <= 1.01 * np.linalg.norm(lone.a.sigma_m)
         assert lone.b.sigma_m.tolist() == [0, 0, 0]
-        truth = of_frame(site.frame, site.truth[8].translation[None])[0]
+        truth = from_frame(site.frame, site.truth[8].translation[None])[0]
         assert np.linalg.norm(found.b.world - truth) < 3 * np.linalg.norm(found.b.sigma_m)
         assert (found.b.sigma_m < 0.05).all()
         in_map = m.measure("site-008:0,0,0", ",".join(map(repr, found.a.map.tolist())))
@@ -261,7 +261,7 @@ def test_heights_of_a_state_plane_are_in_feet(tmp_path: Path, capsys: pytest.Cap
     from gsmap.cli import app
     from gsmap.formats import gcp_list
     from gsmap.types.world import WorldFrame
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     foot = 1200 / 3937
     boston = surveyed_site(3, replace(SITE, rows=2, num_control=4), WorldFrame("EPSG:6319", 42.36, -71.06, 30.0))
@@ -279,7 +279,7 @@ def test_heights_of_a_state_plane_are_in_feet(tmp_path: Path, capsys: pytest.Cap
         assert report.height_unit_m == pytest.approx(foot)
         rows = {row.scene_name: row for row in m.pose_rows()}
     for name, S in zip(boston.names, boston.truth, strict=True):
-        want = in_feet(of_frame(boston.frame, S.translation[None])[0])
+        want = in_feet(from_frame(boston.frame, S.translation[None])[0])
         assert np.abs(rows[name].world - want).max() * foot < 0.05
         assert "US survey feet" in rows[name].heights
     for verb in (["georeference"], ["list"], ["poses"], ["measure"]):
@@ -292,11 +292,11 @@ def test_heights_of_a_state_plane_are_in_feet(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_surveyed_positions_of_scenes(site: Site, tmp_path: Path) -> None:
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     with made_map(tmp_path / "m.gsmap", site) as m:
         for k in (0, 2, 6, 8):
-            at = of_frame(site.frame, site.truth[k].translation[None], "EPSG:4326")[0]
+            at = from_frame(site.frame, site.truth[k].translation[None], "EPSG:4326")[0]
             m.set_world_position(site.names[k], at, (0.01, 0.01))
         assert m.georeference().stale
         m.optimize()
@@ -311,7 +311,7 @@ def test_what_is_exported_says_where_it_lies(tied: Path, site: Site, tmp_path: P
     """3D Tiles lie on the globe; other formats, whose numbers are too short for it, have it beside them."""
     from gsmap.formats import tiles3d
     from gsmap.world.crs import ECEF
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     with gsmap.map.open(tied) as m:
         m.export(tmp_path / "globe", tile_size_m=20, format="3dtiles", merge="union")
@@ -323,7 +323,7 @@ def test_what_is_exported_says_where_it_lies(tied: Path, site: Site, tmp_path: P
     transform = np.reshape(root["transform"], (4, 4)).T
     points = tiles3d.read(tileset).means[::97].astype(np.float64)
     there = points @ transform[:3, :3].T + transform[:3, 3]
-    want = of_frame(tie.frame, tie.S_world_map.apply(points), ECEF)
+    want = from_frame(tie.frame, tie.S_world_map.apply(points), ECEF)
     assert np.abs(there - want).max() < 1e-3
     sidecar = json.loads((tmp_path / "plain" / "tiles.json").read_text())["components"][0]["world"]
     assert sidecar["crs"] == "EPSG:25832"
@@ -402,7 +402,7 @@ def test_positions_in_exif_tie_a_map(tmp_path: Path) -> None:
     """A drone's photos: heights above sea level, and what a whole flight is off by, are in the sigma."""
     from PIL import Image
 
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     site = surveyed_site(4, replace(SITE, spacing_m=40.0, edge_translation_m=5e-3))
     rng, folder = np.random.default_rng(0), tmp_path / "photos"
@@ -410,7 +410,7 @@ def test_positions_in_exif_tie_a_map(tmp_path: Path) -> None:
     for S, cameras in zip(site.truth, site.cameras, strict=True):
         flight = rng.normal(size=3) * [2, 2, 4]
         at = S.apply(cameras.centers[::3]) + flight + rng.normal(size=(3, 3)) * 0.5
-        for name, (lon, lat, height) in zip(cameras.names[::3], of_frame(site.frame, at, "EPSG:4979"), strict=True):
+        for name, (lon, lat, height) in zip(cameras.names[::3], from_frame(site.frame, at, "EPSG:4979"), strict=True):
             picture = Image.new("RGB", (8, 8))
             tags = picture.getexif()
             gps = tags.get_ifd(0x8825)
@@ -429,7 +429,7 @@ def test_positions_in_exif_tie_a_map(tmp_path: Path) -> None:
         assert any("above sea level" in note for note in report.notes)
         assert any("above sea level" in note for note in m.georeference().notes), "as long as it is so"
         found = {row.scene_name: row.world for row in m.pose_rows()}
-        want = of_frame(site.frame, site.truth[4].translation[None])[0]
+        want = from_frame(site.frame, site.truth[4].translation[None])[0]
         assert np.linalg.norm(found[site.names[4]][:2] - want[:2]) < 4
 
 
@@ -462,11 +462,11 @@ def test_photos_above_take_off_are_named_and_tie_nothing_anew(tied: Path, site: 
         m.clone(tmp_path / "c.gsmap")
     with gsmap.map.open(tmp_path / "c.gsmap") as m:
         ids = {scene.name: scene.id for scene in m.store.scenes.list()}
-        from gsmap.world.frame import of_frame
+        from gsmap.world.frame import from_frame
 
         fixes = []
         for name, S, cameras in zip(site.names, site.truth, site.cameras, strict=True):
-            low = of_frame(site.frame, S.apply(cameras.centers) - [0, 0, 520])
+            low = from_frame(site.frame, S.apply(cameras.centers) - [0, 0, 520])
             fixes += [
                 PositionFix(photo, ids[name], point, site.frame.crs, position, (1.5, 3.0), (3.0, 6.0), 40.0)
                 for photo, point, position in zip(cameras.names, cameras.centers, low, strict=True)

@@ -9,7 +9,7 @@ from raising import raises
 from gsmap.errors import ConfigError, InputError
 from gsmap.types.world import WorldFrame
 from gsmap.world.crs import ECEF, WGS84, crs
-from gsmap.world.frame import T_ecef_frame, frame_at, of_frame, to_frame
+from gsmap.world.frame import T_ecef_frame, frame_at, from_frame, to_frame
 
 UTM = np.array([[691234.1234, 5334567.7654, 519.321], [690234.1, 5334067.7, 529.321], [701234.1, 5344567.0, 719.3]])
 
@@ -20,9 +20,9 @@ UTM = np.array([[691234.1234, 5334567.7654, 519.321], [690234.1, 5334067.7, 529.
 def test_coordinates_round_trip(text: str) -> None:
     frame = frame_at("EPSG:25832", UTM)
     metres = to_frame(frame, UTM)
-    there = of_frame(frame, metres, text)
+    there = from_frame(frame, metres, text)
     assert np.abs(to_frame(frame, there, text) - metres).max() < 1e-6
-    assert np.abs(of_frame(frame, metres) - UTM).max() < 1e-6
+    assert np.abs(from_frame(frame, metres) - UTM).max() < 1e-6
 
 
 def test_the_frame_is_euclidean_and_utm_is_not() -> None:
@@ -44,7 +44,7 @@ def test_the_frame_is_euclidean_and_utm_is_not() -> None:
 
 def test_geographic_coordinates_are_longitude_first() -> None:
     frame = WorldFrame("EPSG:4326", 48.0, 11.0, 500.0)
-    assert np.abs(of_frame(frame, np.zeros((1, 3)))[0] - [11.0, 48.0, 500.0]).max() < 1e-9
+    assert np.abs(from_frame(frame, np.zeros((1, 3)))[0] - [11.0, 48.0, 500.0]).max() < 1e-9
     east = to_frame(frame, np.array([[11.001, 48.0, 500.0]]))[0]
     assert east[0] == pytest.approx(74.6, abs=0.1)
     assert abs(east[1]) < 0.01
@@ -53,7 +53,7 @@ def test_geographic_coordinates_are_longitude_first() -> None:
 def test_the_way_to_the_globe() -> None:
     frame = frame_at("EPSG:25832", UTM)
     metres = to_frame(frame, UTM)
-    assert np.abs(T_ecef_frame(frame).apply(metres) - of_frame(frame, metres, ECEF)).max() < 1e-5
+    assert np.abs(T_ecef_frame(frame).apply(metres) - from_frame(frame, metres, ECEF)).max() < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_heights_are_in_the_unit_of_the_system(
     assert found[0, 2] == pytest.approx(metres, abs=1e-6)
     assert system.height_unit_m == pytest.approx(metres / point[2], rel=1e-12)
     assert heights in system.heights
-    assert np.abs(system.of_geodetic(found) - points).max() < 1e-6
+    assert np.abs(system.from_geodetic(found) - points).max() < 1e-6
     # Upwards in the frame by as many metres as ten units are, whatever the horizontal unit.
     frame = frame_at(text, points)
     east, north, up = np.diff(to_frame(frame, points), axis=0)[0] / (10 * system.height_unit_m)
@@ -147,6 +147,6 @@ def test_points_outside_the_area_are_refused() -> None:
 
 def test_nonsense_coordinates_are_refused() -> None:
     with raises(InputError, code="outside_crs"):
-        crs("EPSG:4326").check_area(np.array([[11.0, 948.0, 0.0]]), ["P"], 2.0) if False else crs(WGS84).of_geodetic(
+        crs("EPSG:4326").check_area(np.array([[11.0, 948.0, 0.0]]), ["P"], 2.0) if False else crs(WGS84).from_geodetic(
             np.array([[11.0, 48.0, np.inf]])
         )

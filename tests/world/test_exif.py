@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from raising import raises
 
-from gsmap.errors import InputError
+from gsmap.errors import ConfigError, InputError
 from gsmap.world import Params, exif
 
 
@@ -35,6 +35,19 @@ def test_a_position_is_read(tmp_path: Path) -> None:
     assert own == pytest.approx((4.0, 8.0))
     assert common == pytest.approx((4.0, 8.0))
     assert sea_level == 40, "sea level is not the ellipsoid"
+
+
+def test_a_position_without_an_error_has_the_default_one(tmp_path: Path) -> None:
+    found = exif.read(photo(tmp_path / "a.jpg", t1="N", t2=(48.0, 8.0, 13.2), t3="E", t4=(11.0, 34.0, 30.0), t6=520.5))
+    assert found is not None
+    own, common, _ = found.sigmas(Params(gnss_sigma_m=2.0, gnss_common_sigma_m=5.0))
+    assert (own[0], common[0]) == (2.0, 5.0)
+
+
+@pytest.mark.parametrize("name", ["area_margin_deg", "gcp_sigma_m", "gnss_sigma_m", "survey_sigma_m"])
+def test_sigmas_are_positive(name: str) -> None:
+    with pytest.raises(ConfigError):
+        Params(**{name: 0.0})
 
 
 @pytest.mark.parametrize(

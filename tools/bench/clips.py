@@ -34,7 +34,7 @@ import numpy as np
 
 import gsmap_synthetic as synthetic
 from gsmap.localize import localize_photo, localize_together
-from gsmap.localize.looks import look
+from gsmap.localize.candidate_renders import render_scenes
 from gsmap.localize.params import Params
 from gsmap.methods import family
 from gsmap.types.localization import LocalizationResult, Photo
@@ -104,7 +104,7 @@ def made_clips(place: Place, params: Params) -> Iterator[list[Frame]]:
             coarse = shot.depths_m[k][2::4, 2::4]
             size = (coarse.shape[1], coarse.shape[0])
             has = np.zeros(coarse.shape, bool)
-            for one in look(place.scenes, pose, intrinsics / 4, size, params.features):
+            for one in render_scenes(place.scenes, pose, intrinsics / 4, size):
                 has |= (one.alpha > 0.9) & (np.abs(one.depth_m - coarse) < 0.05 + 0.02 * coarse)
             frames.append(Frame(photo, pose, float(has.mean())))
         yield frames

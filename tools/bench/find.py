@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import gsmap
-from gsmap.find import Model
+from gsmap.find import SimilarityModel
 from gsmap.map.objects import compute_objects
 from tools.bench.find_scores import QUERIES, average_precisions, by_cosine, by_model, items_of, precision
 from tools.make import find_places
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--maps", type=int, default=1, help="of so many places a map is made, too")
     args = parser.parse_args()
-    model = Model.load()
+    model = SimilarityModel.load()
     scores: dict[str, dict[str, list[float]]] = {"likeness": defaultdict(list), "cosine": defaultdict(list)}
     for seed in range(*args.seeds):
         items = items_of(find_places.cached(seed, args.cache))

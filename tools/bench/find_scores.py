@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.find.likeness import Look, Model, differences, looks_of
+from gsmap.find.similarity import SegmentDescriptor, SimilarityModel, describe_segments, differences
 from tools.make.find_places import Sightings
 
 _WHOLE = 0.5  # a thing that shows less of its object stands for none
@@ -30,7 +30,7 @@ class Item:
     kind: int
     name: str
     good: bool
-    look: Look
+    look: SegmentDescriptor
     embedding: np.ndarray | None
 
 
@@ -42,7 +42,7 @@ def items_of(found: Sightings) -> list[Item]:
         assert things is not None
         if graph.up is None:
             continue
-        layer, looks = graph.layers["objects"], looks_of(things, graph.up)
+        layer, looks = graph.layers["objects"], describe_segments(things, graph.up)
         for t in range(len(things)):
             owner, low, high = found.owners[c, t], *things.extents[t]
             mine = ((layer.positions >= low) & (layer.positions <= high)).all(1)
@@ -86,7 +86,7 @@ def precision(query: Item, ranked: Sequence[Item], items: Sequence[Item]) -> flo
     return float(at[hits].sum() / wanted)
 
 
-def by_model(model: Model, question: tuple[Item, Sequence[Item]]) -> np.ndarray:
+def by_model(model: SimilarityModel, question: tuple[Item, Sequence[Item]]) -> np.ndarray:
     """The log-odds of each of some items for one."""
     query, others = question
     return model.log_odds(differences(query.look, [other.look for other in others]))

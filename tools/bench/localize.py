@@ -53,19 +53,18 @@ import gsmap.map
 from gsmap.geometry.rotations import angle_between
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.localize import index_recipe, localize_photo, new_segment, view_index
-from gsmap.localize.candidates import Candidate
+from gsmap.localize.candidate_renders import render_scenes
+from gsmap.localize.candidates import PoseCandidate
 from gsmap.localize.extractors import sift
-from gsmap.localize.features import Params as Features
-from gsmap.localize.features import lifted, quantised
-from gsmap.localize.localizing import judged_pose, photo_features, prepared
-from gsmap.localize.looks import look
-from gsmap.localize.matching import Described, matched
-from gsmap.localize.placed import PlacedFeatures
-from gsmap.localize.resection import moved
-from gsmap.localize.retrieval import most_alike
-from gsmap.localize.settling import Picture
-from gsmap.localize.together import words_of
-from gsmap.localize.words import Words, words_for
+from gsmap.localize.features import lift, quantize
+from gsmap.localize.joint_localization import word_histogram
+from gsmap.localize.localization import SMOOTH_PX, evaluate_pose, extract_features, scale_photo
+from gsmap.localize.map_scene import MapScene
+from gsmap.localize.matching import FeatureSet, match_features
+from gsmap.localize.refinement import ScaledPhoto
+from gsmap.localize.resection import retract_pose
+from gsmap.localize.retrieval import retrieve_views
+from gsmap.localize.vocabulary import Vocabulary, load_vocabulary
 from gsmap.map.progress_logging import log_progress
 from gsmap.map.small_map import SmallLocalizer, export_small
 from gsmap.map.stages.localize import Localizer
@@ -109,11 +108,11 @@ class World:
         found = localize_photo(photo, index, held.placed, held.extractor, held.params, held.metres)
         return found, time.process_time() - began
 
-    def fill(self, num_scenes: int, strangers: list[PlacedFeatures], work: Path) -> None:
+    def fill(self, num_scenes: int, strangers: list[MapScene], work: Path) -> None:
         """Add others until the map has so many scenes; their segment lies on the disk as a map's does."""
         held, rng = self.localizer, np.random.default_rng(7)
         kept = [scene.features for scene in strangers]
-        words = words_for(kept[0].descriptors.shape[1])
+        words = load_vocabulary(kept[0].descriptors.shape[1])
         others = Others(words, np.concatenate([found.descriptors for found in kept]))
         component = held.placed[next(iter(self.ids.values()))].component
         shutil.rmtree(work / "crowd", ignore_errors=True)
@@ -130,7 +129,7 @@ class World:
             self.crowd.add(name)
             there.append((replace(found, scene=name), "0" * 32))
             if len(there) == 64 or number == num_scenes - len(self.ids) - 1:
-                parts.append(new_segment(there, held.params.features.indexed))
+                parts.append(new_segment(there))
                 there = []
         whole = merged(parts)
         store = gsmap.map.create(work / "crowd" / "crowd.gsmap").store
@@ -165,15 +164,15 @@ class Others:
         descriptors: (N, D) int8 that there are.
     """
 
-    def __init__(self, words: Words, descriptors: np.ndarray) -> None:
-        word = words.nearest(words.shortened(descriptors / np.float32(254)))[:, 0]
+    def __init__(self, words: Vocabulary, descriptors: np.ndarray) -> None:
+        word = words.nearest(words.reduce(descriptors / np.float32(254)))[:, 0]
         self.words, self.descriptors = words, descriptors[np.argsort(word, kind="stable")]
         self._known: dict[str, np.ndarray] = {}  # by scene, the words of its features
         self.starts = np.searchsorted(np.sort(word), np.arange(len(words.centres) + 1))
 
     def _words_of(self, found: SceneFeatures) -> np.ndarray:
         if found.scene not in self._known:
-            short = self.words.shortened(found.descriptors / np.float32(254))
+            short = self.words.reduce(found.descriptors / np.float32(254))
             self._known[found.scene] = self.words.nearest(short)[:, 0]
         return self._known[found.scene]
 
@@ -343,9 +342,9 @@ def retrieval_alone(held: World) -> Localise:
         began = time.process_time()
         localizer = held.localizer
         index = localizer.index.only(allowed)
-        picture, _ = prepared(photo, localizer.params)
-        found = photo_features(picture, localizer.extractor, localizer.params.matching.smooth_px)
-        views = most_alike(index, found, picture.intrinsics_px, 1, localizer.params.retrieval)
+        picture, _ = scale_photo(photo, localizer.params.views.image_size_px)
+        found = extract_features(picture, localizer.extractor, SMOOTH_PX)
+        views = retrieve_views(index, found, picture.intrinsics_px, 1)
         if not views:
             return LocalizationResult(photo.name, "no view is like it"), time.process_time() - began
         scene, view = views[0]
@@ -374,7 +373,7 @@ class Started:
     def localize(self, photo: Photo, allowed: set[str]) -> tuple[LocalizationResult, float]:
         shot, localizer = self.shots[photo.name], self.held.localizer
         begin = time.process_time()
-        picture, scale = prepared(photo, localizer.params)
+        picture, scale = scale_photo(photo, localizer.params.views.image_size_px)
         covers = {scene: self._covered(shot, scene, picture) for scene in allowed}
         scenes = sorted(allowed, key=lambda scene: -covers[scene])[:3]
         component = localizer.placed[scenes[0]].component
@@ -382,12 +381,12 @@ class Started:
         pose = self._metric(shot, scenes[0])
         turn, shift = self.rng.normal(size=(2, 3))
         xi = np.r_[np.radians(3) * turn / np.linalg.norm(turn), 0.1 * shift / np.linalg.norm(shift)]
-        start = Candidate(component, moved(pose, xi), picture.intrinsics_px, 0, tuple(scenes))
-        found = judged_pose(picture, start, localizer.placed, localizer.params)
+        start = PoseCandidate(component, retract_pose(pose, xi), picture.intrinsics_px, 0, tuple(scenes))
+        found = evaluate_pose(picture, start, localizer.placed, localizer.params.verdict.aliased_prior)
         seconds = time.process_time() - begin
         if found.covariance is None:
             return LocalizationResult(photo.name, "nothing was found again"), seconds
-        answer = found.settled.T_metric_camera.copy()
+        answer = found.refined.T_metric_camera.copy()
         answer[:3, 3] /= unit
         side = np.r_[np.ones(3), np.full(3, 1 / unit)]
         known = found.covariance * np.outer(side, side)
@@ -400,10 +399,10 @@ class Started:
         out[:3, 3] *= self.held.localizer.metres.get(self.held.localizer.placed[scene].component, 1.0)
         return out
 
-    def _covered(self, shot: Shot, scene: str, picture: Picture) -> float:
+    def _covered(self, shot: Shot, scene: str, picture: ScaledPhoto) -> float:
         small = (picture.size_px[0] // 4, picture.size_px[1] // 4)
         placed = [self.held.localizer.placed[scene]]
-        looks = look(placed, self._metric(shot, scene), picture.intrinsics_px / 4, small, Features())
+        looks = render_scenes(placed, self._metric(shot, scene), picture.intrinsics_px / 4, small)
         return float((looks[0].alpha > 0.9).mean())
 
 
@@ -417,8 +416,8 @@ def sift_beside_colmap(shots: list[Shot]) -> None:
     ours, params = sift.make({}, sift.Params()), sift.Params()
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu, options.num_threads = False, 1
-    options.sift.max_num_features, options.sift.peak_threshold = params.max_features, params.peak_threshold
-    options.sift.edge_threshold, options.sift.normalization = params.edge_threshold, pycolmap.Normalization.L1_ROOT
+    options.sift.max_num_features, options.sift.peak_threshold = params.max_features, sift.PEAK_THRESHOLD
+    options.sift.edge_threshold, options.sift.normalization = sift.EDGE_THRESHOLD, pycolmap.Normalization.L1_ROOT
     warnings.simplefilter("ignore", DeprecationWarning)
     theirs = pycolmap.Sift(options, pycolmap.Device.cpu)
     same, apart, seconds = [], [], np.zeros(2)
@@ -446,17 +445,17 @@ class PosedPhotos:
 
     def __init__(self, data: Path, held: World) -> None:
         self.held = held
-        self.features: list[tuple[str, Described, np.ndarray, np.ndarray]] = []  # scene, features, words, points
+        self.features: list[tuple[str, FeatureSet, np.ndarray, np.ndarray]] = []  # scene, features, words, points
         began = time.process_time()
         for shot, scene in _photographs(data, held):
             camera = Cameras(shot.T_world_camera[None], shot.photo.intrinsics_px[None], np.array([shot.photo.size_px]))
             placed = held.localizer.placed[scene]
             shown = render(placed.gaussians, camera, dominant_id=False, backend="native")
             found = held.localizer.extractor.extract(shot.photo.rgb)
-            rows, points = lifted(found, shown, camera)
-            described = Described(quantised(found.descriptors[rows]), np.zeros(len(rows), np.uint8))
+            rows, points = lift(found, shown, camera)
+            described = FeatureSet(quantize(found.descriptors[rows]), np.zeros(len(rows), np.uint8))
             at = placed.S_metric_scene.apply(points)
-            self.features.append((scene, described, words_of(found), at))
+            self.features.append((scene, described, word_histogram(found), at))
         print(f"features of {len(self.features)} posed photographs: {time.process_time() - began:.0f} CPU s")
 
     def __call__(self, photo: Photo, allowed: set[str]) -> tuple[LocalizationResult, float]:
@@ -465,14 +464,14 @@ class PosedPhotos:
         began = time.process_time()
         localizer = self.held.localizer
         found = localizer.extractor.extract(photo.rgb)
-        mine = Described(quantised(found.descriptors), np.zeros(len(found), np.uint8))
-        mine_words = words_of(found)
+        mine = FeatureSet(quantize(found.descriptors), np.zeros(len(found), np.uint8))
+        mine_words = word_histogram(found)
         known = [one for one in self.features if one[0] in allowed]
         likeness = np.array([one[2] @ mine_words for one in known])
         parts: dict[int, list[tuple[str, np.ndarray, np.ndarray]]] = {}
         for k in np.argsort(-likeness, kind="stable")[:MOST_PHOTOS]:
             scene, described, _, points = known[k]
-            rows, columns = matched(mine, described, localizer.params.matching)
+            rows, columns = match_features(mine, described)
             component = localizer.placed[scene].component
             parts.setdefault(component, []).append((scene, found.pixels[rows], points[columns]))
         best, why = None, LocalizationResult(photo.name, "too few agree")

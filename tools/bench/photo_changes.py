@@ -33,10 +33,10 @@ import numpy as np
 import gsmap_synthetic as synthetic
 from gsmap.errors import ConfigError
 from gsmap.formats import read, read_cameras
-from gsmap.localize import Params, PlacedFeatures
-from gsmap.localize.candidates import Candidate
-from gsmap.localize.differences import compare_photo, open_eyes
-from gsmap.localize.localizing import judged_pose, placement, prepared
+from gsmap.localize import MapScene, Params
+from gsmap.localize.candidates import PoseCandidate
+from gsmap.localize.differences import compare_photo, render_capture_views
+from gsmap.localize.localization import evaluate_pose, make_placement, scale_photo
 from gsmap.types import Cameras, Sim3
 from gsmap.types.localization import Photo
 from gsmap_synthetic.change import pixel_kinds, sight, states
@@ -126,24 +126,23 @@ def measured(folder: Path, path: Path, verbose: bool) -> Iterator[tuple[str, dic
     """What is found in each photograph, beside what is true."""
     scenes = [_placed(folder, k) for k in range(2)]
     params = Params()
-    eyes = {
-        one.scene: open_eyes(one, read_cameras(folder / f"{one.scene}.cameras.json"), params.differences)
-        for one in scenes
-    }
+    eyes = {one.scene: render_capture_views(one, read_cameras(folder / f"{one.scene}.cameras.json")) for one in scenes}
     by_id = {one.scene: one for one in scenes}
     with np.load(path) as told:
         held = {name: told[name] for name in told.files}
     for number, kind in enumerate(held["kind"].tolist()):
         photo = Photo(held["rgb"][number], held["lens"][number], 0.0, f"{kind} {number}")
-        picture, scale = prepared(photo, params)
-        rough = Candidate(0, held["pose"][number], picture.intrinsics_px, MATCHES, tuple(by_id))
-        judged = judged_pose(picture, rough, by_id, params)
-        where = placement(photo.name, judged, 0.0, picture, scale, by_id, params)
+        picture, scale = scale_photo(photo, params.views.image_size_px)
+        rough = PoseCandidate(0, held["pose"][number], picture.intrinsics_px, MATCHES, tuple(by_id))
+        judged = evaluate_pose(picture, rough, by_id, params.verdict.aliased_prior)
+        where = make_placement(photo.name, judged, 0.0, picture, scale, by_id, params.verdict)
         if not where.is_placed:
             continue
         began = time.process_time()
         support = [by_id[scene] for scene in where.scenes]
-        found = compare_photo(photo, where.T_map_camera, where.covariance, where.intrinsics_px, support, eyes, params)
+        pose = (where.T_map_camera, where.covariance, where.intrinsics_px)
+        options = (params.views.image_size_px, params.min_change_fraction)
+        found = compare_photo(photo, *pose, support, eyes, *options)
         seconds = time.process_time() - began
         known = ~held["doors"][number]
         truth = (held["truth"][number] > 0) & known
@@ -159,7 +158,13 @@ def measured(folder: Path, path: Path, verbose: bool) -> Iterator[tuple[str, dic
             mine = (ids == thing) & known & found.compared
             if mine.mean() >= SEEN:
                 things.append(float(mask[mine].mean()))
-        row = {"boxes": len(boxes), "right": sum(right), "things": things, "cpu": seconds, "judged": found.judged}
+        row = {
+            "boxes": len(boxes),
+            "right": sum(right),
+            "things": things,
+            "cpu": seconds,
+            "judged": found.compared_fraction,
+        }
         kinds = [
             (one.kind, int(np.bincount(held["truth"][number][one.mask], minlength=4)[1:].argmax()) + 1)
             for one, fits in zip(regions, right, strict=True)
@@ -168,11 +173,14 @@ def measured(folder: Path, path: Path, verbose: bool) -> Iterator[tuple[str, dic
         row["kinds"] = kinds
         if verbose:
             strengths = [f"{one.kind} {one.strength:.2f} {one.share:.1%}" for one in regions]
-            print(f"  {photo.name} judged {found.judged:.0%}: {strengths} right {right}; things {np.round(things, 2)}")
+            print(
+                f"  {photo.name} compared {found.compared_fraction:.0%}: {strengths} right {right}; "
+                f"things {np.round(things, 2)}"
+            )
         yield kind, row
 
 
-def _placed(folder: Path, k: int) -> PlacedFeatures:
+def _placed(folder: Path, k: int) -> MapScene:
     told = json.loads((folder / "truth" / f"c{k}.json").read_text())
     gaussians = read(folder / f"c{k}.ply")
     S = Sim3.from_matrix(np.array(told["T_scene_world"])).inverse()
@@ -180,7 +188,7 @@ def _placed(folder: Path, k: int) -> PlacedFeatures:
     def none() -> object:
         raise AssertionError("features are not needed")
 
-    return PlacedFeatures(f"c{k}", S, 0, None, lambda: gaussians, none)  # type: ignore[arg-type]
+    return MapScene(f"c{k}", S, 0, None, lambda: gaussians, none)  # type: ignore[arg-type]
 
 
 def say(kind: str, rows: list[dict]) -> None:

@@ -31,8 +31,8 @@ import numpy as np
 
 import gsmap_synthetic as synthetic
 from gsmap.localize import localize_photo
+from gsmap.localize.map_scene import MapScene
 from gsmap.localize.params import Params
-from gsmap.localize.placed import PlacedFeatures
 from gsmap.methods import family
 from gsmap.types.localization import LocalizationResult, Photo
 from gsmap_synthetic.capture import unused_doors
@@ -48,7 +48,7 @@ STREET_SEED, DECORATIONS, ROOMS = 81, 5, 15
 class Map:
     """Some scenes, ready to be asked; each place a component of its own."""
 
-    def __init__(self, scenes: list[PlacedFeatures], params: Params) -> None:
+    def __init__(self, scenes: list[MapScene], params: Params) -> None:
         self.scenes, self.params = {scene.scene: scene for scene in scenes}, params
         self.index = index_of(scenes, params)
         self.extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
@@ -70,7 +70,7 @@ def strangers(count: int) -> Iterator[tuple[np.ndarray, dict, str]]:
             yield image, told, f"{seed} photo {k}"
 
 
-def all_places(folder: Path, cache: Path, params: Params) -> list[PlacedFeatures]:
+def all_places(folder: Path, cache: Path, params: Params) -> list[MapScene]:
     """The captures of all test places, each place a component."""
     out = []
     for number, place in enumerate(places(folder, "test", cache, params)):

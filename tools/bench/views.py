@@ -28,12 +28,12 @@ import numpy as np
 
 import gsmap.map
 from gsmap.localize import index_recipe, new_segment, resection, view_index
-from gsmap.localize.features import quantised, turns
-from gsmap.localize.localizing import photo_features, prepared
-from gsmap.localize.matching import Described, matched
+from gsmap.localize.features import quantize, quantize_angles
+from gsmap.localize.localization import SMOOTH_PX, extract_features, scale_photo
+from gsmap.localize.matching import FeatureSet, match_features
 from gsmap.localize.params import Params
-from gsmap.localize.retrieval import ViewIndex, most_alike
-from gsmap.localize.words import words_for
+from gsmap.localize.retrieval import ViewIndex, retrieve_views
+from gsmap.localize.vocabulary import load_vocabulary
 from gsmap.methods import family
 from gsmap.types.segments import Segment, merged
 from tools.bench.localize import Others
@@ -46,17 +46,20 @@ class Asked:
     """A photograph, and how many right matches it has with each view of its place."""
 
     def __init__(self, place: Place, told: dict, params: Params, extractor) -> None:
-        self.picture, _ = prepared(place.photo(told), params)
-        self.found = photo_features(self.picture, extractor, params.matching.smooth_px)
+        self.picture, _ = scale_photo(place.photo(told), params.views.image_size_px)
+        self.found = extract_features(self.picture, extractor, SMOOTH_PX)
         self.right: dict[tuple[str, int], int] = {}
-        mine, truth = Described(quantised(self.found.descriptors), turns(self.found)), np.array(told["T_world_camera"])
+        mine, truth = (
+            FeatureSet(quantize(self.found.descriptors), quantize_angles(self.found)),
+            np.array(told["T_world_camera"]),
+        )
         for scene in place.scenes:
             held = scene.features
             for view, (a, b) in enumerate(zip(held.starts[:-1], held.starts[1:], strict=True)):
-                rows, columns = matched(mine, Described(held.descriptors[a:b], held.angles[a:b]), params.matching)
+                rows, columns = match_features(mine, FeatureSet(held.descriptors[a:b], held.angles[a:b]))
                 points = scene.S_metric_scene.apply(held.points[a:b][columns])
-                picture = (self.picture.intrinsics_px, self.picture.size_px, params.resection)
-                agree = resection.agreeing(self.found.pixels[rows], points, truth, *picture)
+                picture = (self.picture.intrinsics_px, self.picture.size_px)
+                agree = resection.find_inliers(self.found.pixels[rows], points, truth, *picture)
                 self.right[scene.scene, view] = int(agree.sum())
 
     def has(self, views: list[tuple[str, int]]) -> bool:
@@ -68,7 +71,9 @@ def crowd(made: list[Place], num_scenes: int, params: Params) -> Segment:
     """A segment of so many scenes that show something else."""
     rng = np.random.default_rng(7)
     kept = [scene.features for place in made for scene in place.scenes]
-    others = Others(words_for(kept[0].descriptors.shape[1]), np.concatenate([found.descriptors for found in kept]))
+    others = Others(
+        load_vocabulary(kept[0].descriptors.shape[1]), np.concatenate([found.descriptors for found in kept])
+    )
     parts = []
     for start in range(0, num_scenes, 64):
         there = []
@@ -76,7 +81,7 @@ def crowd(made: list[Place], num_scenes: int, params: Params) -> Segment:
             found = kept[number % len(kept)]
             found = found if number < len(kept) else others.like(found, rng)
             there.append((replace(found, scene=f"{number:032x}"), "0" * 32))
-        parts.append(new_segment(there, params.features.indexed))
+        parts.append(new_segment(there))
     return merged(parts)
 
 
@@ -85,7 +90,7 @@ def say(name: str, asked: list[tuple[Asked, ViewIndex]], params: Params) -> None
     first, good, seconds = [], 0, []
     for one, index in asked:
         began = time.process_time()
-        views = most_alike(index, one.found, one.picture.intrinsics_px, params.matching.views, params.retrieval)
+        views = retrieve_views(index, one.found, one.picture.intrinsics_px, params.max_views)
         seconds.append(time.process_time() - began)
         own = {scene for scene, _ in one.right}
         scenes = list(dict.fromkeys(scene for scene, _ in views))
@@ -94,7 +99,7 @@ def say(name: str, asked: list[tuple[Asked, ViewIndex]], params: Params) -> None
     ranks = ", ".join(f"{sum(rank < k for rank in first)} in {k}" for k in (1, 3, 6))
     print(
         f"{name}: of {len(asked)} photographs that can be found {good} have right views among the first "
-        f"{params.matching.views}; right scene first {ranks}; {np.median(seconds):.2f} CPU s each (median)",
+        f"{params.max_views}; right scene first {ranks}; {np.median(seconds):.2f} CPU s each (median)",
         flush=True,
     )
 
@@ -111,7 +116,7 @@ def main() -> int:
     test, fitted = (places(args.places, split, args.cache, params) for split in ("test", "fit"))
     shots: list[tuple[Asked, Segment]] = []
     for place in [place for place in test if args.only is None or place.seed in args.only]:
-        own = new_segment([(scene.features, "0" * 32) for scene in place.scenes], params.features.indexed)
+        own = new_segment([(scene.features, "0" * 32) for scene in place.scenes])
         made = [Asked(place, told, params, extractor) for told in place.photos]
         shots += [(one, own) for one in made if one.has(list(one.right))]
     say("in its own place alone", [(one, view_index([own])) for one, own in shots], params)

@@ -30,7 +30,7 @@ from gsmap.optimize import joint_covariance, optimize
 from gsmap.types import PoseGraph
 from gsmap.types.world import ControlPoint, Georeference, ImagePoint, Survey
 from gsmap.world.crs import ECEF
-from gsmap.world.frame import of_frame, to_frame
+from gsmap.world.frame import from_frame, to_frame
 from gsmap.world.survey import in_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, ground, surveyed_site
 
@@ -190,12 +190,12 @@ def through_a_map(folder: Path, params: SiteParams) -> None:
     frame, (tileset,) = tie.frame, (folder / "tiles").glob("component_0/tileset.json")
     transform = np.reshape(json.loads(tileset.read_text())["root"]["transform"], (4, 4)).T
     stored = tiles3d.read(tileset).means[::1000].astype(np.float64)
-    from_tiles = of_frame(frame, to_frame(frame, stored @ transform[:3, :3].T + transform[:3, 3], ECEF))
-    want = of_frame(frame, tie.S_world_map.apply(stored))
+    from_tiles = from_frame(frame, to_frame(frame, stored @ transform[:3, :3].T + transform[:3, 3], ECEF))
+    want = from_frame(frame, tie.S_world_map.apply(stored))
     off = 1000 * np.abs(from_tiles - want).max()
     print(f"from 3D Tiles' Earth-centred frame back to {frame.crs}: off by {off:.2g} mm")
     utm = np.array([v for v in before.values() if v is not None])
-    there = of_frame(frame, to_frame(frame, utm))
+    there = from_frame(frame, to_frame(frame, utm))
     print(f"{frame.crs} to the world frame and back: off by {1000 * np.abs(there - utm).max():.2g} mm")
 
 

@@ -1,12 +1,12 @@
 """What photographs of one place are worth to each other, on clips through made places and streets: tables to choose by.
 
     python -m tools.make.localize_places PLACES --set fit
-    python -m tools.fit.clips PLACES alike --cache FOLDER    # `localize.together`: a room that looks alike
-    python -m tools.fit.clips PLACES bundle --cache FOLDER   # `localize.bundle`: how they are adjusted at once
+    python -m tools.fit.clips PLACES alike --cache FOLDER    # constants of `joint_localization` against aliased rooms
+    python -m tools.fit.clips PLACES bundle --cache FOLDER   # constants of `bundle_adjustment`
 
 Clips are those of ``tools/bench/clips.py``, of the places that curves are fitted on. They are looked into once (a
 quarter of an hour of two cores) and kept in FOLDER by what takes part; tables take minutes. Nothing is written:
-defaults are in `gsmap.localize.tying` and `gsmap.localize.bundle`.
+the constants are in `gsmap.localize.joint_localization` and `gsmap.localize.bundle_adjustment`.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -33,8 +33,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from gsmap.localize import bundle, together, verdict
-from gsmap.localize.localizing import rival_of, sigmas_of
+from gsmap.localize import bundle_adjustment, joint_localization, verdict
+from gsmap.localize.localization import max_sigmas, rival_probability
 from gsmap.localize.params import Params
 from gsmap.methods import family
 from gsmap.types.plain import canonical, plain
@@ -42,14 +42,7 @@ from tools.bench.clips import Frame, made_clips, street_clips
 from tools.fit.localize import WRONG_DEG, WRONG_M, Place, camera_error, index_of, places_and_streets
 
 COVERED = 0.2
-_LATER = (
-    "together",
-    "bundle",
-    "clips",
-    "differences",
-    "sighted",
-    "small",
-)  # settings that take no part in what is kept
+_LATER = ("clips", "min_change_fraction")  # settings that take no part in what is kept
 
 
 @dataclass(eq=False)
@@ -68,8 +61,8 @@ class Seen:
     probability: float
     sigmas: tuple[float, float]
     rival: float
-    known: bundle.Shown | None
-    free: bundle.Shown
+    known: bundle_adjustment.BundlePhoto | None
+    free: bundle_adjustment.BundlePhoto
 
 
 @dataclass(eq=False)
@@ -79,7 +72,7 @@ class Clip:
     kind: str
     seen: list[Seen]
     ties: dict[tuple[int, int], bool]
-    matches: bundle.Matches
+    matches: bundle_adjustment.Matches
 
 
 def clips_of(place: Place, params: Params) -> list[Clip]:
@@ -91,21 +84,23 @@ def clips_of(place: Place, params: Params) -> list[Clip]:
     filmed = street_clips(place) if is_street else (("made", frames) for frames in made_clips(place, params))
     out = []
     for kind, frames in filmed:
-        shots, near, ties = together.looked_into([frame.photo for frame in frames], index, scenes, extractor, params)
-        seen = [_seen(frame, shot, params) for frame, shot in zip(frames, shots, strict=True)]
-        out.append(Clip(kind, seen, dict(ties), together.matches_of(shots, near, params)))
+        shots, near, ties = joint_localization.evaluate_photos(
+            [frame.photo for frame in frames], index, scenes, extractor, params
+        )
+        seen = [_seen(frame, shot) for frame, shot in zip(frames, shots, strict=True)]
+        out.append(Clip(kind, seen, dict(ties), joint_localization.match_neighbours(shots, near)))
     print(f"{place.seed}: {len(out)} clips", flush=True)
     return out
 
 
-def _seen(frame: Frame, shot: together.Shot, params: Params) -> Seen:
-    best, free = shot.best, together.shown(shot, False)
+def _seen(frame: Frame, shot: joint_localization.PhotoState) -> Seen:
+    best, free = shot.best, joint_localization.bundle_photo(shot, False)
     blank = replace(frame, photo=replace(frame.photo, rgb=frame.photo.rgb[:1, :1]))
     if best is None:
         return Seen(blank, None, 0.0, (np.inf, np.inf), 0.0, None, free)
-    known = None if best.covariance is None else together.shown(shot, True)
-    rival = rival_of(shot.judged, params)
-    return Seen(blank, best.evidence, best.probability, sigmas_of(best.covariance), rival, known, free)
+    known = None if best.covariance is None else joint_localization.bundle_photo(shot, True)
+    rival = rival_probability(shot.poses)
+    return Seen(blank, best.evidence, best.probability, max_sigmas(best.covariance), rival, known, free)
 
 
 def all_clips(folder: Path, cache: Path, params: Params, workers: int) -> list[Clip]:
@@ -128,17 +123,19 @@ def placed(clip: Clip, params: Params) -> list[bool]:
         SimpleNamespace(
             best=None if one.evidence is None else SimpleNamespace(evidence=one.evidence),
             probability=one.probability,
-            led=False,
+            unsupported=False,
         )
         for one in clip.seen
     ]
     out = []
-    elsewhere = together.elsewhere([one.probability - one.rival for one in clip.seen], clip.ties, params)
-    probable_of = together.probabilities(shots, clip.ties, params)
+    elsewhere = joint_localization.rival_factors([one.probability - one.rival for one in clip.seen], clip.ties)
+    probable_of = joint_localization.combine_probabilities(shots, clip.ties, params.verdict.aliased_prior)
     for one, probable, with_others in zip(clip.seen, probable_of, elsewhere, strict=True):
-        bars = replace(params.verdict, min_inliers=0) if probable > one.probability else params.verdict
+        min_inliers = 0 if probable > one.probability else verdict.MIN_INLIERS
         rival = one.rival * with_others
-        said = one.evidence is not None and not verdict.judge(one.evidence, probable, one.sigmas, rival, bars)
+        said = one.evidence is not None and not verdict.rejection_reason(
+            one.evidence, probable, one.sigmas, rival, params.verdict, min_inliers
+        )
         out.append(said and one.known is not None)
     return out
 
@@ -154,15 +151,17 @@ def say_alike(clips: Sequence[Clip], params: Params) -> None:
         "shared  usual  most   of rooms that look alike placed   of the map's own placed right, wrong   of made clips"
     )
     for shared, usual, most in product((0.25, 0.5, 0.75, 1.0), (1.0, 1.75, 2.5), (2.0, 4.0, 8.0)):
-        one = replace(params, together=replace(params.together, shared=shared, usual=usual, most=most))
+        default = _constants()
+        _set_constants(shared, usual, most)
         counts = {kind: np.zeros(4, int) for kind in ("alike", "own", "made")}
         for clip in clips:
-            for seen, said in zip(clip.seen, placed(clip, one), strict=True):
+            for seen, said in zip(clip.seen, placed(clip, params), strict=True):
                 right = said and is_right(seen.known.T_metric_camera, seen.frame)
                 covered = seen.frame.coverage >= COVERED
                 counts[clip.kind] += [1, said, right and covered, covered]
         alike, own, made = (counts[kind] for kind in ("alike", "own", "made"))
-        star = "*" if (shared, usual, most) == _of(params.together) else " "
+        _set_constants(*default)
+        star = "*" if (shared, usual, most) == default else " "
         print(
             f"{shared:5.2f}{star} {usual:6.2f} {most:5.0f}   {alike[1]:5d} of {alike[0]}"
             f"                       {own[2]:5d} of {own[3]}, {own[1] - own[2]:3d}"
@@ -171,8 +170,14 @@ def say_alike(clips: Sequence[Clip], params: Params) -> None:
         )
 
 
-def _of(params) -> tuple[float, float, float]:
-    return params.shared, params.usual, params.most
+def _constants() -> tuple[float, float, float]:
+    module = joint_localization
+    return module.SHARED_EVIDENCE, module.EXPECTED_LOG_ODDS, module.MAX_LOG_ODDS
+
+
+def _set_constants(shared: float, usual: float, most: float) -> None:
+    module = joint_localization
+    module.SHARED_EVIDENCE, module.EXPECTED_LOG_ODDS, module.MAX_LOG_ODDS = shared, usual, most
 
 
 def say_bundle(clips: Sequence[Clip], params: Params) -> None:
@@ -186,22 +191,28 @@ def say_bundle(clips: Sequence[Clip], params: Params) -> None:
     ]
     print("each by the map:            ", _errors(before))
     changes: list[tuple[str, object]] = [("", None)]
-    changes += [("loose", (1.0,)), ("loose", (1.0, 1.0)), ("loose", (3.0, 1.0)), ("doubt", 0.5), ("doubt", 2.0)]
-    changes += [("min_points", 8), ("min_points", 20), ("supporters", 1), ("max_error_px", 3.0), ("max_off", 1e6)]
-    changes += [("alike", 0.0), ("alike", 0.2), ("alike", 1.0), ("alike_px", 1.0), ("alike_px", 3.0), ("usual", 1e9)]
+    changes += [("TOLERANCES", (1.0,)), ("TOLERANCES", (1.0, 1.0)), ("TOLERANCES", (3.0, 1.0))]
+    changes += [("ROBUST_SIGMAS", 0.5), ("ROBUST_SIGMAS", 2.0), ("MIN_POINTS", 8), ("MIN_POINTS", 20)]
+    changes += [("MIN_SUPPORTERS", 1), ("MAX_ERROR_PX", 3.0), ("MAX_SHIFT_SIGMAS", 1e6), ("VARIANCE_PRIOR", 1e9)]
+    changes += [("POSE_CORRELATION", 0.0), ("POSE_CORRELATION", 0.2), ("POSE_CORRELATION", 1.0)]
+    changes += [("CORRELATED_FEATURE_PX", 1.0), ("CORRELATED_FEATURE_PX", 3.0)]
     for name, value in changes:
-        asked = replace(params.bundle, **({name: value} if name else {}))
+        default = getattr(bundle_adjustment, name) if name else None
+        if name:
+            setattr(bundle_adjustment, name, value)
         began = time.process_time()
         of_map, found = [], []
         for clip, told in zip(clips, said, strict=True):
             photos = [seen.known if one else seen.free for seen, one in zip(clip.seen, told, strict=True)]
-            for k, one in bundle.adjusted(photos, clip.matches, asked, params.resection)[0].items():
-                turn, shift = sigmas_of(one.covariance)
+            for k, one in bundle_adjustment.adjust_photos(photos, clip.matches)[0].items():
+                turn, shift = max_sigmas(one.covariance)
                 bars = params.verdict
                 if np.degrees(turn) < bars.max_rotation_sigma_deg and shift < bars.max_translation_sigma_m:
                     row = (one.T_metric_camera, one.covariance, clip.seen[k].frame)
-                    (found if one.by else of_map).append(row)
+                    (found if one.resected_from else of_map).append(row)
         seconds = (time.process_time() - began) / max(sum(len(clip.seen) for clip in clips), 1)
+        if name:
+            setattr(bundle_adjustment, name, default)
         title = f"{name} {value}" if name else "as it is set"
         print(f"{title:28s} {_errors(of_map)}; {seconds:.3f} CPU s a frame")
         print(f"{'':24s}found {_errors(found)}", flush=True)

@@ -1,4 +1,4 @@
-"""Fit what the differences of two things are worth for finding things that are alike (gsmap/find/likeness.json).
+"""Fit what the differences of two things are worth for finding things that are alike (gsmap/find/similarity.json).
 
     python -m tools.fit.find --cache FOLDER --seeds 200 210
 
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import gsmap.find
-from gsmap.find.likeness import DIFFERENCES, Model, differences
+from gsmap.find.similarity import DIFFERENCES, SimilarityModel, differences
 from tools.bench.find_scores import Item, average_precisions, by_model, items_of
 from tools.fit.monotone import fit_curves
 from tools.make import find_places
@@ -30,7 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs=2, default=(200, 210), metavar=("FIRST", "END"))
     parser.add_argument("--cache", type=Path)
-    parser.add_argument("--write", action="store_true", help="write gsmap/find/likeness.json")
+    parser.add_argument("--write", action="store_true", help="write gsmap/find/similarity.json")
     args = parser.parse_args()
     places = [items_of(find_places.cached(seed, args.cache)) for seed in range(*args.seeds)]
     pairs = [pairs_of(place) for place in places]
@@ -49,7 +49,7 @@ def main() -> None:
             name: {"knots": [round(k, 4) for k in knots], "worth": [round(w, 4) for w in worth]}
             for name, knots, worth in zip(DIFFERENCES, model.knots, model.worth, strict=True)
         }
-        path = Path(gsmap.find.__file__).with_name("likeness.json")
+        path = Path(gsmap.find.__file__).with_name("similarity.json")
         path.write_text(json.dumps({"base": round(model.base, 4), "curves": curves}, indent=1) + "\n")
 
 
@@ -63,11 +63,11 @@ def pairs_of(items: Sequence[Item]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows), np.concatenate(same)
 
 
-def fit(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Model:
+def fit(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> SimilarityModel:
     """Curves that only fall; see `tools.fit.monotone`."""
     x, same = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
     knots, worth, base = fit_curves(x, same, ridge=_RIDGE, share=_RIGHT)
-    return Model(tuple(tuple(k.tolist()) for k in knots), tuple(tuple(w.tolist()) for w in worth), base)
+    return SimilarityModel(tuple(tuple(k.tolist()) for k in knots), tuple(tuple(w.tolist()) for w in worth), base)
 
 
 if __name__ == "__main__":

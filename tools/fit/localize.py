@@ -1,12 +1,12 @@
 """Fits what localisation knows before it sees a map: the words of its index, and what its evidence is worth.
 
     python -m tools.make.localize_places PLACES --set fit && python -m tools.make.localize_places PLACES --set test
-    python -m tools.fit.localize PLACES words --cache FOLDER     # writes gsmap/localize/words.npz
-    python -m tools.fit.localize PLACES cells --cache FOLDER     # writes gsmap/localize/unlike.npz
+    python -m tools.fit.localize PLACES words --cache FOLDER     # writes gsmap/localize/vocabulary.npz
+    python -m tools.fit.localize PLACES cells --cache FOLDER     # writes gsmap/localize/mismatch.npz
     python -m tools.fit.localize PLACES verdict --cache FOLDER   # writes gsmap/localize/probability.json
-    python -m tools.fit.localize PLACES sigma --cache FOLDER     # says which `localize.covariance` fits best
-    python -m tools.fit.localize PLACES displaced --cache FOLDER # says which `localize.displacing` fits best
-    python -m tools.fit.localize PLACES agreement --cache FOLDER # what a `localize.settling.min_agreement` costs
+    python -m tools.fit.localize PLACES sigma --cache FOLDER     # prints the best constants of `covariance`
+    python -m tools.fit.localize PLACES displaced --cache FOLDER # prints the best `displacement.FRACTION`
+    python -m tools.fit.localize PLACES agreement --cache FOLDER # prints the cost of `refinement.MIN_AGREEMENT`
     python -m tools.fit.localize PLACES turned --cache FOLDER    # how alike turned matches lead to rough poses
     python -m tools.fit.localize PLACES placed --cache FOLDER    # says what photos of these are placed, and their cost
     python -m tools.fit.localize PLACES test --cache FOLDER      # says how both do on places that they have not seen
@@ -42,26 +42,30 @@ from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
 from gsmap.localize import (
-    aligning,
+    candidates,
     covariance,
+    direct_alignment,
+    displacement,
+    feature_frames,
     features,
-    localizing,
-    looks,
+    localization,
     matching,
+    mismatch,
     probability,
-    settling,
+    refinement,
+    resection,
+    retrieval,
     tracking,
-    turned,
-    unlike,
-    words,
+    vocabulary,
 )
-from gsmap.localize.candidates import Candidate, candidates, matches_by_component
-from gsmap.localize.filters import means
-from gsmap.localize.looks import GREY, smaller
+from gsmap.localize.candidate_renders import GREY, downsample, render_scenes
+from gsmap.localize.candidates import PoseCandidate, match_views, propose_poses
+from gsmap.localize.features import INDEXED_FEATURES
+from gsmap.localize.filters import box_means
+from gsmap.localize.map_scene import MapScene
 from gsmap.localize.params import Params
-from gsmap.localize.placed import PlacedFeatures
-from gsmap.localize.resection import moved
-from gsmap.localize.retrieval import ViewIndex, most_alike, new_segment, view_index
+from gsmap.localize.resection import retract_pose
+from gsmap.localize.retrieval import ViewIndex, new_segment, retrieve_views, view_index
 from gsmap.methods import family
 from gsmap.types import Sim3
 from gsmap.types.localization import Photo, SceneFeatures
@@ -76,7 +80,7 @@ class Place:
     """A made place: its captures where they truly lie, and its photographs."""
 
     seed: str
-    scenes: list[PlacedFeatures]
+    scenes: list[MapScene]
     photos: list[dict]
     folder: Path
 
@@ -100,7 +104,7 @@ def _place(folder: Path, cache: Path, params: Params) -> Place:
     return Place(folder.name, scenes, json.loads((folder / "photos.json").read_text()), folder)
 
 
-def load_place(folder: Path, cache: Path, params: Params) -> list[PlacedFeatures]:
+def load_place(folder: Path, cache: Path, params: Params) -> list[MapScene]:
     """The captures in a folder where they truly lie, with their features, which are kept."""
     scenes = []
     for path in sorted(folder.glob("*.ply")):
@@ -108,7 +112,7 @@ def load_place(folder: Path, cache: Path, params: Params) -> list[PlacedFeatures
         read = partial(_gaussians, path)
         found = partial(_features, path, cache, params)
         scene = f"{folder.name}/{path.stem}"
-        scenes.append(PlacedFeatures(scene, Sim3.from_matrix(truth).inverse(), 0, None, read, found))
+        scenes.append(MapScene(scene, Sim3.from_matrix(truth).inverse(), 0, None, read, found))
     return scenes
 
 
@@ -117,7 +121,7 @@ def _gaussians(path: Path):
 
 
 def _features(path: Path, cache: Path, params: Params) -> SceneFeatures:
-    settings = canonical(plain([params.views, params.features, params.extractors[params.extractor]]))
+    settings = canonical(plain([params.views, params.extractors[params.extractor]]))
     code = hashlib.sha256(settings.encode()).hexdigest()[:8]
     kept = cache / f"{path.parent.name}-{path.stem}-{code}.pickle"
     if kept.exists():
@@ -128,7 +132,7 @@ def _features(path: Path, cache: Path, params: Params) -> SceneFeatures:
     extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
     began = time.process_time()
     found = features.scene_features(
-        f"{path.parent.name}/{path.stem}", capture.gaussians, capture.cameras, extractor, params.views, params.features
+        f"{path.parent.name}/{path.stem}", capture.gaussians, capture.cameras, extractor, params.views
     )
     seconds = time.process_time() - began
     print(f"{found.scene}: {found.num_views} views, {found.num_features} features, {seconds:.1f} CPU s")
@@ -146,13 +150,15 @@ def fit_words(found: list[Place], params: Params) -> None:
     from scipy.cluster.vq import kmeans2
 
     extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
-    shown = {scene.scene: _indexed(scene.features, params) for place in found for scene in place.scenes}
+    shown = {scene.scene: _indexed(scene.features) for place in found for scene in place.scenes}
     asking: dict[str, np.ndarray] = {}
     for place in found:
-        pictures = [localizing.prepared(place.photo(told), params)[0] for told in place.photos]
-        smooth = params.matching.smooth_px
+        pictures = [localization.scale_photo(place.photo(told), params.views.image_size_px)[0] for told in place.photos]
         asking[place.seed] = np.concatenate(
-            [localizing.photo_features(picture, extractor, smooth).descriptors for picture in pictures]
+            [
+                localization.extract_features(picture, extractor, localization.SMOOTH_PX).descriptors
+                for picture in pictures
+            ]
         )
     everything = np.concatenate([*shown.values(), *asking.values()])
     some = everything[np.random.default_rng(0).permutation(len(everything))[:120_000]].astype(np.float32)
@@ -167,43 +173,39 @@ def fit_words(found: list[Place], params: Params) -> None:
         "axes": axes,
         "centres": np.round(centres / step).astype(np.int8),
         "step": np.float32(step),
-        "turned": words.turned_axes(NUM_AXES).astype(np.float16),
-        "chance": np.zeros(words.NUM_SIGNS + 1, np.float32),
+        "turned": vocabulary.random_sign_axes(NUM_AXES).astype(np.float16),
+        "chance": np.zeros(vocabulary.NUM_SIGNS + 1, np.float32),
     }
-    np.savez_compressed(ROOT / "words.npz", **kept)
-    words.words_for.cache_clear()
-    kept["chance"] = _chance(words.words_for(some.shape[1]), shown, asking, params).astype(np.float32)
-    np.savez_compressed(ROOT / "words.npz", **kept)
-    words.words_for.cache_clear()
-    size = (ROOT / "words.npz").stat().st_size >> 10
+    np.savez_compressed(ROOT / "vocabulary.npz", **kept)
+    vocabulary.load_vocabulary.cache_clear()
+    kept["chance"] = _chance(vocabulary.load_vocabulary(some.shape[1]), shown, asking).astype(np.float32)
+    np.savez_compressed(ROOT / "vocabulary.npz", **kept)
+    vocabulary.load_vocabulary.cache_clear()
+    size = (ROOT / "vocabulary.npz").stat().st_size >> 10
     share = values[::-1][:NUM_AXES].sum() / values.sum()
     print(f"{len(everything)} features, {share:.1%} of their variance kept: {size} KB")
-    told = ", ".join(f"{signs}: {kept['chance'][signs]:.2g}" for signs in range(4, params.retrieval.max_signs + 1, 4))
+    told = ", ".join(f"{signs}: {kept['chance'][signs]:.2g}" for signs in range(4, retrieval.MAX_HAMMING + 1, 4))
     print(f"features of a scene that is another place, by signs that differ at most: {told}")
 
 
-def _indexed(held: SceneFeatures, params: Params) -> np.ndarray:
+def _indexed(held: SceneFeatures) -> np.ndarray:
     """Descriptors of what an index holds of a scene."""
     views = zip(held.starts[:-1], held.starts[1:], strict=True)
-    return np.concatenate([held.descriptors[a : min(b, a + params.features.indexed)] for a, b in views]) / np.float32(
-        254
-    )
+    return np.concatenate([held.descriptors[a : min(b, a + INDEXED_FEATURES)] for a, b in views]) / np.float32(254)
 
 
-def _chance(
-    held: words.Words, shown: dict[str, np.ndarray], asking: dict[str, np.ndarray], params: Params
-) -> np.ndarray:
+def _chance(held: vocabulary.Vocabulary, shown: dict[str, np.ndarray], asking: dict[str, np.ndarray]) -> np.ndarray:
     """(65,) features of a scene within so many signs of a photo's, where it shows another place."""
-    counts, pairs = np.zeros(words.NUM_SIGNS + 1), 0
+    counts, pairs = np.zeros(vocabulary.NUM_SIGNS + 1), 0
     rng = np.random.default_rng(2)
     for seed, descriptors in asking.items():
-        short = held.shortened(descriptors[rng.permutation(len(descriptors))[:2000]])
-        probed = held.nearest(short, params.retrieval.words)
+        short = held.reduce(descriptors[rng.permutation(len(descriptors))[:2000]])
+        probed = held.nearest(short, retrieval.NUM_WORDS)
         for scene, theirs in shown.items():
             if scene.startswith(f"{seed}/"):
                 continue
             pairs += len(short)
-            other = held.shortened(theirs)
+            other = held.reduce(theirs)
             word = held.nearest(other)[:, 0]
             order = np.argsort(word, kind="stable")
             signs, starts = held.signatures(other, word)[order], np.searchsorted(word[order], np.arange(NUM_WORDS + 1))
@@ -212,7 +214,7 @@ def _chance(
                 sizes = starts[column + 1] - starts[column]
                 within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
                 differ = np.bitwise_count(np.repeat(mine, sizes) ^ signs[np.repeat(starts[column], sizes) + within])
-                counts += np.bincount(differ, minlength=words.NUM_SIGNS + 1)
+                counts += np.bincount(differ, minlength=vocabulary.NUM_SIGNS + 1)
     return np.cumsum(counts) / max(pairs, 1)
 
 
@@ -231,7 +233,7 @@ def fit_cells(found: list[Place], params: Params) -> None:
     print(f"{len(truth)} cells, {truth.mean():.1%} of them show something else")
     for k in range(4):
         _save_network(features[fold != k], truth[fold != k])
-        said = unlike.probabilities(features[fold == k][None])[0]
+        said = mismatch.classify(features[fold == k][None])[0]
         right = truth[fold == k]
         ranks = np.argsort(np.argsort(said))
         area = (ranks[right].mean() - (right.sum() - 1) / 2) / (~right).sum()
@@ -247,19 +249,17 @@ def _cells(place: Place, params: Params) -> tuple[np.ndarray, np.ndarray]:
     with np.load(place.folder / "differs.npz") as held:
         told = list(zip(held["photo"], held["T_map_camera"], held["apart"], strict=True))
     for number, pose, apart in told:
-        picture, _ = localizing.prepared(place.photo(place.photos[number]), params)
-        start = moved(pose, rng.normal(size=6) * np.r_[np.full(3, 0.02), np.full(3, 0.05)])
-        settled = localizing.settled_pose(
-            picture, Candidate(0, start, picture.intrinsics_px, 0, tuple(own)), own, params
-        )
+        picture, _ = localization.scale_photo(place.photo(place.photos[number]), params.views.image_size_px)
+        start = retract_pose(pose, rng.normal(size=6) * np.r_[np.full(3, 0.02), np.full(3, 0.05)])
+        settled = refinement.refine_pose(picture, start, picture.intrinsics_px, place.scenes)
         off = camera_error(settled.T_metric_camera, pose)
         if np.degrees(np.linalg.norm(off[:3])) > RIGHT_DEG or np.linalg.norm(off[3:]) > RIGHT_M:
             continue
         lit = np.clip(picture.rgb * np.float32(2 ** (rng.uniform(-1, 1) / 2.2)), 0, 1)
-        for one in settled.looks:
-            here, known = unlike.cells(smaller(lit, 2), one)
+        for one in settled.renders:
+            here, known = mismatch.cell_features(downsample(lit, 2), one)
             differs = apart[sorted(own).index(one.scene)].astype(np.float32)
-            share = means(differs, unlike.SIDE, step=unlike.STEP)[: known.shape[0], : known.shape[1]]
+            share = box_means(differs, mismatch.SIDE, step=mismatch.STEP)[: known.shape[0], : known.shape[1]]
             rows = np.flatnonzero(known & ((share > 0.5) | (share < 0.05)))  # at edges neither is true
             rows = rng.permutation(rows)[:CELLS]
             features.append(here.reshape(-1, here.shape[2])[rows])
@@ -274,7 +274,7 @@ def _save_network(features: np.ndarray, truth: np.ndarray) -> None:
 
     torch.manual_seed(0)
     mean, spread = features.mean(0, dtype=np.float64), features.std(0, dtype=np.float64) + 1e-6
-    x = torch.tensor(unlike.scaled(features, mean, spread), dtype=torch.float32)
+    x = torch.tensor(mismatch.normalize(features, mean, spread), dtype=torch.float32)
     y = torch.tensor(truth, dtype=torch.float32)
     sizes = (x.shape[1], HIDDEN, HIDDEN, 1)
     layers = [torch.nn.Linear(a, b) for a, b in pairwise(sizes)]
@@ -290,8 +290,8 @@ def _save_network(features: np.ndarray, truth: np.ndarray) -> None:
     kept = {"mean": mean, "spread": spread}
     for k, layer in enumerate(layers):
         kept |= {f"weights{k}": layer.weight.detach().numpy().T, f"offsets{k}": layer.bias.detach().numpy()}
-    np.savez(ROOT / "unlike.npz", **{name: np.asarray(value, np.float32) for name, value in kept.items()})
-    unlike.network.cache_clear()
+    np.savez(ROOT / "mismatch.npz", **{name: np.asarray(value, np.float32) for name, value in kept.items()})
+    mismatch.load_network.cache_clear()
 
 
 # --- verdict ---------------------------------------------------------------------------------------------------------
@@ -357,7 +357,8 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
     them than where photos are placed), and poses that settle from near the truth and from far of it; of photos of rooms
     that look like those of the map, the poses that are found there."""
     extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
-    params = replace(params, max_candidates=4, sure=2.0, evidence=replace(params.evidence, ask_from=0.0))
+    params = replace(params, max_candidates=4)
+    localization.HIGH_PROBABILITY, localization.MIN_COMPARED_PROBABILITY = 2.0, 0.0
     fewer, out = replace(params, max_candidates=2), []
     indexes = {place.seed: index_of(place.scenes, params) for place in found}
     for number, place in enumerate(found):
@@ -366,34 +367,36 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
         rng = np.random.default_rng([int(place.seed), 5])
         for count, told in enumerate(place.photos):
             photo, truth = place.photo(told), np.array(told["T_world_camera"])
-            picture, _ = localizing.prepared(photo, params)
+            picture, _ = localization.scale_photo(photo, params.views.image_size_px)
 
             def row(judged, kind, truth=truth, told=told, name=photo.name):
                 error, nees = errors(judged, truth, kind)
                 return Row(name, kind, dict(judged.evidence), error, nees, told["changed"], told.get("differs", 1.0))
 
-            judged, _ = localizing.judged_poses(picture, indexes[place.seed], own, extractor, params)
+            judged, _ = localization.evaluate_candidates(picture, indexes[place.seed], own, extractor, params)
             if "differs" in told:
                 out += [row(one, "alike") for one in judged]
                 continue
             out += [row(one, "found") for one in judged]
             if count % 2 == 0:
-                judged, _ = localizing.judged_poses(picture, indexes[stranger.seed], other, extractor, fewer)
+                judged, _ = localization.evaluate_candidates(picture, indexes[stranger.seed], other, extractor, fewer)
                 out += [row(one, "elsewhere") for one in judged]
             hidden, lit = hidden_and_lit(picture, rng)
             near = (("hidden", hidden, 0.05), ("lit", lit, 0.05))
             sizes = (0.05, rng.uniform(0.1, 0.4), rng.uniform(0.2, 1.2))
             for kind, shown, size in (*(("moved", picture, size) for size in sizes), *near):
                 xi = np.r_[rng.normal(size=3) * size * 0.4, rng.normal(size=3) * size]
-                start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
-                one = localizing.judged_pose(shown, start, own, params)
+                start = PoseCandidate(0, retract_pose(truth, xi), picture.intrinsics_px, 0, tuple(own))
+                one = localization.evaluate_pose(shown, start, own, params.verdict.aliased_prior)
                 one.evidence["matches"] = float("nan")
                 out.append(row(one, kind))
         print(f"{place.seed}: {len(out)} poses, {time.process_time():.0f} CPU s", flush=True)
     return out
 
 
-def hidden_and_lit(picture: settling.Picture, rng: np.random.Generator) -> tuple[settling.Picture, settling.Picture]:
+def hidden_and_lit(
+    picture: refinement.ScaledPhoto, rng: np.random.Generator
+) -> tuple[refinement.ScaledPhoto, refinement.ScaledPhoto]:
     """The same with somebody in about a tenth of it, and a stop brighter or darker."""
     hidden = occluded((picture.rgb * 255).astype(np.uint8), rng, (0.05, 0.13))[0].astype(np.float32) / 255
     lit = np.clip(picture.rgb * np.float32(2 ** (rng.choice([-1, 1]) * rng.uniform(0.5, 1) / 2.2)), 0, 1)
@@ -404,7 +407,7 @@ def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], f
     """Error in degrees and metres, and the normalised squared error by the covariance."""
     if kind in ("elsewhere", "alike"):
         return (180.0, np.inf), np.nan
-    xi = camera_error(judged.settled.T_metric_camera, truth)
+    xi = camera_error(judged.refined.T_metric_camera, truth)
     error = float(np.degrees(np.linalg.norm(xi[:3]))), float(np.linalg.norm(xi[3:]))
     if judged.covariance is None:
         return error, np.nan
@@ -417,9 +420,9 @@ def camera_error(T: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.r_[turn, shift]
 
 
-def index_of(scenes: list[PlacedFeatures], params: Params) -> ViewIndex:
+def index_of(scenes: list[MapScene], params: Params) -> ViewIndex:
     """All views of some scenes."""
-    return view_index([new_segment([(scene.features, scene.scene) for scene in scenes], params.features.indexed)])
+    return view_index([new_segment([(scene.features, scene.scene) for scene in scenes])])
 
 
 def completed(rows: list[Row]) -> list[Row]:
@@ -487,18 +490,18 @@ def log_odds(model: Odds, rows: list[Row]) -> np.ndarray:
 
 def fit_verdict(rows: list[Row]) -> None:
     """Curves of right poses against wrong ones of other places, and of right poses against those of rooms that look
-    alike; and what comes of `localize.verdict.alike`, of places that were left out."""
+    alike; and what comes of `localize.verdict.aliased_prior`, of places that were left out."""
     alike = np.array([row.kind == "alike" for row in rows])
     right = np.array([row.right for row in rows])
     other, odds_other = calibrated(rows, ~alike)
     rooms, odds_rooms = calibrated(rows, right | alike)
     save(other=other, alike=rooms)
     bars = Params().verdict
-    prior, bar = bars.prior, bars.min_probability
+    prior, bar = probability.PRIOR, bars.min_probability
     for share in (0.35, 0.2, 0.1, 0.05, 0.02, 0.005):
         against = np.exp(-odds_other) * (1 - prior - share) + np.exp(-odds_rooms) * share
         p = prior / (prior + against)
-        if share == bars.alike:
+        if share == bars.aliased_prior:
             report("places left out", rows, p)
         differs = np.array([row.differs for row in rows])
         bands = ((LEAST_TOLD, 0.15), (0.15, 0.3), (0.3, 1.01))
@@ -566,40 +569,39 @@ def fit_sigma(found: list[Place], params: Params) -> None:
     Started near the truth; poses that settle right and are more probable than not. Likelihoods are of Student's t of 8
     degrees of freedom, since a few photos are placed on a part of a map that is bent.
     """
-    plain_sigma = covariance.Params(
-        swell=1.0, swell_aligned=1.0, disagreeing=0.0, hidden_m=0.0, hidden_rad=0.0, differing=0.0
-    )
-    params = replace(params, covariance=plain_sigma)
+    covariance.PATCH_SCALE = covariance.ALIGNMENT_SCALE = 1.0
+    covariance.AGREEMENT_SLOPE = covariance.MODEL_SIGMA_M = covariance.MODEL_SIGMA_RAD = 0.0
+    covariance.DIFFERENCE_WEIGHT = 0.0
     # Errors, what patches and what colours tell, by what the two differ, and how well the render agreed.
     told: list[tuple[np.ndarray, ...]] = []
-    rng, between = np.random.default_rng(7), settling._between
+    rng, between = np.random.default_rng(7), refinement._fuse
 
     for place in found:
         own = {scene.scene: scene for scene in place.scenes}
         for photo_told in place.photos:
             photo, truth = place.photo(photo_told), np.array(photo_told["T_world_camera"])
-            picture, _ = localizing.prepared(photo, params)
+            picture, _ = localization.scale_photo(photo, params.views.image_size_px)
             both: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
-            def noted(pose, lens, by_colours, fit, by_patches, differing, both=both):
+            def noted(pose, lens, by_colours, fit, by_patches, both=both):
                 both.append((by_patches, by_colours, camera_error(pose, fit.T_map_camera)))
-                return between(pose, lens, by_colours, fit, by_patches, differing)
+                return between(pose, lens, by_colours, fit, by_patches)
 
-            settling._between = noted
+            refinement._fuse = noted
             xi = np.r_[rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.05]
-            start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
-            judged = localizing.judged_pose(picture, start, own, params)
-            off = camera_error(judged.settled.T_metric_camera, truth)
+            start = PoseCandidate(0, retract_pose(truth, xi), picture.intrinsics_px, 0, tuple(own))
+            judged = localization.evaluate_pose(picture, start, own, params.verdict.aliased_prior)
+            off = camera_error(judged.refined.T_metric_camera, truth)
             right = np.linalg.norm(off[:3]) < np.radians(WRONG_DEG) and np.linalg.norm(off[3:]) < WRONG_M
             if both and right and judged.probability > 0.5:
-                told.append((off, *both[-1], np.array(judged.settled.agreement)))
-    settling._between = between
+                told.append((off, *both[-1], np.array(judged.refined.agreement)))
+    refinement._fuse = between
     error, by_patches, by_colours, apart, agreement = (np.stack(column) for column in zip(*told, strict=True))
     tried = []
     for patches, aligned, disagreeing in product((1.5, 2.1, 2.6), (2.6, 3.7, 4.7, 5.9), (0.0, 1.0, 1.5, 2.0, 2.5, 3.0)):
         parts = by_patches * patches**2, by_colours * aligned**2
         residual = 2 * np.linalg.inv(np.linalg.inv(parts[0]) + np.linalg.inv(parts[1]))
-        doubt = covariance.doubt_of(agreement, disagreeing)[:, None, None] ** 2
+        doubt = covariance.agreement_scale(agreement, disagreeing)[:, None, None] ** 2
         for hidden_m, hidden_rad, differing in product(
             (0.002, 0.003, 0.005, 0.007), (0.0003, 0.0005, 0.001), (0.1, 0.25, 0.5, 1.0)
         ):
@@ -607,8 +609,8 @@ def fit_sigma(found: list[Place], params: Params) -> None:
             known += np.diag(np.r_[np.full(3, hidden_rad), np.full(3, hidden_m)] ** 2)
             nees = np.einsum("ni,ni->n", error, np.linalg.solve(known, error[..., None])[..., 0])
             likely = (-0.5 * np.linalg.slogdet(known)[1] - 7 * np.log1p(nees / 8)).mean()
-            settings = f"swell {patches}, swell_aligned {aligned}, disagreeing {disagreeing}, hidden_m {hidden_m}, "
-            settings += f"hidden_rad {hidden_rad}, differing {differing}"
+            settings = f"PATCH_SCALE {patches}, ALIGNMENT_SCALE {aligned}, AGREEMENT_SLOPE {disagreeing}, "
+            settings += f"MODEL_SIGMA_M {hidden_m}, MODEL_SIGMA_RAD {hidden_rad}, DIFFERENCE_WEIGHT {differing}"
             low = np.median(nees[agreement < 0.45])
             tried.append((likely, settings, *np.quantile(nees, (0.5, 0.9)), low, np.median(nees[agreement > 0.6])))
     print(f"{len(error)} poses")
@@ -623,16 +625,16 @@ def fit_sigma(found: list[Place], params: Params) -> None:
 def fit_displaced(found: list[Place], params: Params) -> None:
     """By how much what renders show lies elsewhere than where it is seen from the true pose, as a share of how far off
     the middles of Gaussians are that they show; and how much further out it lies before and after."""
-    whole = replace(params.displacing, share=1.0)
+    displacement.FRACTION = 1.0
     away, seen, radius = [], [], []
     for place in found:
         for told in place.photos:
             if told["changed"] or told["occluded"]:
                 continue
-            picture, _ = localizing.prepared(place.photo(told), params)
+            picture, _ = localization.scale_photo(place.photo(told), params.views.image_size_px)
             view = np.array(told["T_world_camera"]), picture.intrinsics_px, picture.size_px
-            for one in looks.look(place.scenes, *view, params.features, displaced=whole):
-                hits = tracking.track(one.grey, one.sound, picture.grey, params.settling.near_px, params.tracking)
+            for one in render_scenes(place.scenes, *view, with_displacement=True):
+                hits = tracking.track(one.grey, one.smooth, picture.grey, refinement.NEAR_PX)
                 if hits.found.sum() < FEWEST:
                     continue
                 pixels = hits.render_px[hits.found]
@@ -669,7 +671,7 @@ def place_all(found: list[Place], params: Params) -> None:
             scenes = {scene.scene: scene for scene in other.scenes}
             for told in place.photos[:: 4 if elsewhere else 1]:
                 began = time.process_time()
-                said = localizing.localize_photo(place.photo(told), indexes[other.seed], scenes, extractor, params)
+                said = localization.localize_photo(place.photo(told), indexes[other.seed], scenes, extractor, params)
                 seconds.append(time.process_time() - began)
                 wrong = False
                 if said.T_map_camera is not None:
@@ -692,19 +694,20 @@ def fit_agreement(found: list[Place], params: Params) -> None:
     Of every other photo in its own place and in another one; a pose's agreement is the least of those that are asked.
     """
     extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
-    params = replace(params, max_candidates=4, sure=2.0, settling=replace(params.settling, min_agreement=-1.0))
-    align, judge, asked = aligning.align, localizing.judged_pose, []
+    params = replace(params, max_candidates=4)
+    localization.HIGH_PROBABILITY, refinement.MIN_AGREEMENT = 2.0, -1.0
+    align, judge, asked = direct_alignment.align, localization.evaluate_pose, []
 
     def noted(*args, **kwargs):
         laid = align(*args, **kwargs)
         asked.append(laid.agreement)
         return laid
 
-    aligning.align = noted
+    direct_alignment.align = noted
     rows: list[tuple[float, bool, bool]] = []  # agreement, right, and placed
     for number, place in enumerate(found):
         for told, other in ((t, o) for t in place.photos[::2] for o in (place, found[(number + 1) % len(found)])):
-            picture, _ = localizing.prepared(place.photo(told), params)
+            picture, _ = localization.scale_photo(place.photo(told), params.views.image_size_px)
             scenes = {scene.scene: scene for scene in other.scenes}
             index = index_of(other.scenes, params)
 
@@ -718,9 +721,9 @@ def fit_agreement(found: list[Place], params: Params) -> None:
                 rows.append((least, right, one.probability >= params.verdict.min_probability))
                 return one
 
-            localizing.judged_pose = judged
-            localizing.judged_poses(picture, index, scenes, extractor, params)
-    localizing.judged_pose, aligning.align = judge, align
+            localization.evaluate_pose = judged
+            localization.evaluate_candidates(picture, index, scenes, extractor, params)
+    localization.evaluate_pose, direct_alignment.align = judge, align
     agreement, right, placed = (np.array(column) for column in zip(*rows, strict=True))
     print(f"{right.sum()} right poses, {(right & placed).sum()} of them placed, {(~right).sum()} wrong ones")
     for bar in (0.06, 0.08, 0.1, 0.12, 0.15, 0.2):
@@ -740,16 +743,16 @@ def fit_turned(found: list[Place], params: Params) -> None:
     for place in found:
         own, index = {scene.scene: scene for scene in place.scenes}, index_of(place.scenes, params)
         for told in place.photos:
-            picture, _ = localizing.prepared(place.photo(told), params)
-            finer = [localizing.photo_features(picture, extractor, px) for px in (params.matching.smooth_px, 0.0)]
+            picture, _ = localization.scale_photo(place.photo(told), params.views.image_size_px)
+            finer = [localization.extract_features(picture, extractor, px) for px in (localization.SMOOTH_PX, 0.0)]
             for shown, views in (
-                (finer[0], params.matching.views),
-                (localizing.all_of(finer), params.matching.more_views),
+                (finer[0], params.max_views),
+                (localization.concatenate_keypoints(finer), localization.MORE_VIEWS * params.max_views),
             ):
-                described = matching.Described(features.quantised(shown.descriptors), features.turns(shown))
-                chosen = most_alike(index, shown, picture.intrinsics_px, views, params.retrieval)
-                frames = turned.in_camera(shown, picture.intrinsics_px)
-                matches = matches_by_component(described, frames, chosen, own, params.matching)
+                described = matching.FeatureSet(features.quantize(shown.descriptors), features.quantize_angles(shown))
+                chosen = retrieve_views(index, shown, picture.intrinsics_px, views)
+                frames = feature_frames.camera_frames(shown, picture.intrinsics_px)
+                matches = match_views(described, frames, chosen, own)
                 asked.append((picture, shown.pixels, matches, np.array(told["T_world_camera"])))
     print(f"{len(asked) // 2} photographs")
     for deg, fewest, turns in (
@@ -757,10 +760,10 @@ def fit_turned(found: list[Place], params: Params) -> None:
         (30.0, 4, 3),
         (30.0, 4, 20),
     ):
-        bars = replace(params.resection, max_turn_deg=deg, min_agreeing=fewest, turns=turns)
+        candidates.MAX_TURN_DEG, resection.MIN_INLIERS, candidates.MAX_ORIENTATIONS = deg, fewest, turns
         right, wrong, began = np.zeros(2, int), np.zeros(2, int), time.process_time()
         for number, (picture, pixels, matches, truth) in enumerate(asked):
-            rough = candidates(pixels, matches, picture.intrinsics_px, picture.size_px, picture.focal_sigma, bars)
+            rough = propose_poses(pixels, matches, picture.intrinsics_px, picture.size_px, picture.focal_sigma)
             off = [camera_error(one.T_metric_camera, truth) for one in rough[: params.max_candidates]]
             near = [np.degrees(np.linalg.norm(xi[:3])) < 8 and np.linalg.norm(xi[3:]) < 0.3 for xi in off]
             right[number % 2] += any(near)
@@ -786,7 +789,7 @@ def save(**models: Odds) -> None:
         }
         told[kind] = {"base": round(model.base, 4), "least": model.least, "curves": curves}
     (ROOT / "probability.json").write_text(json.dumps(told, indent=1) + "\n")
-    probability.model.cache_clear()
+    probability.load_model.cache_clear()
 
 
 def main() -> int:
@@ -828,7 +831,7 @@ def main() -> int:
         fit_verdict(rows)
     else:
         bars = params.verdict
-        told = [probability.model().probability(row.evidence, bars.prior, bars.alike) for row in rows]
+        told = [probability.load_model().probability(row.evidence, bars.aliased_prior) for row in rows]
         report("test", rows, np.array(told))
     return 0
 

@@ -1,1 +1,1 @@
-"""Extractors, one file each: from pictures to local features. The contract is in `gsmap.methods.extractor`."""
+"""Extractors of local features, one file each; the protocol is `gsmap.methods.extractor`."""

@@ -1,8 +1,8 @@
-"""Local features of a network that the user gives: SuperPoint, ALIKED, DISK, XFeat or another, as one ONNX file.
+"""Extract local features by a network in an ONNX file of the user: SuperPoint, ALIKED, DISK, XFeat or another.
 
-What the published exports have in common is the contract: one picture in, (1, 1, H, W) grey or (1, 3, H, W) rgb; out
-come keypoints (N, 2), descriptors (N, D) and, in most, scores (N,), with a batch of one before them or not. Keypoints
-are pixels whose centres are whole numbers (SuperPoint, DISK, XFeat), or lie in [-1, 1] over the picture (ALIKED).
+The network takes one image, (1, 1, H, W) grey or (1, 3, H, W) rgb, and returns keypoints (N, 2), descriptors (N, D) and
+optionally scores (N,), with or without a batch dimension of one, as the published exports do. Keypoints are pixels with
+centres at whole numbers (SuperPoint, DISK, XFeat), or lie in [-1, 1] over the image (ALIKED).
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ from gsmap.types.model import ModelSpec
 VERSION = 1
 MODELS = ("extractor",)
 
-_MULTIPLE = 32  # sides that every such network takes
+_MULTIPLE = 32  # of image sides, which all these networks accept
 
 
 @dataclass(frozen=True)
 class Params:
-    """What is kept of the network's answer.
+    """Settings of the extractor ``onnx``.
 
     Args:
-        max_features: of a picture, those with the highest scores.
-        min_score: features that the network itself scores lower are left out.
+        max_features: Number of features, at least 1, of an image, those with the highest scores; larger finds more
+            photos and is slower.
+        min_score: Score, in the unit of the network, below which features are dropped; larger keeps fewer.
     """
 
     max_features: int = 1500
@@ -38,15 +39,15 @@ class Params:
 
 
 def make(models: Mapping[str, ModelSpec], params: Params) -> OnnxExtractor:
-    """Open the network; see `gsmap.methods.extractor`."""
+    """Load the network; see `gsmap.methods.extractor`."""
     return OnnxExtractor(models["extractor"], params)
 
 
 def probe(spec: ModelSpec) -> None:
-    """Refuse a model that gives no features; it is run once.
+    """Reject a model that is no extractor, by running it once.
 
     Raises:
-        InputError: its inputs and outputs do not fit, or it does not run.
+        InputError: its inputs or outputs do not fit, or it fails.
     """
     shape = spec.inputs[0].shape if len(spec.inputs) == 1 else ()
     if len(shape) != 4 or shape[1] not in (1, 3, None):
@@ -56,7 +57,7 @@ def probe(spec: ModelSpec) -> None:
 
 
 class OnnxExtractor:
-    """Runs the network on one picture at a time. Size, channels and names are read from the model."""
+    """Run the network on one image at a time. Size, channels and names are read from the model."""
 
     def __init__(self, spec: ModelSpec, params: Params) -> None:
         self.spec, self.params = spec, params
@@ -65,8 +66,8 @@ class OnnxExtractor:
         self.grey = channels == 1
 
     def extract(self, rgb: np.ndarray) -> Keypoints:
-        """Features of a picture; see `gsmap.methods.extractor`."""
-        height, width = (self.height or _fitting(rgb.shape[0])), (self.width or _fitting(rgb.shape[1]))
+        """Extract the features of an image; see `gsmap.methods.extractor`."""
+        height, width = (self.height or _round_side(rgb.shape[0])), (self.width or _round_side(rgb.shape[1]))
         image = Image.fromarray(rgb).resize((width, height), Image.Resampling.BILINEAR)
         real = np.asarray(image, np.float32) / 255
         if self.grey:
@@ -74,9 +75,9 @@ class OnnxExtractor:
         dtype = np.float16 if self.spec.inputs[0].dtype == "float16" else np.float32
         feed = {self.spec.inputs[0].name: np.ascontiguousarray(real.transpose(2, 0, 1)[None], dtype)}
         names = [tensor.name for tensor in self.spec.outputs]
-        given = dict(zip(names, run(self.spec, self.session, names, feed), strict=True))
-        pixels, descriptors, scores = self._read(given)
-        if len(pixels) and np.abs(pixels).max() <= 1.0 + 1e-6:  # over the picture, as ALIKED gives them
+        outputs = dict(zip(names, run(self.spec, self.session, names, feed), strict=True))
+        pixels, descriptors, scores = self._read(outputs)
+        if len(pixels) and np.abs(pixels).max() <= 1.0 + 1e-6:  # relative to the image, as of ALIKED
             pixels = (pixels + 1) / 2 * (np.array([width, height]) - 1)
         pixels = (pixels + 0.5) * [rgb.shape[1] / width, rgb.shape[0] / height]
         order = np.argsort(-scores, kind="stable")
@@ -85,25 +86,25 @@ class OnnxExtractor:
         vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
         return Keypoints(pixels[order].astype(np.float32), vectors)
 
-    def _read(self, given: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(N, 2) keypoints, (N, D) descriptors and (N,) scores of the network's answer.
+    def _read(self, outputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return (N, 2) keypoints, (N, D) descriptors and (N,) scores from the network's outputs.
 
         Raises:
-            InputError: it gives something else.
+            InputError: the outputs do not fit.
         """
-        flat = {name: value[0] if value.ndim > 1 and len(value) == 1 else value for name, value in given.items()}
-        pixels = _named(flat, ("keypoint", "kpts", "points"), lambda v: v.ndim == 2 and v.shape[1] == 2)
-        descriptors = _named(flat, ("desc", "feat"), lambda v: v.ndim == 2 and min(v.shape) != 2)
+        flat = {name: value[0] if value.ndim > 1 and len(value) == 1 else value for name, value in outputs.items()}
+        pixels = _find_output(flat, ("keypoint", "kpts", "points"), lambda v: v.ndim == 2 and v.shape[1] == 2)
+        descriptors = _find_output(flat, ("desc", "feat"), lambda v: v.ndim == 2 and min(v.shape) != 2)
         if pixels is None or descriptors is None:
-            told = ", ".join(f"{name} {list(value.shape)}" for name, value in given.items())
+            found = ", ".join(f"{name} {list(value.shape)}" for name, value in outputs.items())
             raise InputError(
-                f"{self.spec.path} is no extractor: it gives {told or 'nothing'}, wanted are keypoints (N, 2) and "
+                f"{self.spec.path} is no extractor: it gives {found or 'nothing'}, wanted are keypoints (N, 2) and "
                 "descriptors (N, D)",
                 code="model_misfit",
             )
         if len(descriptors) != len(pixels) and descriptors.shape[1] == len(pixels):
             descriptors = descriptors.T
-        scores = _named(flat, ("score", "conf"), lambda v: v.ndim == 1)
+        scores = _find_output(flat, ("score", "conf"), lambda v: v.ndim == 1)
         if scores is None or len(scores) != len(pixels):
             scores = np.zeros(len(pixels))
         finite = np.isfinite(descriptors.astype(np.float32)).all(1) if len(descriptors) == len(pixels) else None
@@ -115,15 +116,15 @@ class OnnxExtractor:
         return pixels.astype(np.float64), descriptors, scores.astype(np.float64)
 
 
-def _named(given: Mapping[str, np.ndarray], words: tuple[str, ...], fits) -> np.ndarray | None:  # type: ignore[no-untyped-def]
-    """The output whose name holds one of the words and that has the shape, else the only one that has it."""
-    fitting = {name: value for name, value in given.items() if fits(value)}
-    called = [value for name, value in fitting.items() if any(word in name.lower() for word in words)]
-    if called:
-        return called[0]
+def _find_output(outputs: Mapping[str, np.ndarray], words: tuple[str, ...], fits) -> np.ndarray | None:  # type: ignore[no-untyped-def]
+    """Return the output with a fitting shape whose name contains one of the words, else the only fitting one."""
+    fitting = {name: value for name, value in outputs.items() if fits(value)}
+    named = [value for name, value in fitting.items() if any(word in name.lower() for word in words)]
+    if named:
+        return named[0]
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 
 
-def _fitting(side: int) -> int:
-    """The multiple of 32 that is nearest to a side."""
+def _round_side(side: int) -> int:
+    """Round a side to a multiple of 32."""
     return max(_MULTIPLE, round(side / _MULTIPLE) * _MULTIPLE)

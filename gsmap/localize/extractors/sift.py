@@ -1,7 +1,6 @@
-"""SIFT (Lowe 2004) with descriptors as RootSIFT (Arandjelovic and Zisserman 2012), as COLMAP finds them on the CPU.
+"""Extract SIFT features (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012), as COLMAP on the CPU.
 
-It is our own kernel, for it was most of what views of a scene cost and a fifth of a photo: the steps are VLFeat's, and
-so are the features, to rounding.
+A native kernel, since extraction dominates the cost of scene views; features equal those of VLFeat up to rounding.
 """
 
 from __future__ import annotations
@@ -19,42 +18,47 @@ VERSION = 2
 MODELS: tuple[str, ...] = ()
 
 
+PEAK_THRESHOLD = 0.002
+"""Minimum contrast of a feature, relative to the range of grey values."""
+
+EDGE_THRESHOLD = 12.0
+"""Maximum ratio of the principal curvatures of a feature, which excludes edges."""
+
+
 @dataclass(frozen=True)
 class Params:
-    """What counts as a feature.
+    """Settings of the extractor ``sift``.
 
     Args:
-        max_features: of a picture, at most; large ones are kept before small ones.
-        peak_threshold: least contrast, as a share of the range of grey.
-        edge_threshold: largest ratio of the two curvatures: what is no more than an edge is left out.
-        doubled: look for features in the picture doubled, too: twice as many, for three times the work.
+        max_features: Number of features, at least 1, of an image, the largest ones first; larger finds more photos and
+            is slower.
+        upsampled: Extract features from the image at double size as well, which finds twice as many in three times the
+            time.
     """
 
     max_features: int = 1500
-    peak_threshold: float = 0.002
-    edge_threshold: float = 12.0
-    doubled: bool = True
+    upsampled: bool = True
 
 
 def make(models: Mapping[str, ModelSpec], params: Params) -> SiftExtractor:
-    """Open the extractor; see `gsmap.methods.extractor`."""
+    """Create the extractor; see `gsmap.methods.extractor`."""
     return SiftExtractor(params)
 
 
 class SiftExtractor:
-    """SIFT of grey pictures. The same picture gives the same features on any number of threads."""
+    """Extract SIFT features of grey images; the result does not depend on the number of threads."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
 
     def extract(self, rgb: np.ndarray) -> Keypoints:
-        """Features of a picture; see `gsmap.methods.extractor`."""
-        if min(rgb.shape[:2]) < 16:  # less than the smallest octave
+        """Extract the features of an image; see `gsmap.methods.extractor`."""
+        if min(rgb.shape[:2]) < 16:  # smaller than the smallest octave
             none = np.zeros(0, np.float32)
             return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), none, none)
-        # Rec. 601, as every SIFT has been computed of colour pictures since libjpeg gave grey ones.
+        # Rec. 601, as grey JPEG decoding does.
         grey = np.ascontiguousarray((rgb @ np.array([0.299, 0.587, 0.114])).round().astype(np.uint8))
-        kept = self._params
-        found, descriptors = sift(grey, kept.max_features, kept.peak_threshold, kept.edge_threshold, kept.doubled)
+        params = self._params
+        found, descriptors = sift(grey, params.max_features, PEAK_THRESHOLD, EDGE_THRESHOLD, params.upsampled)
         pixels, sizes, angles = (np.ascontiguousarray(found[:, part]) for part in (slice(0, 2), 2, 3))
         return Keypoints(pixels, descriptors, angles, sizes)

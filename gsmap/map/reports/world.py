@@ -122,7 +122,7 @@ def world_positions(
     if not ties:
         return None, {}
     from gsmap.world.crs import crs
-    from gsmap.world.frame import of_frame
+    from gsmap.world.frame import from_frame
 
     found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     named = None
@@ -133,6 +133,6 @@ def world_positions(
         named = crs_text or tie.frame.crs
         if mine:
             metric = tie.S_world_map.apply(np.array([pose.S_map_scene.translation for pose in mine]))
-            world = of_frame(tie.frame, metric, named)
+            world = from_frame(tie.frame, metric, named)
             found |= {pose.scene: (metric[k], world[k]) for k, pose in enumerate(mine)}
     return (None if named is None else (named, crs(named).heights)), found

@@ -25,7 +25,7 @@ from gsmap.types import Cameras
 from gsmap.types.world import UNSOLVED, ControlPoint, ImagePoint, PositionFix, ScaleBar, Survey, WorldFrame
 from gsmap.world.crs import WGS84, crs
 from gsmap.world.exif import read_folder
-from gsmap.world.frame import frame_at, of_frame, to_frame
+from gsmap.world.frame import frame_at, from_frame, to_frame
 from gsmap.world.params import BAR_SIGMA_FRACTION, DEPTH_SIGMA_FRACTION, PIXEL_SIGMA_PX
 from gsmap.world.survey import check_area, frame_for, in_frame
 
@@ -175,7 +175,7 @@ def _refuse_unreachable(before: Survey, frame: WorldFrame | None, new: Sequence[
 
 
 def _origin(frame: WorldFrame) -> np.ndarray:
-    return of_frame(frame, np.zeros((1, 3)))
+    return from_frame(frame, np.zeros((1, 3)))
 
 
 def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | PositionFix]) -> WorldFrame | None:

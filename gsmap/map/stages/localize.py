@@ -16,7 +16,7 @@ from gsmap import retrieve
 from gsmap.engine import QuarantinedJob, run_jobs
 from gsmap.errors import ConfigError, CorruptError, GsmapError, NotFoundError, ReadOnlyError
 from gsmap.geometry.metric_scale import in_metres
-from gsmap.localize import PlacedFeatures, ViewIndex, new_segment, view_index
+from gsmap.localize import MapScene, ViewIndex, new_segment, view_index
 from gsmap.map import models
 from gsmap.map.jobs import features_of_scene
 from gsmap.map.metric_scales import map_metres
@@ -102,7 +102,7 @@ class Localizer:
         self._held: dict[str, SceneFeatures] = {}
         ensure(store, list(self.scenes.values()), self.keys, settings, progress, self._held)
         self.placed = {
-            scene: PlacedFeatures(
+            scene: MapScene(
                 scene,
                 in_metres(poses[scene].S_map_scene, self.metres.get(poses[scene].component, 1.0)),
                 poses[scene].component,
@@ -113,7 +113,7 @@ class Localizer:
             for scene in self.scenes
         }
         self._used: list[str] = []
-        self._views: dict[str, localizing.Eyes] = {}
+        self._capture_views: dict[str, localizing.CaptureViews] = {}
         self.index = self._index(progress)
         specs = models.specs(store)
         method = family("extractor").get(self.params.extractor)
@@ -155,7 +155,7 @@ class Localizer:
         for scene in scenes:
             found.append((self.placed[scene].features, self.keys[scene].digest))
             self.placed[scene].drop()
-        return new_segment(found, self.params.features.indexed)
+        return new_segment(found)
 
     def _query(self, near: SearchRegion | None, ask: Callable[[ViewIndex], _Said]) -> _Said:
         """Query the index; once more after a repair if it was changed or damaged meanwhile."""
@@ -197,13 +197,13 @@ class Localizer:
         while len(self._used) > _KEPT:
             self.placed[self._used.pop(0)].drop()
 
-    def reference_views(self, scene: str) -> localizing.Eyes:
-        """Return the reference views of a scene, for comparison with photos."""
-        if scene not in self._views:
+    def capture_views(self, scene: str) -> localizing.CaptureViews:
+        """Return the depth views of a scene's own cameras, rendered on first use."""
+        if scene not in self._capture_views:
             cameras = self.store.scenes.cameras(scene)
             own = None if cameras is None or cameras.synthesised else cameras
-            self._views[scene] = localizing.open_eyes(self.placed[scene], own, self.params.differences)
-        return self._views[scene]
+            self._capture_views[scene] = localizing.render_capture_views(self.placed[scene], own)
+        return self._capture_views[scene]
 
     def localize(self, photo: Photo, near: SearchRegion | None = None) -> LocalizationResult:
         """Localize one photo."""
@@ -254,7 +254,7 @@ def localizing_near(localizer: Localizer, near: SearchRegion) -> ViewIndex:
     return localizer.index.only(wanted)
 
 
-def _overlap(localizer: Localizer, around: PlacedFeatures, scene: str) -> bool:
+def _overlap(localizer: Localizer, around: MapScene, scene: str) -> bool:
     """Return true if the centre of one scene lies in the box of the other."""
     other = localizer.placed[scene]
     if other.component != around.component:

@@ -17,7 +17,7 @@ from gsmap.formats import scans
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.ingest import read_captures
 from gsmap.localize.scan import AGREE_SIGMAS, as_gaussians
-from gsmap.localize.scan_joining import Joined, OnePlace, Support, join
+from gsmap.localize.scan_consensus import ConsensusPose, PoseTolerance, ScanPose, combine_poses
 from gsmap.map import models
 from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.map.scene_lookup import look_up_graph
@@ -126,7 +126,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
             )
     assert poses is not None
     found: list[Registration] = []
-    supports: list[Support] = []
+    supports: list[ScanPose] = []
     for number, scene in enumerate(candidates):
         told(0.3 + 0.7 * number / len(candidates), f"comparing with {scenes[scene].name}")
         target = _view(store, scenes[scene], known[scene].digest)
@@ -135,14 +135,14 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
         else:
             found.append(register.register_by_shape(target, source, settings.register))
         if found[-1].status == "accepted":
-            supports.append(Support.of(poses.poses[scene], found[-1]))
+            supports.append(ScanPose.from_registration(poses.poses[scene], found[-1]))
     told(1.0, "done")
     joined = None
     if supports:
         names = {scene.id: scene.name for scene in scenes.values()}
         metres = metres_of_scenes(store, settings, poses)[supports[0].scene]
-        one = OnePlace(SAME_ROTATION_DEG, SAME_DISTANCE_M / metres, SAME_LOG_SCALE, AGREE_SIGMAS)
-        joined = join(supports, source.centre, one, names)
+        one = PoseTolerance(SAME_ROTATION_DEG, SAME_DISTANCE_M / metres, SAME_LOG_SCALE, AGREE_SIGMAS)
+        joined = combine_poses(supports, source.centre, one, names)
     seconds = time.process_time() - began
     remarks = (*graph.notes, *notes) if sought.coloured else tuple(notes)
     return _row(request, sought, remarks, found, supports, joined, poses, scenes, source.centre, seconds)
@@ -235,8 +235,8 @@ def _row(
     sought: _ScanQuery,
     remarks: Sequence[str],
     found: Sequence[Registration],
-    supports: Sequence[Support],
-    joined: Joined | None,
+    supports: Sequence[ScanPose],
+    joined: ConsensusPose | None,
     poses: PoseGraph,
     scenes: dict[str, Scene],
     middle: np.ndarray,
@@ -292,7 +292,7 @@ def _row(
     )
 
 
-def _why_not(found: Sequence[Registration], joined: Joined | None, scenes: dict[str, Scene]) -> str:
+def _why_not(found: Sequence[Registration], joined: ConsensusPose | None, scenes: dict[str, Scene]) -> str:
     if joined is not None:
         return joined.reason
     if not found:

@@ -1,4 +1,4 @@
-"""A scene with its place in the map, whose arrays are read when they are needed."""
+"""A scene of the map with its pose, whose arrays are read on first use."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from gsmap.types.localization import SceneFeatures
 
 
 @dataclass(eq=False)
-class PlacedFeatures:
-    """A scene of the map that photographs may show.
+class MapScene:
+    """A scene that photos can be localized in.
 
     Args:
-        scene: its id.
-        S_metric_scene: takes it to the frame of its component, in metres.
-        component: which.
-        covariance: (7, 7) of that pose, on the scene's side and in its unit, or None.
-        read_gaussians, read_features: give its arrays, scene frame and unit.
+        scene: id of the scene.
+        S_metric_scene: transform from the scene frame to the frame of its component, in metres.
+        component: number of the component.
+        covariance: (7, 7) of the scene's pose, on the scene's side and in its unit, or None.
+        read_gaussians, read_features: return the arrays, scene frame and unit.
     """
 
     scene: str
@@ -42,25 +42,24 @@ class PlacedFeatures:
 
     @cached_property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """(3,) the least coordinates of the Gaussians' middles, scene frame, and (3,) how far they reach from there."""
+        """Minimum (3,) and extent (3,) of the Gaussians' means, scene frame."""
         low = self.gaussians.means.min(0).astype(np.float64)
         return low, np.maximum(self.gaussians.means.max(0) - low, 1e-9)
 
     @cached_property
-    def coloured_by_place(self) -> Gaussians:
-        """The Gaussians, each of the colour that is the place of its middle in their box: a render of these says which
-        place a pixel shows."""
+    def coloured_by_position(self) -> Gaussians:
+        """The Gaussians with their means, scaled to the box, as colours: their renders are maps of positions."""
         low, span = self.box
         sh = sh0_of_rgb((self.gaussians.means - low) / span)[:, None].astype(np.float32)
         return replace(self.gaussians, sh=sh)
 
     def drop(self) -> None:
-        """Let go of the arrays."""
-        for name in ("gaussians", "features", "box", "coloured_by_place"):
+        """Release the arrays."""
+        for name in ("gaussians", "features", "box", "coloured_by_position"):
             self.__dict__.pop(name, None)
 
     def camera(self, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray, size_px: tuple[int, int]) -> Cameras:
-        """A camera of the map as one of the scene's frame and unit."""
+        """Return a camera that is posed in the component's frame as a camera of the scene's frame and unit."""
         S = self.S_metric_scene
         pose = np.eye(4)
         pose[:3, :3] = S.rotation.T @ T_metric_camera[:3, :3]

@@ -1,0 +1,61 @@
+"""Estimate by how much the content of a splat render is displaced towards the image centre.
+
+Gaussians that overlap are drawn front to back. On a slanted surface those with nearer means cover those behind them,
+so a pixel shows more of the nearer ones: content is pulled towards the middle of the image, since nearer is further
+out. Training corrects most of it but not all, for views from other sides need another correction. Renders of splats are
+thus a little smaller than photos, the more so the larger their Gaussians are, and uncorrected poses lie too near.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.geometry.projection import project
+from gsmap.localize.filters import box_means
+from gsmap.localize.map_scene import MapScene
+from gsmap.render import render
+
+FRACTION = 0.16
+"""Share of the distance from a pixel to the means of its Gaussians that training left (``tools/fit/localize.py``)."""
+
+MAX_PX = 2.0
+"""Limit of that distance along each axis, for a render of 480 pixels: larger Gaussians have no defined position."""
+
+WINDOW_PX = 36.0
+"""Width of the square over which it is averaged, for a render of 480 pixels."""
+
+RENDER_SIDE_PX = 120
+"""Longer side of the small render that it is computed from."""
+
+
+def displacement_map(
+    scene: MapScene,
+    T_metric_camera: np.ndarray,
+    intrinsics_px: np.ndarray,
+    size_px: tuple[int, int],
+    fraction: float | None = None,
+) -> np.ndarray:
+    """Return (R, C, 2) float32 displacements of a render's content to the right and down in pixels, on a coarser grid.
+
+    Args:
+        intrinsics_px: (4,) of the render, which is of this size.
+        fraction: in place of `FRACTION`.
+    """
+    longest = max(size_px)
+    by = max(1, round(longest / RENDER_SIDE_PX))
+    small = (size_px[0] // by, size_px[1] // by)
+    camera = scene.camera(T_metric_camera, intrinsics_px / by, small)
+    rendered = render(scene.coloured_by_position, camera, depth=False, dominant_id=False, backend="native")
+    alpha = rendered.alpha[0]
+    low, span = scene.box
+    means = rendered.colour[0] / np.maximum(alpha, 1e-3)[..., None] * span + low
+    points = scene.S_metric_scene.apply(means.reshape(-1, 3).astype(np.float64))
+    at, depth = project(points, np.linalg.inv(T_metric_camera), intrinsics_px / by)
+    row, column = np.mgrid[0 : small[1], 0 : small[0]]
+    offset = (at - np.stack([column, row], axis=2).reshape(-1, 2) - 0.5) * by
+    offset[(depth <= 0) | (alpha.ravel() < 0.9)] = 0
+    limit = MAX_PX * longest / 480
+    width = 2 * round(WINDOW_PX * longest / 480 / by / 2) + 1
+    offset = np.clip(offset, -limit, limit).reshape(*alpha.shape, 2).astype(np.float32)
+    out: np.ndarray = np.float32(FRACTION if fraction is None else fraction) * box_means(offset, width)
+    return out
