@@ -130,6 +130,11 @@ def test_tools_that_are_named_exist(page: Path) -> None:
     assert sorted(name for name in modules | files if not (ROOT / name).exists()) == []
 
 
+def test_files_that_the_architecture_names_exist() -> None:
+    named = re.findall(r"`?((?:[a-z_]+/)+[a-z_0-9]+\.(?:py|cpp))`?", (ROOT / "ARCHITECTURE.md").read_text())
+    assert [name for name in named if not (ROOT / name).exists() and not (ROOT / "gsmap" / name).exists()] == []
+
+
 def test_documents_stay_short() -> None:
     assert sum(len(page.read_text().split()) for page in PAGES) <= 50_000
     assert (ROOT / "README.md").stat().st_size <= 9_000
