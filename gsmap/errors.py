@@ -132,7 +132,7 @@ class MissingDependencyError(GsmapError, ImportError):
 
 
 def of_system(error: OSError) -> type[StoreError]:
-    """Which error of ours an error of the operating system is, by its code."""
+    """Return the class of error that an error of the operating system becomes, by its code."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFullError
     if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):

@@ -32,7 +32,7 @@ def command(
 def make_or_list(
     kind: Literal["branch", "tag"], title: str, map: str, name: str | None, delete: bool, list_all: bool, json: bool
 ) -> None:
-    """What `gsmap branch` and `gsmap tag` do; ``title`` heads the table."""
+    """Create, list or delete branches or tags; ``title`` heads the table."""
     from gsmap.errors import ConfigError
 
     if (name is None and delete) or (name is not None and list_all):

@@ -1,4 +1,4 @@
-"""How verbs speak: data on stdout, progress and remarks on stderr.
+"""Output of the verbs: data on stdout, progress and remarks on stderr.
 
 Names, notes and paths come from files and maps that strangers may have made: everything printed passes `escaped`.
 """
@@ -97,7 +97,7 @@ def say_heights(rows: Sequence[Row]) -> None:
 
 
 def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: str = "") -> None:
-    """What a verb answers, as one JSON object or as a table, on stdout.
+    """Print the rows of a verb on stdout, as one JSON object or as a table.
 
     Args:
         verb: its key in `gsmap.cli.objects.OBJECTS`.
@@ -139,7 +139,7 @@ def expect_json() -> None:
 
 
 def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
-    """What a verb prints with ``--json``."""
+    """Return the object that a verb prints with ``--json``."""
     from gsmap.cli.objects import OBJECTS, Many, Maybe
     from gsmap.types.rows import SCHEMA, Row
 

@@ -1,4 +1,4 @@
-"""What each verb prints with ``--json``: one object, ``schema`` first. docs/reference/json.md is generated from it."""
+"""JSON object that each verb prints with ``--json``, ``schema`` first; docs/reference/json.md is generated from it."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def command(
 
 
 def _tell(report: PurgeReport, map: str) -> None:
-    """What is left to do, and by which command."""
+    """Print the remaining steps and their commands."""
     for name in report.branches:
         say(f"{name} still has it: gsmap remove {map} {report.scene_id} --purge --branches")
     for name in report.backups:

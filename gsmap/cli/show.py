@@ -159,7 +159,7 @@ def _print_change(change: ChangeDetail) -> None:
 
 
 def _pose(pose: Sim3 | None) -> str | None:
-    """Where the origin lies, the angle and axis of the rotation, and the scale where there is one."""
+    """Format a pose: position of the origin, angle and axis of the rotation, and the scale if it differs from 1."""
     if pose is None:
         return None
     import numpy as np
@@ -174,7 +174,7 @@ def _pose(pose: Sim3 | None) -> str | None:
 
 
 def _captured(scene: SceneReport) -> str | None:
-    """When, and who or what says so: whoever spoke of it last."""
+    """Format the capture date and its source."""
     if scene.captured_at is None:
         return None
     said = [fact.author for fact in scene.history if fact.fact == "captured_at"]

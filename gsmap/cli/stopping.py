@@ -1,4 +1,4 @@
-"""What becomes of a run that is told to stop: Ctrl-C, ``kill``, a terminal that goes away.
+"""Handling of signals that stop a run: Ctrl-C, ``kill``, a closed terminal.
 
 The first signal is an exception in the main thread, so that every ``finally`` on the way out runs: staged files go,
 workers are killed, leases are given back. Then one line says what is kept. Native code does not see a signal before it

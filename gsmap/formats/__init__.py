@@ -71,7 +71,7 @@ def stream(path: str | os.PathLike[str]) -> GaussianSource:
 
 @dataclass(frozen=True, eq=False)
 class _FileSource:
-    """What a format opened; what the system says while it is read is explained."""
+    """Source of Gaussians from an opened file; errors of the operating system name the file."""
 
     path: Path
     source: GaussianSource
@@ -106,7 +106,7 @@ class _FileSource:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """What the file says about itself beside its Gaussians; an empty `FileInfo` where the format says nothing."""
+    """Return the metadata of the file; an empty `FileInfo` if its format has none."""
     path = Path(path)
     module = _load(_suffix(path, "read"))
     with _explained(path, "read"):
@@ -175,7 +175,7 @@ def _load(suffix: str) -> Any:
 
 
 def _can(suffix: str, verb: str) -> bool:
-    """Whether a format reads or writes; another package's that cannot be loaded does neither."""
+    """Return true if a format reads or writes; a plug-in that cannot be loaded does neither."""
     try:
         return hasattr(_load(suffix), verb)
     except ConfigError:

@@ -1,4 +1,4 @@
-"""Which way the axes of a file point, and turning Gaussians from one convention to another.
+"""Axis conventions of files, and rotation of Gaussians from one convention to another.
 
 A convention is three letters, one per axis: right or left, up or down, front or back. A trained ``.ply`` is ``RDF``,
 SPZ is ``RUB``, glTF is ``LUF``. Only the order and signs of coordinates change, so nothing is rounded up to SH

@@ -1,4 +1,4 @@
-"""What files of cameras share: reading JSON, and one name for each camera."""
+"""Helpers shared by camera files: reading JSON, and one name for each camera."""
 
 from __future__ import annotations
 

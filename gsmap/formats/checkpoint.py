@@ -71,14 +71,14 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """That nerfstudio's frame is not that of its cameras' file."""
+    """Note that the frame of a nerfstudio checkpoint differs from that of its camera file."""
     if Path(path).suffix.lower() != ".ckpt":
         return FileInfo()
     return FileInfo(notes=(f"{Path(path).name} is in nerfstudio's own frame: see dataparser_transforms.json",))
 
 
 def _loaded(path: str | os.PathLike[str]) -> Any:
-    """What ``torch.load`` makes of it, after its outside was looked at."""
+    """Load the checkpoint with ``torch.load``, weights only, after checking its container."""
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()

@@ -48,7 +48,7 @@ class GcpLine:
 
 @dataclass(frozen=True)
 class GcpList:
-    """What a file holds.
+    """Content of a ``gcp_list.txt``.
 
     Args:
         crs: as PROJ takes it. lines: in the file's order.

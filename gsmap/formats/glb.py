@@ -64,7 +64,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: boo
 
 
 def holds_splats(path: str | os.PathLike[str]) -> bool:
-    """Whether the file says that it holds Gaussians; a mesh or a point cloud does not.
+    """Return true if the file declares Gaussians; false for a mesh or a point cloud.
 
     Raises:
         InputError: not a GLB, or damaged.

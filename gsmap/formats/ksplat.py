@@ -106,7 +106,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 @dataclass(frozen=True)
 class _Section:
-    """How the bytes of a section lie; see the module."""
+    """Byte layout of a section; see the module."""
 
     level: int
     splats: int

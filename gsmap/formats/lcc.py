@@ -77,7 +77,7 @@ def stream(path: str | os.PathLike[str]) -> LccSource:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Whose format it is, and that an environment is left out where there is one.
+    """Return the metadata, with a note if an environment is left out.
 
     Raises:
         InputError: as `read`.

@@ -44,7 +44,7 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether a pinhole stands for it, be it roughly."""
+        """Return true if a pinhole camera approximates the lens."""
         return self.shift_px <= _MAX_SHIFT * math.hypot(*self.size_px) / 2
 
 

@@ -37,7 +37,7 @@ def codebook(values: np.ndarray, size: int = 256) -> tuple[np.ndarray, np.ndarra
 
 
 def _cells(flat: np.ndarray) -> np.ndarray:
-    """Where to cut sorted values into cells: evenly by number and evenly by width, never between equal ones."""
+    """Return the boundaries that split sorted values into cells, evenly by count and width, never between equals."""
     at = np.concatenate(
         [
             np.searchsorted(flat, flat[np.linspace(0, len(flat) - 1, _CELLS).astype(np.int64)]),

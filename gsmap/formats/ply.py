@@ -209,7 +209,7 @@ class PlySource:
 
 
 def _is_activated(path: str | os.PathLike[str], source: PlySource) -> bool:
-    """Whether opacities are in 0 to 1 and scales are lengths, as some programs write them.
+    """Return true if opacities are in [0, 1] and scales are lengths, as some programs write them.
 
     Logits of a capture do not all lie in 0 to 1, which are opacities of 0.5 to 0.73, and its logarithms of scales are
     not all positive unless its unit is small beside its Gaussians.
@@ -259,7 +259,7 @@ def _is_activated(path: str | os.PathLike[str], source: PlySource) -> bool:
 
 
 def _origin(rows: Rows) -> np.ndarray:
-    """What is to be taken off positions in double precision; zeros where float32 holds them."""
+    """Return the origin to subtract from positions in double precision; zeros if float32 holds them exactly."""
     if all(rows.dtype[name] == np.float32 for name in "xyz"):
         return np.zeros(3)  # nothing is lost yet
     if not origin_of(_positions(next(rows.parts()))).any():  # the first rows lie near zero: so do all together
@@ -274,7 +274,7 @@ def _positions(part: np.ndarray) -> np.ndarray:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Whether it was trained antialiased, and what reading it changed."""
+    """Return the metadata: antialiased training, and notes on what reading changed."""
     header = read_header(path)
     names = header.elements["vertex"].names if "vertex" in header.elements else ()
     text = " ".join(header.comments).lower()
@@ -519,7 +519,7 @@ def _too_long(path: str | os.PathLike[str], element: Element, more: str) -> Inpu
 
 
 def is_compressed(header: Header) -> bool:
-    """Whether this is PlayCanvas' ``.compressed.ply`` layout, whatever the file is called."""
+    """Return true for the ``.compressed.ply`` layout of PlayCanvas, whatever the file's name."""
     return "vertex" in header.elements and "packed_position" in header.elements["vertex"].names
 
 

@@ -1,4 +1,4 @@
-"""What single precision loses of positions far from zero: an origin is taken off on reading, and is needed to write."""
+"""Origins that keep single precision exact: subtracted on reading positions far from zero, required on writing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the compressed formats share: bytes for opacities, three numbers for a quaternion, limits for what is read."""
+"""Quantization shared by the compressed formats: opacities as bytes, quaternions as three numbers, limits on input."""
 
 from __future__ import annotations
 

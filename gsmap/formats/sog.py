@@ -69,7 +69,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Whether ``meta.json`` says that the Gaussians were trained antialiased.
+    """Return the metadata of ``meta.json``: antialiased training.
 
     Raises:
         InputError: as `read`.

@@ -82,7 +82,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Whether it was trained antialiased, and what reading it leaves out."""
+    """Return the metadata: antialiased training, and notes on what reading leaves out."""
     with open(path, "rb") as file:
         head = file.read(32)
         if head.startswith(_GZIP):
@@ -308,7 +308,7 @@ class _Inflater:
         return data
 
     def rest(self, limit: int) -> bytes:
-        """What is left, at most ``limit`` bytes."""
+        """Return the remaining bytes, at most ``limit``."""
         parts, missing = [], limit
         while missing and not self._stream.eof:
             source = self._stream.unconsumed_tail or self._file.read(1 << 20)

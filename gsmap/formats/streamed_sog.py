@@ -43,7 +43,7 @@ _BLOCK = 1 << 10  # Gaussians that are compared with all leaves at once
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a leaf draws at one level.
+    """Run of Gaussians that a leaf draws at one level.
 
     Args:
         uri: of the ``meta.json`` of a SOG, relative to ``lod-meta.json``, with ``/``.
@@ -96,7 +96,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """That an environment is left out, where there is one.
+    """Return the metadata, with a note if an environment is left out.
 
     Raises:
         InputError: as `read`.

@@ -1,4 +1,4 @@
-"""What a report tells of a map: rows as every verb gives them, and what is drawn."""
+"""Content of a report: rows as the verbs print them, and the data of its drawings."""
 
 from __future__ import annotations
 
@@ -82,9 +82,8 @@ class EdgeEntry:
 
     @property
     def doubt(self) -> float:
-        """How much it wants a person, 0 to 1: what nothing could decide before what no loop confirms, what is pulled
-        further than its own error explains, and what the others voted out; of these, what is less probable first. 0
-        where nobody need look, as after a review."""
+        """Urgency of a review in [0, 1]: undecided edges first, then edges that no cycle confirms, edges with residuals
+        beyond their covariance, and excluded edges; within each group the less probable first. 0 after a review."""
         if self.row.review is not None:
             return 0.0
         unlikely = 1.0 - min(1.0, max(0.0, self.probability or 0.0))
@@ -130,7 +129,7 @@ class ChangePicture:
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """How the scenes differ between a revision and an earlier one."""
+    """Differences of the scene poses between a revision and an earlier one."""
 
     before: int
     after: int
@@ -139,7 +138,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class News:
-    """What came into the map since a date.
+    """Additions to the map since a date.
 
     Args:
         since: ISO 8601.
@@ -156,7 +155,7 @@ class News:
 
 @dataclass(frozen=True)
 class StorageEntry:
-    """What the map keeps of one kind: how many, and how many bytes."""
+    """Number and bytes of one kind of stored data."""
 
     kind: str
     count: int

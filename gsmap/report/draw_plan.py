@@ -147,7 +147,7 @@ def _scale_bar(scale: float, size: np.ndarray) -> Markup:
 
 
 def _axes(plan: Plan, size: np.ndarray) -> Markup:
-    """Where the map's own axes point that lie on the page."""
+    """Return the directions on the page of the map axes that lie in it."""
     x, y = size[0] - 48, size[1] + 8
     out = []
     for k, name in enumerate("xyz"):

@@ -313,7 +313,7 @@ def _largest(edges: Sequence[EdgeEntry], most: int) -> str:
 
 
 def _redundancy(report: Report) -> Markup | None:
-    """How much the edges check each other: what geodesists call the variance factor."""
+    """Format the redundancy of the edges and their variance factor."""
     used = [edge for edge in report.edges if edge.use == "used" and edge.chi2 is not None]
     tied: dict[int, set[str]] = {}
     for edge in used:

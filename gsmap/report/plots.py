@@ -57,7 +57,7 @@ def _kind(edge: EdgeEntry) -> str:
 
 
 def residual_distribution(edges: Sequence[EdgeEntry]) -> Markup:
-    """Which share of the edges has a chi-square up to some value, and which share should."""
+    """Plot the distribution of the edges' chi-square beside the expected one."""
     from scipy.special import gammainc
 
     values = np.sort([e.chi2 for e in edges if e.chi2 is not None])
@@ -77,7 +77,7 @@ def residual_distribution(edges: Sequence[EdgeEntry]) -> Markup:
 
 
 def offset_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
-    """How far the poses leave each edge, in metres, the largest first."""
+    """Plot the distance between each edge's measurement and the poses, metres, the largest first."""
     chosen = [e for e in pulled(edges) if e.translation_m is not None]
     chosen = sorted(chosen, key=lambda e: -(e.translation_m or 0.0))[:most]
     values = [max(e.translation_m or 0.0, 1e-5) for e in chosen]
@@ -98,7 +98,7 @@ def sigma_bars(scenes: Sequence[SceneEntry], most: int) -> Markup:
 
 
 def sigma_distribution(scenes: Sequence[SceneEntry]) -> Markup:
-    """Which share of the scenes lies at least as surely as some standard deviation says."""
+    """Plot the distribution of the scenes' standard deviations."""
     values = np.sort([s.position_sigma_m for s in scenes if s.position_sigma_m])
     unit, factor = _unit(values.tolist())
     frame = Frame()
@@ -162,7 +162,7 @@ def stacked(parts: Sequence[tuple[str, float, str]], title: str) -> Markup:
 
 
 def matrix(names: Sequence[str], cells: Sequence[tuple[int, int, str, str]], title: str) -> Markup:
-    """Which pairs were tried, and what came of it: one square a pair, below the diagonal.
+    """Plot the matrix of pairs by outcome: one square per pair, below the diagonal.
 
     Args:
         cells: (row, column, kind, tip), the row the larger.

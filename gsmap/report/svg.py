@@ -1,4 +1,4 @@
-"""What plots share: axes, ticks and a frame, in the units of an SVG's view box.
+"""Axes, ticks and frame of the plots, in the units of an SVG view box.
 
 Colours and fonts are classes of ``style.css``, so that one drawing serves light, dark and paper.
 """
@@ -34,7 +34,7 @@ class Axis:
     log: bool = False
 
     def at(self, value: float) -> float:
-        """Where a value lies; beyond the ends it lies at the end."""
+        """Return the position of a value, clamped to the axis."""
         low, high, value = (math.log10(v) if self.log else v for v in (self.low, self.high, max(value, _least(self))))
         share = 0.0 if high <= low else (value - low) / (high - low)
         return self.start + min(1.0, max(0.0, share)) * (self.end - self.start)

@@ -52,7 +52,7 @@ def top_picture(parts: Sequence[Gaussians], plan: Plan, eyes: np.ndarray, longes
 
 
 def density_picture(points: np.ndarray, plan: Plan, longest_px: int) -> bytes:
-    """Where points (K, 3) of the component lie, seen from above, darker where more do; WebP as of `top_picture`."""
+    """Draw the density of points (K, 3) from above, darker where more of them lie; WebP as in `top_picture`."""
     from PIL import Image
 
     width, height = _size_px(plan, longest_px // 3)

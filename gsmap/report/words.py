@@ -113,7 +113,7 @@ def cut_pair(pair: tuple[str, str], most: int = 22) -> str:
 
 
 def metre(one: MetricScale) -> str:
-    """How lengths are known, in a sentence's half."""
+    """Describe how the metric scale is known."""
     how = _how(one.known_by)
     if not one.is_known or not math.isfinite(one.sigma):
         return how
@@ -145,7 +145,7 @@ def _percent(share: float) -> str:
 
 
 def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
-    """How a map stands (``good``, ``look``, ``act`` or ``empty``), and the sentences that say so.
+    """Return the state of a map (``good``, ``look``, ``act`` or ``empty``) and the sentences that explain it.
 
     ``act``: it is not solved as it is, or work failed. ``look``: something waits for a person's judgement.
     """
@@ -216,7 +216,7 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
 
 
 def _wants(what: TodoKind) -> Literal["act", "look"]:
-    """Whether something to do is work, or a person's judgement."""
+    """Return true if a task is computation rather than a person's review."""
     match what:
         case "undescribed" | "unregistered" | "unsolved" | "set_aside" | "contradicted_priors":
             return "act"

@@ -1,4 +1,4 @@
-"""What is answered to each address of a map's page; `gsmap/view/page/src/contract.ts` says what is in it."""
+"""Answers of the page's server by address; `gsmap/view/page/src/contract.ts` defines their content."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def draw_change(
 
 
 def draw_place(scene: PosedScene, box: np.ndarray, side_px: int = 320) -> np.ndarray:
-    """What a capture shows in a box, (H, W, 3) uint8, from the camera that sees most of it; the box is outlined.
+    """Render a scene in a box from the camera that sees most of it, (H, W, 3) uint8, with the box outlined.
 
     Args:
         scene: in a metric frame.
@@ -107,7 +107,7 @@ def _crop(camera: Cameras, box: np.ndarray, points: np.ndarray) -> _Crop | None:
 
 
 def _num_seen(scene: PosedScene, camera: Cameras, points: np.ndarray) -> int:
-    """How many of the points lie on the surface that a camera sees of a capture."""
+    """Return the number of points on the surface that a camera sees."""
     small = _sized(camera, _TRIED_PX)
     depth = render(scene.gaussians, small).depth[0]
     pixels, deep = _project(points, small)

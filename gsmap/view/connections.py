@@ -57,7 +57,7 @@ class LocalServer(HTTPServer):
             threading.Thread(target=self._work, daemon=True).start()
 
     def verify_request(self, request: object, client_address: Any) -> bool:
-        """Whether the client may be answered; asked before anything is read."""
+        """Return true if the client may be answered; called before anything is read."""
         return not is_of_another_user(client_address, ("127.0.0.1", self.server_port))
 
     def process_request(self, request: object, client_address: Any) -> None:
@@ -108,8 +108,8 @@ class LocalServer(HTTPServer):
 
 
 def is_of_another_user(client: Address, server: Address) -> bool:
-    """Whether the socket at the other end of a connection on this machine is known to be of another user than this
-    one and root. Linux tells; elsewhere, and of a socket that is closing, nothing is known."""
+    """Return true if the other end of a local connection belongs to a user other than this one and root. Known on Linux
+    only, and not for a socket that is closing: then false."""
     if not sys.platform.startswith("linux"):
         return False
     here, there = _hexadecimal(*client), _hexadecimal(*server)

@@ -1,4 +1,4 @@
-"""What the page is told of a map, as `gsmap/view/page/src/contract.ts` has it; values, and how they become JSON.
+"""Content of the page as `gsmap/view/page/src/contract.ts` defines it, and its conversion to JSON.
 
 Nothing here reads anything: `gsmap.view.doors` says what is loaded when the page asks for it.
 """
@@ -86,7 +86,7 @@ class ViewRevision:
 
 @dataclass(frozen=True, eq=False)
 class ViewChange:
-    """What changed between two captures (scene ids).
+    """Change between two scenes (ids).
 
     Args:
         box: (2, 3) map frame.
@@ -177,7 +177,7 @@ class ViewOverview:
 
 @dataclass(frozen=True, eq=False)
 class Served:
-    """What a server, or a static page, adds to a map: what it answers to, and what it knows from looking.
+    """State that a server or a static page adds to a map: its answers, and its levels of detail.
 
     Args:
         actions: whether a person may judge here.

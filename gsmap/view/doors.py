@@ -1,4 +1,4 @@
-"""What the server asks of a map: every time anew, so that what others do to it meanwhile is seen."""
+"""Interface of a map to the page's server, read anew for each request so that other processes' changes are seen."""
 
 from __future__ import annotations
 
@@ -73,5 +73,5 @@ class Doors(Protocol):
 
     @property
     def actions(self) -> Mapping[str, Action]:
-        """What a person may do, by name; nothing where the map is only looked at."""
+        """Return the allowed actions by name; none if the page is read-only."""
         ...

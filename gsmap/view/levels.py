@@ -1,4 +1,4 @@
-"""What a page draws: trees of scenes and overviews of islands, from the cache or made in the background."""
+"""Levels of detail of scenes and overviews of components, from the cache or made in the background."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def overview_file(parts: Sequence[tuple[ViewScene, Sketch]]) -> bytes:
 def extent_of(
     parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]
 ) -> tuple[tuple[tuple[float, float], ...], tuple[float, float, float]]:
-    """Where floor and ceiling of each scene are along a direction of the map, and length, width and height of them all;
-    a few strays left out on every side."""
+    """Return floor and ceiling of each scene along a direction of the map, and length, width and height of all scenes,
+    without a few outliers on every side."""
     points = [entry.S_map_scene.apply(one.gaussians.means) for entry, one in parts]
     ends = [np.quantile(one @ np.asarray(up), (_STRAYS, 1 - _STRAYS)).tolist() for one in points]
     return tuple((low, high) for low, high in ends), upright_size(np.concatenate(points), np.asarray(up), _STRAYS)
@@ -126,7 +126,7 @@ class Levels:
         return data
 
     def read(self, entry: ViewScene, read: Callable[[Path], _T]) -> _T:
-        """What is read of the folder of a scene's tree, which is made in this thread where it is not there.
+        """Read from the folder of a scene's tree, which is made in this thread if missing.
 
         Args:
             read: again where the tree made room for another one meanwhile.
@@ -154,7 +154,7 @@ class Levels:
         self._forget_if_gone(scene)
 
     def _forget_if_gone(self, scene: str) -> None:
-        """What was purged while it was being made is not kept."""
+        """Discard levels of a scene that was purged while they were made."""
         try:
             self._doors.source(scene)
         except NotFoundError:
@@ -242,7 +242,7 @@ class Levels:
         return overview_file(parts), ViewOverview("", tuple(places), counts, 0, heights, sides), boxes
 
     def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
-        """What is known of one island; what is not is asked for."""
+        """Return the overview of one component as far as it exists, and request the rest."""
         size = sketch_size(len(inside))
         island = self._islands.get(component)
         if island is None or island.size != size:

@@ -19,7 +19,7 @@ Work = Callable[[Progress], object]
 
 @dataclass(frozen=True)
 class Waiting:
-    """What is not there yet.
+    """Result that is not available yet.
 
     Args:
         progress: 0 to 1; 0 while it has not begun.

@@ -195,7 +195,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._guarded(lambda: self.answers.get(path, {name: values[0] for name, values in asked.items()}))
 
     def do_POST(self) -> None:
-        """What a person does: only from the page itself, small, and one at a time."""
+        """Handle an action of the page: from the page itself, small, one at a time."""
         self._waits_since(None)
         length = self.headers.get("Content-Length", "")
         own = f"http://{self.headers.get('Host', '')}"

@@ -70,7 +70,7 @@ _EMBEDDED = """
 
 @dataclass(frozen=True)
 class SiteContents:
-    """What was written.
+    """Summary of a written site.
 
     Args:
         num_bytes: in all.
@@ -157,7 +157,7 @@ class _Maker:
             yield f"edges/{pair[0]}-{pair[1]}.json", _json(detail | {"views": views})
 
     def tried(self, what: str, make: Callable[[], Any]) -> Any:
-        """What is made; None, with a note, where it is damaged or not there."""
+        """Return what the function makes; None, with a note, if its input is damaged or missing."""
         try:
             return make()
         except (CorruptError, NotFoundError, InputError) as error:

@@ -33,7 +33,7 @@ _STALE_S = 3600.0  # what has been in the making for so long was left by a proce
 
 
 class TreeCache:
-    """What is kept below one folder; several processes may use it at once.
+    """Cache of levels of detail below one folder; several processes may use it at once.
 
     Args:
         root: a folder; made when something is kept.
@@ -140,7 +140,7 @@ class TreeCache:
     # --- all of it ---------------------------------------------------------------------------------------------------
 
     def num_files(self, scene: str) -> int:
-        """How many files are kept of a scene, by the beginning of its keys."""
+        """Return the number of cached files of a scene, by the prefix of its keys."""
         found = self.root.glob(f"{glob.escape(scene)}*")
         return sum(sum(f.is_file() for f in path.rglob("*")) if path.is_dir() else 1 for path in found)
 

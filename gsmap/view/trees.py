@@ -54,7 +54,7 @@ class TreeParams:
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """What a scene looks like from afar, and how much room it takes.
+    """Coarse approximation of a scene, and its extent.
 
     Args:
         gaussians: a few, SH degree 0, scene frame.
@@ -116,8 +116,8 @@ class _Extent:
         low, high = (robust_box(corners, self.weight, _STRAYS) for corners in (self.low, self.high))
         return np.stack([low[0], high[1]])
 
-    def said(self, content: Gaussians) -> dict[str, float]:
-        """What a tile says of itself: how many Gaussians it draws, so that a viewer knows its cost before it asks for
+    def extras(self, content: Gaussians) -> dict[str, float]:
+        """Return the extras of a tile: how many Gaussians it draws, so that a viewer knows its cost before it loads
         it, and the box of what matters, from which its distance is taken."""
         low, high = self.core().round(4).tolist()
         corners = zip(("core_x0", "core_y0", "core_z0", "core_x1", "core_y1", "core_z1"), (*low, *high), strict=True)
@@ -163,7 +163,7 @@ def write_tree(
 
 
 def sketch(source: GaussianSource, max_count: int) -> Sketch:
-    """What a scene looks like from afar, of every few of its Gaussians: four times as many as are asked for, or more.
+    """Approximate a scene coarsely from a sample of its Gaussians: at least four times as many as are requested.
 
     Raises:
         InputError: no Gaussian that can be seen.
@@ -184,7 +184,7 @@ def sketch(source: GaussianSource, max_count: int) -> Sketch:
 
 
 def shown(gaussians: Gaussians) -> Gaussians:
-    """Those that are finite and not transparent."""
+    """Return the Gaussians that are finite and not transparent."""
     g = gaussians
     finite = np.isfinite(g.means).all(1) & np.isfinite(g.log_scales).all(1) & np.isfinite(g.quats).all(1)
     finite &= np.isfinite(g.sh).all((1, 2)) & (g.opacities > LEAST_OPACITY)
@@ -226,7 +226,7 @@ class _Builder:
                 return None
             extent = _Extent.of(content)
             uri, box = self._write(content, name)
-            node = TileNode(box, 0.0, uri, extras=extent.said(content))
+            node = TileNode(box, 0.0, uri, extras=extent.extras(content))
             return _Made(node, content, extent)
         below = [self.build(child, f"{name}{i}") for i, child in enumerate(cell.children)]
         made = [one for one in below if one is not None]
@@ -244,7 +244,7 @@ class _Builder:
         box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
         # A level that nothing was merged for must still count as coarser than what it stands for.
         error = max(error, 1e-6 * float(np.linalg.norm(box[1] - box[0])))
-        node = TileNode(box, error, uri, tuple(one.node for one in below), extent.said(level))
+        node = TileNode(box, error, uri, tuple(one.node for one in below), extent.extras(level))
         return _Made(node, level, extent)
 
     def _write(self, content: Gaussians, name: str) -> tuple[str, np.ndarray]:

@@ -23,14 +23,14 @@ __all__ = ["SUFFIXES", "Params", "holds_splat", "is_scan", "read", "read_depth"]
 
 
 def is_scan(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is called as clouds, meshes or splats are; it need not be there."""
+    """Return true if a file has the suffix of a point cloud, mesh or splat; it need not exist."""
     from gsmap.formats import suffix_of
 
     return _suffix(Path(path)) in SUFFIXES or suffix_of(path) is not None
 
 
 def holds_splat(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is one of Gaussians, for `gsmap.formats.read`, and no scan.
+    """Return true if a file holds Gaussians, for `gsmap.formats.read`, rather than a scan.
 
     Raises:
         NotFoundError: no such file.

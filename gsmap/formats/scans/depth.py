@@ -26,7 +26,7 @@ def read_depth(
     colour: str | os.PathLike[str] | None = None,
     units_per_m: float = 1000.0,
 ) -> Scan:
-    """What one view of a depth camera shows, in the camera's own frame (OpenCV axes), metres.
+    """Read a depth image as points in the camera frame (OpenCV axes), metres.
 
     Args:
         path: a picture of one channel, 16 bit or float: depth along the optical axis, 0 where nothing was measured.

@@ -16,7 +16,7 @@ _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_
 
 
 def is_mesh(path: Path) -> bool:
-    """Whether its header names faces."""
+    """Return true if the header names faces."""
     elements = ply.read_header(path).elements
     return any(name in elements and elements[name].count for name in ("face", "tristrips"))
 

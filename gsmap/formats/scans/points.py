@@ -1,4 +1,4 @@
-"""What all readers of points do at their end."""
+"""Checks that all readers of points share."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ _MIB = 1 << 20
 
 
 def asked(path: Path, kind: str, params: limits.Params) -> dict[str, np.ndarray]:
-    """What a library reads of a file, in a process of its own that ends when it takes too long or too much memory.
+    """Read a file with a library in a separate process, with limits on time and memory.
 
     Args:
         kind: ``cloud`` or ``mesh`` (open3d), ``las`` (laspy), or ``usd`` (usd-core).

@@ -77,7 +77,7 @@ def _layout(path: Path) -> tuple[int, re.Pattern[str], int]:
 
 
 def _are_bytes(values: np.ndarray) -> bool:
-    """Whether they are colours from 0 to 255: whole numbers, and not all 0 or 1, as normals would be."""
+    """Return true for colours in [0, 255]: integers that are not all 0 or 1, as normals would be."""
     if values.shape[1] < 3 or not len(values):
         return False
     whole = np.isfinite(values).all() and (values == np.round(values)).all()
