@@ -140,7 +140,7 @@ def expect_json() -> None:
 
 def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
     """Return the object that a verb prints with ``--json``."""
-    from gsmap.cli.objects import OBJECTS, Many, Maybe
+    from gsmap.cli.objects import OBJECTS, ManyRows, OptionalRow
     from gsmap.types.rows import SCHEMA, Row
 
     shape = OBJECTS[verb]
@@ -149,10 +149,10 @@ def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
             raise TypeError(f"{verb} prints {shape.type.__name__}, not {type(row).__name__}")
     if isinstance(rows, Row):
         data = rows.to_json()
-        return {"schema": SCHEMA, **({shape.key: data} if isinstance(shape, Maybe) else data)}
-    if isinstance(shape, Many):
+        return {"schema": SCHEMA, **({shape.key: data} if isinstance(shape, OptionalRow) else data)}
+    if isinstance(shape, ManyRows):
         return {"schema": SCHEMA, shape.key: [row.to_json() for row in rows or ()]}
-    if isinstance(shape, Maybe):
+    if isinstance(shape, OptionalRow):
         return {"schema": SCHEMA, shape.key: None}
     raise TypeError(f"{verb} prints one {shape.type.__name__}")
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gsmap.types.rows import Row
 
 
-class What(StrEnum):
+class ListKind(StrEnum):
     scenes = "scenes"
     edges = "edges"
     revisions = "revisions"
@@ -25,7 +25,7 @@ class What(StrEnum):
 
 def command(
     map: MapPath,
-    what: Annotated[What, typer.Argument(help="What to list.")],
+    what: Annotated[ListKind, typer.Argument(help="ListKind to list.")],
     component: Annotated[
         int | None,
         typer.Option("--component", "--island", help="Only scenes, edges and tiles of this connected component."),
@@ -60,13 +60,13 @@ def command(
     if left_out:
         say(left_out)
     print_rows(f"list {what}", rows, json, what)
-    if what is What.scenes and not json:
+    if what is ListKind.scenes and not json:
         say_heights(rows)
 
 
 def _rows(
     m: Map,
-    what: What,
+    what: ListKind,
     component: int | None,
     status: str | None,
     after: str | None,
@@ -75,21 +75,21 @@ def _rows(
 ) -> Sequence[Row]:
     from gsmap.errors import ConfigError
 
-    if what is What.scenes:
+    if what is ListKind.scenes:
         return m.scene_rows(component=component, status=status, after=after, tag=tag, as_of=as_of)
-    if what is What.edges:
+    if what is ListKind.edges:
         return m.edge_rows(component=component, status=status, after=after, tag=tag, as_of=as_of)
     useless: dict[str, object]
-    if what in (What.tiles, What.photos):
+    if what in (ListKind.tiles, ListKind.photos):
         useless = {"--status": status, "--after": after, "--tag": tag, "--as-of": as_of}
     else:
         useless = {"--status": status, "--component": component, "--tag": tag, "--as-of": as_of}
     for option, value in useless.items():
         if value is not None:
             raise ConfigError(f"{what} are not chosen by {option}: leave it out", code="conflicting_options")
-    if what is What.photos:
+    if what is ListKind.photos:
         return [row for row in m.photo_rows() if component is None or row.component == component]
-    if what is What.tiles:
+    if what is ListKind.tiles:
         return [row for row in m.tile_rows() if component is None or row.component == component]
     from gsmap.map.reports import made_after
 

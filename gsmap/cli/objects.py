@@ -9,14 +9,14 @@ from gsmap.types.rows import Row
 
 
 @dataclass(frozen=True)
-class One:
+class OneRow:
     """The fields of one row or report beside ``schema``."""
 
     type: type[Row]
 
 
 @dataclass(frozen=True)
-class Many:
+class ManyRows:
     """A list of rows under a key beside ``schema``."""
 
     key: str
@@ -24,75 +24,75 @@ class Many:
 
 
 @dataclass(frozen=True)
-class Maybe:
+class OptionalRow:
     """A row, or null, under a key beside ``schema``."""
 
     key: str
     type: type[Row]
 
 
-Object = One | Many | Maybe
+Object = OneRow | ManyRows | OptionalRow
 
 OBJECTS: dict[str, Object] = {
-    "init": One(rows.InitReport),
-    "ingest": Many("ingested", rows.IngestRow),
-    "describe": Many("graphs", rows.GraphRow),
-    "register": Many("edges", rows.EdgeRow),
-    "optimize": One(rows.RevisionRow),
-    "update": One(rows.UpdateReport),
-    "status": One(rows.MapStatus),
-    "confirm": One(rows.EdgeRow),
-    "reject": One(rows.EdgeRow),
-    "confirm CHANGE": One(rows.ChangeRow),
-    "reject CHANGE": One(rows.ChangeRow),
-    "edge": One(rows.EdgeRow),
-    "prior": Maybe("prior", rows.PriorRow),
-    "changes": One(rows.ChangesReport),
-    "graph": One(rows.ObjectsReport),
-    "history": One(rows.HistoryReport),
-    "localize": One(rows.LocalizeReport),
-    "find": One(rows.FindReport),
-    "edit": One(rows.SceneRow),
-    "edit OBJECT": One(rows.ObjectRow),
-    "export": One(rows.ExportReport),
-    "export --for": One(rows.SmallMapReport),
-    "list scenes": Many("scenes", rows.SceneRow),
-    "list edges": Many("edges", rows.EdgeRow),
-    "list revisions": Many("revisions", rows.RevisionRow),
-    "list tiles": Many("tiles", rows.TileRow),
-    "list photos": Many("photos", rows.PhotoRow),
-    "show SCENE": One(rows.SceneReport),
-    "show A:B": One(rows.PairReport),
-    "show CHANGE": One(rows.ChangeDetail),
-    "why A:B": One(rows.PairExplanation),
-    "diff": Many("scenes", rows.PoseChangeRow),
-    "poses": Many("poses", rows.PoseRow),
-    "georeference": One(rows.WorldReport),
-    "measure": One(rows.MeasureReport),
-    "settings": Many("settings", rows.SettingRow),
-    "convert": One(rows.ConvertReport),
-    "models add": One(rows.ModelRow),
-    "models list": Many("models", rows.ModelRow),
-    "evaluate": One(rows.EvaluationReport),
-    "branch": Many("branches", rows.BranchRow),
-    "tag": Many("tags", rows.BranchRow),
-    "merge": One(rows.MergeReport),
-    "split": One(rows.SplitReport),
-    "remove": One(rows.SceneRow),
-    "remove --purge": One(rows.PurgeReport),
-    "remove --photo": One(rows.PhotoRow),
-    "restore-scene": One(rows.SceneRow),
-    "check": One(rows.CheckReport),
-    "prune": One(rows.PruneReport),
-    "thin": One(rows.ThinReport),
-    "migrate": One(rows.MigrateReport),
-    "backup": One(rows.BackupReport),
-    "backup --list": Many("snapshots", rows.SnapshotRow),
-    "restore": One(rows.RestoreReport),
-    "clone": One(rows.CloneReport),
-    "report": One(rows.WrittenReport),
-    "trust": One(rows.TrustReport),
-    "view": One(rows.ViewReport),
-    "demo": One(rows.DemoReport),
+    "init": OneRow(rows.InitReport),
+    "ingest": ManyRows("ingested", rows.IngestRow),
+    "describe": ManyRows("graphs", rows.GraphRow),
+    "register": ManyRows("edges", rows.EdgeRow),
+    "optimize": OneRow(rows.RevisionRow),
+    "update": OneRow(rows.UpdateReport),
+    "status": OneRow(rows.MapStatus),
+    "confirm": OneRow(rows.EdgeRow),
+    "reject": OneRow(rows.EdgeRow),
+    "confirm CHANGE": OneRow(rows.ChangeRow),
+    "reject CHANGE": OneRow(rows.ChangeRow),
+    "edge": OneRow(rows.EdgeRow),
+    "prior": OptionalRow("prior", rows.PriorRow),
+    "changes": OneRow(rows.ChangesReport),
+    "graph": OneRow(rows.ObjectsReport),
+    "history": OneRow(rows.HistoryReport),
+    "localize": OneRow(rows.LocalizeReport),
+    "find": OneRow(rows.FindReport),
+    "edit": OneRow(rows.SceneRow),
+    "edit OBJECT": OneRow(rows.ObjectRow),
+    "export": OneRow(rows.ExportReport),
+    "export --for": OneRow(rows.SmallMapReport),
+    "list scenes": ManyRows("scenes", rows.SceneRow),
+    "list edges": ManyRows("edges", rows.EdgeRow),
+    "list revisions": ManyRows("revisions", rows.RevisionRow),
+    "list tiles": ManyRows("tiles", rows.TileRow),
+    "list photos": ManyRows("photos", rows.PhotoRow),
+    "show SCENE": OneRow(rows.SceneReport),
+    "show A:B": OneRow(rows.PairReport),
+    "show CHANGE": OneRow(rows.ChangeDetail),
+    "why A:B": OneRow(rows.PairExplanation),
+    "diff": ManyRows("scenes", rows.PoseChangeRow),
+    "poses": ManyRows("poses", rows.PoseRow),
+    "georeference": OneRow(rows.WorldReport),
+    "measure": OneRow(rows.MeasureReport),
+    "settings": ManyRows("settings", rows.SettingRow),
+    "convert": OneRow(rows.ConvertReport),
+    "models add": OneRow(rows.ModelRow),
+    "models list": ManyRows("models", rows.ModelRow),
+    "evaluate": OneRow(rows.EvaluationReport),
+    "branch": ManyRows("branches", rows.BranchRow),
+    "tag": ManyRows("tags", rows.BranchRow),
+    "merge": OneRow(rows.MergeReport),
+    "split": OneRow(rows.SplitReport),
+    "remove": OneRow(rows.SceneRow),
+    "remove --purge": OneRow(rows.PurgeReport),
+    "remove --photo": OneRow(rows.PhotoRow),
+    "restore-scene": OneRow(rows.SceneRow),
+    "check": OneRow(rows.CheckReport),
+    "prune": OneRow(rows.PruneReport),
+    "thin": OneRow(rows.ThinReport),
+    "migrate": OneRow(rows.MigrateReport),
+    "backup": OneRow(rows.BackupReport),
+    "backup --list": ManyRows("snapshots", rows.SnapshotRow),
+    "restore": OneRow(rows.RestoreReport),
+    "clone": OneRow(rows.CloneReport),
+    "report": OneRow(rows.WrittenReport),
+    "trust": OneRow(rows.TrustReport),
+    "view": OneRow(rows.ViewReport),
+    "demo": OneRow(rows.DemoReport),
 }
 """By verb, with what tells its forms apart."""

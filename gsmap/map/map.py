@@ -950,8 +950,8 @@ class Map(AbstractContextManager["Map"]):
 
         settings = self._settings_to_look_by()
         actions = {} if read_only or not self.store.catalog.writable else actions_of(self)
-        doors = MapPageSource(self.store, settings, actions, None if tiles is None else Path(tiles))
-        return ViewServer(doors, cache_folder(), settings.view, port=port)
+        page_source = MapPageSource(self.store, settings, actions, None if tiles is None else Path(tiles))
+        return ViewServer(page_source, cache_folder(), settings.view, port=port)
 
     def write_site(self, folder: str | os.PathLike[str], *, tiles: str | os.PathLike[str] | None = None) -> ViewReport:
         """``gsmap view MAP --export DIR``: the page as files that any web server can host.

@@ -13,7 +13,7 @@ from gsmap.errors import InputError
 from gsmap.store import Store
 from gsmap.types import PoseGraph, Prior, Sim3
 from gsmap.types.metric_scale import MetricScale
-from gsmap.view.doors import Action
+from gsmap.view.page_source import Action
 
 _MAX_NOTE = 2_000
 

@@ -54,14 +54,14 @@ def write_site(
 ) -> ViewReport:
     """Write the page as a folder; see `gsmap.Map.write_site`."""
     _check_folder(store, folder)
-    page, doors = built_page(), MapPageSource(store, settings, tiles=tiles)
+    page, page_source = built_page(), MapPageSource(store, settings, tiles=tiles)
     make_folder(folder.parent)
     staged = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}"
-    with _levels(doors, settings) as levels:
+    with _levels(page_source, settings) as levels:
         try:
             staged.mkdir()
             told = partial(progress, "page")
-            written = site.write_site(staged, doors, levels, settings.view, page, told)
+            written = site.write_site(staged, page_source, levels, settings.view, page, told)
             made = _in_order(files_below(staged))
             marker = _mark(store.id, made)
             (staged / SITE).write_bytes(marker)
@@ -91,14 +91,14 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
         raise ConfigError(
             f"{path} exists and is not a page of this map: choose another name, or delete it", code="foreign_export"
         )
-    page, doors = built_page(), MapPageSource(store, settings)
+    page, page_source = built_page(), MapPageSource(store, settings)
     made: list[site.SiteContents] = []
     told = partial(progress, "page")
-    with _levels(doors, settings) as levels:
+    with _levels(page_source, settings) as levels:
         mark = f'<meta name="gsmap-map" content="{store.id}">'  # by which a purge knows it (`gsmap.report.owner_of`)
         write = partial(
             site.write_page,
-            doors=doors,
+            page_source=page_source,
             levels=levels,
             params=settings.view,
             page=page,
@@ -256,9 +256,9 @@ def _remove(folder: Path, files: Sequence[str]) -> None:
 
 
 @contextmanager
-def _levels(doors: MapPageSource, settings: Settings) -> Iterator[Levels]:
+def _levels(page_source: MapPageSource, settings: Settings) -> Iterator[Levels]:
     cache = TreeCache(cache_folder(), int(settings.view.cache_gib * 2**30))
-    levels = Levels(doors, cache, settings.view.workers)
+    levels = Levels(page_source, cache, settings.view.workers)
     try:
         yield levels
     finally:

@@ -29,7 +29,7 @@ from gsmap.types import GaussianSource, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
 from gsmap.types.world import ImagePoint
 from gsmap.view import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
-from gsmap.view.doors import Action, PairPictures
+from gsmap.view.page_source import Action, PairPictures
 from gsmap.view.pair_picture import looks_at
 from gsmap.view.trees import VERSION, TreeParams
 

@@ -31,18 +31,18 @@ from gsmap.map.stages.change import plan_comparisons
 from gsmap.map.status import status
 from gsmap.report import (
     SECTIONS,
+    Additions,
     ChangePicture,
     EdgeEntry,
     Island,
     Moved,
-    News,
     PairPicture,
     Params,
     Plan,
     PlanEdge,
+    PlanScene,
     Report,
     SceneEntry,
-    Shown,
     StorageEntry,
     density_picture,
     make_plan,
@@ -291,7 +291,7 @@ class _ReportBuilder:
         found = [reads[scene.id] for scene in scenes]
         metre = island.metre.metres_per_unit
         shown = [
-            Shown(
+            PlanScene(
                 scene.name,
                 pose.status,
                 pose.S_map_scene.apply(read.points),
@@ -443,9 +443,9 @@ def _known_changes(store: Store, settings: Settings, since: str | None) -> Chang
     return changes_report(store, settings, asked, min_confidence=settings.change.min_confidence)
 
 
-def _news(since: str, when: datetime, scenes: Sequence[Scene], edges: Sequence[EdgeRow]) -> News:
+def _news(since: str, when: datetime, scenes: Sequence[Scene], edges: Sequence[EdgeRow]) -> Additions:
     tried = [edge for edge in edges if is_after(edge.registered_at, when)]
-    return News(
+    return Additions(
         since=since,
         scenes=tuple(scene.name for scene in scenes if is_after(scene.ingested_at, when)),
         num_tried=len(tried),

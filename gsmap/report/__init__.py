@@ -6,11 +6,11 @@ and a Content-Security-Policy that lets a browser load nothing. What a report sa
 """
 
 from gsmap.report.content import (
+    Additions,
     ChangePicture,
     EdgeEntry,
     Island,
     Moved,
-    News,
     PairPicture,
     Report,
     SceneEntry,
@@ -18,7 +18,7 @@ from gsmap.report.content import (
 )
 from gsmap.report.page import SECTIONS, owner_of, page
 from gsmap.report.params import Params
-from gsmap.report.plan import Plan, PlanEdge, Shown, make_plan
+from gsmap.report.plan import Plan, PlanEdge, PlanScene, make_plan
 from gsmap.report.top import density_picture, top_picture
 
 __all__ = [
@@ -27,14 +27,14 @@ __all__ = [
     "EdgeEntry",
     "Island",
     "Moved",
-    "News",
+    "Additions",
     "PairPicture",
     "Params",
     "Plan",
     "PlanEdge",
     "Report",
     "SceneEntry",
-    "Shown",
+    "PlanScene",
     "StorageEntry",
     "density_picture",
     "make_plan",

@@ -137,7 +137,7 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class News:
+class Additions:
     """Additions to the map since a date.
 
     Args:
@@ -208,7 +208,7 @@ class Report:
     change_pictures: tuple[ChangePicture, ...] = ()
     storage: tuple[StorageEntry, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
-    news: News | None = None
+    news: Additions | None = None
     notes: tuple[str, ...] = ()
     params: Params = field(default_factory=Params)
 

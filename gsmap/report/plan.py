@@ -18,7 +18,7 @@ _LEAST_PART, _LEAST_HOLE = 0.1, 0.03  # of the largest part, of what is shown: s
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class PlanScene:
     """A scene on a plan, in the frame and unit of its component.
 
     Args:
@@ -87,7 +87,7 @@ class Plan:
 
 
 def make_plan(
-    shown: Sequence[Shown], edges: Sequence[PlanEdge], up: np.ndarray | None, metres_per_unit: float = 1.0
+    shown: Sequence[PlanScene], edges: Sequence[PlanEdge], up: np.ndarray | None, metres_per_unit: float = 1.0
 ) -> Plan | None:
     """Lay scenes of one component out on a page; None where nothing of them has a place in space.
 

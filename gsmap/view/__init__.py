@@ -1,9 +1,9 @@
 """A page in the browser that shows a map, and pictures of it.
 
-Nothing here knows the store: what is asked of a map stands in `gsmap.view.doors`, and `ViewServer` serves it on this
+Nothing here imports the store: `gsmap.view.page_source` is the interface of a map, and `ViewServer` serves it on this
 machine only::
 
-    with ViewServer(doors, cache) as server:
+    with ViewServer(page_source, cache) as server:
         print(server.url)
         server.serve_forever()
 """

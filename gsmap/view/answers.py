@@ -18,9 +18,9 @@ import numpy as np
 from gsmap.durable import open_file
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.view.content import Served, ViewMap, ViewScene, summary
-from gsmap.view.doors import Doors, PairPictures
 from gsmap.view.levels import Levels
-from gsmap.view.making import Waiting
+from gsmap.view.making import PendingResult
+from gsmap.view.page_source import PageSource, PairPictures
 from gsmap.view.trees import FILE_NAME
 
 JSON, BYTES, JPEG = "application/json", "application/octet-stream", "image/jpeg"
@@ -58,12 +58,12 @@ class Answers:
     """The addresses of one map's page.
 
     Args:
-        doors: to the map.
+        page_source: to the map.
         levels: what is drawn of it.
     """
 
-    def __init__(self, doors: Doors, levels: Levels) -> None:
-        self._doors, self._levels = doors, levels
+    def __init__(self, page_source: PageSource, levels: Levels) -> None:
+        self._page_source, self._levels = page_source, levels
         self._pictures: OrderedDict[str, bytes] = OrderedDict()
         self._drawing, self._reading = threading.Lock(), threading.Lock()
         self._content: tuple[str, ViewMap] | None = None
@@ -107,17 +107,17 @@ class Answers:
 
     def content(self) -> ViewMap:
         """The map as it is now; read again when it has changed."""
-        state = self._doors.state()
+        state = self._page_source.state()
         with self._reading:
             if self._content is None or self._content[0] != state:
-                self._content = state, self._doors.content()
+                self._content = state, self._page_source.content()
             return self._content[1]
 
     def summary(self) -> dict[str, Any]:
         """``map.json`` as it is now."""
         view = self.content()
         overviews, levels = self._levels.overviews(view)
-        served = Served(bool(self._doors.actions), self._levels.boxes(), overviews)
+        served = Served(bool(self._page_source.actions), self._levels.boxes(), overviews)
         return {**summary(view, served), "state": _state(view.state, levels)}
 
     def _map(self) -> Answer:
@@ -138,19 +138,19 @@ class Answers:
         entry = self._entry(key)
         self._levels.look_at(self.content(), entry.scene.id)
         found = self._levels.tree(entry, _number(asked.get("rank", "0")))
-        return _waiting(found) if isinstance(found, Waiting) else Answer((found / FILE_NAME).read_bytes(), JSON)
+        return _waiting(found) if isinstance(found, PendingResult) else Answer((found / FILE_NAME).read_bytes(), JSON)
 
     def _tile(self, key: str, uri: str) -> Answer:
         return Answer(self._levels.tile(self._entry(key), uri), "model/gltf-binary", etag=f'"{uri}"')
 
     def _overview(self, component: str, name: str) -> Answer:
         found = self._levels.overview(self.content(), int(component), name)
-        return _waiting(found) if isinstance(found, Waiting) else Answer(found, BYTES, etag=f'"{name}"')
+        return _waiting(found) if isinstance(found, PendingResult) else Answer(found, BYTES, etag=f'"{name}"')
 
     def _merged(self, component: str, name: str) -> Answer:
         if not _MERGED.fullmatch(name) or int(component) not in self.content().merged:
             raise NotFoundError(f"there is no merged/{component}/{name}", code="page_not_found")
-        path = self._doors.merged(int(component)) / name
+        path = self._page_source.merged(int(component)) / name
         try:
             with open(open_file(path), "rb") as file:
                 data = file.read()
@@ -161,31 +161,31 @@ class Answers:
     # --- what is told ------------------------------------------------------------------------------------------------
 
     def _extras(self, scene: str) -> Answer:
-        return Answer.json(self._doors.extras(scene))
+        return Answer.json(self._page_source.extras(scene))
 
     def _revision(self, number: str) -> Answer:
-        return Answer.json(self._doors.revision(int(number)))
+        return Answer.json(self._page_source.revision(int(number)))
 
     def _graph(self) -> Answer:
-        return Answer.json(self._doors.graph())
+        return Answer.json(self._page_source.graph())
 
     def _history(self, asked: Mapping[str, str]) -> Answer:
         component = asked.get("component", "0")
         if not component.isdecimal() or len(component) > 8:
             raise ConfigError(f"a component is a number, got {component!r}", code="invalid_request")
-        return Answer.json(self._doors.history(asked.get("at", ""), int(component)))
+        return Answer.json(self._page_source.history(asked.get("at", ""), int(component)))
 
     def _edge(self, target: str, source: str) -> Answer:
         return Answer.json(self.edge(target, source))
 
     def edge(self, target: str, source: str) -> dict[str, Any]:
         """`EdgeDetail` of a pair of scene ids."""
-        detail = self._doors.edge(target, source)
+        detail = self._page_source.edge(target, source)
         at = f"edges/{target}-{source}"
         names = ("target", "source", "difference")
         views = [
             {"camera": camera, **{name: f"{at}/{i}-{name}.jpg" for name in names}}
-            for i, camera in enumerate(self._doors.pair_cameras(target, source))
+            for i, camera in enumerate(self._page_source.pair_cameras(target, source))
         ]
         return {**detail, "views": views}
 
@@ -195,7 +195,7 @@ class Answers:
         wanted = f"{target}-{source} {place} {name}"
 
         def draw() -> dict[str, np.ndarray]:
-            made: PairPictures = self._doors.pair_pictures(target, source)
+            made: PairPictures = self._page_source.pair_pictures(target, source)
             return {
                 f"{target}-{source} {i} {kind}": picture
                 for kind in ("target", "source", "difference")
@@ -205,11 +205,11 @@ class Answers:
         return self._drawn(wanted, draw)
 
     def _change_picture(self, change: str) -> Answer:
-        return self._drawn(change, lambda: {change: self._doors.change_picture(change)})
+        return self._drawn(change, lambda: {change: self._page_source.change_picture(change)})
 
     def _drawn(self, name: str, draw: Callable[[], Mapping[str, np.ndarray]]) -> Answer:
         """A picture from memory, or drawn now with those that come with it; one at a time."""
-        state = self._doors.state()
+        state = self._page_source.state()
         with self._drawing:
             found = self._pictures.get(f"{state} {name}")
             if found is None:
@@ -238,7 +238,7 @@ def _state(of_map: str, of_levels: str) -> str:
     return hashlib.sha256(f"{of_map}|{of_levels}".encode()).hexdigest()[:24]
 
 
-def _waiting(found: Waiting) -> Answer:
+def _waiting(found: PendingResult) -> Answer:
     retry_s = min(_LONGEST_S, _RETRY_S + _EACH_S * found.waiting)
     said = {"progress": round(found.progress, 4), "waiting": found.waiting, "retry_s": round(retry_s, 2)}
     return Answer.json(said, HTTPStatus.ACCEPTED)

@@ -1,6 +1,6 @@
 """Content of the page as `gsmap/view/page/src/contract.ts` defines it, and its conversion to JSON.
 
-Nothing here reads anything: `gsmap.view.doors` says what is loaded when the page asks for it.
+Nothing here reads anything: `gsmap.view.page_source` says what is loaded when the page asks for it.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.progress import Progress
 from gsmap.view.content import ViewMap, ViewOverview, ViewScene, up_of
-from gsmap.view.doors import Doors
-from gsmap.view.making import Maker, Waiting
+from gsmap.view.making import Maker, PendingResult
+from gsmap.view.page_source import PageSource
 from gsmap.view.tree_cache import TreeCache
 from gsmap.view.trees import Sketch, TreeParams, sketch, write_tree
 
@@ -80,14 +80,16 @@ class Levels:
     """Trees and overviews of one map, for all who look at it.
 
     Args:
-        doors: to the map.
+        page_source: to the map.
         cache: where they are kept.
         workers: threads that make them.
         tree: sizes of the levels.
     """
 
-    def __init__(self, doors: Doors, cache: TreeCache, workers: int = 2, tree: TreeParams | None = None) -> None:
-        self._doors, self._cache, self._tree = doors, cache, tree or TreeParams()
+    def __init__(
+        self, page_source: PageSource, cache: TreeCache, workers: int = 2, tree: TreeParams | None = None
+    ) -> None:
+        self._page_source, self._cache, self._tree = page_source, cache, tree or TreeParams()
         self._maker = Maker(workers)
         self._lock = threading.RLock()
         self._islands: OrderedDict[int, _Island] = OrderedDict()
@@ -98,7 +100,7 @@ class Levels:
 
     # --- trees -------------------------------------------------------------------------------------------------------
 
-    def tree(self, entry: ViewScene, rank: float = 0.0) -> Path | Waiting:
+    def tree(self, entry: ViewScene, rank: float = 0.0) -> Path | PendingResult:
         """The folder of a scene's tree, or how far it is.
 
         Args:
@@ -149,14 +151,14 @@ class Levels:
     def _make_tree(self, scene: str, key: str, progress: Progress) -> None:
         if self._cache.tree(key) is not None:  # another process was faster
             return
-        source = self._doors.source(scene)
+        source = self._page_source.source(scene)
         self._cache.make_tree(key, lambda folder: write_tree(folder, source, self._tree, progress))
         self._forget_if_gone(scene)
 
     def _forget_if_gone(self, scene: str) -> None:
         """Discard levels of a scene that was purged while they were made."""
         try:
-            self._doors.source(scene)
+            self._page_source.source(scene)
         except NotFoundError:
             self._cache.forget(scene)
             raise
@@ -189,7 +191,7 @@ class Levels:
                 if component not in self._islands:
                     self._overview(component, members(view)[component])
 
-    def overview(self, view: ViewMap, component: int, name: str) -> bytes | Waiting:
+    def overview(self, view: ViewMap, component: int, name: str) -> bytes | PendingResult:
         """The file of an overview by its name, or how far it is.
 
         Raises:
@@ -202,7 +204,7 @@ class Levels:
             told = self._overview(component, inside)
             if name == "none":
                 done = len(inside) - told.pending
-                return Waiting(done / len(inside), told.pending)
+                return PendingResult(done / len(inside), told.pending)
             parts = self._files.get(name)
             if parts is None:
                 raise NotFoundError("this overview is another by now: ask for map.json again", code="content_outdated")
@@ -301,7 +303,7 @@ class Levels:
                 self._tell(island, len(island.looked))
 
     def _make_sketch(self, scene: str, key: str, size: int) -> Sketch:
-        source: GaussianSource = self._doors.source(scene)
+        source: GaussianSource = self._page_source.source(scene)
         made = sketch(source, size)
         self._cache.keep_sketch(key, size, made)
         self._forget_if_gone(scene)

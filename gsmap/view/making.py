@@ -18,7 +18,7 @@ Work = Callable[[Progress], object]
 
 
 @dataclass(frozen=True)
-class Waiting:
+class PendingResult:
     """Result that is not available yet.
 
     Args:
@@ -56,7 +56,7 @@ class Maker:
         for thread in self._threads:
             thread.start()
 
-    def ask(self, name: str, work: Work, *, rank: float = 0.0, lasting: bool = False) -> Waiting:
+    def ask(self, name: str, work: Work, *, rank: float = 0.0, lasting: bool = False) -> PendingResult:
         """Have something done; again and again, until it is there.
 
         Args:
@@ -81,7 +81,7 @@ class Maker:
             job.rank, job.lasting = min(rank, job.rank) if job.lasting else rank, job.lasting or lasting
             job.asked_at = now
             before = sum(j.state == "waiting" and j.rank < job.rank for j in self._jobs.values())
-            return Waiting(job.progress, 0 if job.state == "working" else before)
+            return PendingResult(job.progress, 0 if job.state == "working" else before)
 
     def wait(self, done: Callable[[], bool], timeout_s: float) -> bool:
         """Until something is true that finished jobs make true; whether it is."""

@@ -30,8 +30,8 @@ from gsmap.errors import (
 from gsmap.view.answers import Answer, Answers
 from gsmap.view.built import built_page
 from gsmap.view.connections import LocalServer
-from gsmap.view.doors import Doors
 from gsmap.view.levels import Levels
+from gsmap.view.page_source import PageSource
 from gsmap.view.params import Params
 from gsmap.view.site import CSP
 from gsmap.view.tree_cache import TreeCache
@@ -80,7 +80,7 @@ class ViewServer:
     site can read the map through the visitor's browser; what changes the map must come from the page itself.
 
     Args:
-        doors: to the map.
+        page_source: to the map.
         cache: where levels of detail are kept; a folder of its own.
         params: how the map is looked at.
         port: 0 takes a free one.
@@ -92,7 +92,7 @@ class ViewServer:
 
     def __init__(
         self,
-        doors: Doors,
+        page_source: PageSource,
         cache: Path,
         params: Params | None = None,
         *,
@@ -102,7 +102,7 @@ class ViewServer:
         params = params or Params()
         self.token = secrets.token_hex(16)
         self.page = built_page() if page is None else page
-        shared = {"token": self.token, "page": self.page, "acting": threading.Lock(), "doors": doors}
+        shared = {"token": self.token, "page": self.page, "acting": threading.Lock(), "page_source": page_source}
         handler: Any = type("Handler", (_Handler,), shared)
         try:
             self._http = LocalServer(port, handler)
@@ -110,8 +110,8 @@ class ViewServer:
             raise ConfigError(
                 f"cannot serve on port {port}: {error}; try another --port, or 0", code="port_unavailable"
             ) from error
-        self.levels = Levels(doors, TreeCache(cache, int(params.cache_gib * 2**30)), params.workers)
-        handler.answers = Answers(doors, self.levels)
+        self.levels = Levels(page_source, TreeCache(cache, int(params.cache_gib * 2**30)), params.workers)
+        handler.answers = Answers(page_source, self.levels)
         self._thread: threading.Thread | None = None
 
     @cached_property
@@ -154,7 +154,7 @@ class ViewServer:
 class _Handler(BaseHTTPRequestHandler):
     token: str
     page: Path
-    doors: Doors
+    page_source: PageSource
     answers: Answers
     acting: threading.Lock
     server: LocalServer
@@ -214,9 +214,9 @@ class _Handler(BaseHTTPRequestHandler):
         named = _ACTION.fullmatch(self.path)
         if named is None:
             raise NotFoundError(f"there is no {self.path}", code="page_not_found")
-        action = self.doors.actions.get(named[1])
+        action = self.page_source.actions.get(named[1])
         if action is None:
-            if not self.doors.actions:
+            if not self.page_source.actions:
                 raise ReadOnlyError("this map was opened to be looked at: nothing can be changed from this page")
             raise NotFoundError(f"there is no action {named[1]}", code="page_not_found")
         try:

@@ -25,8 +25,8 @@ from gsmap.formats.tiles3d import CONTENT_FOLDER
 from gsmap.types.progress import Progress
 from gsmap.view.answers import Answers, jpeg
 from gsmap.view.content import Served, ViewMap, ViewOverview, summary
-from gsmap.view.doors import Doors
 from gsmap.view.levels import OVERVIEW_GAUSSIANS, Levels, members
+from gsmap.view.page_source import PageSource
 from gsmap.view.params import Params
 from gsmap.view.trees import FILE_NAME
 
@@ -85,7 +85,7 @@ class SiteContents:
 
 @dataclass(eq=False)
 class _Maker:
-    doors: Doors
+    page_source: PageSource
     levels: Levels
     params: Params
     progress: Progress
@@ -111,22 +111,22 @@ class _Maker:
             boxes |= more
             yield uri, data
         for entry in view.scenes:
-            extras = self.tried(entry.scene.name, lambda e=entry: self.doors.extras(e.scene.id))  # type: ignore[misc]
+            extras = self.tried(entry.scene.name, lambda e=entry: self.page_source.extras(e.scene.id))  # type: ignore[misc]
             yield f"scenes/{entry.scene.id}/extras.json", _json(extras or {"layers": {}, "cameras": []})
         for revision in view.revisions:
             if revision.is_kept:
-                yield f"revisions/{revision.id}.json", _json(self.doors.revision(revision.id))
+                yield f"revisions/{revision.id}.json", _json(self.page_source.revision(revision.id))
         yield from self._edges(view, pictures)
         drawn = []
         surest = sorted(view.changes, key=lambda change: -change.confidence)
         for change in surest[: self.params.site_changes if pictures else 0]:
-            picture = self.tried(f"change {change.id}", lambda c=change: self.doors.change_picture(c.id))  # type: ignore[misc]
+            picture = self.tried(f"change {change.id}", lambda c=change: self.page_source.change_picture(c.id))  # type: ignore[misc]
             if picture is not None:
                 drawn.append(change.id)
                 yield f"changes/{change.id}.jpg", jpeg(picture)
         has_objects = False
         if view.has_objects:
-            graph = self.tried("the graph of objects", self.doors.graph)
+            graph = self.tried("the graph of objects", self.page_source.graph)
             if graph is not None:
                 has_objects = True
                 yield "graph.json", _json(graph)
@@ -135,7 +135,7 @@ class _Maker:
         yield "map.json", _json(said | {"graph": "graph.json" if has_objects else None})
 
     def _edges(self, view: ViewMap, pictures: bool) -> Iterator[tuple[str, bytes]]:
-        answers = Answers(self.doors, self.levels)
+        answers = Answers(self.page_source, self.levels)
         living = {entry.scene.id for entry in view.scenes}
         edges = [edge for edge in view.edges if {edge.target, edge.source} <= living]
         edges.sort(key=lambda edge: -edge.doubt)
@@ -146,7 +146,7 @@ class _Maker:
             if detail is None:
                 continue
             if pictures and place < self.params.site_pairs and detail["views"]:
-                made = self.tried(f"pictures of {pair}", lambda p=pair: self.doors.pair_pictures(*p))  # type: ignore[misc]
+                made = self.tried(f"pictures of {pair}", lambda p=pair: self.page_source.pair_pictures(*p))  # type: ignore[misc]
                 for i, camera in enumerate(made.cameras if made else ()):
                     assert made is not None
                     names = {}
@@ -167,7 +167,7 @@ class _Maker:
 
 def write_site(
     folder: Path,
-    doors: Doors,
+    page_source: PageSource,
     levels: Levels,
     params: Params,
     page: Path,
@@ -178,7 +178,7 @@ def write_site(
     Args:
         page: the folder of the built page.
     """
-    view, maker = doors.content(), _Maker(doors, levels, params, progress)
+    view, maker = page_source.content(), _Maker(page_source, levels, params, progress)
     num_scenes = 0
     for i, entry in enumerate(view.scenes):
         progress(0.5 * i / len(view.scenes), entry.scene.name)
@@ -187,7 +187,7 @@ def write_site(
         if maker.tried(entry.scene.name, lambda e=entry, c=copy: levels.read(e, c)):  # type: ignore[misc]
             num_scenes += 1
     for component in sorted(view.merged):
-        for name, path in _merged(doors.merged(component)):
+        for name, path in _merged(page_source.merged(component)):
             target = folder / "merged" / str(component) / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
@@ -206,7 +206,7 @@ def write_site(
 
 def write_page(
     path: Path,
-    doors: Doors,
+    page_source: PageSource,
     levels: Levels,
     params: Params,
     page: Path,
@@ -220,7 +220,7 @@ def write_page(
         max_bytes: of levels of detail, before they are written as text, which takes a third more; the finest that fit.
         mark: stands in the head, to know the file again.
     """
-    view, maker = doors.content(), _Maker(doors, levels, params, progress)
+    view, maker = page_source.content(), _Maker(page_source, levels, params, progress)
     files: dict[str, bytes] = {}
     # A twentieth for what stands behind everything until the trees are there.
     size = max(1, min(OVERVIEW_GAUSSIANS, max_bytes // (20 * 20 * max(1, len(view.scenes)))))

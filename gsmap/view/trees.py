@@ -125,7 +125,7 @@ class _Extent:
 
 
 @dataclass(frozen=True, eq=False)
-class _Made:
+class _FinishedTile:
     """A finished tile."""
 
     node: TileNode
@@ -217,7 +217,7 @@ class _Builder:
     progress: Callable[[float, str], None]
     num_gaussians: int
 
-    def build(self, cell: _Cell, name: str) -> _Made | None:
+    def build(self, cell: _Cell, name: str) -> _FinishedTile | None:
         """The tile of a cell with all below it; None where nothing of it can be seen."""
         if not cell.children:
             content = shown(self.rows.take(cell.stop - cell.start))
@@ -227,12 +227,12 @@ class _Builder:
             extent = _Extent.of(content)
             uri, box = self._write(content, name)
             node = TileNode(box, 0.0, uri, extras=extent.extras(content))
-            return _Made(node, content, extent)
+            return _FinishedTile(node, content, extent)
         below = [self.build(child, f"{name}{i}") for i, child in enumerate(cell.children)]
         made = [one for one in below if one is not None]
         return self.coarser(made, name, 1) if made else None
 
-    def coarser(self, below: list[_Made], name: str, least: int) -> _Made:
+    def coarser(self, below: list[_FinishedTile], name: str, least: int) -> _FinishedTile:
         """The tile that is drawn in place of some."""
         finer = Gaussians.concatenate([one.content for one in below])
         level, error = _merged(finer, max(least, len(finer) // self.params.coarsening))
@@ -245,7 +245,7 @@ class _Builder:
         # A level that nothing was merged for must still count as coarser than what it stands for.
         error = max(error, 1e-6 * float(np.linalg.norm(box[1] - box[0])))
         node = TileNode(box, error, uri, tuple(one.node for one in below), extent.extras(level))
-        return _Made(node, level, extent)
+        return _FinishedTile(node, level, extent)
 
     def _write(self, content: Gaussians, name: str) -> tuple[str, np.ndarray]:
         """Write the file of a tile; its uri, and the box (2, 3) of what it draws."""

@@ -19,7 +19,7 @@ import gsmap.map
 import gsmap_synthetic
 from gsmap import formats
 from gsmap.cli.app import build
-from gsmap.cli.objects import OBJECTS, Many, Maybe
+from gsmap.cli.objects import OBJECTS, ManyRows, OptionalRow
 from gsmap.store import trust
 from gsmap.types.localized_photo import LocalizedPhoto
 from tools.make.tiny_encoder import image_encoder
@@ -200,9 +200,9 @@ def test_every_verb_prints_its_object_as_json(verb: str, gsmap_run: Callable[[st
     assert data["schema"] == 2
     shape = OBJECTS[verb]
     names = [field.name for field in fields(shape.type)]
-    if isinstance(shape, Many | Maybe):
+    if isinstance(shape, ManyRows | OptionalRow):
         assert list(data) == ["schema", shape.key]
-        rows = data[shape.key] if isinstance(shape, Many) else [data[shape.key]]
+        rows = data[shape.key] if isinstance(shape, ManyRows) else [data[shape.key]]
         assert rows or verb == "models list"
         assert [list(row) for row in rows] == [names] * len(rows)
     else:

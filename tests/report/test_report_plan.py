@@ -7,7 +7,7 @@ from PIL import Image
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import exp
 from gsmap.geometry.uncertainty import middle_covariance_m2
-from gsmap.report import PlanEdge, Shown, density_picture, make_plan, top_picture
+from gsmap.report import PlanEdge, PlanScene, density_picture, make_plan, top_picture
 from gsmap.report.draw_plan import draw_plan, ellipse
 from gsmap.report.plan import rings
 from gsmap.types import Gaussians, ScenePose, Sim3
@@ -24,8 +24,8 @@ def room(rng: np.random.Generator, size=(8.0, 3.0, 2.5), num: int = 4000) -> np.
     return points
 
 
-def shown(points: np.ndarray, **more) -> Shown:
-    return Shown(
+def shown(points: np.ndarray, **more) -> PlanScene:
+    return PlanScene(
         **({"name": "a", "status": "placed", "points": points, "track": NONE, "middle": points.mean(0)} | more)
     )
 

@@ -13,9 +13,9 @@ from gsmap.report import (
     Island,
     PairPicture,
     PlanEdge,
+    PlanScene,
     Report,
     SceneEntry,
-    Shown,
     StorageEntry,
     make_plan,
     page,
@@ -49,7 +49,7 @@ def made() -> Report:
         )  # fmt: skip
         edges.append(EdgeEntry(row, chi2=3.0 + a, translation_m=0.01, rotation_deg=0.1, probability=0.9, component=0))
     shown = [
-        Shown(
+        PlanScene(
             name, status, rng.uniform(0, 5, (500, 3)) + 3 * i, rng.uniform(0, 5, (9, 3)), np.full(3, 3.0 * i), np.eye(3)
         )
         for i, (name, status) in enumerate(zip(names, statuses, strict=True))

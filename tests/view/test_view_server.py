@@ -25,13 +25,13 @@ from gsmap.view.trees import shown
 
 
 @pytest.fixture
-def doors():
+def page_source():
     return MadeDoors()
 
 
 @pytest.fixture
-def server(doors, tmp_path):
-    with ViewServer(doors, tmp_path / "cache", page=page_folder(tmp_path)).start() as found:
+def server(page_source, tmp_path):
+    with ViewServer(page_source, tmp_path / "cache", page=page_folder(tmp_path)).start() as found:
         yield found
 
 
@@ -209,7 +209,7 @@ def test_files_of_the_page_are_served_and_nothing_else_that_lies_there(server):
         assert ask(server, path)[0] == 404
 
 
-def test_the_map_is_told_with_levels_that_come_by_themselves(server, doors):
+def test_the_map_is_told_with_levels_that_come_by_themselves(server, page_source):
     status, headers, body = ask(server, "/map.json", Accept_Encoding="gzip")
     assert (status, headers["Content-Encoding"]) == (200, "gzip")
     said = json.loads(gzip.decompress(body))
@@ -229,8 +229,8 @@ def test_the_map_is_told_with_levels_that_come_by_themselves(server, doors):
     assert len(found) == sum(overview["counts"])
     # In the map frame, one scene after the other.
     for place, rows in ((0, slice(0, overview["counts"][0])), (1, slice(overview["counts"][0], None))):
-        entry = doors.view.scenes[place]
-        whole = transform_gaussians(shown(doors.gaussians[entry.scene.id]), entry.S_map_scene)
+        entry = page_source.view.scenes[place]
+        whole = transform_gaussians(shown(page_source.gaussians[entry.scene.id]), entry.S_map_scene)
         assert abs(found.means[rows].mean(0) - whole.means.mean(0)).max() < 0.1
     # Its name is of these bytes; that of an older one is gone.
     assert ask(server, f"/{overview['uri']}", If_None_Match=headers["ETag"])[0] == 304
@@ -239,7 +239,7 @@ def test_the_map_is_told_with_levels_that_come_by_themselves(server, doors):
     # The island of one scene is made when somebody asks for it.
     assert said["components"][1]["overview"]["uri"] == "overviews/3/none.spz"
     state = said["state"]
-    told(server, f"/scenes/{doors.view.scenes[2].key}/tileset.json")
+    told(server, f"/scenes/{page_source.view.scenes[2].key}/tileset.json")
     assert told(server, "/state.json")["state"] != state
     assert ask(server, "/overviews/3/none.spz")[0] == 202
     end = time.monotonic() + 20
@@ -248,8 +248,8 @@ def test_the_map_is_told_with_levels_that_come_by_themselves(server, doors):
     assert told(server, "/map.json")["components"][1]["overview"]["counts"]
 
 
-def test_a_tree_is_made_when_it_is_asked_for_and_served_in_parts(server, doors, tmp_path):
-    key = doors.view.scenes[0].key
+def test_a_tree_is_made_when_it_is_asked_for_and_served_in_parts(server, page_source, tmp_path):
+    key = page_source.view.scenes[0].key
     tileset = told(server, f"/scenes/{key}/tileset.json?rank=0")
     uri = f"/scenes/{key}/{tileset['root']['content']['uri']}"
     status, headers, body = ask(server, uri)
@@ -272,15 +272,15 @@ def test_a_tree_is_made_when_it_is_asked_for_and_served_in_parts(server, doors, 
     assert ask(server, uri)[2] == body
 
 
-def test_a_scene_that_cannot_be_read_is_said(server, doors):
+def test_a_scene_that_cannot_be_read_is_said(server, page_source):
     def broken(scene):
         raise InputError("scene a is damaged: run gsmap check")
 
-    doors.source = broken
+    page_source.source = broken
     end = time.monotonic() + 10
     status = 202
     while status == 202 and time.monotonic() < end:
-        status, _, body = ask(server, f"/scenes/{doors.view.scenes[0].key}/tileset.json")
+        status, _, body = ask(server, f"/scenes/{page_source.view.scenes[0].key}/tileset.json")
         time.sleep(0.02)
     assert status == 400
     assert "gsmap check" in json.loads(body)["error"]
@@ -290,8 +290,8 @@ def test_a_scene_that_cannot_be_read_is_said(server, doors):
     assert told(server, "/map.json")["components"][0]["overview"]["pending"] == 0
 
 
-def test_a_scene_that_was_purged_while_its_tree_was_made_is_not_kept(server, doors, tmp_path):
-    real = doors.source
+def test_a_scene_that_was_purged_while_its_tree_was_made_is_not_kept(server, page_source, tmp_path):
+    real = page_source.source
     asked = []
 
     def once(scene):
@@ -300,8 +300,8 @@ def test_a_scene_that_was_purged_while_its_tree_was_made_is_not_kept(server, doo
             raise NotFoundError("purged")
         return real(scene)
 
-    doors.source = once
-    key = doors.view.scenes[2].key
+    page_source.source = once
+    key = page_source.view.scenes[2].key
     status = 202
     while status == 202:
         status = ask(server, f"/scenes/{key}/tileset.json")[0]
@@ -310,7 +310,7 @@ def test_a_scene_that_was_purged_while_its_tree_was_made_is_not_kept(server, doo
     assert not list((tmp_path / "cache").glob(f"{C}*"))
 
 
-def test_everything_else_is_told_by_its_address(server, doors):
+def test_everything_else_is_told_by_its_address(server, page_source):
     assert told(server, f"/scenes/{A}/extras.json") == {"layers": {}, "cameras": []}
     assert told(server, "/revisions/1.json")["id"] == 1
     assert told(server, "/graph.json") == {"objects": [], "relations": [], "rooms": []}
@@ -326,18 +326,18 @@ def test_everything_else_is_told_by_its_address(server, doors):
         for name in ("target", "source", "difference"):
             status, headers, body = ask(server, f"/{view[name]}")
             assert (status, headers["Content-Type"], body[:2]) == (200, "image/jpeg", b"\xff\xd8")
-    assert doors.drawn == 1  # once for all of them
+    assert page_source.drawn == 1  # once for all of them
     assert ask(server, f"/edges/{A}-{B}/9-target.jpg")[0] == 404
 
 
-def test_merged_tiles_are_served_from_their_folder_and_no_further(server, doors, tmp_path):
+def test_merged_tiles_are_served_from_their_folder_and_no_further(server, page_source, tmp_path):
     folder = tmp_path / "export" / "component_000"
     (folder / "levels").mkdir(parents=True)
     (folder / "tileset.json").write_text("{}")
     (folder / "levels" / "x.glb").write_bytes(b"glTF")
     (tmp_path / "export" / "tiles.json").write_text("{}")
     (folder / "link.glb").symlink_to(tmp_path / "export" / "tiles.json")
-    doors.merged_folder, doors.view = folder, replace(doors.view, merged=frozenset([0]))
+    page_source.merged_folder, page_source.view = folder, replace(page_source.view, merged=frozenset([0]))
     assert told(server, "/map.json")["components"][0]["merged"] == "merged/0/tileset.json"
     assert ask(server, "/merged/0/tileset.json")[2] == b"{}"
     assert ask(server, "/merged/0/levels/x.glb")[2] == b"glTF"
@@ -357,11 +357,11 @@ def test_merged_tiles_are_served_from_their_folder_and_no_further(server, doors,
 # --- what a person does ----------------------------------------------------------------------------------------------
 
 
-def test_an_action_is_done_and_answered_with_the_map_as_it_is_then(server, doors):
+def test_an_action_is_done_and_answered_with_the_map_as_it_is_then(server, page_source):
     status, said = act(server, "confirm", {"what": f"{A}:{B}", "note": "seen"})
     assert status == 200
     assert said["map"]["title"] == "after confirm"
-    assert doors.done == [("confirm", {"what": f"{A}:{B}", "note": "seen"})]
+    assert page_source.done == [("confirm", {"what": f"{A}:{B}", "note": "seen"})]
     end = time.monotonic() + 20
     while told(server, "/map.json")["components"][0]["overview"]["pending"] and time.monotonic() < end:
         time.sleep(0.05)
@@ -373,7 +373,7 @@ def test_an_action_is_done_and_answered_with_the_map_as_it_is_then(server, doors
     assert act(server, "destroy", {})[0] == 404
 
 
-def test_only_the_page_itself_may_ask_for_an_action(server, doors):
+def test_only_the_page_itself_may_ask_for_an_action(server, page_source):
     own, said = f"http://127.0.0.1:{server.port}", json.dumps({"what": "x"}).encode()
     good = {"Origin": own, "Content_Type": "application/json"}
     path = "/actions/confirm"
@@ -401,25 +401,25 @@ def test_only_the_page_itself_may_ask_for_an_action(server, doors):
     for other in ("/map.json", "/actions/", "/actions/confirm/x", "/actions/confirm?x=1"):
         assert ask(server, other, "POST", body=said, **good)[0] == 404
     assert ask(server, path)[0] == 404  # it is no address to read
-    assert doors.done == []
+    assert page_source.done == []
 
 
-def test_a_map_that_is_only_looked_at_cannot_be_changed(server, doors):
-    doors.read_only = True
+def test_a_map_that_is_only_looked_at_cannot_be_changed(server, page_source):
+    page_source.read_only = True
     assert told(server, "/map.json")["actions"] is False
     status, said = act(server, "confirm", {"what": "x"})
     assert status == 403
     assert "looked at" in said["error"]
 
 
-def test_one_action_at_a_time(server, doors):
+def test_one_action_at_a_time(server, page_source):
     began, go_on = threading.Event(), threading.Event()
 
     def slow(said):
         began.set()
         assert go_on.wait(20)
 
-    type(doors).actions = property(lambda self: {"confirm": slow})
+    type(page_source).actions = property(lambda self: {"confirm": slow})
     try:
         thread = threading.Thread(target=act, args=(server, "confirm", {}))
         thread.start()
@@ -430,28 +430,28 @@ def test_one_action_at_a_time(server, doors):
     finally:
         go_on.set()
         thread.join()
-        type(doors).actions = ACTIONS
+        type(page_source).actions = ACTIONS
 
 
 ACTIONS = MadeDoors.actions
 
 
-def test_a_port_that_is_taken_is_named(server, doors, tmp_path):
+def test_a_port_that_is_taken_is_named(server, page_source, tmp_path):
     for port in (server.port, 99999):
         with raises(ConfigError, code="port_unavailable"):
-            ViewServer(doors, tmp_path / "cache", page=server.page, port=port)
+            ViewServer(page_source, tmp_path / "cache", page=server.page, port=port)
 
 
-def test_a_page_that_is_not_built_is_said_with_what_to_do(doors, tmp_path, monkeypatch):
+def test_a_page_that_is_not_built_is_said_with_what_to_do(page_source, tmp_path, monkeypatch):
     from gsmap.view import built
 
     monkeypatch.setattr(built, "FOLDER", "nowhere")
     with raises(ConfigError, code="page_not_built"):
-        ViewServer(doors, tmp_path / "cache")
+        ViewServer(page_source, tmp_path / "cache")
 
 
 def test_an_empty_map_is_served(tmp_path):
-    doors = MadeDoors()
-    doors.view = ViewMap("empty")
-    with ViewServer(doors, tmp_path / "cache", page=page_folder(tmp_path)).start() as server:
+    page_source = MadeDoors()
+    page_source.view = ViewMap("empty")
+    with ViewServer(page_source, tmp_path / "cache", page=page_folder(tmp_path)).start() as server:
         assert told(server, "/map.json")["scenes"] == []

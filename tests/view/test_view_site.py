@@ -31,7 +31,7 @@ TREE = TreeParams(leaf_gaussians=200, root_gaussians=32)
 
 
 @pytest.fixture
-def doors(tmp_path):
+def page_source(tmp_path):
     found = MadeDoors()
     found.gaussians[A] = blob(1, 3000)
     folder = tmp_path / "export" / "component_000"
@@ -48,8 +48,8 @@ def doors(tmp_path):
 
 
 @pytest.fixture
-def levels(doors, tmp_path):
-    found = Levels(doors, TreeCache(tmp_path / "cache", 1 << 30), 1, TREE)
+def levels(page_source, tmp_path):
+    found = Levels(page_source, TreeCache(tmp_path / "cache", 1 << 30), 1, TREE)
     yield found
     found.close()
 
@@ -58,10 +58,10 @@ def silent(fraction: float, text: str) -> None:
     assert 0 <= fraction <= 1
 
 
-def site(doors, levels, tmp_path, params=PARAMS) -> Path:
+def site(page_source, levels, tmp_path, params=PARAMS) -> Path:
     out = tmp_path / "site"
     out.mkdir()
-    written = write_site(out, doors, levels, params, page_folder(tmp_path), silent)
+    written = write_site(out, page_source, levels, params, page_folder(tmp_path), silent)
     assert written.num_bytes == sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     return out
 
@@ -73,8 +73,8 @@ def addresses(said: object):
             yield text
 
 
-def test_every_address_is_a_file_and_none_is_of_this_machine(doors, levels, tmp_path):
-    out = site(doors, levels, tmp_path)
+def test_every_address_is_a_file_and_none_is_of_this_machine(page_source, levels, tmp_path):
+    out = site(page_source, levels, tmp_path)
     said = json.loads((out / "map.json").read_bytes())
     assert said["actions"] is False
     assert said["history"] is None
@@ -102,25 +102,25 @@ def test_every_address_is_a_file_and_none_is_of_this_machine(doors, levels, tmp_
     assert "script-src 'self' 'wasm-unsafe-eval'" in html
 
 
-def test_pictures_of_a_static_page_are_bounded(doors, levels, tmp_path):
-    out = site(doors, levels, tmp_path, replace(PARAMS, site_pairs=0, site_changes=0))
-    assert doors.drawn == 0
+def test_pictures_of_a_static_page_are_bounded(page_source, levels, tmp_path):
+    out = site(page_source, levels, tmp_path, replace(PARAMS, site_pairs=0, site_changes=0))
+    assert page_source.drawn == 0
     assert json.loads((out / f"edges/{A}-{B}.json").read_bytes())["views"] == []
     assert json.loads((out / "map.json").read_bytes())["changes"][0]["pictures"] is None
 
 
-def test_a_scene_that_cannot_be_read_is_left_out_and_named(doors, levels, tmp_path):
-    real = doors.source
+def test_a_scene_that_cannot_be_read_is_left_out_and_named(page_source, levels, tmp_path):
+    real = page_source.source
 
     def source(scene):
         if scene == C:
             raise InputError("it is damaged")
         return real(scene)
 
-    doors.source = source
+    page_source.source = source
     out = tmp_path / "site"
     out.mkdir()
-    written = write_site(out, doors, levels, PARAMS, page_folder(tmp_path), silent)
+    written = write_site(out, page_source, levels, PARAMS, page_folder(tmp_path), silent)
     assert written.num_scenes == 2
     assert any("far" in note and "damaged" in note for note in written.notes)
     assert json.loads((out / "map.json").read_bytes())["components"][1]["overview"] is None
@@ -134,22 +134,24 @@ def inside(path: Path) -> dict[str, bytes]:
     return {name: base64.b64decode(text) for name, text in json.loads(found[1]).items()}
 
 
-def test_one_file_holds_as_much_of_every_tree_as_fits(doors, levels, tmp_path):
+def test_one_file_holds_as_much_of_every_tree_as_fits(page_source, levels, tmp_path):
     path, page = tmp_path / "map.html", page_folder(tmp_path)
-    write_page(path, doors, levels, PARAMS, page, 10_000_000, silent, mark='<meta name="x" content="y">')
+    write_page(path, page_source, levels, PARAMS, page, 10_000_000, silent, mark='<meta name="x" content="y">')
     whole = inside(path)
     small_path = tmp_path / "small.html"
-    write_page(small_path, doors, levels, PARAMS, page, 30_000, silent)
+    write_page(small_path, page_source, levels, PARAMS, page, 30_000, silent)
     small = inside(small_path)
 
     def glbs(files):
         return sum(len(data) for name, data in files.items() if name.endswith(".glb"))
 
-    tree = levels.read(doors.view.scenes[0], Path)
-    assert sum(f"scenes/{doors.view.scenes[0].key}" in name for name in whole) == 1 + len(list(tree.rglob("*.glb")))
+    tree = levels.read(page_source.view.scenes[0], Path)
+    assert sum(f"scenes/{page_source.view.scenes[0].key}" in name for name in whole) == 1 + len(
+        list(tree.rglob("*.glb"))
+    )
     assert glbs(small) <= 30_000 < glbs(whole)
     for files in (whole, small):
-        for entry in doors.view.scenes:
+        for entry in page_source.view.scenes:
             tileset = json.loads(files[f"scenes/{entry.key}/tileset.json"])
             uris = re.findall(r"tiles/[^\"]+\.glb", json.dumps(tileset))
             assert uris
@@ -158,18 +160,18 @@ def test_one_file_holds_as_much_of_every_tree_as_fits(doors, levels, tmp_path):
     assert path.read_text().startswith('<!doctype html><html><head><meta name="x" content="y">')
     (page / "index.html").write_text("<!doctype html><head></head><body></body>")
     with raises(GsmapError, code="page_not_built"):
-        write_page(path, doors, levels, PARAMS, page, 1000, silent)
+        write_page(path, page_source, levels, PARAMS, page, 1000, silent)
 
 
-def test_nothing_in_a_name_ends_the_script_it_stands_in(doors, levels, tmp_path):
-    view = doors.view
+def test_nothing_in_a_name_ends_the_script_it_stands_in(page_source, levels, tmp_path):
+    view = page_source.view
     scene = replace(view.scenes[0].scene, name="</script><script>window.bad = 1</script><!--")
-    doors.view = replace(view, scenes=[replace(view.scenes[0], scene=scene), *view.scenes[1:]], title="</script>")
+    page_source.view = replace(view, scenes=[replace(view.scenes[0], scene=scene), *view.scenes[1:]], title="</script>")
     path, page = tmp_path / "map.html", page_folder(tmp_path)
     (page / "page.js").write_text(
         'fetch("map.json").then((a) => a.json()).then((m) => { window.told = m; }); "</script>";'
     )
-    write_page(path, doors, levels, PARAMS, page, 100_000, silent)
+    write_page(path, page_source, levels, PARAMS, page, 100_000, silent)
     with Page(f"file://{path}", tmp_path / "profile") as browser:
         browser.wait("window.told")
         assert browser.value("window.told.scenes[0].name") == scene.name
@@ -192,11 +194,11 @@ def shows(browser: Page) -> dict:
     return json.loads(browser.value("JSON.stringify(window.gsmap)"))
 
 
-def test_the_page_opens_from_a_sub_path_of_a_plain_web_server(doors, levels, tmp_path, built):
+def test_the_page_opens_from_a_sub_path_of_a_plain_web_server(page_source, levels, tmp_path, built):
     out = tmp_path / "www" / "maps" / "house"
     out.mkdir(parents=True)
-    doors.view = replace(doors.view, merged=frozenset())
-    write_site(out, doors, levels, PARAMS, built, silent)
+    page_source.view = replace(page_source.view, merged=frozenset())
+    write_site(out, page_source, levels, PARAMS, built, silent)
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None:
@@ -211,9 +213,9 @@ def test_the_page_opens_from_a_sub_path_of_a_plain_web_server(doors, levels, tmp
         server.shutdown()
 
 
-def test_the_page_opens_from_one_file(doors, levels, tmp_path, built):
+def test_the_page_opens_from_one_file(page_source, levels, tmp_path, built):
     path = tmp_path / "a map.html"
-    write_page(path, doors, levels, PARAMS, built, 2_000_000, silent)
+    write_page(path, page_source, levels, PARAMS, built, 2_000_000, silent)
     with Page(path.as_uri(), tmp_path / "profile") as browser:
         assert shows(browser)["error"] is None
         assert browser.failures() == []

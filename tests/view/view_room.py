@@ -1,4 +1,4 @@
-"""A made map behind doors of its own, and a page of a few bytes: what the tests of the server look through."""
+"""A made map behind page_source of its own, and a page of a few bytes: what the tests of the server look through."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.morton import morton_order
 from gsmap.types import Gaussians, GaussianSource, Scene, ScenePose, Sim3
 from gsmap.view import ViewEdge, ViewMap, ViewScene, ViewServer
-from gsmap.view.doors import PairPictures
+from gsmap.view.page_source import PairPictures
 
 A, B, C = ("a" * 32, "b" * 32, "c" * 32)
 

@@ -169,11 +169,11 @@ def look(url: str, settle_s: float) -> dict[str, Any]:
 
 
 def large(args: argparse.Namespace) -> None:
-    doors = MadeDoors(args.scenes, args.gaussians)
+    page_source = MadeDoors(args.scenes, args.gaussians)
     with tempfile.TemporaryDirectory() as cache_folder:
         for name in ("cold", "warm"):
             cpu = time.process_time()
-            with ViewServer(doors, Path(cache_folder), Params()).start() as server:
+            with ViewServer(page_source, Path(cache_folder), Params()).start() as server:
                 said = look(server.url, args.settle)
             report(f"large {name}", said | {"server_cpu_s": round(time.process_time() - cpu, 1)})
 
@@ -207,12 +207,12 @@ def catalog(args: argparse.Namespace) -> None:
             scene, _ = m.store.scenes.add(made_room(i, 50), none, name=f"room {i}")
             poses[scene.id] = ScenePose(scene.id, Sim3(np.eye(3), np.array([7.0 * i, 0, 0])), 0, "placed", np.eye(7))
         m.store.revisions.save(PoseGraph(poses))
-        doors = MapPageSource(m.store, m.settings)
+        page_source = MapPageSource(m.store, m.settings)
         for name in ("first", "same", "changed"):
             if name == "changed":
                 m.edit("room 3", name="another")
             wall, cpu = time.perf_counter(), time.process_time()
-            doors.content()
+            page_source.content()
             took = {"ms": round(1000 * (time.perf_counter() - wall), 1)}
             report(f"catalog {args.scenes} {name}", took | {"cpu_ms": round(1000 * (time.process_time() - cpu), 1)})
 
@@ -240,8 +240,10 @@ def fidelity(args: argparse.Namespace) -> None:
         )
         from gsmap.map.page_source import MapPageSource, cache_folder
 
-        doors = MapPageSource(m.store, m.settings)
-        placed = [entry for entry in doors.content().scenes if entry.pose is not None and entry.pose.component == 0]
+        page_source = MapPageSource(m.store, m.settings)
+        placed = [
+            entry for entry in page_source.content().scenes if entry.pose is not None and entry.pose.component == 0
+        ]
         union = Gaussians.concatenate(
             [transform_gaussians(m.store.scenes.gaussians(e.scene.id), e.S_map_scene) for e in placed]
         )
@@ -253,7 +255,7 @@ def fidelity(args: argparse.Namespace) -> None:
             cameras.append(transform_cameras(own[row : row + 1], entry.S_map_scene))
         width, height = cameras[0].sizes_px[0].tolist()
         with (
-            ViewServer(doors, cache_folder(), m.settings.view, page=page_folder).start() as server,
+            ViewServer(page_source, cache_folder(), m.settings.view, page=page_folder).start() as server,
             Page(server.url, folder / "profile", width, height) as page,
         ):
             page.wait("!!window.gsmap?.stage", 60)

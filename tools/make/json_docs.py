@@ -22,7 +22,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # the rows of this checkout, whichever one is installed
 
-from gsmap.cli.objects import OBJECTS, Many, Maybe, Object
+from gsmap.cli.objects import OBJECTS, ManyRows, Object, OptionalRow
 from gsmap.reason_codes import ERRORS, REASONS
 from gsmap.settings import field_docs
 from gsmap.types.rows import SCHEMA, Row
@@ -115,9 +115,9 @@ def _parts(hint: object) -> list[type[Row]]:
 
 def _shape(shape: Object) -> str:
     link = f"[{shape.type.__name__}](#{shape.type.__name__.lower()})"
-    if isinstance(shape, Many):
+    if isinstance(shape, ManyRows):
         return f'`"{shape.key}"`: list of {link}'
-    if isinstance(shape, Maybe):
+    if isinstance(shape, OptionalRow):
         return f'`"{shape.key}"`: {link}, or null'
     return f"the keys of {link}"
 

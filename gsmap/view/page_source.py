@@ -31,7 +31,7 @@ class PairPictures:
     difference: tuple[np.ndarray, ...] = ()
 
 
-class Doors(Protocol):
+class PageSource(Protocol):
     """A map as the page sees it. Every method may be called from any thread, and may raise `GsmapError`; what is named
     and not there is a `NotFoundError`. What is returned as a dict is JSON of `contract.ts`."""
 
