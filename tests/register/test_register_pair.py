@@ -172,7 +172,7 @@ def test_captures_said_to_be_in_metres_that_disagree_say_so():
     assert [found.status for found in (right, wrong)] == ["accepted", "accepted"]
     assert all(found.S_target_source.is_rigid for found in (right, wrong))
     assert right.notes == ()
-    assert "differ by +1.5" in wrong.notes[0]
+    assert "differ in scale by +1.5" in wrong.notes[0]
     assert wrong.evidence["log_scale"] == pytest.approx(np.log(1.015), abs=0.001)
     assert np.sqrt(np.linalg.inv(wrong.information)[6, 6]) > 0.014
 
