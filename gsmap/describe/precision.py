@@ -32,7 +32,7 @@ def round_graph(graph: SceneGraph) -> SceneGraph:
     """Return the graph with its numbers rounded."""
     step = float(2.0 ** np.round(np.log2(LENGTH_M / graph.working_m)))
     layers = {name: _layer(layer, step) for name, layer in graph.layers.items()}
-    return replace(graph, layers=layers, things=None if graph.things is None else _things(graph.things, step))
+    return replace(graph, layers=layers, segments=None if graph.segments is None else _things(graph.segments, step))
 
 
 def _layer(layer: NodeLayer, step: float) -> NodeLayer:

@@ -155,10 +155,10 @@ def _points(
         if sighting.state != "seen" or sighting.thing < 0:
             continue
         graph = graph_of(sighting.scene)
-        if graph is None or graph.things is None or sighting.scene not in poses:
+        if graph is None or graph.segments is None or sighting.scene not in poses:
             return None
-        mine = np.repeat(np.arange(len(graph.things)), graph.things.sample_counts) == sighting.thing
-        return poses[sighting.scene].apply(graph.things.samples[mine])
+        mine = np.repeat(np.arange(len(graph.segments)), graph.segments.sample_counts) == sighting.thing
+        return poses[sighting.scene].apply(graph.segments.samples[mine])
     return None
 
 

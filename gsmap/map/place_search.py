@@ -355,7 +355,7 @@ def _thing_at(point: np.ndarray, component: int, index: _SearchIndex, scene: str
 
 def _samples(index: _SearchIndex, sighting: ObjectObservation) -> np.ndarray:
     """Return the (K, 3) surface samples of a segment, map frame and unit."""
-    things = index.graphs[sighting.scene].things
+    things = index.graphs[sighting.scene].segments
     assert things is not None
     end = int(things.sample_counts[: sighting.thing + 1].sum())
     own = things.samples[end - int(things.sample_counts[sighting.thing]) : end]
@@ -371,8 +371,8 @@ def _by_likeness(
     """Rank objects by their similarity to one object, itself first."""
     looks: dict[str, list[find.SegmentDescriptor]] = {}
     for scene, graph in index.graphs.items():
-        if graph.things is not None and graph.up is not None:
-            looks[scene] = find.describe_segments(graph.things, graph.up)
+        if graph.segments is not None and graph.up is not None:
+            looks[scene] = find.describe_segments(graph.segments, graph.up)
 
     def shown(sightings: Sequence[ObjectObservation]) -> list[tuple[ObjectObservation, find.SegmentDescriptor]]:
         return [(s, looks[s.scene][s.thing]) for s in sightings if s.thing >= 0 and s.scene in looks]
@@ -445,7 +445,7 @@ def _thing_of(index: _SearchIndex, scene: str, positions: np.ndarray) -> np.ndar
     """Return (M,) the segment of a scene that contains each point (M, 3) of its frame, -1 for none."""
     from scipy.spatial import cKDTree
 
-    things = index.graphs[scene].things
+    things = index.graphs[scene].segments
     if things is None or not len(things.samples):
         return np.full(len(positions), -1)
     distance, row = cKDTree(things.samples).query(positions)

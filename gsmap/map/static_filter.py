@@ -123,12 +123,12 @@ def dynamic_rows(store: Store, scene: str, passing: DynamicContent) -> np.ndarra
             f"the segments of scene {scene[:12]} were deleted meanwhile: run the same export again",
             code="changed_meanwhile",
         )
-    if graph is not None and graph.things is not None and len(graph.things):
+    if graph is not None and graph.segments is not None and len(graph.segments):
         from gsmap.objects.changed_segments import CHANGED  # naming what passes does without
 
-        members = graph.things.members
-        of = np.bincount(members[members >= 0], minlength=len(graph.things))
-        changed = np.bincount(members[out & (members >= 0)], minlength=len(graph.things))
+        members = graph.segments.members
+        of = np.bincount(members[members >= 0], minlength=len(graph.segments))
+        changed = np.bincount(members[out & (members >= 0)], minlength=len(graph.segments))
         whole = np.flatnonzero(changed >= CHANGED * np.maximum(of, 1))  # else it is of a part, or of what stands by it
         out |= np.isin(members, np.union1d(whole, np.array(passing.things, np.int64)))
     return out

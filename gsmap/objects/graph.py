@@ -34,24 +34,24 @@ def object_graph(
     import networkx as nx
 
     graph = nx.MultiDiGraph()
-    for thing in objects:
-        stays = estimate_persistence(thing, dates)
-        facts: dict[str, Any] = {"kind": "object", "component": thing.component}
-        facts |= {axis: float(value) for axis, value in zip("xyz", thing.position, strict=True)}
-        facts |= {f"size_{axis}": float(v) for axis, v in zip("xyz", thing.box[1] - thing.box[0], strict=True)}
-        facts |= {channel: float(value) for channel, value in zip("Lab", thing.colour, strict=True)}
-        facts |= {"seen": stays.seen, "looks": stays.looks, "there": thing.there}
+    for obj in objects:
+        stays = estimate_persistence(obj, dates)
+        facts: dict[str, Any] = {"kind": "object", "component": obj.component}
+        facts |= {axis: float(value) for axis, value in zip("xyz", obj.position, strict=True)}
+        facts |= {f"size_{axis}": float(v) for axis, v in zip("xyz", obj.box[1] - obj.box[0], strict=True)}
+        facts |= {channel: float(value) for channel, value in zip("Lab", obj.colour, strict=True)}
+        facts |= {"seen": stays.seen, "looks": stays.looks, "there": obj.there}
         if stays.half_life_days is not None:
             facts["half_life_days"] = stays.half_life_days
-        facts |= {word: value for word in ("name", "label") if (value := getattr(thing.words, word))}
-        graph.add_node(thing.id, **facts)
+        facts |= {word: value for word in ("name", "label") if (value := getattr(obj.words, word))}
+        graph.add_node(obj.id, **facts)
     for relation in relations(objects, metres):
         graph.add_edge(relation.source, relation.target, kind=relation.kind)
     for room in rooms:
         at = {axis: float(value) for axis, value in zip("xyz", room.position, strict=True)}
         graph.add_node(room.id, kind="room", component=room.component, area_m2=room.area_m2, **at)
     for room in rooms:
-        graph.add_edges_from((thing, room.id, {"kind": "in room"}) for thing in room.objects)
+        graph.add_edges_from((obj, room.id, {"kind": "in room"}) for obj in room.objects)
         graph.add_edges_from((room.id, other, {"kind": "door"}) for other in room.doors)
     return graph
 

@@ -155,7 +155,7 @@ def make_objects(
         middle = captures[last[0]].S_map_scene.apply(captures[last[0]].segments.positions[last[1]][None])[0]
         colour = captures[last[0]].segments.colours[last[1]]
         objects.append(MapObject(name, component, box, middle, colour, tuple(mine[c] for c in range(len(captures)))))
-    objects.sort(key=lambda thing: (-float(np.prod(thing.box[1] - thing.box[0])), thing.id))
+    objects.sort(key=lambda obj: (-float(np.prod(obj.box[1] - obj.box[0])), obj.id))
     return _distinct(objects)
 
 
@@ -172,10 +172,10 @@ def _distinct(objects: list[MapObject]) -> list[MapObject]:
     """Make ids unique where two are the same by chance."""
     taken: set[str] = set()
     out = []
-    for thing in objects:
-        name = thing.id
+    for obj in objects:
+        name = obj.id
         while name in taken:
             name = text_digest(name)[:8]
         taken.add(name)
-        out.append(thing if name == thing.id else replace(thing, id=name))
+        out.append(obj if name == obj.id else replace(obj, id=name))
     return out

@@ -33,7 +33,7 @@ class Persistence:
         return self.seen / self.looks if self.looks else 0.0
 
 
-def estimate_persistence(thing: MapObject, dates: Mapping[str, str | None]) -> Persistence:
+def estimate_persistence(obj: MapObject, dates: Mapping[str, str | None]) -> Persistence:
     """Estimate the persistence of an object.
 
     Objects depart at a constant rate (an exponential survival prior, as in Rosen, Mason and Leonard 2016, "Towards
@@ -43,12 +43,12 @@ def estimate_persistence(thing: MapObject, dates: Mapping[str, str | None]) -> P
     time permits.
 
     Args:
-        thing: the object.
+        obj: the object.
         dates: ISO 8601 date of each scene, by its id; undated observations do not count for the half-life.
     """
     observed = [
         (datetime.fromisoformat(when).timestamp() / _DAY_S, sighting.state == "seen")
-        for sighting in thing.sightings
+        for sighting in obj.sightings
         if sighting.state != "unseen" and (when := dates.get(sighting.scene)) is not None
     ]
     observed.sort()
@@ -58,4 +58,4 @@ def estimate_persistence(thing: MapObject, dates: Mapping[str, str | None]) -> P
             at_risk += (after - before) * (1.0 if still else 0.5)
             departures += not still
     half_life = float(np.log(2) * at_risk / (departures + 0.5)) if at_risk > 0 else None
-    return Persistence(thing.seen, thing.looks, half_life)
+    return Persistence(obj.seen, obj.looks, half_life)

@@ -35,8 +35,8 @@ def relations(objects: Sequence[MapObject], metres: float | Mapping[int, float] 
         metres: per unit of the map; by component, or for all.
     """
     out = []
-    of = metres if isinstance(metres, Mapping) else dict.fromkeys((thing.component for thing in objects), metres)
-    boxes = np.array([thing.box * of[thing.component] for thing in objects]).reshape(-1, 2, 3)
+    of = metres if isinstance(metres, Mapping) else dict.fromkeys((obj.component for obj in objects), metres)
+    boxes = np.array([obj.box * of[obj.component] for obj in objects]).reshape(-1, 2, 3)
     size = np.maximum(boxes[:, 1] - boxes[:, 0], 1e-6)
     for i, one in enumerate(objects):
         low, high = np.maximum(boxes[:, 0], boxes[i, 0]), np.minimum(boxes[:, 1], boxes[i, 1])

@@ -49,9 +49,9 @@ def to_arrays(graph: SceneGraph) -> tuple[dict[str, np.ndarray], dict[str, Any]]
         "layers": layers,
         "extents_around_positions": around,
     }
-    if graph.things is not None:
-        whole |= {f"things.{name}": getattr(graph.things, name) for name in _THINGS}
-        about["things"] = {"count": len(graph.things), "unit_m": float(graph.things.unit_m)}
+    if graph.segments is not None:
+        whole |= {f"things.{name}": getattr(graph.segments, name) for name in _THINGS}
+        about["things"] = {"count": len(graph.segments), "unit_m": float(graph.segments.unit_m)}
     kept = {key: encode_array(array) for key, array in whole.items()}
     about["arrays"] = {key: how for key, (_, how) in kept.items()}
     return {key: array for key, (array, _) in kept.items()}, about

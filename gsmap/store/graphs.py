@@ -138,17 +138,17 @@ class Graphs:
 
     def _with_whole_members(self, graph: SceneGraph) -> SceneGraph:
         """Convert segment members to rows of the whole capture; see `gsmap.store.row_index_maps`."""
-        if graph.things is None:
+        if graph.segments is None:
             return graph
-        members = self._rows.of(graph.scene_id).values_of_whole(graph.things.members, -1)
-        return replace(graph, things=replace(graph.things, members=members))
+        members = self._rows.of(graph.scene_id).values_of_whole(graph.segments.members, -1)
+        return replace(graph, segments=replace(graph.segments, members=members))
 
     def _with_kept_members(self, graph: SceneGraph) -> SceneGraph:
         """Convert segment members to rows of the stored Gaussians: the inverse of `_with_whole_members`."""
-        if graph.things is None:
+        if graph.segments is None:
             return graph
-        members = self._rows.of(graph.scene_id).values_of_kept(graph.things.members)
-        return replace(graph, things=None if members is None else replace(graph.things, members=members))
+        members = self._rows.of(graph.scene_id).values_of_kept(graph.segments.members)
+        return replace(graph, segments=None if members is None else replace(graph.segments, members=members))
 
     def num_bytes(self, ref: str) -> int:
         """Return the size of the arrays of all graphs of a scene, as written."""

@@ -117,7 +117,7 @@ class Segments:
         if not (np.isfinite(self.samples).all() and np.isfinite(self.sample_colours).all()):
             raise InputError("Segments.samples holds NaN or infinity", code="not_finite")
         if self.members.size and not (self.members.min() >= -1 and self.members.max() < m):
-            raise InputError(f"Segments.members names things outside -1 to {m - 1}", code="shape_mismatch")
+            raise InputError(f"Segments.members refers to segments outside -1 to {m - 1}", code="shape_mismatch")
         if not (np.isfinite(self.unit_m) and self.unit_m > 0):
             raise InputError(f"Segments.unit_m must be positive, got {self.unit_m}", code="invalid_metre")
 
@@ -140,7 +140,7 @@ class SceneGraph:
         up: (3,) unit vector against gravity in the scene frame, or None where it could not be told.
         unit_m: guess of metres per scene unit (good to a factor of about 2); 1 where the scale is known.
         notes: remarks (few nodes, no gravity, ...).
-        things: which Gaussians are one thing; None where it was not asked, as in graphs of older releases.
+        segments: segments of its Gaussians; None if they were not computed, as in graphs of older releases.
         working_m: working metres per scene unit: the lengths of landmarks, refinement and evidence hold in them. The
             metre, where that may be the unit and the scene is seen as rooms are; else what makes it look like one.
     """
@@ -150,7 +150,7 @@ class SceneGraph:
     up: np.ndarray | None = None
     unit_m: float = 1.0
     notes: tuple[str, ...] = ()
-    things: Segments | None = None
+    segments: Segments | None = None
     working_m: float = 1.0
 
     @property

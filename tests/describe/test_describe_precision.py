@@ -32,7 +32,7 @@ def test_numbers_stay_near_what_was_found(unit: float) -> None:
     found, told = graph(unit), round_graph(graph(unit))
     a, b = found.layers["landmarks"], told.layers["landmarks"]
     half_step = 0.5 * 0.001 * unit * np.sqrt(2)  # the step is a power of two near a millimetre
-    for before, after in ((a.positions, b.positions), (found.things.samples, told.things.samples)):
+    for before, after in ((a.positions, b.positions), (found.segments.samples, told.segments.samples)):
         assert 0 < np.abs(before - after).max() <= half_step
     assert np.abs(a.extents - b.extents).max() <= 2 * half_step
     assert np.abs(a.embeddings - b.embeddings).max() <= 0.5 / 256
@@ -40,7 +40,7 @@ def test_numbers_stay_near_what_was_found(unit: float) -> None:
     assert np.abs(np.linalg.norm(b.embeddings, axis=1) - 1).max() < 0.01
     assert np.allclose(a.features, b.features, rtol=2.0**-11)
     assert np.allclose(a.weights, b.weights, rtol=2.0**-11)
-    assert np.abs(found.things.sample_colours - told.things.sample_colours).max() <= 0.25
+    assert np.abs(found.segments.sample_colours - told.segments.sample_colours).max() <= 0.25
 
 
 def test_a_landmark_reaches_as_far_to_all_sides() -> None:

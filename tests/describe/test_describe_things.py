@@ -83,11 +83,11 @@ def test_graphs_name_the_thing_of_every_gaussian(place):
     gaussians, owners = place
     params = Params(landmarks=False, objects=False)
     graph = describe("a", gaussians, None, params)
-    assert graph.things is not None
+    assert graph.segments is not None
     assert graph.layers == {}
-    assert graph.things.members.shape == (len(gaussians),)
+    assert graph.segments.members.shape == (len(gaussians),)
     if graph.up is not None:
-        assert min(ious(graph.things.members, owners)) > 0.75
+        assert min(ious(graph.segments.members, owners)) > 0.75
     without = describe("a", gaussians, None, Params(landmarks=False, objects=False, things=False))
     assert without.things is None
 
@@ -124,6 +124,6 @@ def test_things_that_do_not_fit_together_are_refused(change):
         "sample_counts": np.array([1]),
     }
     assert len(Segments(**good)) == 1
-    assert SceneGraph("a", things=Segments(**good)).num_nodes == 0  # they are no nodes: nothing is registered by them
+    assert SceneGraph("a", segments=Segments(**good)).num_nodes == 0  # they are no nodes: nothing is registered by them
     with pytest.raises(InputError):
         Segments(**good | change)

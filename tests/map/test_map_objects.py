@@ -164,10 +164,10 @@ def save_moved(m: Map, version: str) -> int:
     def members(scene: str, name: str, place: list[float]) -> np.ndarray:
         graph = m.store.graphs.load(scene)
         assert graph is not None
-        assert graph.things is not None
-        there = FRAMES[name].inverse().apply(graph.things.positions)
+        assert graph.segments is not None
+        there = FRAMES[name].inverse().apply(graph.segments.positions)
         nearest = int(np.argmin(np.linalg.norm(there - place, axis=1)))
-        return np.flatnonzero(graph.things.members == nearest).astype(np.int32)
+        return np.flatnonzero(graph.segments.members == nearest).astype(np.int32)
 
     change = Change(
         "moved",
@@ -319,10 +319,10 @@ def test_a_number_stays_when_captures_are_described_otherwise(site: Map) -> None
     may = site.store.scenes.get("may").id
     graph = site.store.graphs.load(may)
     assert graph is not None
-    assert graph.things is not None
-    order = np.arange(len(graph.things))[::-1]
-    other = reordered(graph.things, order)
-    site.store.graphs.save(replace(graph, things=other), RecipeKey("describe", "other", {"it": 1}).of(may))
+    assert graph.segments is not None
+    order = np.arange(len(graph.segments))[::-1]
+    other = reordered(graph.segments, order)
+    site.store.graphs.save(replace(graph, segments=other), RecipeKey("describe", "other", {"it": 1}).of(may))
     try:
         after = {row.id: row.position for row in site.objects().objects}
     finally:
@@ -408,9 +408,9 @@ def test_a_name_of_what_is_found_no_more_is_told_of(site: Map) -> None:
     june = site.store.scenes.get("june").id
     graph = site.store.graphs.load(june)
     assert graph is not None
-    assert graph.things is not None
+    assert graph.segments is not None
     key = RecipeKey("describe", "blind", {"it": 1}).of(june)
-    site.store.graphs.save(replace(graph, things=None), key)
+    site.store.graphs.save(replace(graph, segments=None), key)
     try:
         report = site.objects()
     finally:

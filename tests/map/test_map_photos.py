@@ -65,7 +65,7 @@ def seen(scene: str, at=(0.0, 0.0, DEPTH)) -> ObjectObservation:
 def said(found: PhotoComparison, samples: np.ndarray) -> list[PhotoObjectObservation]:
     things = OneThing(samples, np.array([len(samples)]))
     row = SimpleNamespace(T_map_camera=np.eye(4), intrinsics_px=LENS, component=0)
-    graph = SimpleNamespace(things=things)
+    graph = SimpleNamespace(segments=things)
     poses = {"a": Sim3.identity()}
     return objects_in_photo(SimpleNamespace(found=found), row, 1.0, [an_object(seen("a"))], lambda scene: graph, poses)
 

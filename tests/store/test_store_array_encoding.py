@@ -90,7 +90,7 @@ def graph():
 
 
 def bits(graph):
-    for part in (*graph.layers.values(), graph.things):
+    for part in (*graph.layers.values(), graph.segments):
         for field in fields(part):
             value = getattr(part, field.name)
             yield (value.tobytes(), value.shape, value.dtype) if isinstance(value, np.ndarray) else value

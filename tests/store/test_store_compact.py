@@ -171,7 +171,7 @@ def two_captures(store, n=60):
     """Two scenes of which the first has things, and a change of known rows of both."""
     ids = [store.scenes.add(make_gaussians(n, seed=i), make_cameras(), name="ab"[i])[0].id for i in range(2)]
     members = np.arange(n, dtype=np.int32) % 3 - 1
-    store.graphs.save(SceneGraph(ids[0], things=things_of(members)), key("describe", ids[0]))
+    store.graphs.save(SceneGraph(ids[0], segments=things_of(members)), key("describe", ids[0]))
     gone = made_change(BOX, before=np.array([3, 8, 40, 59], np.int32), after=np.array([7, 1], np.int32))
     return ids, members, save_comparison(store, *ids, gone).number
 
@@ -196,7 +196,7 @@ def test_rows_of_changes_and_things_are_the_same_gaussians_after_thinning(store)
     (change,) = store.changes.load(number).changes
     np.testing.assert_allclose(rows_at(store, ids[0], change.before), before[[8, 40, 59]], atol=2e-4)
     np.testing.assert_array_equal(change.after, [7, 1])
-    np.testing.assert_array_equal(store.graphs.load(ids[0]).things.members, members[stays])
+    np.testing.assert_array_equal(store.graphs.load(ids[0]).segments.members, members[stays])
     store.scenes.add(make_gaussians(60, seed=0), make_cameras(), name="a")
     (change,) = store.changes.load(number).changes
     np.testing.assert_array_equal(change.before, [3, 8, 40, 59])
@@ -231,7 +231,7 @@ def test_things_of_a_thinned_capture_fit_the_whole_one_that_they_are_merged_into
         keep_every_third_out(store, ids[0])
         merge(other, store)
         assert other.scenes.get(ids[0]).thinning is None
-        np.testing.assert_array_equal(other.graphs.load(ids[0], key("thin", ids[0])).things.members, members)
+        np.testing.assert_array_equal(other.graphs.load(ids[0], key("thin", ids[0])).segments.members, members)
         np.testing.assert_array_equal(other.changes.load(number).changes[0].before, [3, 8, 40, 59])
 
 
@@ -243,6 +243,6 @@ def test_rows_of_a_capture_that_an_older_gsmap_thinned_are_not_guessed(store):
         connection.execute(update(schema.scenes).where(schema.scenes.c.id == ids[0]).values(thinned=about))
     (change,) = store.changes.load(number).changes
     assert (len(change.before), len(change.after)) == (0, 2)
-    assert store.graphs.load(ids[0]).things is None
-    store.graphs.save(SceneGraph(ids[0], things=things_of(members[stays])), key("older", ids[0]))
-    np.testing.assert_array_equal(store.graphs.load(ids[0], key("older", ids[0])).things.members, members[stays])
+    assert store.graphs.load(ids[0]).segments is None
+    store.graphs.save(SceneGraph(ids[0], segments=things_of(members[stays])), key("older", ids[0]))
+    np.testing.assert_array_equal(store.graphs.load(ids[0], key("older", ids[0])).segments.members, members[stays])

@@ -38,7 +38,7 @@ def items_of(found: Sightings) -> list[Item]:
     """The things of all captures of a place."""
     items = []
     for c, graph in enumerate(found.graphs):
-        things = graph.things
+        things = graph.segments
         assert things is not None
         if graph.up is None:
             continue

@@ -163,7 +163,7 @@ def sightings(place: FindPlace) -> Sightings:
     for c, capture in enumerate(place.captures):
         owner = place.owners(capture)
         graphs.append(describe(capture.name, capture.gaussians, capture.cameras, _PARAMS, scale_policy="known"))
-        things = graphs[-1].things
+        things = graphs[-1].segments
         assert things is not None
         for t in range(len(things)):
             mine = owner[things.members == t]

@@ -174,7 +174,7 @@ def _made(
         key: None if scenes are not rendered to look for objects of other scenes.
     """
     things = {
-        scene: graph.things for scene in poses if (graph := graphs[scene]) is not None and graph.things is not None
+        scene: graph.segments for scene in poses if (graph := graphs[scene]) is not None and graph.segments is not None
     }
     captures = [SegmentedScene(scene, poses[scene], mine) for scene, mine in things.items()]
     digests = {scene: _digest(things[scene]) if scene in things else "" for scene in poses}

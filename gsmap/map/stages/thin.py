@@ -115,7 +115,7 @@ THINGS = RecipeKey("thin", "things", {"things": 1})
 
 def _keep_things(store: Store, graph: SceneGraph | None) -> None:
     """Keep the segments of a thinned scene without its node layers."""
-    if graph is None or graph.things is None:
+    if graph is None or graph.segments is None:
         return
     store.graphs.save(replace(graph, layers={}), THINGS.of(graph.scene_id))
 
