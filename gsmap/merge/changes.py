@@ -39,24 +39,24 @@ class ResolvedScenes:
 
     Args:
         scenes: in the given order, without outdated Gaussians, and in the newest scene's exposure.
-        lost: number of removed Gaussians of each scene.
+        num_removed: number of removed Gaussians of each scene.
         changed: per scene (N,) bool, Gaussians that replace removed ones of another scene; as no older scene shows
             their place, they stay as they are.
         behind: per scene (N,) bool, Gaussians beside a change that are occluded in newer scenes: they are not
             disproved, but do not show the present place either.
-        rivals: per scene, the present Gaussians at the places of its removed ones; empty without any.
-        losers: per scene, its removed Gaussians.
+        replacements: per scene, the present Gaussians at the places of its removed ones; empty without any.
+        removed: per scene, its removed Gaussians.
     """
 
     scenes: list[PosedScene]
-    lost: list[int]
+    num_removed: list[int]
     changed: list[np.ndarray]
     behind: list[np.ndarray]
-    rivals: list[Gaussians]
-    losers: list[Gaussians]
+    replacements: list[Gaussians]
+    removed: list[Gaussians]
     _flagged: dict[int, tuple[Gaussians, int]] = field(default_factory=dict)
 
-    def overruled_pixels(self, scene: int, camera: Cameras, longest_side_px: int = 240) -> np.ndarray:
+    def outdated_pixels(self, scene: int, camera: Cameras, longest_side_px: int = 240) -> np.ndarray:
         """Return (H, W) bool, pixels of a scene's view from one camera that show outdated or miss present content."""
         flagged, count = self._flagged_of(scene)
         width, height = (int(v) for v in camera.sizes_px[0])
@@ -78,20 +78,20 @@ class ResolvedScenes:
         """
         if scene not in self._flagged:
             self._flagged.clear()
-            disputed = Gaussians.concatenate([self.losers[scene], self.rivals[scene]])
+            disputed = Gaussians.concatenate([self.removed[scene], self.replacements[scene]])
             parts = [_in_grey(disputed, 1.0), _in_grey(self.scenes[scene].gaussians, 0.0)]
             self._flagged[scene] = Gaussians.concatenate(parts), len(disputed)
         return self._flagged[scene]
 
     def is_disputed(self, scene: int) -> bool:
         """Return whether any view of a scene may show outdated or miss present content."""
-        return len(self.losers[scene]) + len(self.rivals[scene]) > 0
+        return len(self.removed[scene]) + len(self.replacements[scene]) > 0
 
     def notes(self) -> list[str]:
         """Return notes on removed Gaussians."""
         return [
             f"{n} outdated Gaussians of scene {s.scene_id[:12]} are removed where the place changed"
-            for s, n in zip(self.scenes, self.lost, strict=True)
+            for s, n in zip(self.scenes, self.num_removed, strict=True)
             if n
         ]
 
@@ -120,7 +120,7 @@ def resolve_changes(
     """
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
     changed, behind = ([np.zeros(len(s.gaussians), dtype=bool) for s in scenes] for _ in range(2))
-    rivals = [_empty(s) for s in scenes]
+    replacements = [_empty(s) for s in scenes]
     exposures: list[compare.Balance | None] = [None] * len(scenes)
     newer: list[_NewerScene] = []
     groups = _by_date(scenes) if prefer != "both" else []
@@ -136,7 +136,7 @@ def resolve_changes(
             found = compare.compare(views, joined)
             verdict = _find_disagreement(views, joined, found, prefer)
             exposures[i] = _exposure(found)
-            keeps[i] &= ~verdict.lost
+            keeps[i] &= ~verdict.removed
             if prefer == "newest":
                 beside = _beside(views.gaussians.means, joined, verdict)
                 behind[i] = beside & (found.older.state == HIDDEN)
@@ -146,11 +146,11 @@ def resolve_changes(
             for one in parts:
                 rows = np.flatnonzero(one.shows)
                 mine = slice(first, first + len(rows))
-                changed[one.scene][rows[verdict.changed[mine]]] = True
-                keeps[one.scene][rows[verdict.beaten[mine]]] = False
-                one.shows[rows[verdict.beaten[mine]]] = False
+                changed[one.scene][rows[verdict.replacing[mine]]] = True
+                keeps[one.scene][rows[verdict.removed_newer[mine]]] = False
+                one.shows[rows[verdict.removed_newer[mine]]] = False
                 first += len(rows)
-            rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
+            replacements[i] = Gaussians.concatenate([replacements[i], joined.gaussians[verdict.replacing]])
             if group is groups[-1]:
                 continue  # nothing is compared with the oldest
             # Only Gaussians unobserved by newer scenes are added, so that `newer` stays as large as the place.
@@ -164,7 +164,7 @@ def resolve_changes(
         [int((~k).sum()) for k in keeps],
         [c[k] for c, k in zip(changed, keeps, strict=True)],
         [b[k] for b, k in zip(behind, keeps, strict=True)],
-        rivals,
+        replacements,
         [s.gaussians[~k] for s, k in zip(scenes, keeps, strict=True)],
     )
 
@@ -182,21 +182,21 @@ class _NewerScene:
 class _Disagreement:
     """Masks of (N,) removed Gaussians of the older scene, (M,) replacing and (M,) removed ones of the newer."""
 
-    lost: np.ndarray
-    changed: np.ndarray
-    beaten: np.ndarray
+    removed: np.ndarray
+    replacing: np.ndarray
+    removed_newer: np.ndarray
 
 
 def _find_disagreement(older: CaptureViews, newer: CaptureViews, found: Comparison, prefer: Prefer) -> _Disagreement:
-    lost = np.isin(found.older.state, (GONE, REPAINTED))
-    changed = np.isin(found.newer.state, (GONE, REPAINTED))
-    changed |= (found.newer.state != SAME) & _revealed(newer, found)
-    beaten = np.zeros(len(changed), dtype=bool)
+    removed = np.isin(found.older.state, (GONE, REPAINTED))
+    replacing = np.isin(found.newer.state, (GONE, REPAINTED))
+    replacing |= (found.newer.state != SAME) & _revealed(newer, found)
+    removed_newer = np.zeros(len(replacing), dtype=bool)
     if prefer == "best":
-        stays = lost & (older.sharpness > found.older.sharpness)
-        beaten = np.isin(found.newer.state, (GONE, REPAINTED)) & (newer.sharpness < found.newer.sharpness)
-        lost, changed = lost & ~stays, changed & ~beaten
-    return _Disagreement(lost, changed, beaten)
+        stays = removed & (older.sharpness > found.older.sharpness)
+        removed_newer = np.isin(found.newer.state, (GONE, REPAINTED)) & (newer.sharpness < found.newer.sharpness)
+        removed, replacing = removed & ~stays, replacing & ~removed_newer
+    return _Disagreement(removed, replacing, removed_newer)
 
 
 def _revealed(newer: CaptureViews, found: Comparison) -> np.ndarray:
@@ -214,7 +214,7 @@ def _revealed(newer: CaptureViews, found: Comparison) -> np.ndarray:
 
 def _beside(older: np.ndarray, newer: CaptureViews, verdict: _Disagreement) -> np.ndarray:
     """Return (N,) bool, Gaussians of the older scene (N, 3) near removed or new ones."""
-    disputed = np.concatenate([older[verdict.lost], newer.gaussians.means[verdict.changed]])
+    disputed = np.concatenate([older[verdict.removed], newer.gaussians.means[verdict.replacing]])
     if not len(disputed):
         return np.zeros(len(older), dtype=bool)
     out: np.ndarray = np.isfinite(nearest_of(disputed, older, _NEAR_M)[0])

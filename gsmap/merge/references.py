@@ -113,7 +113,7 @@ def render_references(
             depth = shared.depth(sight)
         else:
             seen = render(scenes[i].gaussians, camera, max_weight=True)
-            disputed = settled.overruled_pixels(i, camera) if settled is not None and settled.is_disputed(i) else None
+            disputed = settled.outdated_pixels(i, camera) if settled is not None and settled.is_disputed(i) else None
             _count(seen, disputed, pixels[i], sure[i], largest[i])
             depth = seen.depth[0]
         counts = inside_pixels(camera, depth, bounds, halo_m / 2)
@@ -140,7 +140,7 @@ def render_references(
     for i, one in _photos(scenes, pieces, longest_side_px) if photo_weight else ():
         counts = one.counts & inside_pixels(one.camera, one.depth, bounds, halo_m / 2)
         if settled is not None and settled.is_disputed(i):
-            counts &= ~settled.overruled_pixels(i, one.camera)
+            counts &= ~settled.outdated_pixels(i, one.camera)
         share = float(counts.mean())
         if share < _MIN_TILE_FRACTION:
             continue

@@ -64,9 +64,9 @@ def merged(method: str, **settings: object) -> Callable[[], dict[str, np.ndarray
 
 def changes() -> dict[str, np.ndarray]:
     found = resolve_changes(scenes())
-    pixels = found.overruled_pixels(0, cameras(np.zeros(1)))
+    pixels = found.outdated_pixels(0, cameras(np.zeros(1)))
     kept = {f"kept_{s.scene_id}": s.gaussians.means for s in found.scenes}
-    return kept | {"lost": np.array(found.lost), "changed": found.changed[1], "overruled": pixels}
+    return kept | {"lost": np.array(found.num_removed), "changed": found.changed[1], "overruled": pixels}
 
 
 def exposure() -> dict[str, np.ndarray]:

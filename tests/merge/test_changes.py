@@ -32,25 +32,25 @@ def test_what_a_later_capture_looked_through_is_gone():
     old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
     settled = resolve_changes([old, new])
     assert standing(settled, 0) == 0
-    assert len(box(5)) <= settled.lost[0] <= 1.05 * len(box(5))
-    assert settled.lost[1] == 0
+    assert len(box(5)) <= settled.num_removed[0] <= 1.05 * len(box(5))
+    assert settled.num_removed[1] == 0
     # The other way round the box is new, and stays; so it does where nobody knows the time, or it is the same.
     later = replace(old, captured_at="2022-01-01")
     assert standing(resolve_changes([later, new]), 0) == len(box(5))
     for when in (None, new.captured_at):
-        assert resolve_changes([replace(old, captured_at=when), new]).lost == [0, 0]
+        assert resolve_changes([replace(old, captured_at=when), new]).num_removed == [0, 0]
 
 
 def test_an_older_capture_in_another_exposure_loses_no_more_beside_what_went():
     scene = Gaussians.concatenate([wall(1, -1, 1, colour=plain), box(5)])
     old = dated("old", 2020, apply_gain(scene, np.full(3, 0.6)))
-    assert resolve_changes([old, dated("new", 2021, wall(2, -1, 1, colour=plain))]).lost == [len(box(5)), 0]
+    assert resolve_changes([old, dated("new", 2021, wall(2, -1, 1, colour=plain))]).num_removed == [len(box(5)), 0]
 
 
 def test_what_no_newer_capture_saw_stays():
     away = dated("new", 2021, wall(1, -1.5, 1.5), cameras=cameras_facing(np.linspace(-3.6, -3.0, 7)))
     old = dated("old", 2020, wall(0, -1.5, 1.5), box(5))
-    assert resolve_changes([old, away]).lost == [0, 0]
+    assert resolve_changes([old, away]).num_removed == [0, 0]
 
 
 def test_paint_is_told_from_exposure():
@@ -65,7 +65,7 @@ def test_paint_is_told_from_exposure():
     # The same picture a stop and a half darker and in warmer light says nothing of paint ...
     gain = np.array([0.5, 0.4, 0.3])
     lit = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=plain), gain))
-    assert resolve_changes([old, lit]).lost == [0, 0]
+    assert resolve_changes([old, lit]).num_removed == [0, 0]
     # ... and hides none.
     both = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=patched), gain))
     left = resolve_changes([old, both]).scenes[0].gaussians.means
@@ -195,8 +195,8 @@ def test_a_capture_of_another_place_costs_nothing(monkeypatch):
     near, far = dated("a", 2020, wall(0, -1, 1)), dated("b", 2021, wall(1, 9, 11), cameras=cameras_facing([10.0]))
     monkeypatch.setattr(compare, "compare", None)
     settled = resolve_changes([near, far])
-    assert settled.lost == [0, 0]
-    assert isinstance(settled.rivals[0], Gaussians)
+    assert settled.num_removed == [0, 0]
+    assert isinstance(settled.replacements[0], Gaussians)
 
 
 def test_truth_grows_by_what_is_new_to_it_alone(monkeypatch):
@@ -249,5 +249,5 @@ def test_tiles_keep_each_capture_in_its_own_exposure():
 def test_cameras_that_nobody_held_saw_nothing():
     old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
     invented = replace(new, cameras=replace(new.cameras, synthesised=True))
-    assert resolve_changes([old, invented]).lost == [0, 0]
-    assert resolve_changes([old, new]).lost[0] > 0
+    assert resolve_changes([old, invented]).num_removed == [0, 0]
+    assert resolve_changes([old, new]).num_removed[0] > 0
