@@ -89,7 +89,7 @@ def test_graphs_name_the_thing_of_every_gaussian(place):
     if graph.up is not None:
         assert min(ious(graph.segments.members, owners)) > 0.75
     without = describe("a", gaussians, None, Params(landmarks=False, objects=False, things=False))
-    assert without.things is None
+    assert without.segments is None
 
 
 def test_the_key_of_a_graph_without_things_is_that_of_older_releases():
