@@ -14,6 +14,7 @@ from gsmap.optimize.measurements import measurements
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import chi_squares
 from gsmap.optimize.state import State, refine
+from gsmap.reason_codes import reason_code
 from gsmap.types import Edge, Sim3
 
 GATE = float(chi2.ppf(0.999, 6))
@@ -86,6 +87,29 @@ def test_when_components_join(agreeing, rival, sizes, confirmed, decision):
     m = edges_between([[k, 6 + k] for k in range(6)], confirmed)
     join = Join(0, 1, np.arange(agreeing), rival, np.arange(6))
     assert decision in join_decision(join, m, np.array(sizes), Params())
+
+
+@pytest.mark.guards("answers")
+@pytest.mark.parametrize(
+    ("agreeing", "rival", "sizes", "odds", "decision"),
+    [
+        (1, 0, (3, 6), 0.0, "too_few_edges"),  # from three scenes on a component is large
+        (1, 0, (2, 6), 0.0, "single"),
+        (2, 1, (6, 2), 0.0, "agreed"),
+        (2, 2, (6, 2), 0.0, "outvoted"),
+        (2, 2, (6, 2), 2.0, "outvoted"),
+        (2, 2, (6, 2), 100.0, "agreed"),
+        (2, 2, (6, 2), -100.0, "outvoted"),
+        (2, 3, (6, 2), 100.0, "outvoted"),
+        (1, 1, (6, 2), 100.0, "single"),
+        (5, 3, (6, 6), 0.0, "outvoted"),
+    ],
+)
+def test_as_many_edges_as_contradict_them_join_only_by_much_better_evidence(agreeing, rival, sizes, odds, decision):
+    m = edges_between([[k, 6 + k] for k in range(6)])
+    join = Join(0, 1, np.arange(agreeing), rival, np.arange(6), log_odds=odds)
+    found = join_decision(join, m, np.array(sizes), Params())
+    assert (found if found in ("agreed", "single") else reason_code(found)) == decision
 
 
 @pytest.mark.guards("answers")

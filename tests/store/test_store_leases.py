@@ -128,9 +128,18 @@ def test_a_lease_longer_than_any_is_none(store: Store) -> None:
 
 
 @pytest.mark.guards("data")
+@pytest.mark.parametrize(("lease_s", "free"), [(1.9, False), (2.1, True)])
+def test_another_machine_s_lease_counts_up_to_twice_its_length(store: Store, lease_s: float, free: bool) -> None:
+    mine = Leases(store.catalog, lease_s=100.0, heartbeat_s=20.0)
+    of_another_machine(store, "poses", seconds_left=100 * lease_s)
+    assert mine.try_hold("poses", "update") is free
+    mine.close()
+
+
+@pytest.mark.guards("data")
 def test_all_that_a_process_holds_is_renewed_while_it_holds_it(store: Store) -> None:
     mine = Leases(store.catalog, lease_s=1.0, heartbeat_s=0.2)
-    assert mine.take(["a", "b", "c"], "update").ours == ("a", "b", "c")
+    assert mine.acquire(["a", "b", "c"], "update").ours == ("a", "b", "c")
     mine.release(["b"])
     first = rows(store)
     time.sleep(1.5)
