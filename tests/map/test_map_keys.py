@@ -315,7 +315,7 @@ def test_named_pairs_are_registered_again(watched: Watched, tmp_path: Path) -> N
     [
         ("capture_a capture_b\ncapture_a\n", InputError, "invalid_pairs_file"),
         ("capture_a capture_b capture_a\n", InputError, "invalid_pairs_file"),
-        ("capture_a capture_z\n", NotFoundError, "invalid_pairs_file"),
+        ("capture_a capture_z\n", NotFoundError, "scene_not_found"),
         ("capture_a capture_a\n", ConfigError, "same_scene"),
         (None, NotFoundError, "file_not_found"),
     ],

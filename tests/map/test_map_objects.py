@@ -534,7 +534,7 @@ def test_a_thinning_that_ends_in_its_middle_changes_nothing(
         before = m.objects().objects
         with monkeypatch.context() as patched:
             patched.setattr(Graphs, "save", lambda *_: (_ for _ in ()).throw(OSError("the disk failed")))
-            with raises(StoreError, code="disk_failed"):
+            with raises(StoreError, code="system_refused"):
                 m.thin(keep_days=1, now="2026-07-01T00:00:00+00:00")
         assert all(scene.thinning is None for scene in m.scenes())
         assert m.objects().objects == before

@@ -9,7 +9,7 @@ from sqlalchemy import MetaData, select
 from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 from test_store_nouns import graph_of, layer, registration, tile
 
-from gsmap.store import Store
+from gsmap.store import Store, schema
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.repository import SNAPSHOTS, Backup, Snapshot, format_file_list, object_name
 from gsmap.store.catalog_copy import snapshot_read, tables
@@ -71,7 +71,7 @@ def make_snapshot(
         "name": "",
         "map_id": map_id,
         "created_at": "2026-01-02T03:04:05.000000+00:00",
-        "schema": "0003",
+        "schema": schema.HEAD,
         "gsmap_version": "0.0",
         "files": put(place, text),
         "files_bytes": len(text),
