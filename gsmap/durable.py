@@ -185,7 +185,9 @@ def remove_tree(root: Path, *names: str) -> None:
                     names[-1], dir_fd=parent
                 )  # by folder descriptors: follows no link, even if swapped in meanwhile
             except RecursionError as error:
-                raise OSError(f"{root.joinpath(*names)} is too deep to be deleted: remove it by hand") from error
+                raise OSError(
+                    f"{root.joinpath(*names)} has too many nested folders to be deleted: remove it by hand"
+                ) from error
         else:
             os.unlink(names[-1], dir_fd=parent)
 
@@ -268,7 +270,7 @@ def open_file(path: Path) -> int:
     if not is_file(path):
         path.lstat()  # raises FileNotFoundError if it is missing
         raise CorruptError(
-            f"{path} is no plain file (a link, folder, pipe or device): gsmap made none; remove it",
+            f"{path} is not a regular file (it is a link, folder, pipe or device), and gsmap creates none: remove it",
             code="not_a_plain_file",
         )
     return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
@@ -323,12 +325,13 @@ def _mode(name: str, folder: int) -> int | None:
 def _checked_name(root: Path, name: str) -> str:
     if name in ("", ".", "..") or "/" in name or "\0" in name:
         raise CorruptError(
-            f"{name!r} is not the name of anything in {root}: nothing is done with it", code="invalid_stored_name"
+            f"{name!r} is not the name of an entry of {root}; nothing was changed", code="invalid_stored_name"
         )
     return name
 
 
 def _is_a_link(path: Path) -> CorruptError:
     return CorruptError(
-        f"{path} is a link: gsmap makes none and follows none here; put what it names in its place", code="link_refused"
+        f"{path} is a link, and gsmap does not follow links here: replace it by the file or folder it points to",
+        code="link_refused",
     )

@@ -122,21 +122,21 @@ def read_members(size: int, read: Read) -> Mapping[str, ByteRange]:
     """
     end = size - _END.size
     if end < 0:
-        raise ValueError("it is too short for an archive")
+        raise ValueError("the archive is too short")
     mark, _, _, _, count, table_bytes, table, comment = _END.unpack(read(end, size))
     if mark != b"PK\5\6" or comment:
-        raise ValueError("it does not end as an archive does")
+        raise ValueError("the archive has no end record")
     if 0xFFFF in (count,) or 0xFFFFFFFF in (table_bytes, table):
         end -= _LOCATOR.size
         mark, _, where, _ = _LOCATOR.unpack(read(end, end + _LOCATOR.size)) if end >= 0 else (b"", 0, 0, 0)
         end -= _END_64.size
         if mark != b"PK\6\7" or where != end or end < 0:
-            raise ValueError("it does not end as a long archive does")
+            raise ValueError("the archive has no valid zip64 end record")
         mark, *_, count, table_bytes, table = _END_64.unpack(read(end, end + _END_64.size))
         if mark != b"PK\6\6":
-            raise ValueError("it does not end as a long archive does")
+            raise ValueError("the archive has no valid zip64 end record")
     if table + table_bytes != end or table_bytes > _MAX_TABLE_BYTES:
-        raise ValueError("its table of contents does not lie at its end")
+        raise ValueError("the archive's central directory is not at its end")
     return _entries(read(table, end), count, table)
 
 
@@ -147,7 +147,7 @@ def _entries(table: bytes, count: int, end: int) -> Mapping[str, ByteRange]:
     at = lies = 0
     for _ in range(count):
         if at + _ENTRY.size > len(table):
-            raise ValueError("its table of contents is cut off")
+            raise ValueError("the archive's central directory is truncated")
         entry = _ENTRY.unpack_from(table, at)
         mark, _, _, flags, method, _, _, crc, packed, size, named, more, comment, disk, _, _, start = entry
         at += _ENTRY.size
@@ -155,16 +155,16 @@ def _entries(table: bytes, count: int, end: int) -> Mapping[str, ByteRange]:
         extra = table[at + named : at + named + more]
         at += named + more + comment
         if size == 0xFFFFFFFF:
-            raise ValueError("it has a member of over 4 GB")
+            raise ValueError("the archive has a member of over 4 GB")
         if start == 0xFFFFFFFF and len(extra) == 12 and extra[:4] == b"\1\0\x08\0":
             start, extra = int.from_bytes(extra[4:], "little"), b""
         if mark != b"PK\1\2" or flags & ~_UTF8 or method or packed != size or comment or disk or extra or name in out:
-            raise ValueError("its table of contents has entries that gsmap does not make")
+            raise ValueError("the archive's central directory has entries that gsmap does not write")
         if start != lies:
-            raise ValueError("its members do not lie one after the other")
+            raise ValueError("the archive's members are not contiguous")
         body = start + _LOCAL.size + named
         out[name] = ByteRange(FILE, body, size, crc)
         lies = body + size
     if at != len(table) or lies != end:
-        raise ValueError("its table of contents does not tell all that is in it")
+        raise ValueError("the archive's central directory does not list all of its members")
     return MappingProxyType(out)

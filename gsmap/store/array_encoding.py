@@ -46,7 +46,7 @@ def decode_array(stored: np.ndarray, encoding: Mapping[str, Any]) -> np.ndarray:
     """
     kept, dtype = _TYPES[encoding["as"]], _TYPES[encoding["is"]]
     if stored.dtype != (kept if kept.itemsize == 1 else np.uint8):
-        raise ValueError(f"its values are {stored.dtype}, but the catalog says {kept}")
+        raise ValueError(f"its values are {stored.dtype}, but the catalog records {kept}")
     values = stored if kept.itemsize == 1 else _join_bytes(stored, kept)
     values = values.reshape(encoding["shape"])
     if kept == dtype:
@@ -69,7 +69,7 @@ def encoded_shape(encoding: Mapping[str, Any]) -> Shape:
     )
     if not (_is_shape(shape) and known and type(step) is float and math.isfinite(step) and step > 0):
         raise CorruptError(
-            f"the catalog has an array that is kept as {encoding!r:.100}: gsmap did not write that",
+            f"the catalog records an array encoding {encoding!r:.100} that gsmap does not write",
             code="catalog_invalid",
         )
     width = _TYPES[encoding["as"]].itemsize

@@ -75,7 +75,7 @@ def unless_pruned(catalog: Catalog, group_id: str, gone: str) -> Iterator[None]:
             if has_group(connection, group_id):
                 raise
         raise NotFoundError(
-            f"{gone}, and its arrays were pruned while they were read: try again", code="changed_meanwhile"
+            f"{gone}, and its arrays were pruned during the read: try again", code="changed_meanwhile"
         ) from None
 
 

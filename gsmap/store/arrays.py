@@ -152,7 +152,7 @@ class Arrays:
             return
         handle = os.open(self.root, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
-            lock_within(handle, fcntl.LOCK_EX, patience_s, f"{self.root}: others have been writing arrays")
+            lock_within(handle, fcntl.LOCK_EX, patience_s, f"{self.root}: other processes have been writing arrays")
             self._held.depth = 1
             yield
         finally:
@@ -232,11 +232,13 @@ class Arrays:
             path, found = place / file.path, present.get(file.path)
             if found is not None and not stat.S_ISREG(found.st_mode):
                 raise CorruptError(
-                    f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it",
+                    f"{path} is not a regular file (it is a link, pipe or device); gsmap creates none: remove it",
                     code="not_a_plain_file",
                 )
             if found is None or found.st_size != file.size_bytes:
-                raise CorruptError(f"{path} is missing or cut off: {layout.repair_advice(kind)}", code="arrays_missing")
+                raise CorruptError(
+                    f"{path} is missing or truncated: {layout.repair_advice(kind)}", code="arrays_missing"
+                )
         try:
             with _open_body(place, kind, files) as body:
                 names = body.array_names() if only is None else only
@@ -259,9 +261,9 @@ class Arrays:
             if found is None:
                 out.append(f"{path} is missing")
             elif not stat.S_ISREG(found.st_mode):
-                out.append(f"{path} is no plain file (a link, pipe or device)")
+                out.append(f"{path} is not a regular file (it is a link, pipe or device)")
             elif found.st_size != file.size_bytes:
-                out.append(f"{path} has {found.st_size} bytes, {file.size_bytes} were written")
+                out.append(f"{path} has {found.st_size} bytes, but gsmap wrote {file.size_bytes}")
             elif (problem := _content_problem(path, file.sha256)) is not None:
                 out.append(problem)
         if not out:
@@ -271,7 +273,7 @@ class Arrays:
             except CorruptError as error:
                 out.append(str(error))
         extra = sorted(set(present) - {file.path for file in files})
-        return out + [f"{place / name} does not belong there" for name in extra]
+        return out + [f"{place / name} is not a file of the map" for name in extra]
 
     def size_bytes(self, kind: str, name: str) -> int:
         return sum(found.st_size for found in files_below(self._group_folder(kind, name)).values())
@@ -306,7 +308,7 @@ class Arrays:
         """Return the folder of a group; validates the name, which may come from an untrusted catalog."""
         if kind not in KINDS or not is_digest(name):
             raise CorruptError(
-                f"{kind}/{name} is not the name of a group of arrays: nothing is done with it",
+                f"{kind}/{name} is not the name of an array group; nothing was changed",
                 code="invalid_stored_name",
             )
         self._check_root()
@@ -399,13 +401,14 @@ def _copy_group(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
         path, mine, found = place / file.path, target / file.path, present.get(file.path)
         if found is None or not stat.S_ISREG(found.st_mode) or found.st_size != file.size_bytes:
             raise CorruptError(
-                f"{path} is missing or cut off: run gsmap check on that map, and repair it first", code="arrays_missing"
+                f"{path} is missing or truncated: run gsmap check on that map and repair it first",
+                code="arrays_missing",
             )
         mine.parent.mkdir(parents=True, exist_ok=True)
         link_or_copy(path, mine)
         if _sha256(mine) != file.sha256:
             raise CorruptError(
-                f"{path} differs from what was written: run gsmap check on that map, repair it first",
+                f"{path} differs from what gsmap wrote: run gsmap check on that map and repair it first",
                 code="bytes_differ",
             )
     for path in [*(p for p in target.rglob("*") if p.is_dir()), target]:
@@ -477,4 +480,4 @@ def _content_problem(path: Path, sha256: str) -> str | None:
         same = _sha256(path) == sha256
     except OSError as error:  # report a failing disk as a problem, so that `check` can go on
         return f"{path} cannot be read: {error.strerror or error}"
-    return None if same else f"{path} differs from what was written"
+    return None if same else f"{path} differs from what gsmap wrote"

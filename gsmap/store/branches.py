@@ -108,7 +108,7 @@ def locate(path: str | os.PathLike[str]) -> MapLocation:
         if place.branch == name:
             return place
     known = ", ".join(place.branch for place in branch_locations(home))
-    there = f"it has {known}" if known else f"make it with gsmap branch {home} {name}"
+    there = f"it has {known}" if known else f"create it with gsmap branch {home} {name}"
     raise NotFoundError(f"{home} has no branch or tag {name!r}: {there}", code="branch_not_found")
 
 
@@ -155,7 +155,7 @@ def validated_name(name: str) -> str:
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            "a branch or tag is called by up to 64 letters, digits, '.', '_' and '-', not beginning with '.': "
+            "the name of a branch or tag has up to 64 letters, digits, '.', '_' and '-', and does not begin with '.': "
             f"{name!r}",
             code="invalid_name",
         )
@@ -201,17 +201,21 @@ class Branches:
         if self._place.remote is not None:
             kind = "tag" if tag else "branch"
             raise ConfigError(
-                f"{self._place.location} lies in a bucket, where a map has no branches or tags: gsmap clone makes "
-                f"a map of its own in a folder, which can have a {kind}",
+                f"{self._place.location} lies in a bucket, and maps in buckets have no branches or tags: copy "
+                f"it with gsmap clone to a folder, and create the {kind} there",
                 code="no_branches_in_bucket",
             )
         folder = home / FOLDER / validated_name(name)
         if folder.exists() or Path(f"{home}@{name}").exists():
             taken = "a branch or tag" if folder.exists() else f"the path {home}@{name}"
-            raise ConfigError(f"{taken} of the name {name!r} exists already: choose another name", code="branch_exists")
+            raise ConfigError(
+                f"{taken} with the name {name!r} exists already: choose another name", code="branch_exists"
+            )
         if not os.access(home, os.W_OK):
             raise StoreError(
-                f"{home} cannot be written, so it can get no branch: copy it to where it can be", code="not_writable"
+                f"{home} cannot be written, so no branch can be created in it: clone it to a folder that can be "
+                "written",
+                code="not_writable",
             )
         staged = folder.with_name(f".{name}.{uuid.uuid4().hex[:8]}")
         # The lock keeps arrays from being reclaimed between the copy and the rename.
@@ -305,8 +309,8 @@ class OtherCatalogs:
         """
         if strange := unknown_entries(self._home):
             raise StoreError(
-                f"{self._home / strange[0]} is no branch, and may be one that lost {MARKER} or its name: nothing is "
-                "reclaimed while it lies there; put back what it lacks, or move it out of the map",
+                f"{self._home / strange[0]} is not a valid branch (it may have lost {MARKER} or its name), so "
+                "nothing is reclaimed: restore what it lacks, or move it out of the map",
                 code="stray_branch",
             )
         for place in other_locations(self._home, self._folder):

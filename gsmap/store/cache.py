@@ -63,7 +63,7 @@ def keep(sha256: str, chunks: Iterable[bytes], what: str) -> Path:
                 digest.update(chunk)
                 file.write(chunk)
         if digest.hexdigest() != sha256:
-            raise CorruptError(f"{what} differs from what was written", code="bytes_differ")
+            raise CorruptError(f"{what} differs from what gsmap wrote", code="bytes_differ")
         _make_room(root, staged.stat().st_size)
         os.replace(staged, root / sha256)
     finally:

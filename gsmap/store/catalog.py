@@ -82,7 +82,7 @@ class Catalog:
 
     @property
     def _busy_message(self) -> str:
-        return f"{display_name(self.folder)}: others have been writing"
+        return f"{display_name(self.folder)}: other processes have been writing"
 
     @property
     def _writing(self) -> Connection | None:
@@ -274,14 +274,12 @@ class Catalog:
         if self.is_sqlite:
             if page_digests.digests_path(self.folder / sqlite.FILE).exists():
                 return []
-            return [
-                "the catalog was written by an older gsmap, which kept no digests of its pages: the next write does"
-            ]
+            return ["the catalog was written by an older gsmap without page digests: the next write adds them"]
         if self.engine.dialect.name != "postgresql":
-            return ["the catalog lies in a database that gsmap knows nothing of"]
+            return ["the catalog lies in a database whose integrity gsmap cannot verify"]
         with self.read() as connection:
             checks = connection.exec_driver_sql("SHOW data_checksums").scalar() == "on"
-        says = "on, so that it verifies what it reads" if checks else "off, so that nobody verifies it"
+        says = "on: it verifies each page that it reads" if checks else "off: damaged pages go unnoticed"
         return [f"the catalog lies in a PostgreSQL server, whose own page checksums are {says}"]
 
     def accept(self) -> list[str]:
@@ -292,7 +290,7 @@ class Catalog:
         """
         if not self.is_sqlite:
             raise ConfigError(
-                f"{self.folder}: its catalog is no file of the map, so that there is nothing to accept",
+                f"{self.folder}: its catalog is not a file of the map: only an SQLite catalog can be accepted",
                 code="nothing_to_accept",
             )
         with self.lock(), translate_errors(self.folder):
@@ -334,9 +332,9 @@ class Catalog:
             with translate_errors(self.folder):
                 sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
         except CorruptError as error:
-            raise CorruptError(f"{error}; what was written since is kept in its log", code="catalog_damaged") from error
+            raise CorruptError(f"{error}; later writes are kept in its log", code="catalog_damaged") from error
         except StoreError as error:
-            _log.warning("what was written is kept, but not yet folded into %s: %s", sqlite.FILE, error)
+            _log.warning("the writes are kept in the log, but not yet checkpointed into %s: %s", sqlite.FILE, error)
 
 
 @contextlib.contextmanager
@@ -348,7 +346,7 @@ def pause_writers(folder: Path, patience_s: float) -> Iterator[None]:
         yield
         return
     try:
-        lock_within(handle, fcntl.LOCK_SH, patience_s, f"{folder}: others have been writing")
+        lock_within(handle, fcntl.LOCK_SH, patience_s, f"{folder}: other processes have been writing")
         yield
     finally:
         os.close(handle)
@@ -380,9 +378,7 @@ def url_engine(url: str) -> Engine:
             )
         return create_engine(url, pool_pre_ping=True)
     except (ArgumentError, NoSuchModuleError) as error:
-        raise ConfigError(
-            f"{url!r} is not a database URL that SQLAlchemy knows: {error}", code="invalid_catalog_url"
-        ) from error
+        raise ConfigError(f"{url!r} is not a valid database URL: {error}", code="invalid_catalog_url") from error
     except ModuleNotFoundError as error:
         raise MissingDependencyError(f"the catalog needs the package {error.name}: pip install {error.name}") from error
 

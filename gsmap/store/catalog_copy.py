@@ -97,7 +97,8 @@ def copy_catalog(source: Catalog, target: Catalog, *, leave_out: Collection[str]
     versions = [migrate.version(one.engine, one.folder) for one in (source, target)]
     if versions[0] != versions[1]:
         raise StoreError(
-            f"{source.folder} has schema {versions[0]}, the catalog to copy it to {versions[1]}: run gsmap migrate",
+            f"{source.folder} has schema {versions[0]}, but the catalog to copy it to has schema {versions[1]}: "
+            "run gsmap migrate",
             code="schema_mismatch",
         )
     with snapshot_read(source) as reading, target.write() as writing:
@@ -110,7 +111,7 @@ def copy_rows(source: Connection, target: Connection, *, leave_out: Collection[s
     for table in tables():
         if target.execute(select(text("1")).select_from(table).limit(1)).first() is not None:
             raise StoreError(
-                f"the catalog to copy to holds {table.name} already: give it an empty database",
+                f"the catalog to copy to already has rows in {table.name}: name an empty database",
                 code="database_not_empty",
             )
         counts[table.name] = 0 if table.name in leave_out else _copy_table(source, target, table)

@@ -178,9 +178,9 @@ def review_notes(connection: Connection, pair: str, same: Mapping[int, int]) -> 
         if change.status == OPEN:
             continue
         if number in same.values():
-            notes.append(f"c{number} was {change.status} before this comparison: it stays so")
+            notes.append(f"c{number} was {change.status} before this comparison, and stays {change.status}")
         else:
-            notes.append(f"c{number}, which was {change.status}, is not found any more")
+            notes.append(f"c{number}, which was {change.status}, was not detected again")
     return notes
 
 

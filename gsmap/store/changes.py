@@ -156,7 +156,7 @@ class Changes:
         with self._catalog.read() as connection:
             row = connection.execute(select(comparisons).where(comparisons.c.number == number)).first()
             if row is None:
-                raise NotFoundError(f"no comparison {number} in this map", code="change_not_found")
+                raise NotFoundError(f"this map has no comparison {number}", code="change_not_found")
             return read_comparison(connection, row)
 
     def load(self, comparison: int) -> ChangeReport:
@@ -178,14 +178,15 @@ class Changes:
             }
         if not found.whole:
             raise NotFoundError(
-                f"the arrays of comparison {comparison} were pruned: gsmap changes MAP makes those of today's again",
+                f"the arrays of comparison {comparison} were pruned: gsmap changes MAP computes those of "
+                "current comparisons again",
                 code="arrays_pruned",
             )
         parts: list[dict[str, np.ndarray]] = []
         if found.changes:
             counts = _counts(found.changes)
             shapes: dict[str, Shape] = {name: (sum(counts[name]), *_PARTS[name][0][1:]) for name in _PARTS}
-            with unless_pruned(self._catalog, group_id, f"comparison {comparison} was dropped or made again"):
+            with unless_pruned(self._catalog, group_id, f"comparison {comparison} was dropped or computed again"):
                 arrays = self._arrays.read(KIND, group_id, files, only=tuple(shapes), shapes=shapes)
             where = f"{KIND}/{group_id}"
             parts = _parts(arrays, found.changes, sizes[found.older], sizes[found.newer], where)
@@ -245,7 +246,7 @@ class Changes:
                     return change
             names = " and ".join(scene_name(connection, scene) for scene in (found.older, found.newer))
         raise NotFoundError(
-            f"change c{number} is no longer found: {names} were compared again on {found.created_at}",
+            f"change c{number} no longer exists: {names} were compared again on {found.created_at}",
             code="change_not_found",
         )
 
@@ -261,9 +262,7 @@ class Changes:
             raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
         with self._catalog.write() as connection:
             if review == "withdraw" and self.get(number).status == OPEN:
-                raise InputError(
-                    f"nobody has reviewed c{number}: there is nothing to withdraw", code="nothing_to_withdraw"
-                )
+                raise InputError(f"c{number} has no review to withdraw", code="nothing_to_withdraw")
             self.get(number)
             when = next_timestamp(connection, change_reviews.c.created_at, change_reviews.c.change == number)
             row = {"change": number, "review": review, "note": note, "created_at": when}
@@ -313,7 +312,7 @@ def _parts(
     most = {"before": older, "after": newer}
     fits = all(((arrays[name] >= 0) & (arrays[name] < count)).all() for name, count in most.items())
     if not fits or not np.isfinite(arrays["voxels"]).all():
-        raise CorruptError(f"{where} is not what a comparison can have found: run gsmap check", code="catalog_invalid")
+        raise CorruptError(f"{where} is not a valid result of a comparison: run gsmap check", code="catalog_invalid")
     cut = {name: np.split(arrays[name], np.cumsum(counts)[:-1]) for name, counts in _counts(found).items()}
     return [{name: cut[name][i] for name in _PARTS} for i in range(len(found))]
 

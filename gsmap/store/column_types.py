@@ -101,7 +101,7 @@ class PairText(_CheckedText):
     """Two scene ids separated by a colon."""
 
     cache_ok = True
-    what = "two digests with a colon between them"
+    what = "two digests separated by a colon"
 
     def is_valid(self, value: str) -> bool:
         return all(map(is_digest, value.split(":"))) and value.count(":") == 1
@@ -135,7 +135,7 @@ class RelativePathText(_CheckedText):
     """A path that leads downwards only; empty if there is no file."""
 
     cache_ok = True
-    what = "a path that stays inside"
+    what = "a relative path inside the map"
 
     def is_valid(self, value: str) -> bool:
         return not value or is_relative(value)
@@ -238,8 +238,8 @@ def malformed_as_corrupt(where: str) -> Iterator[None]:
         yield
     except GsmapError as error:
         raise CorruptError(
-            f"the catalog holds bytes in {where} that are none of its numbers ({error}): gsmap did not write that; "
-            "restore the catalog from a backup, and do not trust a map that was sent to you so",
+            f"the catalog holds bytes in {where} that are not an array ({error}), which gsmap did not write: "
+            "restore the catalog from a backup, and do not trust the map if you received it like this",
             code="catalog_invalid",
         ) from error
 
@@ -356,8 +356,8 @@ def _numbers(value: Any, *shape: int) -> bool:
 def corrupt_value(where: str, value: Any, what: str) -> CorruptError:
     """Return the error for a value that gsmap cannot have written."""
     return CorruptError(
-        f"the catalog holds {_short(value)} in {where}, which is not {what}: gsmap did not write that; "
-        "restore the catalog from a backup, and do not trust a map that was sent to you so",
+        f"the catalog holds {_short(value)} in {where}, which is not {what} and which gsmap did not write: "
+        "restore the catalog from a backup, and do not trust the map if you received it like this",
         code="catalog_invalid",
     )
 

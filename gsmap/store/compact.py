@@ -24,7 +24,7 @@ _LEVELS_16, _LEVELS_10, _LEVELS_8 = 65535.0, 1023.0, 255.0
 _SIZE_STEP = 0.06  # of the natural logarithm: 6 percent
 _COLOUR_STEP = 0.02  # 0.006 of a colour in [0, 1]
 _GLOSS_STEP = 0.06  # of the view-dependent coefficients
-_NOT_FINITE = "a compact scene holds numbers that are not finite: ingest its capture again"
+_NOT_FINITE = "a thinned scene has numbers that are not finite: ingest its capture again"
 _VALUES = ("log_scales", "sh0", "sh_rest")
 
 

@@ -24,10 +24,10 @@ from gsmap.errors import (
 )
 from gsmap.store import sqlite
 
-NOT_KEPT = "this step was not kept, what was finished before it is"
+NOT_KEPT = "this step was undone; the steps before it are kept"
 """Consequence of an error inside a transaction: it was rolled back."""
 
-UNCERTAIN = "whether this last step was kept shows once that is mended; what was finished before it is kept"
+UNCERTAIN = "this last step may or may not be kept; the steps before it are kept"
 """Consequence of a disk or connection failure during a commit."""
 
 LITTLE_BYTES = 64 << 10  # a disk with less is full: the index of SQLite's log alone takes half of it
@@ -41,18 +41,23 @@ _FAILED: _Explanation = (
     DiskError,
     "disk_failed",
     "the disk failed",
-    "run gsmap check once it works (a quota that is used up looks the same)",
+    "run gsmap check once the disk works (an exhausted quota looks the same)",
 )
 _TOO_MANY: _Explanation = (StoreError, "too_many_open_files", "too many files are open", "raise the limit (ulimit -n)")
 _REFUSED: _Explanation = (StoreError, "system_refused", "the system refused", "")
 _BUSY: _Explanation = (BusyError, "catalog_busy", "another process holds the catalog", "try again later")
 _CATALOG_REFUSED: _Explanation = (StoreError, "catalog_refused", "the catalog refused", "")
-_GONE: _Explanation = (StoreError, "server_lost", "the catalog's server went away", "try again once it is back")
+_GONE: _Explanation = (
+    StoreError,
+    "server_lost",
+    "the connection to the catalog's server was lost",
+    "try again once the server is reachable",
+)
 _PASSWORD: _Explanation = (
     StoreError,
     "password_refused",
-    "the catalog's server wants another password",
-    "give it in PGPASSWORD or ~/.pgpass",
+    "the catalog's server rejected the password",
+    "set it in PGPASSWORD or ~/.pgpass",
 )
 
 
@@ -140,7 +145,12 @@ def _explain_database(error: SQLAlchemyError | sqlite3.Error, folder: Path) -> _
     if isinstance(error, StatementError) and isinstance(error.orig, GsmapError):
         raise error.orig from error  # a gsmap error wrapped by SQLAlchemy
     if isinstance(error, (NoResultFound, MultipleResultsFound)):
-        return CorruptError, "catalog_invalid", "the catalog lacks a row, or has it twice", "restore it from a backup"
+        return (
+            CorruptError,
+            "catalog_invalid",
+            "the catalog lacks a row or has a duplicate row",
+            "restore it from a backup",
+        )
     code = sqlite_code(error)
     if code is not None:
         return _explain_sqlite(code, folder)
@@ -174,7 +184,7 @@ def _explain_sqlite(code: int, folder: Path) -> _Explanation:
             StoreError,
             "catalog_unreadable",
             "the catalog could not be read",
-            "its bytes are as they were written: try again",
+            "its bytes are intact: try again",
         )
     if primary == sqlite3.SQLITE_NOMEM or code == sqlite3.SQLITE_IOERR_NOMEM:
         return StoreError, "out_of_memory", "there is not enough memory", ""
@@ -218,12 +228,12 @@ def _explain_server(state: str) -> _Explanation:
     if state == "58030":
         return DiskError, "disk_failed", "the disk of the catalog's server failed", "look at the server's log"
     if state == "25006":
-        return ReadOnlyError, "read_only", "the catalog's server lets nobody write", ""
+        return ReadOnlyError, "read_only", "the catalog's server is read-only", ""
     if state in ("XX001", "XX002"):
         return (
             CorruptError,
             "catalog_damaged",
-            "the catalog's server finds its own data damaged",
+            "the catalog's server reports damaged data",
             "restore that database from a backup",
         )
     if state in ("40001", "40P01", "53300", "55P03", "57P03"):

@@ -81,7 +81,7 @@ def specified_metres(connection: Connection) -> dict[str, str]:
         return {scene: validated_metres(value) for scene, value in values.items() if value}
     except InputError as error:
         raise CorruptError(
-            f"the catalog holds a fact that gsmap did not write: {error}", code="catalog_invalid"
+            f"the catalog holds an annotation that gsmap did not write: {error}", code="catalog_invalid"
         ) from error
 
 
@@ -97,7 +97,7 @@ def validated_metres(value: float | str) -> str:
         metres = float("nan")
     if not (math.isfinite(metres) and metres > 0):
         raise InputError(
-            f"metres per unit of a scene are a positive number such as 0.3, got {value!r}", code="invalid_metre"
+            f"the metres per unit of a scene must be a positive number such as 0.3, got {value!r}", code="invalid_metre"
         )
     return repr(metres)
 
@@ -134,7 +134,7 @@ def validated_text(what: str, text: str, *, lines: bool = False) -> str:
         raise InputError(f"{what} must not be empty", code="invalid_name")
     bad = control_characters(text, lines=lines)
     if bad:
-        raise InputError(f"{what} {text!r} has a control character ({bad[0]!r}): leave it out", code="invalid_name")
+        raise InputError(f"{what} {text!r} has a control character ({bad[0]!r}): remove it", code="invalid_name")
     return text
 
 
@@ -148,6 +148,6 @@ def validated_date(when: str) -> str:
         parsed = datetime.fromisoformat(when)
     except ValueError as error:
         raise InputError(
-            f"a capture date is ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}", code="invalid_date"
+            f"a capture date must be in ISO 8601, such as 2026-05-31T14:00:00+02:00, got {when!r}", code="invalid_date"
         ) from error
     return (parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)).isoformat()

@@ -86,7 +86,8 @@ def from_arrays(scene_id: str, about: Mapping[str, Any], stored: Mapping[str, np
             things = Segments(**own, unit_m=segments["unit_m"])
     except (KeyError, ValueError, TypeError) as error:
         raise CorruptError(
-            f"the graph of scene {scene_id[:12]} does not fit its row ({error!r})", code="catalog_invalid"
+            f"the graph of scene {scene_id[:12]} does not match its row in the catalog ({error!r}): run gsmap check",
+            code="catalog_invalid",
         ) from error
     return SceneGraph(scene_id, layers, up, unit_m, tuple(about["notes"]), things, working_m)
 

@@ -83,7 +83,8 @@ class Graphs:
         """
         if graph.scene_id not in key.inputs:
             raise InputError(
-                f"the key of a graph must name its scene {graph.scene_id} among its inputs", code="key_input_mismatch"
+                f"the recipe key of a graph must have its scene {graph.scene_id} among its inputs",
+                code="key_input_mismatch",
             )
         arrays, about = to_arrays(self._with_whole_members(graph))
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")

@@ -55,7 +55,7 @@ class StoredSegment:
 
     def _read(self, names: Sequence[str], rows: Sequence[tuple[int, int]] | None) -> dict[str, np.ndarray]:
         shapes = {"nodes": (self.num_nodes, None)}
-        with unless_pruned(self._catalog, self.id, "a segment of the index became one with others"):
+        with unless_pruned(self._catalog, self.id, "a segment of the index was merged with others"):
             return self._arrays.read(KIND, self.id, self._files, only=names, rows=rows, shapes=shapes)
 
 
@@ -179,7 +179,9 @@ class Indexes:
         members = [IndexedScene(scene, graph, bool(up), bool(metric), c) for scene, graph, up, metric, c in row.members]
         if row.num_nodes < 0:
             raise CorruptError(
-                f"the catalog holds {row.num_nodes} in index_segments.num_nodes: restore it", code="catalog_invalid"
+                f"the catalog holds the invalid value {row.num_nodes} in index_segments.num_nodes: restore the "
+                "catalog from a backup",
+                code="catalog_invalid",
             )
         return StoredSegment(row.group_id, members, row.num_nodes, files, self._arrays, self._catalog)
 

@@ -49,7 +49,7 @@ from gsmap.types.progress import Progress
 _WORTH_BYTES = 64 << 10
 _WORTH_SHARE = 0.05  # of the file: smaller free space is kept for new rows
 _log = logging.getLogger("gsmap.store")
-_RECLAIM_LATER = "what was to be reclaimed and is still there goes with the next prune"
+_RECLAIM_LATER = "files that could not be reclaimed remain until the next gsmap prune"
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,9 @@ def check(
         spare = {group for _, group in _find_garbage(connection, None).groups}
         if catalog.is_sqlite:
             problems += sqlite.integrity_problems(connection)
-    problems += [f"{arrays.url}/{name} does not belong there: remove it" for name in arrays.unknown_entries()]
+    problems += [f"{arrays.url}/{name} is not a file of the map: remove it" for name in arrays.unknown_entries()]
     problems += [
-        f"{home / name} is no branch: put back what it lacks, or move it out of the map"
+        f"{home / name} is not a valid branch: restore what it lacks, or move it out of the map"
         for name in unknown_entries(home)
     ]
     problems += _model_entry_problems(home)
@@ -227,7 +227,7 @@ def _give_back(catalog: Catalog) -> int:
                 sqlite.vacuum(catalog.engine, file)
             return max(0, before - file.stat().st_size)
     except StoreError as error:  # a full disk, or a reader: the free space inside the file is reused
-        _log.warning("%s keeps the room of what was dropped: %s", sqlite.FILE, error)
+        _log.warning("%s could not be shrunk, and keeps the space of dropped rows: %s", sqlite.FILE, error)
         return 0
 
 
@@ -368,23 +368,23 @@ def _advice(connection: Connection, kind: str, group: str, location: str | None)
     if kind == CHANGES:
         return _comparison_advice(connection, group, location)
     if kind == INDEXES:
-        return " (the index of retrieval: it is made anew when the next new scene asks it)"
+        return " (the retrieval index: gsmap builds it again when the next scene is added)"
     if kind == VIEWS:
-        return " (features of a scene's views: they are made anew when the next photograph is localised)"
+        return " (features of a scene's views: gsmap computes them again when the next photo is localized)"
     if kind == PHOTOS:
-        return " (the small picture of a photo that is kept: remove the photo and add it again)"
+        return " (the preview of a kept photo: remove the photo and add it again)"
     if kind != "graphs":
         return ""
     of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
     found = connection.execute(select(scenes).select_from(of_scene).where(graphs.c.group_id == group)).first()
     if found is None:
-        return f" (a graph that nothing needs: gsmap prune {quote(location)})" if location else ""
+        return f" (an unused graph: remove it with gsmap prune {quote(location)})" if location else ""
     if location is None:
         return f" (the graph of scene {found.name}: restore the file from a backup)"
     again = f"gsmap describe {quote(location)} {quote(found.name)}"
     if found.removed_at is not None:
         again = f"gsmap restore-scene {quote(location)} {found.id[:12]}, then {again}"
-    return f" (the graph of scene {found.name}: {again} makes it again)"
+    return f" (the graph of scene {found.name}: compute it again with {again})"
 
 
 def _comparison_advice(connection: Connection, group: str, location: str | None) -> str:
@@ -394,9 +394,9 @@ def _comparison_advice(connection: Connection, group: str, location: str | None)
         pair = f"{name_of[row.older]}:{name_of[row.newer]}"
         again = "restore the file from a backup"
         if location is not None:
-            again = f"gsmap changes {quote(location)} {quote(pair)} finds them again"
+            again = f"compute them again with gsmap changes {quote(location)} {quote(pair)}"
         return f" (the changes of {pair}: {again})"
-    return f" (changes of an earlier comparison: gsmap prune {quote(location)})" if location else ""
+    return f" (changes of an earlier comparison: remove them with gsmap prune {quote(location)})" if location else ""
 
 
 def _row_problems(connection: Connection, arrays: Arrays) -> list[str]:
@@ -407,7 +407,7 @@ def _row_problems(connection: Connection, arrays: Arrays) -> list[str]:
         query = text(f"SELECT count(*) FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
         boxes = connection.execute(query, {"s": row.number}).scalar_one()
         if boxes != -(-row.num_gaussians // CHUNK_ROWS):
-            out.append(f"scene {row.name} has {boxes} chunk boxes, not one for every {CHUNK_ROWS} Gaussians")
+            out.append(f"scene {row.name} has {boxes} chunk boxes; expected one for every {CHUNK_ROWS} Gaussians")
     for row in connection.execute(select(models).where(models.c.removed_at.is_(None))):
         try:
             path = model_path(home, row)
@@ -422,7 +422,7 @@ def _row_problems(connection: Connection, arrays: Arrays) -> list[str]:
             continue
         with open(opened, "rb") as file:
             if hashlib.file_digest(file, "sha256").hexdigest() != row.sha256:
-                out.append(f"model {row.name} differs from what was added: {path}")
+                out.append(f"model {row.name} differs from the file that was added: {path}")
     return out
 
 
@@ -449,8 +449,8 @@ def _forgotten_models(catalog: Catalog, others: OtherCatalogs, home: Path) -> li
 def _model_entry_problems(home: Path) -> list[str]:
     place = home / FOLDER
     if os.path.lexists(place) and not is_folder(place):
-        return [f"{place} is no folder (a link, perhaps): put a folder in its place"]
-    return [f"{path} does not belong there: remove it" for path in _model_entries(home) if not is_file(path)]
+        return [f"{place} is not a folder (it may be a link): put a folder in its place"]
+    return [f"{path} is not a file of the map: remove it" for path in _model_entries(home) if not is_file(path)]
 
 
 def _model_entries(home: Path) -> list[Path]:

@@ -84,7 +84,7 @@ class GroupReader:
     def _bytes(self, span: ByteRange) -> bytes:
         found = self._reader.read(span.file, span.start, span.start + span.size)
         if len(found) != span.size:
-            raise ValueError(f"{span.file} is shorter than it was")
+            raise ValueError(f"{span.file} is shorter than when it was opened")
         return found
 
     def metadata(self, key: str) -> dict[str, Any]:
@@ -93,10 +93,10 @@ class GroupReader:
             raise ValueError("it has no zarr metadata")
         text = self._bytes(span)
         if span.crc32 not in (None, zlib.crc32(text)):
-            raise ValueError("its zarr metadata differs from what was written")
+            raise ValueError("its zarr metadata differs from what gsmap wrote")
         found = json.loads(text)
         if not isinstance(found, dict):
-            raise ValueError("its zarr metadata is no object")
+            raise ValueError("its zarr metadata is not a JSON object")
         return found
 
     def array_names(self) -> list[str]:
@@ -108,9 +108,9 @@ class GroupReader:
         try:
             yield
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, struct.error) as error:
-            problem = str(error) if type(error) is ValueError else f"its zarr metadata makes no sense ({error!r})"
+            problem = str(error) if type(error) is ValueError else f"its zarr metadata is invalid ({error!r})"
             raise CorruptError(
-                f"{at}: {problem}; gsmap did not write that: {repair_advice(self.kind)}", code="arrays_corrupt"
+                f"{at}: {problem}, which gsmap did not write: {repair_advice(self.kind)}", code="arrays_corrupt"
             ) from error
 
     def check_arrays(
@@ -140,7 +140,7 @@ class GroupReader:
         total = sum(array.num_bytes for array in out.values())
         with self._translate_errors(self.at):
             if total > _ALWAYS_ALLOWED_BYTES + _MAX_PACKED * self.num_bytes:
-                raise ValueError(f"its arrays would take {total:.3g} bytes, far more than such files can hold")
+                raise ValueError(f"its arrays would take {total:.3g} bytes, far more than the file can hold")
         return out
 
     def _array(self, name: str, known: Shape | None) -> ArrayLayout:
@@ -148,7 +148,7 @@ class GroupReader:
         if not _KEYS <= set(about) <= _MAY_HAVE or about["node_type"] != "array" or about["zarr_format"] != 3:
             raise ValueError("it is not a plain zarr v3 array")
         if about["chunk_key_encoding"] != _CHUNK_KEYS or about.get("storage_transformers"):
-            raise ValueError("its chunks lie elsewhere than gsmap puts them")
+            raise ValueError("its chunks are not stored at the paths that gsmap uses")
         shape, kind = about["shape"], about["data_type"]
         if not isinstance(kind, str) or kind not in _ITEM_BYTES:
             raise ValueError(f"its values are {kind!r}, not plain numbers")
@@ -156,7 +156,7 @@ class GroupReader:
             raise ValueError(f"its shape is {shape!r}")
         if known is not None and not _matches(shape, known):
             wanted = ", ".join("any" if length is None else str(length) for length in known)
-            raise ValueError(f"its shape is {shape}, but the catalog says ({wanted})")
+            raise ValueError(f"its shape is {shape}, but the catalog records ({wanted})")
         grid = about["chunk_grid"]
         outer = grid["configuration"]["chunk_shape"]
         inner, sharded = _inner_chunks(about["codecs"], outer)
@@ -164,7 +164,7 @@ class GroupReader:
         if grid["name"] != "regular" or not all(_are_lengths(c, least=1) and c[1:] == rows for c in (outer, inner)):
             raise ValueError(f"its chunks {outer!r} are not rows")
         if inner[0] > CHUNK_ROWS or outer[0] > _SHARD_ROWS or outer[0] % inner[0]:
-            raise ValueError(f"its chunks {inner} in {outer} are not of gsmap's sizes")
+            raise ValueError(f"its chunks {inner} in {outer} are not of the sizes that gsmap writes")
         out = ArrayLayout(tuple(shape), np.dtype(kind), inner[0], [])
         if not out.num_bytes:
             return out
@@ -190,7 +190,7 @@ class GroupReader:
         index = self._bytes(ByteRange(span.file, span.start + end, 16 * count)) if end > 0 else b""
         places = list(struct.iter_unpack("<QQ", index))[:used]
         if len(places) < used or any(start + length > end for start, length in places):
-            raise ValueError(f"{span.file.rpartition('/')[2]} of its shards lacks chunks")
+            raise ValueError(f"its shard {span.file.rpartition('/')[2]} lacks chunks")
         return [ByteRange(span.file, span.start + start, length) for start, length in places]
 
     def read(self, arrays: Mapping[str, ArrayLayout], rows: Sequence[Range] | None = None) -> dict[str, np.ndarray]:
@@ -240,7 +240,7 @@ class ArrayLayout:
 
     def check_head(self, frame: bytes) -> None:
         if _unpacked_bytes(frame) != self.chunk_bytes:
-            raise ValueError("a chunk of it would not unpack to its size")
+            raise ValueError("one of its chunks does not decompress to its recorded size")
 
     def read(self, bytes_of: Callable[[ByteRange], bytes], rows: Sequence[Range] | None) -> np.ndarray:
         """Read ranges ``[start, stop)`` of rows, in order; default: all."""
@@ -267,18 +267,18 @@ class ArrayLayout:
         try:
             content = zstd.decompress(frame)
         except RuntimeError as error:
-            raise ValueError(f"a chunk of it differs from what was written ({error})") from error
+            raise ValueError(f"one of its chunks differs from what gsmap wrote ({error})") from error
         return np.frombuffer(content, self.dtype).reshape(self.chunk_rows, *self.shape[1:])
 
 
 def repair_advice(kind: str) -> str:
     """Return advice for a damaged group of this kind."""
     again = {
-        "graphs": "make the graph again (gsmap describe MAP SCENE)",
+        "graphs": "compute the graph again (gsmap describe MAP SCENE)",
         "changes": "compare its two scenes again (gsmap changes MAP A:B)",
-        "views": "localise a photograph: what is lost of this is made anew when the next one asks it",
+        "views": "localize a photo: gsmap computes lost features again",
         "photos": "remove the photo and add it again (gsmap localize MAP PHOTO --add)",
-        "indexes": "add a capture: the index is made anew when the next one asks it",
+        "indexes": "add a capture: gsmap builds the index again",
     }
     return f"run gsmap check, and {again.get(kind, 'ingest the scene again')}"
 
@@ -297,7 +297,7 @@ def _inner_chunks(codecs: Any, outer: list[int]) -> tuple[list[int], bool]:
         if plain and at_end and _is_little_endian(inner[0]) and _is_little_endian(shard["index_codecs"][0]):
             return shard["chunk_shape"], True
         names += [*_codec_names(inner), *index]
-    raise ValueError(f"its codecs are {', '.join(names)[:100]}, which are not gsmap's")
+    raise ValueError(f"its codecs are {', '.join(names)[:100]}, which gsmap does not use")
 
 
 def _codec_names(codecs: Any) -> list[str]:

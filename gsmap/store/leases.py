@@ -109,7 +109,7 @@ class Leases:
                 try:
                     self.acquire([mine], task)
                 except StoreError as error:  # a full disk: the work itself may not need to write here
-                    _log.info("others are not told that this process is at work: %s", error)
+                    _log.info("the lease could not be saved, so other processes may do the same work: %s", error)
             yield [lease for lease in self.others() if lease.what == what]
         finally:
             with self._lock:
@@ -131,7 +131,7 @@ class Leases:
             holder = next((lease for lease in self.list() if lease.what == what), None)
             owner = "another process" if holder is None else holder.who
             raise BusyError(
-                f"{display_name(self._catalog.folder)}: {owner} is at work on {what}; try again when it has ended",
+                f"{display_name(self._catalog.folder)}: {owner} is working on {what}: try again when it has finished",
                 code="lease_held",
             )
         try:
@@ -207,7 +207,10 @@ class Leases:
             until = _text(self._now(connection) + timedelta(seconds=self._lease_s))
             renewed = connection.execute(update(leases).where(self._mine(held)).values(expires_at=until))
         if renewed.rowcount < len(held):
-            _log.info("%d leases had run out: others may do the same work", len(held) - renewed.rowcount)
+            _log.info(
+                "%d leases of this process had expired: other processes may do the same work",
+                len(held) - renewed.rowcount,
+            )
 
     def _insert(self, connection: Connection, work: list[str], task: str, now: datetime) -> list[str]:
         """Insert leases and return those that no process on another machine inserted at the same moment."""
@@ -274,7 +277,7 @@ class _Heartbeat:
             try:
                 self._do()
             except Exception as error:  # a full disk, a server restart, a store being closed
-                _log.info("leases were not renewed, which is tried again in %g s: %s", self._every_s, error)
+                _log.info("the leases could not be renewed; the next attempt is in %g s: %s", self._every_s, error)
 
 
 def _text(time: datetime) -> str:

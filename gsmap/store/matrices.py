@@ -53,7 +53,7 @@ def matrices_of_bytes(values: Sequence[bytes]) -> np.ndarray:
     found = _floats(values, 49).reshape(-1, 7, 7).astype(np.float64)
     size = np.abs(found).max((1, 2), initial=0)
     if (np.abs(found - found.transpose(0, 2, 1)).max((1, 2), initial=0) > _SKEWED * size).any():
-        raise InputError("a matrix that is not symmetric", code="invalid_record")
+        raise InputError("the matrix is not symmetric", code="invalid_record")
     return found
 
 

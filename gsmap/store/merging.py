@@ -130,7 +130,8 @@ def import_scene(into: Store, source: Store, scene: str) -> MergeResult:
     with open_transfer(into, source, only={scene}, mend=True) as transfer:
         if scene not in transfer.wanted:
             raise NotFoundError(
-                f"scene {scene} was forgotten in {into.location} on demand: ingest its capture if it is to come back",
+                f"scene {scene} was purged from {into.location}, so it is not copied: ingest its capture to add "
+                "it again",
                 code="scene_removed",
             )
         transfer.scenes()
@@ -156,7 +157,7 @@ def _check_shared(transfer: Transfer, scene: str) -> None:
     problems = transfer.into.arrays.problems(SCENES, group, manifest(transfer.ours, group))
     if problems:
         raise CorruptError(
-            f"the arrays of scene {scene} are damaged, and {transfer.source.location} has the very same: bring them "
+            f"the arrays of scene {scene} are damaged here and in {transfer.source.location}: copy them "
             f"from another map or a restored backup ({problems[0]})",
             code="arrays_corrupt",
         )
@@ -236,8 +237,8 @@ def _compare_settings(into: Store, source: Store) -> list[str]:
     """Return a note for each setting that differs; the settings of the target map are kept."""
     mine, theirs = load(into.folder / FILE_NAME), load(source.folder / FILE_NAME)
     return [
-        f"setting {name} stays {_format_setting(mine, name)} (there: {_format_setting(theirs, name)}): what it made "
-        "there is out of date here"
+        f"setting {name} stays {_format_setting(mine, name)} (in the other map: {_format_setting(theirs, name)}): "
+        "results of the other map that depend on it are stale here"
         for name in sorted({*mine, *theirs})
         if mine.get(name) != theirs.get(name)
     ]

@@ -45,7 +45,7 @@ def require_current(catalog: Catalog) -> None:
         )
     if found > schema.HEAD:
         raise SchemaVersionError(
-            f"{folder} was written by a newer gsmap (schema {found}, this gsmap {__version__} knows up to "
+            f"{folder} was written by a newer gsmap (schema {found}; this gsmap {__version__} supports up to "
             f"{schema.HEAD}): upgrade gsmap",
             code="map_too_new",
         )
@@ -70,7 +70,7 @@ def _require_tables(connection: Connection, folder: Path) -> None:
     strict = {row.name: bool(row.strict) for row in connection.execute(text("PRAGMA table_list"))}
     for name, table in schema.metadata.tables.items():
         if not strict.get(name):
-            raise _not_ours(folder, f"has no table {name!r} with types that are kept to")
+            raise _not_ours(folder, f"has no table {name!r} with strict column types")
         found = {
             row.name: (row.type, bool(row.notnull), row.hidden)
             for row in connection.execute(text(f"PRAGMA table_xinfo({name})"))
@@ -78,13 +78,13 @@ def _require_tables(connection: Connection, folder: Path) -> None:
         wanted = {c.name: (c.type.compile(connection.dialect), not c.nullable, 0) for c in table.columns}
         if found != wanted:
             odd = sorted(column for column in {*found, *wanted} if found.get(column) != wanted.get(column))
-            raise _not_ours(folder, f"has another column {name}.{odd[0]}")
+            raise _not_ours(folder, f"has an unexpected column {name}.{odd[0]}")
 
 
 def _not_ours(folder: Path, what: str) -> CorruptError:
     return CorruptError(
-        f"{folder}: its catalog {what}: gsmap did not make it so; restore it from a backup, and do not trust a map "
-        "that was sent to you so",
+        f"{folder}: its catalog {what}, which gsmap does not write: restore it from a backup, and do not trust the map "
+        "if you received it like this",
         code="catalog_invalid",
     )
 
@@ -115,7 +115,8 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
                     _run(connection, revision)
                     if catalog.is_sqlite and connection.exec_driver_sql("PRAGMA foreign_key_check").first():
                         raise StoreError(
-                            f"{catalog.folder}: the migration would break references: it was not kept",
+                            f"{catalog.folder}: the migration would break references, so it was undone; the map "
+                            "is unchanged",
                             code="migration_breaks_references",
                         )
                     with translate_errors(catalog.folder, NOT_KEPT, committing=True):
@@ -141,7 +142,7 @@ def folder() -> Path:
     for place in (package / "migrations", package.parent / "migrations"):
         if (place / "env.py").is_file():
             return place
-    raise StoreError(f"{package} was installed without its migrations: install gsmap again", code="no_migrations")
+    raise StoreError(f"{package} was installed without its migrations: reinstall gsmap", code="no_migrations")
 
 
 def _driver(connection: Connection) -> Any:

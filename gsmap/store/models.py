@@ -108,7 +108,7 @@ class Models:
             if model.name == name:
                 return model
         raise NotFoundError(
-            f"no model is called {name!r}: gsmap models list MAP shows what there is", code="model_not_found"
+            f"this map has no model {name!r}: gsmap models list MAP shows the models", code="model_not_found"
         )
 
     def list(self) -> list[Model]:
@@ -149,8 +149,8 @@ def model_path(folder: Path, row: Row[Any]) -> Path:
     above, _, name = path.partition("/")
     if above != FOLDER or "/" in name or not is_relative(path):
         raise CorruptError(
-            f"the catalog holds {path!r} in models.path, which is not a file of the map's own: gsmap did not write "
-            "that; restore the catalog from a backup, and do not trust a map that was sent to you so",
+            f"the catalog holds {path!r} in models.path, which is not a file inside the map and which gsmap did "
+            "not write: restore the catalog from a backup, and do not trust the map if you received it like this",
             code="catalog_invalid",
         )
     refuse_links(folder, FOLDER, name)

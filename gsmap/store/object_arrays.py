@@ -147,7 +147,7 @@ class ObjectArrays(Arrays):
             return body.read(body.check_arrays(names, shapes), rows)
         except NotFoundError as error:
             raise CorruptError(
-                f"{error}, or not all of it: {layout.repair_advice(kind)}", code="arrays_corrupt"
+                f"{error}, or it is incomplete: {layout.repair_advice(kind)}", code="arrays_corrupt"
             ) from error
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
@@ -158,7 +158,7 @@ class ObjectArrays(Arrays):
             if found is None:
                 out.append(f"{self._storage.url}/{key} is missing")
             elif found != file.sha256:
-                out.append(f"{self._storage.url}/{key} differs from what was written")
+                out.append(f"{self._storage.url}/{key} differs from what gsmap wrote")
         if not out and files:
             try:
                 body = self._body(_ObjectReader(self, kind, name, files), kind, name, files)
@@ -186,7 +186,7 @@ class ObjectArrays(Arrays):
                     copy.write(chunk)
             if stored_file(target, file.path) != file:
                 raise CorruptError(
-                    f"{self._storage.url}/{self._key(kind, name, file)} differs from what was written",
+                    f"{self._storage.url}/{self._key(kind, name, file)} differs from what gsmap wrote",
                     code="bytes_differ",
                 )
         return target
@@ -235,7 +235,7 @@ class ObjectArrays(Arrays):
     def _key(self, kind: str, name: str, file: StoredFile) -> str:
         if "/" in file.path:
             raise CorruptError(
-                f"{kind}/{name} has a file {file.path!r}, which no archive is called: nothing is done",
+                f"{kind}/{name} has a file {file.path!r}, which is not the name of an archive; nothing was changed",
                 code="invalid_stored_name",
             )
         return f"{self._prefix(kind, name)}{file.sha256[:32]}-{file.path}"
@@ -243,7 +243,7 @@ class ObjectArrays(Arrays):
     def _prefix(self, kind: str, name: str) -> str:
         if kind not in KINDS or not is_digest(name):
             raise CorruptError(
-                f"{kind}/{name} is not the name of a group of arrays: nothing is done with it",
+                f"{kind}/{name} is not the name of an array group; nothing was changed",
                 code="invalid_stored_name",
             )
         return f"{_ROOT}/{kind}/{name}/"

@@ -373,7 +373,9 @@ def current_annotations(connection: Connection) -> dict[int, ObjectAnnotations]:
 def _validated_name(name: str) -> str:
     name = facts.validated_text("the name of an object", name).strip()
     if _RESERVED_NAME.fullmatch(name):
-        raise InputError(f"an object cannot be called {name!r}: ids and points look so", code="invalid_name")
+        raise InputError(
+            f"{name!r} cannot be the name of an object: it has the form of an id or a point", code="invalid_name"
+        )
     return name
 
 
@@ -381,7 +383,7 @@ def _check_free(annotations: Mapping[int, ObjectAnnotations], number: int, name:
     for other, annotation in annotations.items():
         if other != number and annotation.name.casefold() == name.casefold():
             raise InputError(
-                f"o{other} is called {annotation.name!r} already: choose another name, rename that one, or mark "
+                f"o{other} has the name {annotation.name!r} already: choose another name, rename that object, or mark "
                 f"both as the same object (--same-as o{other})",
                 code="name_taken",
             )
@@ -392,9 +394,7 @@ def _check_acyclic(annotations: Mapping[int, ObjectAnnotations], number: int, sa
     at: str | None = same_as
     while at:
         if at in seen:
-            raise InputError(
-                f"o{number} and {same_as} are said to be one already, or are the same object", code="already_same"
-            )
+            raise InputError(f"o{number} and {same_as} are the same object already", code="already_same")
         seen.add(at)
         at = annotations.get(number_of(at) or 0, ObjectAnnotations()).same_as
 
@@ -488,8 +488,8 @@ def _read(row: Row[Any]) -> ObjectSet:
         )
     except (GsmapError, TypeError, ValueError, KeyError, IndexError, AttributeError, zlib.error) as error:
         raise CorruptError(
-            f"the catalog holds objects, in object_sets row {row.number}, that make no sense ({error}): gsmap did not "
-            "write that; restore the catalog from a backup",
+            f"the catalog holds objects, in object_sets row {row.number}, that are invalid ({error}) and that "
+            "gsmap did not write: restore the catalog from a backup",
             code="catalog_invalid",
         ) from error
 
@@ -498,12 +498,12 @@ def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, 
     observations: dict[int, ObjectObservation] = {}
     for at, state, thing, box, looked, asked in one["sightings"]:
         if state not in OBSERVATION_STATES or not 0 <= at < len(scenes) or not -1 <= asked < len(scenes):
-            raise InputError(f"a sighting of {state!r}", code="invalid_record")
+            raise InputError(f"an observation with the state {state!r}", code="invalid_record")
         corners = None if box is None else _numbers(box, (2, 3))
         by = "" if asked < 0 else scenes[asked]
         observations[at] = ObjectObservation(scenes[at], state, int(thing), corners, float(looked), by)
     if number_of(str(one["id"])) is None:
-        raise InputError(f"an object called {one['id']!r}", code="invalid_record")
+        raise InputError(f"an object with the id {one['id']!r}", code="invalid_record")
     # Captures with unknown segments have no observations.
     every = tuple(
         observations.get(i, ObjectObservation(scene, "unseen", -1, None, 0.0))
@@ -518,18 +518,18 @@ def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, 
 def _room(one: Mapping[str, Any], count: int) -> Room:
     width, depth = (int(n) for n in one["shape"])
     if not (0 < width * depth <= _MAX_CELLS and width > 0):
-        raise InputError(f"a room of {width} x {depth} cells", code="invalid_record")
+        raise InputError(f"a room with {width} x {depth} cells", code="invalid_record")
     packed = zlib.decompressobj().decompress(base64.b64decode(one["cells"], validate=True), -(-width * depth // 8))
     cells = np.unpackbits(np.frombuffer(packed, np.uint8), count=width * depth).astype(bool).reshape(width, depth)
     floor, ceiling = _numbers(one["heights_m"], (2,)).tolist()
     doors = tuple(int(other) for other in one["doors"])
     if not cells.any() or not float(one["cell_m"]) > 0 or not all(0 <= other < count for other in doors):
-        raise InputError("a room without floor, or with a door to nowhere", code="invalid_record")
+        raise InputError("a room without floor, or with a door that leads to no room", code="invalid_record")
     return Room(_numbers(one["low"], (2,)), cells, float(one["cell_m"]), floor, ceiling, doors)
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     array = np.array(value, np.float64)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{shape} finite numbers are wanted", code="invalid_record")
+        raise InputError(f"expected {shape} finite numbers", code="invalid_record")
     return array

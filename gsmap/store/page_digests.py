@@ -84,7 +84,7 @@ def load(file: Path) -> PageDigests | None:
         if len(body) == end + changed * _ENTRY.size:
             return PageDigests(page_size, body[start:end], next_count, dict(_ENTRY.iter_unpack(body[end:])))
     raise CorruptError(
-        f"{path} is damaged, so that the catalog cannot be verified: restore it from a backup, or take the catalog as "
+        f"{path} is damaged, so the catalog cannot be verified: restore it from a backup, or accept the catalog as "
         f"it is with gsmap check {file.parent} --accept-catalog",
         code="catalog_damaged",
     )
@@ -212,8 +212,8 @@ def _digest_wal(file: Path, log: WalContent, page_size: int) -> dict[int, bytes]
 def damage_message(file: Path, found: Iterable[str]) -> str:
     """Return the message for a damaged catalog."""
     return (
-        f"{file.parent}: the catalog is damaged: {'; '.join(found)}: restore {file.name} from a backup (or take it as "
-        f"it is: gsmap check {file.parent} --accept-catalog)"
+        f"{file.parent}: the catalog is damaged: {'; '.join(found)}: restore {file.name} from a backup (or "
+        f"accept it as it is: gsmap check {file.parent} --accept-catalog)"
     )
 
 

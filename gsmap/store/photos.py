@@ -58,7 +58,7 @@ class Photos:
             NotFoundError: no such scene.
         """
         if not jpeg.startswith(b"\xff\xd8\xff") or len(jpeg) > MAX_BYTES:
-            raise InputError(f"a photo is kept as a JPEG of at most {MAX_BYTES} bytes", code="photo_not_jpeg")
+            raise InputError(f"a kept photo must be a JPEG of at most {MAX_BYTES} bytes", code="photo_not_jpeg")
         when = None if sighting.captured_at is None else facts.validated_date(sighting.captured_at)
         pixels = np.frombuffer(jpeg, np.uint8)
         group_id = digest(pixels, text=KIND)
@@ -106,15 +106,16 @@ class Photos:
             row = connection.execute(select(photo_sightings).where(mine)).first()
             if row is None:
                 raise NotFoundError(
-                    f"the map keeps no photo {number}: gsmap list MAP photos shows them", code="photo_not_found"
+                    f"the map has no photo {number}: gsmap list MAP photos shows the photos", code="photo_not_found"
                 )
             files = manifest(connection, row.group_id)
-        with unless_pruned(self._catalog, row.group_id, f"photo {row.name} was taken back"):
+        with unless_pruned(self._catalog, row.group_id, f"photo {row.name} was removed"):
             held = self._arrays.read(KIND, row.group_id, files, shapes={"jpeg": (None,)})["jpeg"]
         content = held.tobytes() if held.dtype == np.uint8 and len(held) <= MAX_BYTES else b""
         if not content.startswith(b"\xff\xd8\xff"):
             raise CorruptError(
-                f"what the map keeps of photo {row.name} is no JPEG: restore it from a backup", code="photo_damaged"
+                f"the stored preview of photo {row.name} is not a JPEG: restore the map from a backup",
+                code="photo_damaged",
             )
         return content
 
@@ -129,9 +130,9 @@ class Photos:
         if not found and len(reference) >= _MIN_DIGEST_LENGTH:
             found = [one for one in kept if one.sighting.digest.startswith(reference)]
         if len(found) != 1:
-            why = "keeps several photos of that name" if found else "keeps no photo"
+            why = "has several photos with this name" if found else "has no photo with this name"
             raise NotFoundError(
-                f"{reference}: the map {why}; gsmap list MAP photos shows them with numbers such as p3",
+                f"{reference}: the map {why}; gsmap list MAP photos shows the photos with their numbers, such as p3",
                 code="photo_not_found",
             )
         return found[0]
@@ -199,8 +200,8 @@ def _stored(row: Row[Any]) -> StoredPhoto:
         )
     except (GsmapError, TypeError, ValueError, KeyError, AttributeError) as error:
         raise CorruptError(
-            f"the catalog holds a photo, in photo_sightings row {row.number}, that makes no sense ({error}): gsmap did "
-            "not write that; restore the catalog from a backup",
+            f"the catalog holds a photo, in photo_sightings row {row.number}, that is invalid ({error}) and "
+            "that gsmap did not write: restore the catalog from a backup",
             code="catalog_invalid",
         ) from error
     return StoredPhoto(row.number, sighting, row.created_at, row.group_id or "")

@@ -48,7 +48,10 @@ def join_pose_graphs(
             common = [(ours.poses[p.scene], p) for p in shared if ours.poses[p.scene].component == component]
             S_ours_theirs = _between(common, bounds)
             if not _agree(common, S_ours_theirs):
-                notes.append(f"{len(new)} scenes stay a component of their own: those in both maps lie otherwise here")
+                notes.append(
+                    f"{len(new)} scenes stay a separate component: the scenes that both maps share have "
+                    "different poses here"
+                )
                 component, S_ours_theirs = free, Sim3.identity()
         for pose in new:
             moved = S_ours_theirs @ pose.S_map_scene

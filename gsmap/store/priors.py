@@ -26,7 +26,7 @@ class Priors:
         sigmas = np.asarray(prior.sigmas, np.float64)
         if sigmas.shape != (7,) or not (sigmas > 0).all():
             raise InputError(
-                f"a prior needs 7 positive sigmas (inf where nothing is known), got {sigmas.tolist()}",
+                f"a prior needs 7 positive sigmas (inf where unknown), got {sigmas.tolist()}",
                 code="invalid_sigma",
             )
         with self._catalog.write() as connection:
@@ -71,7 +71,7 @@ class Priors:
             query = select(priors).where(priors.c.scene == scene, priors.c.number == number)
             row = connection.execute(query).one_or_none()
         if row is None:
-            raise NotFoundError(f"scene {ref!r} has no prior of number {number}", code="prior_not_found")
+            raise NotFoundError(f"scene {ref!r} has no prior with number {number}", code="prior_not_found")
         return _prior(row)
 
     def remove(self, ref: str) -> None:

@@ -222,8 +222,8 @@ def erase_deleted_rows(catalog: Catalog) -> None:
             return
         if not sqlite.vacuum(catalog.engine, catalog.folder / sqlite.FILE, erase=True):
             raise BusyError(
-                f"{catalog.folder}: another process reads the state from before the purge; its rows are gone, but not "
-                "yet from the file: run the same command again when that process is done",
+                f"{catalog.folder}: another process reads the state before the purge; the rows are deleted, but not "
+                "yet erased from the file: run the same command again when that process has finished",
                 code="purge_pending",
             )
 

@@ -34,7 +34,7 @@ class Recipes:
         with self._catalog.read() as connection:
             row = connection.execute(select(recipes).where(recipes.c.digest == digest)).first()
         if row is None:
-            raise NotFoundError(f"no result of this map was made by a recipe {digest}", code="recipe_not_found")
+            raise NotFoundError(f"this map has no result of a recipe {digest}", code="recipe_not_found")
         return _recipe(row)
 
     def list(self) -> list[RecipeKey]:
@@ -51,7 +51,7 @@ def save_recipe(connection: Connection, recipe: RecipeKey | Mapping[str, Any] | 
     parts: Mapping[str, Any] = recipe.to_json() if isinstance(recipe, RecipeKey) else plain(recipe)
     if set(parts) != set(PARTS):
         raise InputError(
-            f"a recipe has {', '.join(PARTS)} (RecipeKey.to_json), got {', '.join(parts)}", code="invalid_recipe"
+            f"a recipe must have {', '.join(PARTS)} (RecipeKey.to_json), got {', '.join(parts)}", code="invalid_recipe"
         )
     digest = text_digest(canonical(parts))
     if connection.execute(select(recipes.c.digest).where(recipes.c.digest == digest)).first() is None:

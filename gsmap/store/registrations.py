@@ -179,7 +179,7 @@ class Registrations:
                 a, b = sorted((registration.target, registration.source))
                 if a == b or not {a, b} <= known:
                     raise InputError(
-                        f"a registration is of two scenes of the map, by their ids, got {a} and {b}",
+                        f"a registration needs the ids of two scenes of the map, got {a} and {b}",
                         code="invalid_registration",
                     )
                 rows.append(_row_of(registration, f"{a}:{b}", key, kept[key.recipe]))
@@ -196,10 +196,10 @@ class Registrations:
         with self._catalog.write() as connection:
             row = connection.execute(select(registrations).where(registrations.c.number == number)).first()
             if row is None:
-                raise NotFoundError(f"no registration {number} in this map", code="registration_not_found")
+                raise NotFoundError(f"this map has no registration {number}", code="registration_not_found")
             if row.proposer == MANUAL:
                 raise InputError(
-                    f"registration {number} was measured by a person: save it again instead",
+                    f"registration {number} is a manual one and cannot be computed again: save it again instead",
                     code="registration_measured",
                 )
             pair = _rows_of(connection, row.pair)
@@ -391,12 +391,13 @@ class Registrations:
                 )
             if review == "confirm" and found.registration.S_target_source is None:
                 raise InputError(
-                    f"{first} and {second} have no pose to confirm: {found.registration.reason or 'none was found'}",
+                    f"{first} and {second} have no pose to confirm: "
+                    f"{found.registration.reason or 'the registration found none'}",
                     code="no_pose_of_pair",
                 )
             if review == "withdraw" and found.review is None and not found.manual:
                 raise InputError(
-                    f"nobody has reviewed {first} and {second}: there is nothing to withdraw",
+                    f"the pair {first} and {second} has no review to withdraw",
                     code="nothing_to_withdraw",
                 )
             row = {"review": review, "registration": found.number, "note": note, "created_at": now()}
@@ -459,7 +460,7 @@ def _check_key(r: Registration, key: RecipeKey | None) -> None:
         )
     if r.proposer == MANUAL and r.status != "accepted":
         raise InputError(
-            "a measured registration has status 'accepted', a pose and an information matrix",
+            "a manual registration needs status 'accepted', a pose and an information matrix",
             code="invalid_registration",
         )
 

@@ -41,7 +41,7 @@ def local_folder(path: str | os.PathLike[str]) -> Path:
         return Path(text)
     if scheme != "file":
         raise ConfigError(
-            f"a map lies in a folder, at file:///FOLDER or at s3://BUCKET/PREFIX, not at {scheme}://",
+            f"a map must lie in a folder, at file:///FOLDER or at s3://BUCKET/PREFIX, got {scheme}://",
             code="invalid_location",
         )
     host, _, below = rest.partition("/")
@@ -89,7 +89,7 @@ class RemoteMap:
             except NotFoundError:
                 if name == trust.URL_FILE:
                     raise NotFoundError(
-                        f"no map at {self.url}: make one with gsmap init {self.url}", code="map_not_found"
+                        f"no map at {self.url}: create one with gsmap init {self.url}", code="map_not_found"
                     ) from None
                 (self.mirror / name).unlink(missing_ok=True)
                 continue
@@ -124,7 +124,7 @@ class RemoteMap:
         folder, _, file = name.partition("/")
         if "/" in name.replace("/", "", 1) or {folder, file} & {"", ".", ".."}:
             raise CorruptError(
-                f"{self.url} has no file called {name!r}: nothing is done with it", code="invalid_stored_name"
+                f"{self.url} cannot have a file {name!r}; nothing was changed", code="invalid_stored_name"
             )
         target = self.mirror / name
         if not target.is_file():
@@ -137,7 +137,7 @@ class RemoteMap:
             out += chunk
             if len(out) > _MAX_BYTES:
                 raise CorruptError(
-                    f"{self.url}/{name} is far too long: gsmap did not write that", code="file_too_large"
+                    f"{self.url}/{name} is far too long, so gsmap did not write it: remove it", code="file_too_large"
                 )
         return out
 

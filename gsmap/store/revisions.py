@@ -142,11 +142,12 @@ class Revisions:
             row = connection.execute(select(revisions).where(revisions.c.number == wanted)).first()
             if row is None:
                 raise NotFoundError(
-                    f"no revision {number}: gsmap list MAP revisions shows what there is", code="revision_not_found"
+                    f"the map has no revision {number}: gsmap list MAP revisions shows the revisions",
+                    code="revision_not_found",
                 )
             if is_dropped(connection, row):
                 raise NotFoundError(
-                    f"revision {number} was dropped by gsmap prune: of it only its line in the list is left",
+                    f"the poses of revision {number} were deleted by gsmap prune: only its line in the list is left",
                     code="revision_dropped",
                 )
             return _pose_graph(connection, row)
@@ -166,7 +167,8 @@ class Revisions:
             row = connection.execute(select(revisions).where(revisions.c.number == number)).first()
         if row is None:
             raise NotFoundError(
-                f"no revision {number}: gsmap list MAP revisions shows what there is", code="revision_not_found"
+                f"the map has no revision {number}: gsmap list MAP revisions shows the revisions",
+                code="revision_not_found",
             )
         return _revision(row)
 

@@ -69,7 +69,8 @@ class RowIndexMap:
             return rows
         if counted != self.num_kept:
             raise InputError(
-                "the capture was thinned or ingested again meanwhile: run the same again", code="changed_meanwhile"
+                "the capture was thinned or ingested again meanwhile: run the same command again",
+                code="changed_meanwhile",
             )
         if self.rows is None:
             return _empty(rows)
@@ -127,8 +128,8 @@ class RowIndexMaps:
         rows = compact.unpack_kept(read[compact.KEPT], thinning.num_gaussians)
         if len(rows) != row.num_gaussians:
             raise CorruptError(
-                f"scene {row.name}: its row map keeps {len(rows)} Gaussians, the catalog {row.num_gaussians}: ingest "
-                "its capture again",
+                f"scene {row.name}: its row index map has {len(rows)} Gaussians, but the catalog records "
+                f"{row.num_gaussians}: ingest its capture again",
                 code="catalog_invalid",
             )
         return RowIndexMap(thinning.num_gaussians, row.num_gaussians, rows)

@@ -116,7 +116,7 @@ class GaussianBlocks:
             self._boxes.append(chunk_boxes(self._block, self._rows)[0])
             self._count += 1
         if start != self._rows * (self._count - 1):
-            raise ValueError(f"rows from {start} on were asked for out of order")
+            raise ValueError(f"rows from {start} on were read out of order")
         column: np.ndarray = getattr(self._block, name)
         return column
 

@@ -64,10 +64,10 @@ def find(connection: Connection, ref: str) -> Row[Any]:
     if rows:
         several = ", ".join(r.name for r in rows)
         raise NotFoundError(
-            f"{ref!r} is the beginning of several scene ids ({several}): add digits", code="scene_ambiguous"
+            f"several scene ids begin with {ref!r} ({several}): give more digits", code="scene_ambiguous"
         )
     raise NotFoundError(
-        f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes shows what there is",
+        f"no scene is called {ref!r}, and no id begins with it: gsmap list MAP scenes shows the scenes",
         code="scene_not_found",
     )
 
@@ -83,13 +83,13 @@ def find_removed(connection: Connection, ref: str) -> Row[Any]:
     if named:
         several = ", ".join(f"{row.name} {row.id[:12]}" for row in named)
         raise NotFoundError(
-            f"several removed scenes are called {ref!r} ({several}): give more of an id", code="scene_ambiguous"
+            f"several removed scenes have the name {ref!r} ({several}): give an id", code="scene_ambiguous"
         )
     with contextlib.suppress(NotFoundError):
         raise InputError(
-            f"scene {find(connection, ref).name} was not removed: there is nothing to bring back", code="not_removed"
+            f"scene {find(connection, ref).name} was not removed, so it cannot be restored", code="not_removed"
         )
-    raise NotFoundError(f"no removed scene is called {ref!r}, and no id begins so", code="scene_not_found")
+    raise NotFoundError(f"no removed scene is called {ref!r}, and no id begins with it", code="scene_not_found")
 
 
 def by_id(connection: Connection, wanted: str) -> Row[Any] | None:

@@ -259,7 +259,8 @@ class Scenes:
             for kind, value in new:
                 if kind == "name" and name_taken(connection, value):
                     raise InputError(
-                        f"another scene is called {value!r}: choose another name, or rename that one", code="name_taken"
+                        f"another scene has the name {value!r}: choose another name, or rename that scene",
+                        code="name_taken",
                     )
                 if kind == "untag" and value not in tags:
                     raise NotFoundError(
@@ -469,7 +470,8 @@ class Scenes:
             image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
         except UnicodeDecodeError as error:
             raise CorruptError(
-                f"scene {row.name}: the names of its cameras are no text: ingest it again", code="catalog_invalid"
+                f"scene {row.name}: the names of its cameras are not valid text: ingest it again",
+                code="catalog_invalid",
             ) from error
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
 
@@ -497,14 +499,15 @@ class Scenes:
             files = manifest(connection, row.group_id or "")
             if not files:
                 raise NotFoundError(
-                    f"the arrays of scene {row.name} ({row.id}) were pruned: bring them from another map, a branch or "
-                    "a restored backup with --from, or ingest its capture again",
+                    f"the arrays of scene {row.name} ({row.id}) were pruned: restore them from another map, a "
+                    "branch or a restored backup with --from, or ingest its capture again",
                     code="arrays_pruned",
                 )
             problems = self._arrays.problems(KIND, row.group_id, files)
             if problems:
                 raise CorruptError(
-                    f"scene {row.name} stays removed, its arrays are damaged: {problems[0]}", code="arrays_corrupt"
+                    f"scene {row.name} stays removed because its arrays are damaged: {problems[0]}",
+                    code="arrays_corrupt",
                 )
             name = unused_name(connection, row.name)
             back = {"removed_at": None, "ingested_at": now(), "name": name}
@@ -540,7 +543,8 @@ class Scenes:
         wanted, name = fields["name"], unused_name(connection, fields["name"])
         if name != wanted and not rename:
             raise InputError(
-                f"another scene is called {wanted!r}: choose another name, or remove that one first", code="name_taken"
+                f"another scene has the name {wanted!r}: choose another name, or remove that scene first",
+                code="name_taken",
             )
         fields = fields | {"name": name, "ingested_at": now(), "removed_at": None}
         before = by_id(connection, new_id)

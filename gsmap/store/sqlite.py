@@ -115,7 +115,7 @@ def engine(file: Path, *, writable: bool) -> Engine:
             # A reader in WAL mode must write an index, which is impossible here; so no process writes the log either.
             if _log_bytes(file):
                 raise StoreError(
-                    f"{file.parent} was not closed cleanly: open it once where it can be written",
+                    f"{file.parent} was not closed cleanly: open it once with write access",
                     code="not_closed_cleanly",
                 ) from None
             still: sqlite3.Connection = _connect(f"{uri}&immutable=1")
@@ -214,7 +214,8 @@ def refuse_unexpected_files(file: Path) -> None:
         path = file.with_name(file.name + ending)
         if os.path.lexists(path) and not is_file(path):
             raise CorruptError(
-                f"{path} is a link, a pipe or a device: gsmap makes none; put a file in its place", code="link_refused"
+                f"{path} is a link, a pipe or a device, and gsmap creates none: put a file in its place",
+                code="link_refused",
             )
     journal = file.with_name(f"{file.name}-journal")
     try:
@@ -225,7 +226,7 @@ def refuse_unexpected_files(file: Path) -> None:
         return
     if ends == _JOURNAL_MAGIC:
         raise CorruptError(
-            f"{journal} names another file for SQLite to delete: gsmap writes no such thing; remove it",
+            f"{journal} names another file for SQLite to delete, which gsmap does not write: remove it",
             code="hostile_journal",
         )
 

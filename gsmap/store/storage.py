@@ -95,12 +95,12 @@ def open_storage(target: str | os.PathLike[str]) -> Storage:
     parts = urllib.parse.urlsplit(text)
     if scheme not in ("file", "s3"):
         raise ConfigError(
-            f"a backup goes to a folder, file:///FOLDER or s3://BUCKET/PREFIX, not to {scheme}://",
+            f"a backup must go to a folder, file:///FOLDER or s3://BUCKET/PREFIX, got {scheme}://",
             code="invalid_location",
         )
     if "@" in parts.netloc or parts.query or parts.fragment:
         raise ConfigError(
-            "the address of a backup has no password and no options: give them as AWS_... variables",
+            "the address of a backup must have no password and no options: set the AWS_... variables instead",
             code="invalid_location",
         )
     if scheme == "file":
@@ -123,7 +123,7 @@ class FolderStorage:
 
     def list(self, prefix: str) -> dict[str, ObjectInfo]:
         if prefix and not prefix.endswith("/"):
-            raise ValueError(f"a prefix ends with a slash, got {prefix!r}")
+            raise ValueError(f"a prefix must end with a slash, got {prefix!r}")
         out: dict[str, ObjectInfo] = {}
         with self._translate_errors():
             todo = [prefix] if prefix != f"{_STAGING}/" else []
@@ -222,7 +222,9 @@ class FolderStorage:
         for part in name.split("/")[:-1]:
             folder = folder / part
             if folder.is_symlink():
-                raise StoreError(f"{folder} is a link: a backup has none; it may lead anywhere", code="link_refused")
+                raise StoreError(
+                    f"{folder} is a link: gsmap does not follow links in a backup; remove it", code="link_refused"
+                )
         return self.root / name
 
     @contextlib.contextmanager
@@ -234,7 +236,7 @@ class FolderStorage:
         except OSError as error:
             kind = of_system(error)
             if kind is DiskFullError:
-                text = f"{self.url}: the disk is full; make room and run it again: what is there is kept"
+                text = f"{self.url}: the disk is full: free some space and repeat the command (sent files are kept)"
                 raise DiskFullError(text) from error
             if kind is ReadOnlyError:
                 raise ReadOnlyError(f"{self.url} cannot be written or read here ({error.strerror})") from error
@@ -242,7 +244,8 @@ class FolderStorage:
                 raise DiskError(f"{self.url}: the disk failed ({error.filename or error.strerror})") from error
             if error.errno == errno.ELOOP:
                 raise StoreError(
-                    f"{error.filename} is a link: a backup has none; it may lead anywhere", code="link_refused"
+                    f"{error.filename} is a link: gsmap does not follow links in a backup; remove it",
+                    code="link_refused",
                 ) from error
             raise StoreError(
                 f"{self.url}: {error.strerror or error} ({error.filename or 'no name'})", code="place_failed"
@@ -355,12 +358,12 @@ class BucketStorage:
             yield
         except (PermissionDeniedError, UnauthenticatedError) as error:
             raise StorageRequestError(
-                f"{self.url}: not allowed to {what} ({_first_line(error)}): see AWS_ACCESS_KEY_ID",
+                f"{self.url}: not allowed to {what} ({_first_line(error)}): check AWS_ACCESS_KEY_ID",
                 code="place_refused",
             ) from error
         except (BaseError, OSError) as error:
             raise StorageRequestError(
-                f"{self.url}: cannot {what} ({_first_line(error)}): see AWS_ENDPOINT_URL, and try again",
+                f"{self.url}: cannot {what} ({_first_line(error)}): check AWS_ENDPOINT_URL, and try again",
                 code="place_failed",
             ) from error
 

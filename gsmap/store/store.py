@@ -121,7 +121,7 @@ class Store:
             is_map = "is a map already" if branches.has_catalog(folder) else "is not empty"
             raise StoreError(f"{path} {is_map}: open it, or choose another name", code="already_exists")
         if folder.exists() and not folder.is_dir():
-            raise StoreError(f"{path} is a file: a map is a folder; choose another name", code="not_a_folder")
+            raise StoreError(f"{path} is a file, but a map is a folder: choose another name", code="not_a_folder")
         if not folder.parent.is_dir():
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist", code="folder_not_found")
         with translate_errors(folder, "no map was made"), staging.beside(folder) as staged:
@@ -231,19 +231,19 @@ class Store:
         verify: bool = True,
     ) -> Store:
         if mode not in ("r", "w"):
-            raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}", code="invalid_choice")
+            raise ConfigError(f"the mode of a store must be 'r' or 'w', got {mode!r}", code="invalid_choice")
         place = branches.locate(path)
         folder = place.folder
         if place.remote is not None:
             place.remote.refresh_mirror()
         if not folder.exists():
-            raise NotFoundError(f"no map at {path}: make one with gsmap init {path}", code="map_not_found")
+            raise NotFoundError(f"no map at {path}: create one with gsmap init {path}", code="map_not_found")
         if not branches.is_map(place.home):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
-            raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init", code="not_a_map")
+            raise StoreError(f"{path} is not a gsmap map (it {what}): create one with gsmap init", code="not_a_map")
         _refuse_unexpected_entries(place.home)
         _refuse_unexpected_entries(folder)
-        read_only_message = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
+        read_only_message = f"{path} is a tag and cannot be changed: create a branch of it (gsmap branch {path} NAME)"
         if mode == "w" and place.is_tag and not allow_tags:
             raise StoreError(read_only_message, code="not_writable")
         if mode == "w" and not os.access(folder, os.W_OK):
@@ -290,7 +290,7 @@ class Store:
         known = trust.read_address(self.folder).map_id if (self.folder / trust.URL_FILE).exists() else None
         if known is not None and known != self.id:
             raise CorruptError(
-                f"{self.folder} belongs to map {known[:12]}, but the database named for it holds map {self.id[:12]}: "
+                f"{self.folder} belongs to map {known[:12]}, but its database holds map {self.id[:12]}: "
                 f"name the right one in {trust.ENVIRONMENT}",
                 code="wrong_catalog",
             )
@@ -361,7 +361,8 @@ def _refuse_unexpected_entries(folder: Path) -> None:
             if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 what = "a link" if stat.S_ISLNK(mode) else "a pipe or a device"
                 raise CorruptError(
-                    f"{folder / name} is {what}: gsmap makes none in a map; put what belongs there in its place",
+                    f"{folder / name} is {what}, and gsmap creates none in a map: replace it by the original "
+                    "file or folder",
                     code="not_a_plain_file",
                 )
 
@@ -370,7 +371,7 @@ def _claim(home: RemoteMap, catalog_url: str | None) -> None:
     """Create an empty remote map."""
     if catalog_url is None:
         raise ConfigError(
-            f"{home.url} is a bucket, which can hold no catalog: name an empty PostgreSQL database (gsmap init "
+            f"{home.url} is a bucket, which cannot hold a catalog: name an empty PostgreSQL database (gsmap init "
             f"{home.url} --catalog postgresql+psycopg://...)",
             code="bucket_needs_catalog",
         )
@@ -382,7 +383,7 @@ def _claim(home: RemoteMap, catalog_url: str | None) -> None:
         _make_catalog(Path(folder), catalog_url)
         if not home.claim(Path(folder)):
             raise StoreError(
-                f"another process made a map at {home.url} meanwhile: open it, or choose another name",
+                f"another process created a map at {home.url} meanwhile: open it, or choose another name",
                 code="already_exists",
             )
         trust.trust_new_map(Path(folder))

@@ -63,7 +63,9 @@ def open_transfer(
     """
     same_home = into.home.samefile(source.home)
     if same_home and into.folder.samefile(source.folder):
-        raise ConfigError(f"{into.location} and {source.location} are the same map: name two", code="same_map")
+        raise ConfigError(
+            f"{into.location} and {source.location} are the same map: name two different maps", code="same_map"
+        )
     with contextlib.ExitStack() as stack:
         staged: dict[tuple[str, str], StagedGroup] = {}
         if not same_home:
@@ -114,7 +116,7 @@ class Transfer:
     def scenes(self) -> None:
         """Copy scenes, facts, arrays and chunk boxes; for a scene in both maps the later facts are in force."""
         for scene in sorted(self._forgotten):
-            self.notes.append(f"scene {scene} was forgotten here on demand, so it stays away")
+            self.notes.append(f"scene {scene} was purged from this map, so it is not copied")
         for row in self._rows:
             if row.id in self._forgotten:
                 continue
@@ -149,22 +151,28 @@ class Transfer:
             values |= _kept(row)
             self._copy_boxes(row, mine.number)
             forget_derived(self.ours, mine.id)  # computed from the compact Gaussians, which have other rows
-            self.notes.append(f"scene {mine.name} is whole again: it was thinned here, and not there")
+            self.notes.append(f"scene {mine.name} has all Gaussians again: it was thinned in this map only")
         returns = mine.removed_at is not None and row.removed_at is None and row.ingested_at > mine.removed_at
         leaves = mine.removed_at is None and row.removed_at is not None and row.removed_at > mine.ingested_at
         if returns:
             values |= {"removed_at": None, "ingested_at": row.ingested_at, "name": self._unused_name(row.name)}
             self.counts["scenes"] += 1
-            self.notes.append(f"scene {row.name} is back: it was ingested there after it was removed here")
+            self.notes.append(
+                f"scene {row.name} is restored: it was ingested in the other map after it was removed here"
+            )
         elif leaves:
             values["removed_at"] = row.removed_at
             self.counts["removed"] += 1
-            self.notes.append(f"scene {mine.name} is removed: it was removed there after it was ingested here")
+            self.notes.append(
+                f"scene {mine.name} is removed: it was removed from the other map after it was ingested here"
+            )
         elif mine.removed_at is not None and row.removed_at is None:
-            self.notes.append(f"scene {mine.name} stays removed: it was removed here after it was ingested there")
+            self.notes.append(
+                f"scene {mine.name} stays removed: it was removed here after it was ingested in the other map"
+            )
         if mine.scale_policy != row.scale_policy:
             self.notes.append(
-                f"scene {mine.name} keeps the scale policy {mine.scale_policy} (there: {row.scale_policy})"
+                f"scene {mine.name} keeps the scale policy {mine.scale_policy} (in the other map: {row.scale_policy})"
             )
         if values:
             self.ours.execute(update(scenes).where(scenes.c.id == mine.id).values(**values))
@@ -240,7 +248,8 @@ class Transfer:
             self.counts["bytes"] += sum(file.size_bytes for file in files)
         else:
             raise StoreError(
-                f"{self.into.location} was pruned meanwhile; nothing was changed: try again", code="changed_meanwhile"
+                f"{self.into.location} was pruned meanwhile, so nothing was changed: try again",
+                code="changed_meanwhile",
             )
 
     # --- results and reviews -----------------------------------------------------------------------------------------
@@ -339,7 +348,7 @@ class Transfer:
         if not self.counts["priors"]:
             return
         if standing_here:
-            self.notes.append("both maps were told where scenes lie: that fits only if both mean the same frame")
+            self.notes.append("both maps have pose priors: they agree only if both use the same frame")
         for scene in self.wanted:
             current = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
             rows = self.ours.execute(select(priors).where(current).order_by(priors.c.created_at)).all()
@@ -369,7 +378,7 @@ class Transfer:
             known = mine.get(_identity(row, "removed_at"))
             if known is None and row.kind == "frame" and has_frame:
                 if row.removed_at is None:
-                    self.notes.append("both maps are tied to the world: this one's frame stays")
+                    self.notes.append("both maps are georeferenced: this map keeps its frame")
                 continue
             if known is None:
                 self.ours.execute(insert(observations), _content(row))
@@ -413,7 +422,7 @@ class Transfer:
             if mine is not None:
                 if mine.sha256 != row.sha256:
                     self.notes.append(
-                        f"model {row.name} stays the one of this map: graphs made with the other are stale"
+                        f"model {row.name} of this map is kept: graphs computed with the other map's model are stale"
                     )
             elif taken_back.get((row.name, row.sha256), "") < row.created_at:
                 place = model_path(self.into.home, row)  # validates the path, which may come from an untrusted map
@@ -426,7 +435,7 @@ class Transfer:
                     self.into.arrays.upload_model(row.path)
                 self.ours.execute(insert(models), _content(row))
                 self.counts["models"] += 1
-                self.notes.append(f"model {row.name} came along: graphs made without it are out of date")
+                self.notes.append(f"model {row.name} was copied: graphs computed without it are stale")
 
 
 def _missing_groups(

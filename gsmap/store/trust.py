@@ -82,8 +82,8 @@ def read_address(folder: Path) -> CatalogAddress:
     if not fits:
         raise CorruptError(
             f"{display_name(folder)}/{URL_FILE} does not name a PostgreSQL database (postgresql+psycopg://...), and "
-            f"gsmap writes nothing else there: name the catalog in {ENVIRONMENT}, and do not trust a map that was sent "
-            "to you so",
+            f"gsmap writes nothing else there: name the catalog in {ENVIRONMENT}, and do not trust the map if you "
+            "received it like this",
             code="catalog_invalid",
         )
     return CatalogAddress(lines[0], lines[1] if len(lines) > 1 else None)
@@ -136,12 +136,12 @@ def trusted_urls() -> dict[str, tuple[str, ...]]:
         # older files have one URL instead of a list
         known = {key: (urls,) if isinstance(urls, str) else tuple(urls) for key, urls in found.items()}
         if not all(isinstance(key, str) and all(isinstance(url, str) for url in known[key]) for key in known):
-            raise TypeError("it maps ids to URLs")
+            raise TypeError("expected an object that maps ids to URLs")
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StoreError(
-            f"{path} cannot be read ({error}): mend it, or remove it and trust your maps again",
+            f"{path} cannot be read ({error}): repair it, or remove it and run gsmap trust for your maps again",
             code="trust_file_unreadable",
         ) from error
     return known
@@ -163,7 +163,7 @@ def trust(map_id: str, url: str) -> None:
             os.close(handle)
     except OSError as error:
         raise StoreError(
-            f"cannot remember in {path} that the catalog is trusted ({error.strerror}): name its URL in {ENVIRONMENT}",
+            f"cannot record in {path} that the catalog is trusted ({error.strerror}): name its URL in {ENVIRONMENT}",
             code="not_writable",
         ) from error
 

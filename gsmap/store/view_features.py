@@ -50,7 +50,8 @@ class ViewFeatures:
         """
         if found.scene not in key.inputs:
             raise InputError(
-                f"the key of features must name their scene {found.scene} among its inputs", code="key_input_mismatch"
+                f"the recipe key of features must have their scene {found.scene} among its inputs",
+                code="key_input_mismatch",
             )
         arrays: dict[str, np.ndarray] = {
             "starts": found.starts.astype(np.int64),
@@ -112,13 +113,13 @@ class ViewFeatures:
             "intrinsics": (V, 4),
             "sizes": (V, 2),
         }
-        with unless_pruned(self._catalog, row.group_id, f"the features of scene {scene[:12]} were made anew"):
+        with unless_pruned(self._catalog, row.group_id, f"the features of scene {scene[:12]} were computed again"):
             arrays = self._arrays.read(KIND, row.group_id, files, shapes=shapes)
         try:
             return _features(scene, arrays, N)
         except (InputError, *MALFORMED) as error:
             raise CorruptError(
-                f"the features of scene {scene[:12]} make no sense ({error}): run gsmap check", code="arrays_corrupt"
+                f"the features of scene {scene[:12]} are invalid ({error}): run gsmap check", code="arrays_corrupt"
             ) from error
 
 
@@ -128,7 +129,7 @@ def _features(scene: str, arrays: dict[str, np.ndarray], num_features: int) -> S
             raise InputError(f"{name} are {arrays[name].dtype}", code="invalid_record")
     starts = arrays["starts"]
     if starts[0] != 0 or starts[-1] != num_features or (np.diff(starts) < 0).any():
-        raise InputError("its views do not divide its features", code="invalid_record")
+        raise InputError("its views do not partition its features", code="invalid_record")
     if not np.isfinite(arrays["points"]).all():
         raise InputError("a point holds NaN or infinity", code="not_finite")
     cameras = Cameras(arrays["poses"].reshape(-1, 4, 4), arrays["intrinsics"], arrays["sizes"])

@@ -133,7 +133,7 @@ def _read(handle: int, size: int, stored: IndexHeader | None, at_most: int) -> W
         at += len(block)
     if lost or committed > good:
         return WalContent(
-            frames, num_pages, f"its frame {good + 1} or one after it is damaged, and what follows is lost"
+            frames, num_pages, f"its frame {good + 1} or a later one is damaged, and the frames after it are lost"
         )
     return WalContent(frames, num_pages)
 

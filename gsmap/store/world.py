@@ -103,7 +103,7 @@ class WorldObservations:
             missing = sorted(wanted - found)
             if missing:
                 raise NotFoundError(
-                    f"no observation is called {missing[0]!r}: gsmap georeference MAP shows them",
+                    f"this map has no observation {missing[0]!r}: gsmap georeference MAP shows the observations",
                     code="observation_not_found",
                 )
             for number in gone:
@@ -172,14 +172,14 @@ def _item(row: Row[Any]) -> Any:
         }
         texts = [value for name, value in values.items() if name in _TEXTS]
         if not all(isinstance(text, str) for text in [*texts, *values.get("scenes", ())]):
-            raise ValueError("names that are no texts")
+            raise ValueError("names that are not strings")
         made = _TYPES[row.kind](**values)
         if _row(made)["scene"] != row.scene or _row(made)["other"] != row.other or _row(made)["name"] != row.name:
-            raise ValueError("of another name or scene than its row")
+            raise ValueError("the name or scene differs from that of its row")
     except (GsmapError, TypeError, ValueError, KeyError) as error:
         raise CorruptError(
-            f"the catalog holds an observation ({row.kind} {row.name!r}) that makes no sense: {error}; gsmap did not "
-            "write that: restore the catalog from a backup",
+            f"the catalog holds an observation ({row.kind} {row.name!r}) that is invalid ({error}) and that "
+            "gsmap did not write: restore the catalog from a backup",
             code="catalog_invalid",
         ) from error
     return made

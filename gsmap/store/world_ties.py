@@ -41,8 +41,8 @@ def world_ties_of_json(values: list[dict[str, Any]]) -> tuple[Georeference, ...]
         return tuple(_tie(value) for value in values)
     except (GsmapError, TypeError, ValueError, KeyError, AttributeError) as error:
         raise CorruptError(
-            f"the catalog holds a place in the world, in revisions.world, that makes no sense ({error!r}): gsmap did "
-            "not write that; restore the catalog from a backup",
+            f"the catalog holds a georeference, in revisions.world, that is invalid ({error!r}) and that gsmap did "
+            "not write: restore the catalog from a backup",
             code="catalog_invalid",
         ) from error
 
@@ -57,7 +57,7 @@ def _tie(value: dict[str, Any]) -> Georeference:
     for row in value["residuals"]:
         values: dict[str, Any] = {k: tuple(map(float, v)) if k in _PAIRS else v for k, v in row.items()}
         if not all(isinstance(values[k], str) for k in ("kind", "name", "scene", "use", "reason")):
-            raise ValueError("names that are no texts")
+            raise ValueError("names that are not strings")
         if not isinstance(values["dof"], int) or not isinstance(values["statistic"], float | int | None):
             raise ValueError("no statistic")
         rows.append(Residual(**values))
@@ -81,7 +81,7 @@ def _contradiction(value: dict[str, Any]) -> Contradiction:
     lists = {k: tuple(v) for k, v in value.items() if isinstance(v, list | tuple)}
     one = Contradiction(**{**value, **lists})
     if not all(isinstance(text, str) for text in (one.text, *one.scenes)):
-        raise ValueError("names that are no texts")
+        raise ValueError("names that are not strings")
     numbers = [*one.offset_m, *one.sigma_m, *([] if one.ratio is None else [one.ratio])]
     if not all(isinstance(number, float | int) for number in numbers) or not isinstance(one.count, int):
         raise ValueError("no numbers")

@@ -57,7 +57,7 @@ def test_a_tag_says_what_to_do_instead(site: Path, cli: Run) -> None:
     ):
         refused = cli(*verb)
         assert (refused.code, refused.stdout) == (1, "")
-        assert "is a tag, which does not change" in refused.stderr
+        assert "is a tag and cannot be changed" in refused.stderr
     assert not (site / "branches" / "v1" / "settings.toml").exists()
 
 

@@ -19,7 +19,7 @@ from gsmap.store import array_archive
 from gsmap.store.layout import CHUNK_ROWS
 
 READ = ("check MAP", "show MAP a", "export MAP TILES --tile-size 0 --merge voxel", "look MAP")
-LAYOUT = r"gsmap did not write that"
+LAYOUT = r"gsmap did not write"
 
 # --- links and pipes -------------------------------------------------------------------------------------------------
 
@@ -35,17 +35,17 @@ def a_staging_that_lies_elsewhere(w: World) -> None:
     w.replaced(w.map / "arrays" / "staging", w.home / "photos")
 
 
-@case(r"extra does not belong there", works=("list MAP scenes", "prune MAP --keep-revisions 0"))
+@case(r"extra is not a file of the map", works=("list MAP scenes", "prune MAP --keep-revisions 0"))
 def a_link_among_the_kinds(w: World) -> None:
     (w.map / "arrays" / "extra").symlink_to(w.home / "photos")
 
 
-@case(r"does not belong there", works=("list MAP scenes", "prune MAP --keep-revisions 0"))
+@case(r"is not a file of the map", works=("list MAP scenes", "prune MAP --keep-revisions 0"))
 def a_link_among_the_groups(w: World) -> None:
     (w.map / "arrays" / "scenes" / ("0" * 32)).symlink_to(w.home / "photos")
 
 
-@case(r"does not belong there", works=("list MAP scenes", "prune MAP --keep-revisions 0"))
+@case(r"is not a file of the map", works=("list MAP scenes", "prune MAP --keep-revisions 0"))
 def a_group_with_another_name(w: World) -> None:
     (w.map / "arrays" / "scenes" / "notes").mkdir()
     (w.map / "arrays" / "scenes" / "notes" / "x").write_bytes(b"x")
@@ -67,7 +67,7 @@ def a_group_that_lies_elsewhere(w: World) -> None:
     group.symlink_to(w.home / "group")
 
 
-@case(r"no plain file", works=("list MAP scenes",))
+@case(r"not a regular file", works=("list MAP scenes",))
 def a_chunk_that_is_a_link(w: World) -> None:
     for group in w.older_form():
         chunk = group / "means" / "c" / "0" / "0"
@@ -75,14 +75,14 @@ def a_chunk_that_is_a_link(w: World) -> None:
         chunk.symlink_to(w.home / f"chunk_{group.name}")
 
 
-@case(r"missing or cut off|is missing", works=("list MAP scenes",))
+@case(r"missing or truncated|is missing", works=("list MAP scenes",))
 def a_folder_of_chunks_that_is_a_link(w: World) -> None:
     for group in w.older_form():
         shutil.move(group / "means", w.home / f"means_{group.name}")
         (group / "means").symlink_to(w.home / f"means_{group.name}")
 
 
-@case(r"no plain file", works=("list MAP scenes",))
+@case(r"not a regular file", works=("list MAP scenes",))
 def a_chunk_that_is_a_pipe(w: World) -> None:
     for group in w.older_form():
         chunk = group / "sh" / "c" / "0" / "0" / "0"
@@ -97,7 +97,7 @@ def a_model_that_is_a_link(w: World) -> None:
         w.replaced(model, w.home / "thesis.txt")
 
 
-@case(r"does not belong there", works=("list MAP scenes", "prune MAP --keep-revisions 0"))
+@case(r"is not a file of the map", works=("list MAP scenes", "prune MAP --keep-revisions 0"))
 def a_folder_among_the_models(w: World) -> None:
     (w.map / "models" / "mine").mkdir()
     (w.map / "models" / "mine" / "net.onnx").write_bytes(b"x")
@@ -314,7 +314,7 @@ def an_archive_whose_metadata_differs_from_its_digest(w: World) -> None:
     _edited(w, lambda data, table: data.__setitem__(data.index(b"float32"), ord("x")))
 
 
-@case(r"gsmap did not write that|does not fit its row", verbs=("check MAP", "look MAP"))
+@case(r"gsmap did not write|does not match its row", verbs=("check MAP", "look MAP"))
 def a_graph_whose_row_says_otherwise(w: World) -> None:
     """Arrays of a terabyte by the row, of other types, of layers of other widths."""
     with w.sql() as connection:
@@ -325,13 +325,13 @@ def a_graph_whose_row_says_otherwise(w: World) -> None:
         connection.execute("UPDATE graphs SET about = ?", (json.dumps(about),))
 
 
-@case(r"gsmap did not write that", verbs=("look MAP",))
+@case(r"gsmap did not write", verbs=("look MAP",))
 def a_graph_of_types_that_there_are_none_of(w: World) -> None:
     w.set('UPDATE graphs SET about = replace(about, \'"is": "f8"\', \'"is": "O"\')')
     w.set('UPDATE graphs SET about = replace(about, \'"is":"f8"\', \'"is":"O"\')')
 
 
-@case(r"no text", verbs=("look MAP", "export MAP TILES --tile-size 0 --merge union"))
+@case(r"not valid text", verbs=("look MAP", "export MAP TILES --tile-size 0 --merge union"))
 def camera_names_that_are_no_text(w: World) -> None:
     """In the place of the good ones, packed as gsmap packs them."""
     for group in (w.map / "arrays" / "scenes").iterdir():

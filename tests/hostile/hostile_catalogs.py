@@ -9,8 +9,8 @@ import struct
 
 from hostile_world import ALL, Plant, World, case
 
-ROWS = r"the catalog holds .* gsmap did not write that"
-TABLES = r"its catalog has .*gsmap did not make it so"
+ROWS = r"the catalog holds .* gsmap did not write"
+TABLES = r"its catalog has .*gsmap does not write"
 
 
 @case(verbs=ALL, works=ALL)
@@ -86,27 +86,27 @@ def a_file_of_a_group_that_leads_upwards(w: World) -> None:
     w.set("UPDATE files SET path = '../../../../home/thesis.txt' WHERE path = 'arrays.zip'")
 
 
-@case(r"models.path.*gsmap did not write that", works=("list MAP scenes",))
+@case(r"models.path.*gsmap did not write", works=("list MAP scenes",))
 def a_model_that_leads_upwards(w: World) -> None:
     w.set("UPDATE models SET path = 'models/../../home/thesis.txt'")
 
 
-@case(r"models.path.*gsmap did not write that")
+@case(r"models.path.*gsmap did not write")
 def a_copied_model_with_an_absolute_path(w: World) -> None:
     w.set("UPDATE models SET path = ?, removed_at = NULL", str(w.home / "thesis.txt"))
 
 
-@case(r"differs from what was added", works=("list MAP scenes", "models list MAP"))
+@case(r"differs from the file that was added", works=("list MAP scenes", "models list MAP"))
 def a_model_elsewhere_that_is_no_model(w: World) -> None:
     w.set("UPDATE models SET path = ?, copied = 0", str(w.home / "thesis.txt"))
 
 
-@case(r"is no plain file", works=("list MAP scenes",))
+@case(r"is not a regular file", works=("list MAP scenes",))
 def a_model_elsewhere_that_is_a_device(w: World) -> None:
     w.set("UPDATE models SET path = '/dev/zero', copied = 0")
 
 
-@case(r"is no plain file", works=("list MAP scenes",))
+@case(r"is not a regular file", works=("list MAP scenes",))
 def a_model_elsewhere_that_is_a_pipe(w: World) -> None:
     os.mkfifo(w.root / "pipe.onnx")
     w.set("UPDATE models SET path = ?, copied = 0", str(w.root / "pipe.onnx"))
@@ -204,7 +204,7 @@ def information_that_is_not_symmetric(w: World) -> None:
     w.set("UPDATE registrations SET information = ?", struct.pack("<49d", *range(49)))
 
 
-@case(r"lacks a row, or has it twice", verbs=("export MAP TILES --tile-size 0",))
+@case(r"lacks a row or has a duplicate row", verbs=("export MAP TILES --tile-size 0",))
 def a_map_without_an_id(w: World) -> None:
     w.set("DELETE FROM about")
 
@@ -338,7 +338,7 @@ def a_catalog_url_that_is_a_link(w: World) -> None:
     (w.map / "catalog.url").symlink_to(w.home / "thesis.txt")
 
 
-@case(r"holds nothing|not a gsmap map|is a link|damaged|gsmap did not")
+@case(r"holds nothing|not a gsmap map|is a link|damaged|gsmap (did|does) not")
 def a_map_that_is_only_links(w: World) -> None:
     shutil.rmtree(w.map)
     w.map.mkdir()

@@ -63,12 +63,12 @@ def a_manifest_that_is_too_deep(w: World) -> None:
     (w.tiles / "tiles.json").write_text("[" * 200_000)
 
 
-@case(r"is no plain file", verbs=AGAIN)
+@case(r"is not a regular file", verbs=AGAIN)
 def a_manifest_that_is_a_link(w: World) -> None:
     w.replaced(w.tiles / "tiles.json", w.home / "thesis.txt")
 
 
-@case(r"is no plain file", verbs=AGAIN)
+@case(r"is not a regular file", verbs=AGAIN)
 def a_manifest_that_is_a_pipe(w: World) -> None:
     (w.tiles / "tiles.json").unlink()
     os.mkfifo(w.tiles / "tiles.json")

@@ -381,7 +381,7 @@ def test_nothing_is_deleted_while_another_saves(filled, place):
         before = objects(place)
         made = save(filled, place, keep=1)
         assert made.deleted == ()
-        assert "others are at work" in made.notes[0]
+        assert "other processes use" in made.notes[0]
         assert before.keys() <= objects(place).keys()
         old = time.time() - EXPIRES_S - 60  # of one that died
         os.utime(place.root / other.name, (old, old))
@@ -477,7 +477,7 @@ def test_a_map_that_cannot_be_written_is_backed_up(filled, place, tmp_path):
     filled.close()
     with Store.open(filled.catalog.folder, "r") as store:
         made = save(store, place)
-    assert "does not remember" in made.notes[0]
+    assert "no record of this backup" in made.notes[0]
     restore(place, tmp_path / "r")
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
 

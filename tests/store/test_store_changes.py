@@ -104,8 +104,8 @@ def test_words_and_numbers_survive_another_comparison(store, ids):
     assert numbers(second) == [4, 1]
     assert [change.status for change in second.changes] == ["open", "confirmed"]
     assert second.notes == (
-        "c1 was confirmed before this comparison: it stays so",
-        "c3, which was rejected, is not found any more",
+        "c1 was confirmed before this comparison, and stays confirmed",
+        "c3, which was rejected, was not detected again",
     )
     with raises(NotFoundError, code="change_not_found"):
         store.changes.review(3, "confirm")
@@ -153,7 +153,9 @@ def test_damage_is_found_and_mended(store, ids):
     spoil(store, group)
     assert store.changes.damaged([kept.number, 99]) == {kept.number}
     (problem, *_) = store.check().problems
-    assert f"the changes of scene0:scene1: gsmap changes {store.location} scene0:scene1 finds them again" in problem
+    assert (
+        f"the changes of scene0:scene1: compute them again with gsmap changes {store.location} scene0:scene1" in problem
+    )
     with raises(CorruptError, code="arrays_missing"):
         store.changes.load(kept.number)
     assert save_comparison(store, *ids, found).number == kept.number

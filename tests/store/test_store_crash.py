@@ -189,7 +189,7 @@ def test_check_finds_a_flipped_bit_in_every_file(tmp_path):
         assert "missing" in store.check().problems[0]
         file.write_bytes(whole)
         (files[0].parent / "stranger").touch()
-        assert "does not belong" in store.check().problems[0]
+        assert "is not a file of the map" in store.check().problems[0]
 
 
 def test_check_finds_flipped_bits_in_the_catalog(tmp_path):

@@ -242,7 +242,7 @@ def test_life_and_death_by_the_later_word(store, other):
     assert {s.id for s in store.scenes.list(removed=True)} == {b, c, gone}
     assert merged.scenes == 1
     assert merged.removed == 2
-    assert any("is back" in note for note in merged.notes)
+    assert any("is restored" in note for note in merged.notes)
     assert store.check().ok
     store.scenes.remove(a)
     assert merge(store, other).scenes == 0
@@ -277,8 +277,8 @@ def test_where_they_disagree_the_other_stays_apart(store, other):
     merged = merge(store, other)
     poses = store.revisions.get().poses
     assert {s: p.component for s, p in poses.items()} == {a: 0, b: 0, d: 1}
-    assert any("component of their own" in note for note in merged.notes)
-    assert any("component of their own" in note for note in store.revisions.get().notes)
+    assert any("separate component" in note for note in merged.notes)
+    assert any("separate component" in note for note in store.revisions.get().notes)
     # but not where both solutions leave that much open
     wide = np.diag([1e-4] * 3 + [1.0] * 3 + [1e-6])
     with Store.create(store.home.parent / "third") as third:

@@ -133,7 +133,7 @@ def test_a_damaged_graph_that_another_replaces_is_no_problem_any_more(store, two
         store.graphs.save(SceneGraph(scene, {"objects": layer(m)}), made)
     found = spoil()  # one that was replaced before it was damaged
     assert len(found) == 2
-    assert sum(f"nothing needs: gsmap prune {store.location})" in problem for problem in found) == 1
+    assert sum(f"an unused graph: remove it with gsmap prune {store.location})" in problem for problem in found) == 1
 
 
 def test_a_damaged_graph_of_a_tag_or_of_a_removed_scene(store, two_scenes):

@@ -149,7 +149,7 @@ def test_a_removed_scene_can_be_forgotten_and_comes_back_only_by_ingest(place, t
         with Store.open(tmp_path / "copy.gsmap", "r") as copy:
             merged = merge(m.store, copy)
             assert merged.scenes == 0
-            assert any("forgotten here on demand" in note for note in merged.notes)
+            assert any("was purged from this map" in note for note in merged.notes)
             with raises(NotFoundError, code="scene_removed"):
                 m.restore_scene(secret, tmp_path / "copy.gsmap")
         assert finds(place, NAME, NOTE) == []

@@ -65,14 +65,18 @@ class BackupLease:
         """
         if time.monotonic() - self._renewed > EXPIRES_S / 2:
             raise StoreError(
-                f"{self._storage.url} could not be reached for {EXPIRES_S / 2:g} s: run it again", code="place_failed"
+                f"{self._storage.url} could not be reached for {EXPIRES_S / 2:g} s: run the same command again",
+                code="place_failed",
             )
 
     def others(self, task: str = "") -> list[str]:
         """Return the names of the valid leases of other processes, of one task or of all."""
         listed = self._storage.list(LEASES)
         if self.name not in listed:
-            raise StoreError(f"{self._storage.url}: our lease was taken away; run it again", code="lease_lost")
+            raise StoreError(
+                f"{self._storage.url}: another process took over the expired lease: run the same command again",
+                code="lease_lost",
+            )
         oldest = listed[self.name].modified_s - EXPIRES_S
         del listed[self.name]
         wanted = {name: about for name, about in listed.items() if name.startswith(LEASES + task)}
@@ -105,7 +109,7 @@ class BackupLease:
         while self.others(SWEEP):
             if time.monotonic() > deadline:
                 raise BusyError(
-                    f"{self._storage.url}: another gsmap is deleting old snapshots there; try again later",
+                    f"{self._storage.url}: another gsmap process is deleting old snapshots there: try again later",
                     code="backup_busy",
                 )
             time.sleep(pause)

@@ -128,7 +128,7 @@ def read_state(file: Path, created_at: str = "") -> MapState:
         for one in named:
             check_path(one.path)
             if not (isinstance(one.sha256, str) and _DIGEST.fullmatch(one.sha256) and isinstance(one.size_bytes, int)):
-                raise CorruptError(f"{file}: the digest of {one.path} is none", code="backup_damaged")
+                raise CorruptError(f"{file}: the digest of {one.path} is malformed", code="backup_damaged")
         counts = {
             "scenes": "scenes WHERE removed_at IS NULL",
             "removed": "scenes WHERE removed_at IS NOT NULL",
@@ -143,7 +143,7 @@ def read_state(file: Path, created_at: str = "") -> MapState:
             counts={name: int(_one(connection, f"SELECT count(*) FROM {rest}")) for name, rest in counts.items()},
         )
     except (sqlite3.Error, TypeError) as error:
-        raise CorruptError(f"{file} is no catalog of a map ({error})", code="backup_damaged") from error
+        raise CorruptError(f"{file} is not the catalog of a map ({error})", code="backup_damaged") from error
     finally:
         connection.close()
 
@@ -155,7 +155,7 @@ def check_path(path: object) -> str:
         CorruptError: the path leads outside the map, or where a map keeps no files.
     """
     if not isinstance(path, str) or not path.isprintable() or "\\" in path:
-        raise CorruptError(f"no path of a file in a map: {path!r}", code="invalid_stored_name")
+        raise CorruptError(f"not the path of a file in a map: {path!r}", code="invalid_stored_name")
     parts = path.split("/")
     sound = all(part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts)
     top, depth = parts[0], len(parts)
@@ -168,7 +168,7 @@ def check_path(path: object) -> str:
         or (parts[0] == ARRAYS and parts[1:2] not in (["staging"], []) and depth >= 4)
     )
     if not sound or not known or PurePosixPath(path).is_absolute():
-        raise CorruptError(f"no path of a file in a map: {path!r}", code="invalid_stored_name")
+        raise CorruptError(f"not the path of a file in a map: {path!r}", code="invalid_stored_name")
     return path
 
 
@@ -227,9 +227,9 @@ def verify_chunks(chunks: Iterator[bytes], file: StoredFile, what: str) -> Itera
         digest.update(chunk)
         yield chunk
     if seen != file.size_bytes:
-        raise CorruptError(f"{what} does not have the {file.size_bytes} bytes that were written", code="bytes_differ")
+        raise CorruptError(f"{what} does not have the {file.size_bytes} bytes that gsmap wrote", code="bytes_differ")
     if digest.hexdigest() != file.sha256:
-        raise CorruptError(f"{what} differs from what was written", code="bytes_differ")
+        raise CorruptError(f"{what} differs from what gsmap wrote", code="bytes_differ")
 
 
 def _capture_catalog(source: Catalog, folder: Path) -> MapState:

@@ -99,7 +99,7 @@ class Backup:
             text = _read(storage, MARKER, 1 << 16)
         except NotFoundError:
             raise NotFoundError(
-                f"{storage.url} is no backup of a map: it lacks {MARKER}", code="not_a_backup"
+                f"{storage.url} is not a backup of a map: it lacks {MARKER}", code="not_a_backup"
             ) from None
         marker = _object(text, f"{storage.url}/{MARKER}")
         return cls(storage, _field(marker, "map_id", str, f"{storage.url}/{MARKER}"))
@@ -117,7 +117,8 @@ class Backup:
             found = cls._begun(storage, map_id)
         if found.map_id != map_id:
             raise StoreError(
-                f"{storage.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its own place",
+                f"{storage.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its "
+                "own folder",
                 code="backup_of_another_map",
             )
         return found
@@ -132,7 +133,7 @@ class Backup:
             return cls.at(storage)  # another process may have created it at the same moment
         except NotFoundError:
             raise StoreError(
-                f"{storage.url} holds other things ({other}): give the backup a place of its own",
+                f"{storage.url} holds files that are not of a backup ({other}): name an empty folder for the backup",
                 code="folder_not_empty",
             ) from None
 
@@ -160,7 +161,8 @@ class Backup:
             return timestamp_after(datetime.strptime(newest, _TIME).replace(tzinfo=UTC))
         except (ValueError, OverflowError) as error:
             raise StoreError(
-                f"snapshot {names[-1]} of {self.storage.url} has a time that nothing comes after: delete its file",
+                f"snapshot {names[-1]} of {self.storage.url} has the largest possible time, so that no later "
+                "snapshot can follow: delete its file",
                 code="snapshot_in_future",
             ) from error
 
@@ -173,7 +175,9 @@ class Backup:
         where = f"{self.storage.url}/{SNAPSHOTS}{name}.json"
         text = _read(self.storage, f"{SNAPSHOTS}{name}.json", 1 << 20)
         if hashlib.sha256(text).hexdigest()[:16] != name[-16:]:
-            raise CorruptError(f"{where} is damaged: restore an earlier one, and delete it", code="backup_damaged")
+            raise CorruptError(
+                f"{where} is damaged: restore an earlier snapshot, and delete this one", code="backup_damaged"
+            )
         data = _object(text, where)
         kinds: dict[str, Any] = {"revision": int | None, "counts": dict}
         kinds |= dict.fromkeys(("files_bytes", "num_files", "num_bytes", "num_bytes_new"), int)
@@ -181,9 +185,9 @@ class Backup:
         found = Snapshot(name=name, **{key: _field(data, key, kinds.get(key, str), where) for key in keys})
         counts = all(key.isidentifier() and isinstance(count, int) for key, count in found.counts.items())
         if not _DIGEST.fullmatch(found.files) or found.map_id != self.map_id or not counts:
-            raise CorruptError(f"{where} is no snapshot of map {self.map_id}", code="backup_damaged")
+            raise CorruptError(f"{where} is not a snapshot of map {self.map_id}", code="backup_damaged")
         if found.time != name[: -len("Z-") - 16]:
-            raise CorruptError(f"{where} has another time than its name says", code="backup_damaged")
+            raise CorruptError(f"the time in {where} differs from the time in its name", code="backup_damaged")
         return found
 
     def snapshots(self) -> list[Snapshot]:
@@ -203,15 +207,15 @@ class Backup:
         names = self.names()
         if not names:
             raise NotFoundError(
-                f"{self.storage.url} has no snapshot yet: a backup was begun there and never finished",
+                f"{self.storage.url} has no snapshot yet: its first backup was not finished; run gsmap backup again",
                 code="snapshot_not_found",
             )
         if name is not None:
             found = [one for one in names if name == one or (len(name) >= 6 and one[-16:].startswith(name))]
             if len(found) != 1:
-                hint = "gsmap backup MAP DEST --list shows what there is"
+                hint = "gsmap backup MAP DEST --list shows the snapshots"
                 raise NotFoundError(
-                    f"{self.storage.url} has no snapshot {name!r}, and it is no time either: {hint}",
+                    f"{self.storage.url} has no snapshot {name!r}, and {name!r} is not a time: {hint}",
                     code="snapshot_not_found",
                 )
             return self.snapshot(found[0])
@@ -231,14 +235,14 @@ class Backup:
         """
         where = f"{self.storage.url}/{object_name(snapshot.files)}"
         if snapshot.files_bytes > _MAX_TEXT_BYTES:
-            raise CorruptError(f"{where} is too long for a list of files", code="backup_damaged")
+            raise CorruptError(f"{where} is too long to be a list of files", code="backup_damaged")
         format_file_list = StoredFile("", snapshot.files_bytes, snapshot.files)
         text = b"".join(self.read(format_file_list)).decode("utf-8", errors="replace")
         out: dict[str, StoredFile] = {}
         for line in text.splitlines():
             parts = _LINE.fullmatch(line)
             if parts is None or parts[3] in out:
-                raise CorruptError(f"{where} is no list of files: {line[:200]!r}", code="backup_damaged")
+                raise CorruptError(f"{where} is not a list of files: {line[:200]!r}", code="backup_damaged")
             out[check_path(parts[3])] = StoredFile(parts[3], int(parts[2]), parts[1])
         return list(out.values())
 
@@ -290,9 +294,9 @@ def _object(text: bytes, where: str) -> dict[str, Any]:
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise CorruptError(f"{where} is damaged: it is no JSON", code="backup_damaged") from error
+        raise CorruptError(f"{where} is damaged: it is not JSON", code="backup_damaged") from error
     if not isinstance(data, dict) or not isinstance(data.get("format"), int):
-        raise CorruptError(f"{where} is damaged: it lacks its format", code="backup_damaged")
+        raise CorruptError(f"{where} is damaged: it lacks its format number", code="backup_damaged")
     if data["format"] > FORMAT:
         raise StoreError(
             f"{where} was written by a newer gsmap than this ({__version__}): upgrade gsmap", code="backup_version"
@@ -303,5 +307,5 @@ def _object(text: bytes, where: str) -> dict[str, Any]:
 def _field(data: Mapping[str, Any], key: str, kind: Any, where: str) -> Any:
     value = data.get(key)
     if not isinstance(value, kind) or (isinstance(value, str) and not value.isprintable()):
-        raise CorruptError(f"{where} is damaged: {key} is not what it should be", code="backup_damaged")
+        raise CorruptError(f"{where} is damaged: {key} has an invalid value", code="backup_damaged")
     return value

@@ -134,7 +134,8 @@ def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silen
             _note(store, made)
             return made
     raise StoreError(
-        f"{store.catalog.folder}: others pruned it faster than it could be copied; run it again",
+        f"{store.catalog.folder}: other processes pruned the map faster than it could be copied: run the same "
+        "command again",
         code="changed_meanwhile",
     )
 
@@ -145,14 +146,14 @@ def _note(store: Store, made: CloneResult) -> None:
         try:
             store.backups.add(str(made.path), f"clone {made.map_id}", made.num_bytes_copied)
         except GsmapError as error:
-            _log.warning("the clone is complete, but the map could not note it: %s", error)
+            _log.warning("the clone is complete, but the map could not record it: %s", error)
 
 
 def _check_target(path: str | os.PathLike[str]) -> Path:
     target = Path(path).absolute()
     if os.path.lexists(target) and not (target.is_dir() and not target.is_symlink() and not any(target.iterdir())):
         raise StoreError(
-            f"{path} is there already: name a folder that does not exist, or move it away first", code="already_exists"
+            f"{path} exists already: name a folder that does not exist, or move it away first", code="already_exists"
         )
     if not target.parent.is_dir():
         raise NotFoundError(f"cannot make {path}: {target.parent} does not exist", code="folder_not_found")
@@ -199,13 +200,13 @@ def _link_all(store: Store, state: MapState, folder: Path, target: Path, progres
             os.link(source, place, follow_symlinks=False)
             if place.is_symlink() or place.stat().st_size != file.size_bytes:
                 place.unlink()
-                raise FileNotFoundError(errno.ENOENT, "not what was written", str(source))
+                raise FileNotFoundError(errno.ENOENT, "not what gsmap wrote", str(source))
             linked += 1
         except OSError:  # another disk, or one without links; `read_file` raises if the file is gone
             with contextlib.closing(read_file(store, file, folder)) as chunks:
                 _write(place, chunks)
             copied, num_bytes = copied + 1, num_bytes + file.size_bytes
-        progress(i / len(state.files), f"sharing, {i} of {len(state.files)} files")
+        progress(i / len(state.files), f"linking, {i} of {len(state.files)} files")
     return CloneResult(target, uuid.uuid4().hex, linked, copied, num_bytes)
 
 
@@ -235,7 +236,8 @@ def _verify_catalogs(folder: Path, files: list[StoredFile], snapshot: Snapshot) 
         named += read_state(branch / sqlite.FILE).files
     if (state.map_id, state.schema) != (snapshot.map_id, snapshot.schema):
         raise CorruptError(
-            f"snapshot {snapshot.name} holds another map, or another schema, than it says", code="backup_damaged"
+            f"snapshot {snapshot.name} holds a map or a schema that differs from the one in its description",
+            code="backup_damaged",
         )
     for file in named:
         if there.get(file.path) != (file.size_bytes, file.sha256):
@@ -283,7 +285,11 @@ def _drop_tables(catalog: Catalog) -> None:
         with translate_errors(catalog.folder), catalog.engine.begin() as connection:
             connection.execute(text("DROP TABLE alembic_version"))
     except GsmapError as error:
-        _log.warning("the database %r keeps tables of a map that was not restored: %s", catalog.engine.url, error)
+        _log.warning(
+            "the database %r still has the tables of a map that was not restored (drop them by hand): %s",
+            catalog.engine.url,
+            error,
+        )
 
 
 def _require_room(folder: Path, num_bytes: int) -> None:
@@ -312,7 +318,8 @@ def _confirm(target: Path) -> None:
         sync_folder(target.parent)
     except OSError as error:
         raise DiskError(
-            f"{target} is in place and whole, but the disk did not confirm it ({error.strerror}): check the disk"
+            f"{target} is restored completely, but the disk did not confirm the last write ({error.strerror}): "
+            "check the disk"
         ) from error
 
 

@@ -76,10 +76,11 @@ def save(
         raise ConfigError(f"the number of snapshots to keep must be at least 1, got {keep}", code="out_of_range")
     home = map_folder(store).resolve()
     if store.catalog.folder.resolve() != home:
-        raise ConfigError(f"branches are backed up with their map: name {home}", code="backup_of_branch")
+        raise ConfigError(f"branches are backed up with their map: pass {home}", code="backup_of_branch")
     if isinstance(storage, FolderStorage) and storage.root.resolve().is_relative_to(home):
         raise ConfigError(
-            f"{storage.url} lies inside the map: a backup must survive it; name another folder", code="place_inside_map"
+            f"{storage.url} lies inside the map, and would be lost with it: name another folder",
+            code="place_inside_map",
         )
     backup = Backup.at_or_new(storage, store.id)
     with BackupLease(storage, SAVE) as lease:
@@ -121,7 +122,7 @@ def sweep(backup: Backup, keep: int, *, made: str = "") -> tuple[tuple[str, ...]
     storage = backup.storage
     with BackupLease(storage, SWEEP) as lease:
         if lease.others():
-            return (), 0, (f"others are at work in {storage.url}: old snapshots go with the next --keep",)
+            return (), 0, (f"other processes use {storage.url}: the next backup with --keep deletes the old snapshots",)
         names = backup.names()
         kept = [*names[-keep:], *(name for name in names[:-keep] if name == made)]
         doomed = [name for name in names if name not in kept]
@@ -182,7 +183,8 @@ class _BackupRun:
                     return self._write(state)
         name = self.store.catalog.folder
         raise StoreError(
-            f"{name}: others pruned it faster than it could be read; run it again, what was sent is kept",
+            f"{name}: other processes pruned the map faster than it could be read: run the same command again; "
+            "files that were sent are kept",
             code="changed_meanwhile",
         )
 
@@ -203,7 +205,7 @@ class _BackupRun:
 
         with ThreadPoolExecutor(TRANSFERS) as pool:
             for i, (sha256, problem_text) in enumerate(zip(there, pool.map(problem, there), strict=True)):
-                self.progress(i / len(there), f"reading what is there, {i} of {len(there)}")
+                self.progress(i / len(there), f"reading the files of the backup, {i} of {len(there)}")
                 if problem_text is not None:
                     damaged[sha256] = problem_text
         for name in self.backup.names():
@@ -232,7 +234,8 @@ class _BackupRun:
             file, names = found.needed.get(sha256, (None, []))
             if file is not None:
                 out.append(
-                    f"{found.damaged[sha256]}; the map has it no longer, and {_format_names(names)} cannot be restored"
+                    f"{found.damaged[sha256]}; the map no longer has this file, and {_format_names(names)} "
+                    "cannot be restored"
                 )
             elif sha256 in found.damaged:
                 self.backup.storage.delete(object_name(sha256))  # unneeded, and must not be taken for a sound object
@@ -242,11 +245,11 @@ class _BackupRun:
         """Record the backup in the map; returns notes."""
         target = self.backup.storage.url
         if not self.store.catalog.writable:
-            return ("the map cannot be written, so it does not remember this backup",)
+            return ("the map cannot be written, so it has no record of this backup",)
         try:
             self.store.backups.add(target, snapshot.name, snapshot.num_bytes_new)
         except GsmapError as error:
-            return (f"the backup is complete, but the map could not note it: {error}",)
+            return (f"the backup is complete, but the map could not record it: {error}",)
         return ()
 
     def _send(self, state: MapState, folder: Path) -> None:
@@ -284,12 +287,15 @@ class _BackupRun:
             listed_so = there.get(file.sha256) == file.size_bytes
             # Listings may lag behind, so check missing objects one by one.
             if not listed_so and self.backup.storage.size_bytes(name) != file.size_bytes:
-                raise StoreError(f"{self.backup.storage.url} lost {name}: run it again", code="backup_file_missing")
+                raise StoreError(
+                    f"{self.backup.storage.url} lost {name} during the backup: run the same command again",
+                    code="backup_file_missing",
+                )
         created_at = self.backup.time_of_next(state.created_at)
         if created_at != state.created_at:
             self.notes.append(
-                f"the newest snapshot there is from {created_at}, later than this clock: one of the clocks was wrong; "
-                "this snapshot is dated right after it"
+                f"the newest snapshot there is from {created_at}, later than the clock of this machine: one of "
+                "the clocks was wrong; this snapshot is dated right after that one"
             )
         snapshot = Snapshot(
             name="",
