@@ -25,7 +25,7 @@ class ListKind(StrEnum):
 
 def command(
     map: MapPath,
-    what: Annotated[ListKind, typer.Argument(help="ListKind to list.")],
+    what: Annotated[ListKind, typer.Argument(help="Kind of rows to list.")],
     component: Annotated[
         int | None,
         typer.Option("--component", "--island", help="Only scenes, edges and tiles of this connected component."),

@@ -111,7 +111,7 @@ def write_digests(file: Path) -> None:
 
 
 def find_backup_digests(file: Path, handle: FileHandle) -> PageDigests | None:
-    """Return the digests of a ``*.bak`` file that was restored in place of the database; None if it is none."""
+    """Return the digests of a ``*.bak`` file that was restored in place of the database; otherwise None."""
     for path in sorted(file.parent.glob(f"{file.name}.*.bak.digests")):
         stored = load(path.with_suffix(""))
         if stored is not None and _digest_file(handle, stored).pages == stored.pages:

@@ -355,7 +355,7 @@ def _mentions(connection: Connection, scene: str, names: set[str]) -> list[str]:
     for table, column, of in _USER_TEXTS:
         for line in connection.execute(select(table)).mappings():
             if pattern.search(line[column]):
-                found.append(f"a {line.get('kind', 'record_tile_files')} of {of} {line[of]}")
+                found.append(f"a {line.get('kind', 'note')} of {of} {line[of]}")
     return found
 
 

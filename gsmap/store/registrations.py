@@ -453,7 +453,7 @@ def _find_current(rows: Sequence[Row[Any]], history: Iterable[Review]) -> tuple[
 
 
 def _check_key(r: Registration, key: RecipeKey | None) -> None:
-    """Validate that computed registrations have a key and measurements none; see `Registrations.save`."""
+    """Validate that computed registrations have a recipe key, and manual ones have none; see `Registrations.save`."""
     if (r.proposer == MANUAL) != (key is None):
         raise InputError(
             f"a registration needs its recipe key, unless its proposer is {MANUAL!r}", code="invalid_registration"

@@ -325,7 +325,7 @@ def a_graph_whose_row_says_otherwise(w: World) -> None:
         connection.execute("UPDATE graphs SET about = ?", (json.dumps(about),))
 
 
-@case(r"gsmap did not write", verbs=("look MAP",))
+@case(r"gsmap does not write", verbs=("look MAP",))
 def a_graph_of_types_that_there_are_none_of(w: World) -> None:
     w.set('UPDATE graphs SET about = replace(about, \'"is": "f8"\', \'"is": "O"\')')
     w.set('UPDATE graphs SET about = replace(about, \'"is":"f8"\', \'"is":"O"\')')

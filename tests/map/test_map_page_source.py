@@ -115,7 +115,9 @@ def test_a_scene_that_is_named_gets_its_damaged_graph_again(site: Map, monkeypat
     problems = site.check().problems
     assert len(problems) == 2
     assert not any("scene hall" in problem for problem in problems)
-    assert f"scene stairs: compute it again with gsmap describe {site.store.location} stairs" in problems[0] + problems[1]
+    assert (
+        f"scene stairs: compute it again with gsmap describe {site.store.location} stairs" in problems[0] + problems[1]
+    )
     site.describe("stairs", "attic:east", "hall")
     assert described[:2] == [hall, stairs]
     assert (len(described), site.check().problems) == (3, ())

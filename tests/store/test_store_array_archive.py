@@ -78,7 +78,7 @@ def test_an_archive_of_more_members_than_a_short_one_counts(tmp_path):
 def test_every_cut_is_told(tmp_path, at):
     data, _ = written(tmp_path / "a.zip")
     short = data[: len(data) - 1 - at]
-    with pytest.raises(ValueError, match=r"archive|table"):
+    with pytest.raises(ValueError):
         array_archive.read_members(len(short), lambda start, stop: short[start:stop])
 
 

@@ -106,7 +106,7 @@ def test_a_damaged_graph_is_mended_by_saving_it_again(store, two_scenes):
             store.graphs.load(scene, made)
         assert "ingest" not in str(caught.value)
         (problem, *_) = store.check().problems
-        assert f"scene scene0: gsmap describe {store.location} scene0" in problem
+        assert f"scene scene0: compute it again with gsmap describe {store.location} scene0" in problem
         assert store.graphs.save(graph, made) == kept
         assert (store.check().problems, store.graphs.damaged([made])) == ((), set())
         assert broken.read_bytes() == content
