@@ -102,7 +102,7 @@ def objects_of_components(
         without += [scenes[scene].name for scene, digest in parts[-1].made.things.items() if not digest]
     notes = []
     if without:
-        notes.append(f"no segments of {few(without)}: run gsmap describe MAP SCENE with describe.things is on")
+        notes.append(f"no segments of {few(without)}: run gsmap describe MAP SCENE with describe.things switched on")
     thinned = {scene.name: scene.thinning for scene in scenes.values() if scene.thinning is not None}
     if thinned:
         notes.append(
