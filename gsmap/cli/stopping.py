@@ -23,8 +23,8 @@ _AGAIN_S = 0.01  # after a signal struck where nothing can be raised, until it d
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Stopped(BaseException):
-    """A signal asked this run to stop. Stages note on it what is kept (`BaseException.add_note`)."""
+class StopSignal(BaseException):
+    """Signal that ends this run; stages add a note of what is kept (`BaseException.add_note`)."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(signum)
@@ -33,7 +33,7 @@ class Stopped(BaseException):
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Inside, a signal that asks to stop ends this process with one line and the exit code that shells give it."""
+    """End this process with one line and the exit code of shells on a signal that arrives within the context."""
     from gsmap._native import StopWatch
 
     ears, mouth = os.pipe()
@@ -44,14 +44,14 @@ def stoppable() -> Iterator[None]:
     def raise_once(signum: int, frame: FrameType | None) -> None:
         if not stopped:
             stopped.append(signum)
-            raise Stopped(signum)
+            raise StopSignal(signum)
 
     def raise_again(signum: int, frame: FrameType | None) -> None:
-        raise Stopped(stopped[0])
+        raise StopSignal(stopped[0])
 
     def swallowed(found: sys.UnraisableHookArgs) -> None:
         """It struck in a finalizer or a callback, where nothing can be raised (importing is full of them)."""
-        if isinstance(found.exc_value, Stopped):
+        if isinstance(found.exc_value, StopSignal):
             signal.signal(signal.SIGALRM, raise_again)
             signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
         else:
@@ -65,7 +65,7 @@ def stoppable() -> Iterator[None]:
         for signum in heard:
             signal.signal(signum, raise_once)
         yield
-    except Stopped as stop:
+    except StopSignal as stop:
         if watch.claim():
             with suppress(OSError, ValueError):
                 sys.stdout.flush()

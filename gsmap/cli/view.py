@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
-from gsmap.cli.stopping import Stopped
+from gsmap.cli.stopping import StopSignal
 
 
 def command(
@@ -48,7 +48,7 @@ def command(
         return
 
     # A signal is the way to end it, and no interruption.
-    with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, suppress(Stopped):
+    with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, suppress(StopSignal):
         if json:
             print_rows("view", ViewReport(url=server.url), json)
         else:  # with -q too: without it nobody finds the page

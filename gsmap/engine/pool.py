@@ -36,7 +36,7 @@ _MAX_FALSE_STARTS = 3
 """Consecutive workers that may end before they have begun."""
 
 
-class WorkerDied(Exception):
+class WorkerDeath(Exception):
     """The process of a worker has ended."""
 
 
@@ -73,7 +73,7 @@ class Worker:
         """Send a job; the worker must have none.
 
         Raises:
-            WorkerDied: the process ended before.
+            WorkerDeath: the process ended before.
         """
         self._unsent.append(pickle.dumps((job, arguments), pickle.HIGHEST_PROTOCOL))
         try:
@@ -87,7 +87,7 @@ class Worker:
         """Wait for (returned, value or error) of the job; None if the worker has only begun.
 
         Raises:
-            WorkerDied: the process ended.
+            WorkerDeath: the process ended.
         """
         try:
             message = self.connection.recv_bytes()
@@ -107,13 +107,13 @@ class Worker:
         self._process.wait()
         self.connection.close()
 
-    def _died(self) -> WorkerDied:
+    def _died(self) -> WorkerDeath:
         self._process.kill()  # one that closed its socket is of no use either
         code = self._process.wait()
         self.connection.close()
         if code == -signal.SIGKILL:
-            return WorkerDied("its process was killed, most likely for lack of memory")
-        return WorkerDied(f"its process ended by {signal.Signals(-code).name if code < 0 else f'exit code {code}'}")
+            return WorkerDeath("its process was killed, most likely for lack of memory")
+        return WorkerDeath(f"its process ended by {signal.Signals(-code).name if code < 0 else f'exit code {code}'}")
 
 
 class Pool:
@@ -149,7 +149,7 @@ class Pool:
         at: dict[Connection, tuple[Worker, _Task]] = {}
         false_starts = 0
 
-        def lost(worker: Worker, task: _Task, died: WorkerDied) -> bool:
+        def lost(worker: Worker, task: _Task, died: WorkerDeath) -> bool:
             """Return True if the job is to be quarantined; otherwise it will be tried again."""
             nonlocal false_starts
             if not worker.has_begun:
@@ -174,7 +174,7 @@ class Pool:
                 worker, task = self._matched(ahead) if ahead else (self._any(), again.popleft())
                 try:
                     worker.begin(job, task.arguments, task.reads)
-                except WorkerDied as died:  # while it had no job
+                except WorkerDeath as died:  # while it had no job
                     worker.has_begun = False
                     lost(worker, task, died)
                 except BaseException:
@@ -193,7 +193,7 @@ class Pool:
                     worker, task = at[connection]
                     try:
                         answer = worker.answer()
-                    except WorkerDied as died:
+                    except WorkerDeath as died:
                         del at[connection]
                         if lost(worker, task, died):
                             done.append((task.index, QuarantinedJob(f"{died}, like the one that had tried it before")))

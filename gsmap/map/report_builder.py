@@ -35,12 +35,12 @@ from gsmap.report import (
     ChangePicture,
     EdgeEntry,
     Island,
-    Moved,
     PairPicture,
     Params,
     Plan,
     PlanEdge,
     PlanScene,
+    PoseDifferences,
     Report,
     SceneEntry,
     StorageEntry,
@@ -453,20 +453,22 @@ def _news(since: str, when: datetime, scenes: Sequence[Scene], edges: Sequence[E
     )
 
 
-def _moved(store: Store, settings: Settings, revisions: Sequence[RevisionRow], most: int) -> Iterable[Moved]:
+def _moved(store: Store, settings: Settings, revisions: Sequence[RevisionRow], most: int) -> Iterable[PoseDifferences]:
     """Return the pose changes between the newest stored revisions, newest first."""
     kept = [row.number for row in revisions if row.dropped_at is None]
     for after, before in list(zip(reversed(kept), reversed(kept[:-1]), strict=False))[:most]:
-        yield Moved(before, after, tuple(reports.pose_change_rows(store, before, after, settings)))
+        yield PoseDifferences(before, after, tuple(reports.pose_change_rows(store, before, after, settings)))
 
 
-def _moved_since(store: Store, settings: Settings, revisions: Sequence[RevisionRow], when: datetime) -> Moved | None:
+def _moved_since(
+    store: Store, settings: Settings, revisions: Sequence[RevisionRow], when: datetime
+) -> PoseDifferences | None:
     kept = [row for row in revisions if row.dropped_at is None]
     before = [row.number for row in kept if not is_after(row.created_at, when)]
     if not before or before[-1] == kept[-1].number:
         return None
     rows = reports.pose_change_rows(store, before[-1], kept[-1].number, settings)
-    return Moved(before[-1], kept[-1].number, tuple(rows))
+    return PoseDifferences(before[-1], kept[-1].number, tuple(rows))
 
 
 def _seconds(stored: Iterable[StoredRegistration]) -> dict[str, float]:

@@ -128,7 +128,7 @@ class ChangePicture:
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
+class PoseDifferences:
     """Differences of the scene poses between a revision and an earlier one."""
 
     before: int
@@ -200,8 +200,8 @@ class Report:
     islands: tuple[Island, ...] = ()
     revisions: tuple[RevisionRow, ...] = ()
     num_revisions: int = 0
-    moved: tuple[Moved, ...] = ()
-    moved_since: Moved | None = None
+    moved: tuple[PoseDifferences, ...] = ()
+    moved_since: PoseDifferences | None = None
     changes: ChangesReport | None = None
     objects: ObjectsReport | None = None
     pair_pictures: tuple[PairPicture, ...] = ()

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.report import plots
-from gsmap.report.content import CHI2_999, EdgeEntry, Island, Moved, Report
+from gsmap.report.content import CHI2_999, EdgeEntry, Island, PoseDifferences, Report
 from gsmap.report.draw_plan import draw_plan
 from gsmap.report.markup import Markup, Part, joined, tag
 from gsmap.report.top import picture_webp
@@ -590,7 +590,7 @@ def _history(report: Report) -> Markup | None:
     return joined(parts)
 
 
-def _moves(moved: Moved | None) -> str:
+def _moves(moved: PoseDifferences | None) -> str:
     if moved is None:
         return ""
     went = [row.translation_m for row in moved.rows if row.change == "moved" and row.translation_m is not None]
@@ -601,7 +601,7 @@ def _moves(moved: Moved | None) -> str:
     return f"{', '.join(told)} since {moved.before}"
 
 
-def _moved_table(moved: Moved) -> Markup:
+def _moved_table(moved: PoseDifferences) -> Markup:
     changed = [row for row in moved.rows if row.change != "same"]
     changed.sort(key=lambda row: -(row.translation_m or float("inf")))
     title = tag("h3", f"What moved from revision {moved.before} to {moved.after}")

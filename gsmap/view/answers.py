@@ -17,7 +17,7 @@ import numpy as np
 
 from gsmap.durable import open_file
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
-from gsmap.view.content import Served, ViewMap, ViewScene, summary
+from gsmap.view.content import ServerState, ViewMap, ViewScene, summary
 from gsmap.view.levels import Levels
 from gsmap.view.making import PendingResult
 from gsmap.view.page_source import PageSource, PairPictures
@@ -117,7 +117,7 @@ class Answers:
         """``map.json`` as it is now."""
         view = self.content()
         overviews, levels = self._levels.overviews(view)
-        served = Served(bool(self._page_source.actions), self._levels.boxes(), overviews)
+        served = ServerState(bool(self._page_source.actions), self._levels.boxes(), overviews)
         return {**summary(view, served), "state": _state(view.state, levels)}
 
     def _map(self) -> Answer:

@@ -176,15 +176,15 @@ class ViewOverview:
 
 
 @dataclass(frozen=True, eq=False)
-class Served:
+class ServerState:
     """State that a server or a static page adds to a map: its answers, and its levels of detail.
 
     Args:
-        actions: whether a person may judge here.
+        actions: true if reviews are allowed.
         boxes: (2, 3) of what a scene shows, without floaters, scene frame, by key; the scene's bounds elsewhere.
         overviews: by component.
-        live: whether more is computed when the page asks.
-        drawn: changes whose pictures are there where it is not.
+        live: true for a server, which computes more on request; false for a static page.
+        drawn: ids of the changes with pictures on a static page.
     """
 
     actions: bool = False
@@ -194,7 +194,7 @@ class Served:
     drawn: frozenset[str] = frozenset()
 
 
-def summary(view: ViewMap, served: Served) -> dict[str, Any]:
+def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
     """``map.json``: everything the page lists."""
     components = view.components()
     at = {entry.scene.id: index for index, entry in enumerate(view.scenes)}

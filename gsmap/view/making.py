@@ -41,12 +41,12 @@ class _Job:
     error: GsmapError | None = None
 
 
-class _Closed(Exception):
-    """The maker ends."""
+class _ShutdownRequest(Exception):
+    """Request to the threads of a maker to end."""
 
 
 class Maker:
-    """Threads that do jobs by name, each once, those of the lowest rank first."""
+    """Threads that run named jobs, each once, in order of rank."""
 
     def __init__(self, workers: int) -> None:
         self._jobs: dict[str, _Job] = {}
@@ -120,7 +120,7 @@ class Maker:
                 job.state = "working"
             try:
                 job.work(lambda fraction, text, job=job: self._told(job, fraction))  # type: ignore[misc]
-            except _Closed:
+            except _ShutdownRequest:
                 return
             except GsmapError as error:
                 job.error = error
@@ -135,5 +135,5 @@ class Maker:
 
     def _told(self, job: _Job, fraction: float) -> None:
         if self._closed:
-            raise _Closed
+            raise _ShutdownRequest
         job.progress = fraction

@@ -164,7 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def setup(self) -> None:
         super().setup()
-        self.rfile: Any = _Bounded(self.rfile)
+        self.rfile: Any = _BoundedStream(self.rfile)
 
     def handle_one_request(self) -> None:
         self.rfile.left = _MAX_HEADER_BYTES
@@ -316,8 +316,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Nothing below the command line prints."""
 
 
-class _Bounded:
-    """A stream of requests of which each may be so long and no longer."""
+class _BoundedStream:
+    """Stream of requests of bounded length."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream

@@ -24,7 +24,7 @@ from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.formats.tiles3d import CONTENT_FOLDER
 from gsmap.types.progress import Progress
 from gsmap.view.answers import Answers, jpeg
-from gsmap.view.content import Served, ViewMap, ViewOverview, summary
+from gsmap.view.content import ServerState, ViewMap, ViewOverview, summary
 from gsmap.view.levels import OVERVIEW_GAUSSIANS, Levels, members
 from gsmap.view.page_source import PageSource
 from gsmap.view.params import Params
@@ -130,7 +130,7 @@ class _Maker:
             if graph is not None:
                 has_objects = True
                 yield "graph.json", _json(graph)
-        served = Served(False, boxes, overviews, live=False, drawn=frozenset(drawn))
+        served = ServerState(False, boxes, overviews, live=False, drawn=frozenset(drawn))
         said = summary(view, served)
         yield "map.json", _json(said | {"graph": "graph.json" if has_objects else None})
 

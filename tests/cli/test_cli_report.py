@@ -240,7 +240,8 @@ def test_pairs_and_changes_are_drawn_on_demand(site: Path, cli: Run, tmp_path: P
 
 
 def test_the_settings_bound_what_is_shown(site: Path, cli: Run) -> None:
-    bounds = ["report.edges=1", "report.scenes=1", "report.pair_pictures=0", "report.islands=0"]
+    bounds = ["report.edges=1", "report.scenes=1", "report.pair_pictures=0", "report.change_pictures=0"]
+    bounds += ["report.islands=0"]
     for bound in bounds:
         assert cli("settings", site, "--set", bound).code == 0
     page, said = report(cli, site)

@@ -24,7 +24,7 @@ from gsmap.cli import app as command_line
 from gsmap.errors import GsmapError
 from gsmap.map.page_source import MapPageSource
 from gsmap.texts import escaped
-from gsmap.view.content import Served, summary
+from gsmap.view.content import ServerState, summary
 
 assert hostile_arrays
 assert hostile_catalogs
@@ -76,7 +76,7 @@ def _look(arguments: list[str]) -> NoReturn:
         with gsmap.map.open(arguments[1]) as m:
             doors = MapPageSource(m.store, m.settings)
             view = doors.content()
-            summary(view, Served())
+            summary(view, ServerState())
             for one in view.scenes:
                 doors.source(one.scene.id).load()
                 doors.extras(one.scene.id)

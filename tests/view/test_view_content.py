@@ -7,12 +7,12 @@ import numpy as np
 from view_room import POSE_B, A, B, C, MadeDoors
 
 from gsmap.view import ViewMap
-from gsmap.view.content import Served, ViewOverview, summary
+from gsmap.view.content import ServerState, ViewOverview, summary
 
 
 def test_summary_tells_where_everything_is():
     view = MadeDoors().view
-    said = json.loads(json.dumps(summary(view, Served(actions=True)), allow_nan=False))
+    said = json.loads(json.dumps(summary(view, ServerState(actions=True)), allow_nan=False))
     assert [s["component"] for s in said["scenes"]] == [0, 0, 3]
     assert [s["status"] for s in said["scenes"]] == ["placed", "tentative", "not placed"]
     np.testing.assert_allclose(said["scenes"][1]["S_map_scene"], POSE_B.matrix())
@@ -32,7 +32,7 @@ def test_summary_tells_where_everything_is():
 def test_how_surely_a_scene_lies_is_told_in_metres_and_in_the_maps_unit():
     view = replace(MadeDoors().view, metres_per_unit={0: 0.5})
     boxes = {view.scenes[0].key: np.array([[-1.0, -1, -1], [1, 1, 1]])}
-    one, other, _ = summary(view, Served(boxes=boxes))["scenes"]
+    one, other, _ = summary(view, ServerState(boxes=boxes))["scenes"]
     assert one["middle"] == [0, 0, 0]
     assert abs(one["sigma_m"] - 0.5 * 0.02) < 1e-9
     values = np.sort(np.linalg.eigvalsh(one["ellipsoid"]))
@@ -43,19 +43,19 @@ def test_how_surely_a_scene_lies_is_told_in_metres_and_in_the_maps_unit():
 def test_what_is_up_is_what_most_scenes_say():
     view = MadeDoors().view
     first, second, alone = view.scenes
-    ups = [c["up"] for c in summary(view, Served())["components"]]
+    ups = [c["up"] for c in summary(view, ServerState())["components"]]
     assert ups == [[0, 0, 1], [0, -1, 0]]
     tilted = replace(
         view, scenes=[replace(first, up=np.array([0.0, 1, 0])), second, replace(alone, up=np.array([1.0, 0, 0]))]
     )
-    ups = [c["up"] for c in summary(tilted, Served())["components"]]
+    ups = [c["up"] for c in summary(tilted, ServerState())["components"]]
     np.testing.assert_allclose(ups, [first.S_map_scene.rotation @ [0, 1, 0], [1, 0, 0]])
 
 
 def test_a_static_page_promises_nothing_that_is_computed_when_asked():
     view = replace(MadeDoors().view, has_objects=True, merged=frozenset([0]))
     overviews = {0: ViewOverview("o.spz", (0,), (9,), 1, ((0.0, 2.5),), (6.0, 5.0, 2.5))}
-    live, still = (summary(view, Served(live=live, overviews=overviews)) for live in (True, False))
+    live, still = (summary(view, ServerState(live=live, overviews=overviews)) for live in (True, False))
     assert (live["graph"], live["history"]) == ("graph.json", "history.json")
     assert (still["graph"], still["history"], still["actions"]) == ("graph.json", None, False)
     assert still["components"][0]["merged"] == "merged/0/tileset.json"
@@ -66,4 +66,4 @@ def test_a_static_page_promises_nothing_that_is_computed_when_asked():
 
 
 def test_an_empty_map_is_told():
-    assert summary(ViewMap("empty"), Served())["components"] == []
+    assert summary(ViewMap("empty"), ServerState())["components"] == []

@@ -30,14 +30,14 @@ RIDDLE = re.compile(r"(What|Which|Whether|Who|Whose|How|Where|When|That|Those)\b
 """First words of a docstring that names neither an action nor a thing."""
 
 PARTICIPLE = re.compile(
-    r"(?:[a-z]+ed|Known|Shown|Told|Held|Found|Laid|Taken|Drawn|Sought|Made|Kept|Given|Seen|Thin|Lent|Put|Left|LeftOut|Swept"
-    r"|Spent|Spoken|Said|Gone|Built|Read)$"
+    r"(?:[A-Z][a-z]+ed|Known|Shown|Told|Held|Found|Laid|Taken|Drawn|Sought|Made|Kept|Given|Seen|Lent|Put|Left|Swept|Spent"
+    r"|Spoken|Said|Gone|Built|Read)$"
 )
 _EVERYDAY = """
 Accepting Around Belief Carrying Doors Doubts Eyes Glance Growth Home Kin Look Looks Mark Maybe Near Nearby Many News
 One Others
 Passing Paint Pictured Rounds Sights Sight Standing Stopping Snap Teller Tells Things Thing Unlike Waiting Waste
-Whole What Word Words Work Both Joining Matching Proposing Settling Sharing Strongest Vanished Visit Wanted
+Whole What Word Words Work Both Joining Matching Proposing Settling Sharing Strongest Vanished Wanted
 """
 _NOUNS = "Bed Seed Speed Feed Need Embed Shed Thread Unnamed"
 EVERYDAY = frozenset(_EVERYDAY.split())
@@ -157,11 +157,14 @@ def test_measures() -> Iterator[Measure]:
     wording = [
         f"{path.relative_to(ROOT)}:{node.lineno}"
         for path in tracked("tests/*.py")
+        if path.name != "raising.py"  # which compares codes
         for node in ast.walk(tree_of(path))
-        if isinstance(node, ast.Call) and any(word.arg == "match" for word in node.keywords)
+        if isinstance(node, ast.Call)
+        and "match" in (given := {word.arg for word in node.keywords})
+        and "code" not in given  # beside a code it names a file, a line or an option
     ]
     yield Measure("planted faults that quote source", faults, 0, quoting)
-    yield Measure("tests that match the wording of a message", len(wording), 50, wording)
+    yield Measure("tests that tell errors apart by the wording of a message", len(wording), 50, wording)
 
 
 # --- prose -----------------------------------------------------------------------------------------------------------
