@@ -108,6 +108,6 @@ def test_a_newer_map_is_left_alone(tmp_path):
 
 
 def test_the_storage_page_names_every_table_and_version():
-    page = (Path(__file__).parents[2] / "docs" / "storage.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "storage.md").read_text()
     for name in [*schema.metadata.tables, schema.CHUNK_BOXES, *(s.revision for s in scripts().walk_revisions())]:
         assert f"`{name}`" in page, name
