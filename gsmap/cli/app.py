@@ -1,6 +1,6 @@
 """The ``gsmap`` program: collects the verbs and turns errors into one line and an exit code.
 
-Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 done but for jobs or captures that were set aside; 130 after Ctrl-C,
+Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 done except for quarantined jobs or captures; 130 after Ctrl-C,
 143 after SIGTERM, 129 after SIGHUP (`gsmap.cli.stopping`).
 """
 
@@ -50,17 +50,17 @@ PANELS = {
         "remove",
         "restore-scene",
     ),
-    "Time": ("changes", "history", "diff", "thin"),
-    "Ask": ("view", "report", "graph", "find", "localize", "evaluate"),
+    "Changes over time": ("changes", "history", "diff", "thin"),
+    "View and query": ("view", "report", "graph", "find", "localize", "evaluate"),
     "Export": ("export", "convert"),
-    "Share and keep": ("branch", "tag", "merge", "split", "clone", "backup", "restore"),
-    "Admin": ("check", "prune", "migrate", "trust"),
+    "Branches and backups": ("branch", "tag", "merge", "split", "clone", "backup", "restore"),
+    "Maintenance": ("check", "prune", "migrate", "trust"),
 }
-"""The verbs by the panel of ``gsmap -h`` that lists them, in the order a newcomer meets them."""
+"""Verbs by panel of ``gsmap -h``, in the order in which a new user needs them."""
 
 VERBS = tuple(verb for panel in PANELS.values() for verb in panel)
-"""``gsmap/cli/<verb>.py`` holds ``command`` (or ``app`` where it has sub-verbs),
-and ``TAKES_POINTS`` where an argument may be ``X,Y,Z``."""
+"""Each ``gsmap/cli/<verb>.py`` defines ``command`` (or ``app`` if it has sub-verbs),
+and ``TAKES_POINTS`` if an argument may be a point ``X,Y,Z``."""
 
 
 def _version(value: bool) -> None:
@@ -73,19 +73,19 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Errors only: no progress and no remarks.")] = False,
+    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only: no progress and no notes.")] = False,
     verbose: Annotated[
-        int, typer.Option("-v", "--verbose", count=True, help="Log what is done; -vv logs every detail.")
+        int, typer.Option("-v", "--verbose", count=True, help="Log each step; -vv logs every detail.")
     ] = 0,
 ) -> None:
     start_logging(verbose, quiet)
 
 
 def build(verbs: Sequence[str] = VERBS) -> typer.Typer:
-    """The typer application with these verbs attached."""
+    """Return the typer application with these verbs attached."""
     app = typer.Typer(
         name="gsmap",
-        help="The map-management database for 3D Gaussian Splatting: many captures in, one maintained map out.",
+        help="Map-management database for 3D Gaussian Splatting: merge many captures into one maintained map.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode="markdown",
@@ -98,17 +98,17 @@ def build(verbs: Sequence[str] = VERBS) -> typer.Typer:
         if hasattr(module, "app"):
             app.add_typer(module.app, name=verb, rich_help_panel=panels[verb])
         else:
-            # A point may begin with a minus: what is no option of the verb is one of its arguments.
+            # A point may begin with a minus sign, so an unknown option is an argument.
             points = {"ignore_unknown_options": True} if getattr(module, "TAKES_POINTS", False) else None
             app.command(name=verb, context_settings=points, rich_help_panel=panels[verb])(module.command)
     return app
 
 
 def run(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit with its code. typer itself exits with 2 on wrong usage.
+    """Run the command line and exit with its code; typer itself exits with 2 on wrong usage.
 
     Args:
-        arguments: in place of those of the process.
+        arguments: Command-line arguments; default: those of the process.
     """
     left()
     expect_json()
@@ -128,7 +128,11 @@ def run(arguments: list[str] | None = None) -> None:
         code, message, reason = 1, str(error), error.code
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
-        code, message, reason = 1, f"the system refused{where}: {error.strerror or error}", "system_refused"
+        code, message, reason = (
+            1,
+            f"the operating system reported an error{where and f' for{where}'}: {error.strerror or error}",
+            "system_refused",
+        )
     except Exception as error:
         code, message, reason = 1, _internal_error(error), "internal_error"
     if reason and "--json" in given:
@@ -140,7 +144,7 @@ def run(arguments: list[str] | None = None) -> None:
 def _internal_error(error: Exception) -> str:
     """Describe an error that gsmap did not raise on purpose in one line, and write its traceback to a log file."""
     logging.getLogger("gsmap.cli").info("internal error", exc_info=error)  # shown with -v
-    said = str(error).strip().partition("\n")[0]
+    text = str(error).strip().partition("\n")[0]
     about = f"gsmap {__version__}, Python {platform.python_version()}, {platform.platform()}\n"
     trace = "".join(traceback.format_exception(error))
     try:
@@ -150,6 +154,6 @@ def _internal_error(error: Exception) -> str:
             log.write(about + trace)
     except OSError:
         print(escaped(trace, lines=True), file=sys.stderr, end="")
-        return str(GsmapError(f"internal error: {type(error).__name__}: {said}"))
+        return str(GsmapError(f"internal error: {type(error).__name__}: {text}"))
     where = f"Traceback: {log.name} (gsmap -v prints it)"
-    return f"{GsmapError(f'internal error: {type(error).__name__}: {said}')}. {where}"
+    return f"{GsmapError(f'internal error: {type(error).__name__}: {text}')}. {where}"

@@ -1,4 +1,4 @@
-"""gsmap backup: save a map, while it is in use."""
+"""gsmap backup: save a map while it is in use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Dest = Annotated[
     str,
     typer.Argument(
         metavar="DEST",
-        help="The backup: a folder, `file:///FOLDER` or `s3://BUCKET/PREFIX`, of one map alone.",
+        help="Backup folder, `file:///FOLDER` or `s3://BUCKET/PREFIX`; it holds the snapshots of one map.",
         show_default=False,
     ),
 ]
@@ -22,22 +22,22 @@ def command(
     map: MapPath,
     dest: Dest,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Read again all that is there; send again what is damaged.")
+        bool, typer.Option("--verify", help="Read every stored byte again, and send damaged files again.")
     ] = False,
     keep: Annotated[
-        int | None, typer.Option("--keep", metavar="N", help="Then delete all but the newest N snapshots.")
+        int | None, typer.Option("--keep", metavar="N", help="Delete all but the newest N snapshots afterwards.")
     ] = None,
     list: Annotated[
-        bool, typer.Option("--list", help="Save nothing: list the snapshots. MAP need not exist any more.")
+        bool, typer.Option("--list", help="Only list the snapshots and save nothing; MAP may be missing.")
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Save the map as it is now, while others go on writing to it. Only what the backup lacks is sent.
+    """Save the map as it is now, while other processes may write to it. Only files that the backup lacks are sent.
 
-    Of the map the catalog and what is sent are read; where those are damaged, nothing is saved. Damage that came to
-    files after they were sent is found by `gsmap check` alone, and the backup keeps the sound bytes. Exit code 1 where
-    `--verify` finds damage in the backup that the map cannot mend. S3 is reached as `AWS_ACCESS_KEY_ID`,
-    `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and `AWS_ENDPOINT_URL` say.
+    The command reads the catalog and the files to send; if one of them is damaged, it saves nothing. Files that were
+    damaged after they had been sent are found by `gsmap check`, and the backup keeps their sound bytes. Exit code 1 if
+    `--verify` finds damage in the backup that the map cannot repair. For S3, set `AWS_ACCESS_KEY_ID`,
+    `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and `AWS_ENDPOINT_URL`.
 
     Example: `gsmap backup site.gsmap /mnt/backup/site --keep 30`
     """
@@ -45,7 +45,7 @@ def command(
         from gsmap.map import snapshots
 
         if verify or keep is not None:
-            raise typer.BadParameter("--list saves, verifies and deletes nothing: give it alone")
+            raise typer.BadParameter("--list cannot be combined with --verify or --keep")
         print_rows("backup --list", snapshots(dest), json, "snapshots")
         return
     with opened(map, bars=True) as m:

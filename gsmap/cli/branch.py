@@ -1,4 +1,4 @@
-"""gsmap branch: another catalog over the same arrays."""
+"""gsmap branch: a second catalog over the same arrays."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ if TYPE_CHECKING:
 
 def command(
     map: MapPath,
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="What to call it.", show_default=False)] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Name of the branch.", show_default=False)
+    ] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Delete the branch NAME.")] = False,
     list_all: Annotated[bool, typer.Option("--list", help="List the branches of the map.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Make a branch of a map: a catalog of its own over the same arrays, opened as MAP@NAME wherever a map is given.
+    """Create a branch of a map: a second catalog over the same arrays. Open it as MAP@NAME in any command.
 
-    What is done to a branch leaves the map as it is; `gsmap merge MAP MAP@NAME` brings it back. Without NAME the
+    Changes to a branch do not affect the map; `gsmap merge MAP MAP@NAME` merges them into it. Without NAME, the
     branches are listed.
 
     Example: `gsmap branch site.gsmap what-if`
@@ -36,15 +38,15 @@ def make_or_list(
     from gsmap.errors import ConfigError
 
     if (name is None and delete) or (name is not None and list_all):
-        raise ConfigError(f"name the {kind} to make or to delete, or give --list alone", code="nothing_requested")
+        raise ConfigError(f"pass the NAME of the {kind} to create or delete, or --list alone", code="nothing_requested")
     with opened(map) as m:
         if name is None:
             rows: list[BranchRow] = m.branches(kind)
         elif delete:
             rows = [m.delete_branch(name, kind)]
-            say(f"deleted {kind} {name}; gsmap prune {map} reclaims what only it named")
+            say(f"deleted {kind} {name}; run gsmap prune {map} to free the space of its results")
         else:
             rows = [m.tag(name) if kind == "tag" else m.branch(name)]
-            say(f"made {kind} {name}: open it as {rows[0].map}")
+            say(f"created {kind} {name}; open it as {rows[0].map}")
     if name is None or json:
         print_rows(kind, rows, json, title)

@@ -1,4 +1,4 @@
-"""gsmap changes: what changed between captures."""
+"""gsmap changes: differences between captures."""
 
 from __future__ import annotations
 
@@ -25,21 +25,25 @@ def command(
     map: MapPath,
     pair: Annotated[
         str | None,
-        typer.Argument(metavar="[A:B]", help="Only these two captures, by names or ids; compared if need be."),
+        typer.Argument(metavar="[A:B]", help="Show only this pair of captures, by names or ids."),
     ] = None,
     since: Annotated[
-        str | None, typer.Option("--since", metavar="DATE", help="Only what captures after this show to have changed.")
+        str | None,
+        typer.Option("--since", metavar="DATE", help="Show only changes that captures after this date reveal."),
     ] = None,
     between: Annotated[
         tuple[str, str] | None,
-        typer.Option("--between", metavar="D1 D2", help="Only what captures after D1, up to D2, show to have changed."),
+        typer.Option(
+            "--between", metavar="D1 D2", help="Show only changes that captures after D1 and up to D2 reveal."
+        ),
     ] = None,
     as_of: AsOf = None,
     min_confidence: Annotated[
-        float, typer.Option("--min-confidence", min=0, max=1, help="Only changes that are at least as sure.")
+        float, typer.Option("--min-confidence", min=0, max=1, help="Show only changes of at least this confidence.")
     ] = 0.0,
     pictures: Annotated[
-        str | None, typer.Option("--pictures", metavar="DIR", help="Also draw each change before and after, to here.")
+        str | None,
+        typer.Option("--pictures", metavar="DIR", help="Also draw each change, before and after, into this folder."),
     ] = None,
     sets: Sets = None,
     preset: Preset = None,
@@ -47,7 +51,7 @@ def command(
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Show what changed from each capture to the next; what has not been compared yet is.
+    """Show what changed from each capture to the next. Compares missing pairs first.
 
     Example: `gsmap changes site.gsmap --since 2024-05-31`
     """

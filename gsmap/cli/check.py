@@ -1,4 +1,4 @@
-"""gsmap check: verify every byte."""
+"""gsmap check: verify every byte of a map."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def command(
     map: MapPath,
     accept_catalog: Annotated[
         bool,
-        typer.Option("--accept-catalog", help="First take a catalog that differs from what gsmap wrote as it is."),
+        typer.Option("--accept-catalog", help="First accept a catalog that something other than gsmap has changed."),
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Read every byte of the map and compare it with what was written. Exit code 1 where anything is wrong.
+    """Read every byte of the map and compare it with its digest. Exit code 1 if anything is damaged.
 
     Example: `gsmap check site.gsmap`
     """
@@ -35,10 +35,10 @@ def command(
             print(f"cannot verify the catalog: {shown(why)}")
     if not report.ok:
         count = len(report.problems)
-        again = "restore files from a backup, or ingest (of graphs: describe) their scenes again"
+        again = "restore the files from a backup, ingest their scenes again, or describe again (for scene graphs)"
         say(f"{count} problems in {map}: {again}")
         raise typer.Exit(1)
-    say(f"nothing wrong was found in {map}" if report.unverified else f"{map} is whole")
+    say(f"no damage found in {map}" if report.unverified else f"{map} is intact")
 
 
 def _accept(map: str) -> None:
@@ -46,11 +46,11 @@ def _accept(map: str) -> None:
 
     found = gsmap.map.accept_catalog(map)
     if not found:
-        say(f"the catalog of {map} is as gsmap wrote it: there was nothing to accept")
+        say(f"the catalog of {map} is as gsmap wrote it; nothing to accept")
     for what in found:
         say(f"ACCEPTED: {what}")
     if found:
         say(
-            f"SQLite finds the catalog of {map} sound, but nobody knows whether what it says there is true. "
-            "From now on it counts as written: compare names, poses and edges with what you know, or restore a backup"
+            f"SQLite finds the catalog of {map} consistent, but its values may be wrong. From now on gsmap accepts it: "
+            "check names, poses and edges, or restore a backup"
         )

@@ -1,4 +1,4 @@
-"""gsmap confirm: a person's review of an edge or a change."""
+"""gsmap confirm: accept an edge or a change by review."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 def command(
     map: MapPath,
     what: Annotated[
-        str, typer.Argument(metavar="A:B|CHANGE", help="The pair, by names or ids; or a change, such as c12.")
+        str, typer.Argument(metavar="A:B|CHANGE", help="Pair of scenes, by names or ids, or a change such as c12.")
     ],
-    note: Annotated[str, typer.Option("--note", help="Why, for whoever asks later.")] = "",
+    note: Annotated[str, typer.Option("--note", help="Reason; kept in the history.")] = "",
     withdraw: Annotated[
-        bool, typer.Option("--withdraw", help="Take back the last review, or else the pair's own measurement.")
+        bool,
+        typer.Option(
+            "--withdraw", help="Withdraw the last review, or the measured edge (`gsmap edge`) if there is none."
+        ),
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Vouch for an edge, so that it is used whatever the votes say; or for a change. Kept in history.
+    """Confirm an edge, so that optimize uses it even if other edges contradict it, or confirm a change.
 
     Example: `gsmap confirm site.gsmap monday:tuesday`
     """

@@ -1,6 +1,6 @@
-"""Output of the verbs: data on stdout, progress and remarks on stderr.
+"""Output of the verbs: data on stdout, progress and notes on stderr.
 
-Names, notes and paths come from files and maps that strangers may have made: everything printed passes `escaped`.
+Names, notes and paths may come from untrusted files and maps, so all printed text passes `escaped`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MapPath = Annotated[
     str,
     typer.Argument(
         metavar="MAP",
-        help="The map's directory, such as site.gsmap; site.gsmap@NAME for a branch or tag.",
+        help="Folder of the map, such as site.gsmap, or site.gsmap@NAME for a branch or tag.",
         show_default=False,
     ),
 ]
@@ -39,26 +39,28 @@ Sets = Annotated[
 ]
 AsOf = Annotated[
     str | None,
-    typer.Option("--as-of", metavar="DATE", help="Only captures dated at or before this, ISO 8601; of a day, its end."),
+    typer.Option(
+        "--as-of", metavar="DATE", help="Use only captures dated at or before this, ISO 8601; a day counts to its end."
+    ),
 ]
-Preset = Annotated[
-    str | None, typer.Option("--preset", help="Start from this preset, for this run: `default` or `paper`.")
-]
+Preset = Annotated[str | None, typer.Option("--preset", help="Preset of settings for this run: `default` or `paper`.")]
 Executor = Annotated[
     str | None,
-    typer.Option("--executor", help="Where jobs run: local (this machine) or dask (a cluster); GSMAP_EXECUTOR else."),
+    typer.Option(
+        "--executor", help="Run jobs on this machine (`local`) or a cluster (`dask`); default: $GSMAP_EXECUTOR."
+    ),
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option("--scheduler", metavar="URL", help="Of a Dask cluster, tcp://HOST:8786; GSMAP_SCHEDULER else."),
+    typer.Option("--scheduler", metavar="URL", help="Dask scheduler, tcp://HOST:8786; default: $GSMAP_SCHEDULER."),
 ]
 
 
-# --- remarks and logs ------------------------------------------------------------------------------------------------
+# --- notes and logs --------------------------------------------------------------------------------------------------
 
 
 class _Stderr(logging.StreamHandler[Any]):
-    """Writes to whatever stderr is now: progress bars put themselves in its place while they are drawn."""
+    """Log handler that writes to the current ``sys.stderr``, which progress bars replace while they are drawn."""
 
     def format(self, record: logging.LogRecord) -> str:
         return escaped(super().format(record), lines=True)
@@ -69,7 +71,7 @@ class _Stderr(logging.StreamHandler[Any]):
 
 
 def start_logging(verbose: int, quiet: bool) -> None:
-    """Send what the library logs (loggers ``gsmap.<room>``) to stderr: warnings, or as ``-q``, ``-v``, ``-vv`` ask."""
+    """Send the library's log (loggers ``gsmap.<room>``) to stderr, at the level of ``-q``, ``-v`` or ``-vv``."""
     logger = logging.getLogger("gsmap")
     logger.setLevel(logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)])
     if not any(isinstance(handler, _Stderr) for handler in logger.handlers):
@@ -80,13 +82,13 @@ def start_logging(verbose: int, quiet: bool) -> None:
 
 
 def say(text: str) -> None:
-    """A remark for the person, on stderr; silent with ``-q``."""
+    """Print a note for the user on stderr; silent with ``-q``."""
     if logging.getLogger("gsmap").isEnabledFor(logging.WARNING):
         print(escaped(text), file=sys.stderr, flush=True)
 
 
 def say_heights(rows: Sequence[Row]) -> None:
-    """Name the CRS of the world coordinates that rows show, and the unit and zero of their heights."""
+    """Print the CRS of the rows' world coordinates, with the unit and zero of their heights."""
     for crs, heights in dict.fromkeys((getattr(row, "crs", None), getattr(row, "heights", None)) for row in rows):
         if heights is None:
             continue
@@ -100,9 +102,9 @@ def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: s
     """Print the rows of a verb on stdout, as one JSON object or as a table.
 
     Args:
-        verb: its key in `gsmap.cli.objects.OBJECTS`.
-        rows: the row or rows that are declared there.
-        title: of the table.
+        verb: Key of the verb in `gsmap.cli.objects.OBJECTS`.
+        rows: Row or rows of the type declared there.
+        title: Title of the table; default: the verb.
     """
     if json:
         print_json(json_object(verb, rows))
@@ -125,7 +127,7 @@ def print_json(data: dict[str, Any]) -> None:
 
 
 def print_json_error(code: str, message: str) -> None:
-    """Print the JSON object of a command that failed; nothing where the command has printed its own object before."""
+    """Print the JSON object of a failed command, unless the command has already printed its own object."""
     from gsmap.types.rows import SCHEMA
 
     if not _has_printed_json:
@@ -158,7 +160,7 @@ def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
 
 
 def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> None:
-    """The named fields of rows as a table on stdout; numbers are right-aligned. A pipe gets every column in full."""
+    """Print fields of rows as a table on stdout, numbers right-aligned; a pipe gets every column in full."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -177,7 +179,7 @@ def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> 
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
-    """Facts, one a line, on stdout; those that are None or empty are left out."""
+    """Print facts on stdout, one per line, without those that are None or empty."""
     from rich.table import Table
     from rich.text import Text
 
@@ -211,13 +213,14 @@ def opened(
     executor: str | None = None,
     scheduler: str | None = None,
 ) -> Iterator[Map]:
-    """A map, open until the verb is done.
+    """Open a map for one verb.
 
     Args:
-        create: make it where it is missing.
-        bars: show how far long work is.
-        sets, preset: settings for this run, as ``--set`` and ``--preset`` give them.
-        executor, scheduler: where jobs run.
+        path: Folder or URL of the map.
+        create: Create the map if it is missing.
+        bars: Show progress bars.
+        sets, preset: Settings for this run, in the form of ``--set`` and ``--preset``.
+        executor, scheduler: Executor of jobs and URL of the Dask scheduler.
     """
     import gsmap.map
     from gsmap.settings import parse
@@ -239,7 +242,7 @@ _left: list[QuarantinedJob] = []
 
 
 def left() -> str:
-    """Name what verbs of this process have set aside or left out, and forget it; empty where that is nothing."""
+    """Return a sentence on the jobs and captures quarantined since the last call; empty if there are none."""
     if not _left:
         return ""
     from gsmap.store.quarantine import CAPTURE
@@ -251,7 +254,7 @@ def left() -> str:
     parts += [f"{jobs} job{'s' * (jobs != 1)}"] if jobs else []
     names = f" ({', '.join(one.about for one in captures)})" if captures else ""
     verb = "is" if len(captures) + jobs == 1 else "are"
-    return f"{' and '.join(parts)} {verb} set aside{names}: gsmap status MAP says which, and why"
+    return f"{' and '.join(parts)} {verb} quarantined{names}: run gsmap status MAP for the reasons"
 
 
 @contextmanager
@@ -261,8 +264,9 @@ def _no_bars() -> Iterator[None]:
 
 @contextmanager
 def progress_bars() -> Iterator[StageProgress | None]:
-    """Yields what draws one bar per stage on stderr (plain lines when piped); None with ``-q``, and with ``-v``, when
-    the logs say as much.
+    """Yield a callback that draws one progress bar per stage on stderr (plain lines in a pipe).
+
+    Yields None with ``-q``, and with ``-v``, because the log then shows the progress.
     """
     if logging.getLogger("gsmap").getEffectiveLevel() != logging.WARNING:
         yield None
@@ -293,7 +297,7 @@ def progress_bars() -> Iterator[StageProgress | None]:
 
 
 def _progress_lines() -> StageProgress:
-    """For logs: one line whenever what is being worked on changes, and at the end of each stage."""
+    """Return a callback for pipes: one line whenever the subject of the work changes, and at the end of each stage."""
     last: dict[str, str] = {}
 
     def progress(stage: str, fraction: float, text: str = "") -> None:

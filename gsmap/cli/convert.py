@@ -1,4 +1,4 @@
-"""gsmap convert: file to file."""
+"""gsmap convert: convert one file of Gaussians to another format."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from gsmap.cli.console import AsJson, print_rows, say
 
 
 def command(
-    source: Annotated[str, typer.Argument(metavar="IN", help="A file of Gaussians.")],
-    target: Annotated[str, typer.Argument(metavar="OUT", help="The file to write; its suffix names the format.")],
+    source: Annotated[str, typer.Argument(metavar="IN", help="File of Gaussians to read.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="File to write; its suffix selects the format.")],
     local: Annotated[
         bool,
         typer.Option(
-            "--local", help="Write map coordinates less an offset, which is printed, for formats of single precision."
+            "--local", help="Subtract an offset from all positions, and print it; for formats of single precision."
         ),
     ] = False,
     json: AsJson = False,
@@ -38,9 +38,9 @@ def command(
     say(f"wrote {len(gaussians)} Gaussians to {target}")
     step = rounded_to(gaussians) if gaussians.origin.any() else 0.0
     if step:
-        say(f"{source} has its positions in single precision, which rounds them to {step:g} there")
+        say(f"{source} stores positions in single precision, rounded to {step:g} at this distance from the origin")
     if offset.any():
-        say(f"its positions are those of {source} less {' '.join(f'{value:.15g}' for value in offset)}")
+        say(f"positions in {target} are those in {source} minus {' '.join(f'{value:.15g}' for value in offset)}")
     if json:
         report = ConvertReport(
             input=source,

@@ -1,4 +1,4 @@
-"""gsmap demo: the whole job on small captures it makes itself."""
+"""gsmap demo: the whole workflow on small synthetic captures."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def command(
-    folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Where to work; made if missing.")] = "gsmap-demo",
-    seed: Annotated[int, typer.Option("--seed", help="Another flat, other walks through it.")] = 0,
+    folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Working folder; created if missing.")] = "gsmap-demo",
+    seed: Annotated[int, typer.Option("--seed", help="Random seed of the flat and the camera paths.")] = 0,
     json: AsJson = False,
 ) -> None:
-    """Make three small captures of a furnished flat, map them, and show how close the map comes to the truth.
+    """Make three small captures of a furnished flat, map them, and print the errors of the poses.
 
     Example: `gsmap demo`
     """
@@ -31,7 +31,7 @@ def command(
     synthetic = _synthetic()
     root = Path(folder)
     map_path = root / "demo.gsmap"
-    root.mkdir(parents=True, exist_ok=True)  # refused now, and not after a minute of making captures
+    root.mkdir(parents=True, exist_ok=True)  # fail now, not after a minute of making captures
     with progress_bars() as progress:
         draw = progress or (lambda stage, fraction, text: None)
         captures = synthetic.make_captures(seed, progress=lambda fraction, text: draw("capture", fraction, text))
@@ -59,18 +59,18 @@ def command(
     for tile in report.tiles:
         say(f"merged tile: {root / 'tiles' / tile.path} ({tile.num_gaussians} Gaussians; any 3DGS viewer opens it)")
     say(f"picture: {report.picture}")
-    say(f"look around: gsmap view {map_path}")
+    say(f"to explore the map: gsmap view {map_path}")
 
 
 def _synthetic() -> ModuleType:
-    """The maker of synthetic scenes, a distribution of its own: maps of real captures need none of it."""
+    """Import the generator of synthetic scenes, which is a separate distribution."""
     try:
         import gsmap_synthetic
     except ModuleNotFoundError as error:
         if error.name != "gsmap_synthetic":
             raise
         raise MissingDependencyError(
-            "gsmap demo makes its captures with gsmap-synthetic, which is not installed: "
+            "gsmap demo needs gsmap-synthetic, which is not installed: "
             "pip install the folder synthetic/ of gsmap's source, or run tools/setup.sh there"
         ) from error
     module: ModuleType = gsmap_synthetic
@@ -78,7 +78,7 @@ def _synthetic() -> ModuleType:
 
 
 def _draw(m: Map, path: Path) -> None:
-    """The map's picture: every placed scene, what ties it to which, and where the cameras went."""
+    """Draw the map: all placed scenes, the edges between them, and the camera paths."""
     from PIL import Image
 
     from gsmap.durable import write_output

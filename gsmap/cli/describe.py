@@ -1,4 +1,4 @@
-"""gsmap describe: scene graphs for what lacks one."""
+"""gsmap describe: compute missing scene graphs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets
 def command(
     map: MapPath,
     scenes: Annotated[
-        list[str] | None, typer.Argument(metavar="[SCENE...]", help="Names or ids; all where none is given.")
+        list[str] | None, typer.Argument(metavar="[SCENE...]", help="Names or ids of scenes; default: all.")
     ] = None,
     sets: Sets = None,
     preset: Preset = None,
@@ -20,7 +20,7 @@ def command(
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Make the scene graph of every scene that lacks one, and of scenes that are named also where it is damaged.
+    """Compute missing scene graphs, and damaged ones of the scenes given by name.
 
     Example: `gsmap describe site.gsmap`
     """

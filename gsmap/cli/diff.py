@@ -1,4 +1,4 @@
-"""gsmap diff: what moved between two revisions."""
+"""gsmap diff: differences of scene poses between two revisions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def command(
     after: Annotated[int, typer.Argument(metavar="R2", help="Number of the newer revision.")],
     json: AsJson = False,
 ) -> None:
-    """Show which scenes moved between two revisions, and by how much (translation at each scene's middle).
+    """Show which scenes moved between two revisions, and by how much (translation at the centre of each scene).
 
     Example: `gsmap diff site.gsmap 1 2`
     """

@@ -1,4 +1,4 @@
-"""gsmap edge: a measurement of your own."""
+"""gsmap edge: add a measured relative pose."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ if TYPE_CHECKING:
 
     from gsmap.types import Sim3
 
-_RIGID_SIGMA = 1e-5  # of the log scale of an edge that has none
+_RIGID_SIGMA = 1e-5  # standard deviation of the log scale of an edge without a scale
 
 
 def command(
     map: MapPath,
-    pair: Annotated[str, typer.Argument(metavar="A:B", help="The pair, by names or ids.")],
+    pair: Annotated[str, typer.Argument(metavar="A:B", help="Pair of scenes, by names or ids.")],
     pose: Annotated[
         str,
-        typer.Option("--pose", metavar="FILE", help="How B lies in A: a 4x4 matrix (`x_a = M x_b`), as text or JSON."),
+        typer.Option("--pose", metavar="FILE", help="Pose of B in A: a 4x4 matrix (`x_a = M x_b`), as text or JSON."),
     ],
     sigma: Annotated[
         str,
         typer.Option(
             "--sigma",
             metavar="DEG,M[,SCALE]",
-            help="Standard deviations of rotation (degrees, per axis), translation (B's unit, per axis) and, where "
-            "the scale was measured, of its logarithm.",
+            help="Standard deviations of rotation (degrees, per axis), translation (units of B, per axis) and, if the "
+            "scale was measured, of its logarithm.",
         ),
     ],
-    note: Annotated[str, typer.Option("--note", help="How it was measured, for whoever asks later.")] = "",
+    note: Annotated[str, typer.Option("--note", help="How the pose was measured; kept in the history.")] = "",
     json: AsJson = False,
 ) -> None:
-    """Add a measurement of your own of how scene B lies in scene A; the next optimize weighs it with the others.
+    """Add your own measurement of the pose of scene B in scene A. The next optimize uses it like other edges.
 
     Example: `gsmap edge site.gsmap monday:tuesday --pose tape.txt --sigma 0.5,0.02`
     """
@@ -50,11 +50,11 @@ def command(
 
 
 def read_pose(path: Path) -> Sim3:
-    """A 4x4 similarity from a text file (16 numbers) or from JSON (4 rows, or an object with ``S_target_source``).
+    """Read a 4x4 similarity from text (16 numbers) or JSON (4 rows, or an object with ``S_target_source``).
 
     Raises:
-        NotFoundError: no such file.
-        InputError: a file that holds no such matrix.
+        NotFoundError: The file is missing.
+        InputError: The file holds no similarity matrix.
     """
     import numpy as np
 
@@ -70,16 +70,18 @@ def read_pose(path: Path) -> Sim3:
             numbers = np.array(content.replace(",", " ").split(), dtype=np.float64)
         return Sim3.from_matrix(numbers.reshape(4, 4))
     except FileNotFoundError as error:
-        raise NotFoundError(f"no pose at {path}", code="file_not_found") from error
+        raise NotFoundError(f"no pose file at {path}", code="file_not_found") from error
     except (OSError, *MALFORMED) as error:
-        raise InputError(f"{path} holds no pose, a 4x4 matrix as text or JSON: {error}", code="invalid_pose") from error
+        raise InputError(
+            f"{path} is not a pose (a 4x4 matrix as text or JSON): {error}", code="invalid_pose"
+        ) from error
 
 
 def read_sigmas(text: str, pose: Sim3) -> np.ndarray:
-    """(7,) standard deviations [rotation (3, rad), translation (3), log scale] from ``DEG,M[,SCALE]``.
+    """Parse ``DEG,M[,SCALE]`` into (7,) standard deviations [rotation (3, rad), translation (3), log scale].
 
     Raises:
-        ConfigError: not two or three positive numbers, or a pose with a scale whose deviation is not given.
+        ConfigError: The text is not two or three positive numbers, or the pose has a scale and the text has none.
     """
     import numpy as np
 
@@ -95,7 +97,8 @@ def read_sigmas(text: str, pose: Sim3) -> np.ndarray:
         )
     if len(numbers) == 2 and not pose.is_rigid:
         raise ConfigError(
-            f"the pose has scale {pose.scale:.6g}: give its deviation too, --sigma DEG,M,SCALE", code="invalid_sigma"
+            f"the pose has scale {pose.scale:.6g}: pass its standard deviation, too: --sigma DEG,M,SCALE",
+            code="invalid_sigma",
         )
     log_scale = numbers[2] if len(numbers) == 3 else _RIGID_SIGMA
     return np.array([np.radians(numbers[0])] * 3 + [numbers[1]] * 3 + [log_scale])

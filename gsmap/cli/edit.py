@@ -11,34 +11,38 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows
 
 def command(
     map: MapPath,
-    scene: Annotated[str, typer.Argument(metavar="SCENE|OBJECT", help="A scene's name or id, or an object (`o12`).")],
-    name: Annotated[str | None, typer.Option("--name", help="Call it this.")] = None,
+    scene: Annotated[str, typer.Argument(metavar="SCENE|OBJECT", help="Name or id of a scene, or an object (`o12`).")],
+    name: Annotated[str | None, typer.Option("--name", help="New name.")] = None,
     captured_at: Annotated[
-        str | None, typer.Option("--captured-at", help="When it was captured, ISO 8601; `none` takes its date back.")
+        str | None, typer.Option("--captured-at", help="Date of the capture, ISO 8601; `none` removes it.")
     ] = None,
-    note: Annotated[str | None, typer.Option("--note", help="What people should know of it.")] = None,
-    tag: Annotated[list[str] | None, typer.Option("--tag", help="Give it this tag; may be repeated.")] = None,
-    untag: Annotated[list[str] | None, typer.Option("--untag", help="Take this tag away; may be repeated.")] = None,
+    note: Annotated[str | None, typer.Option("--note", help="Free text about the scene or object.")] = None,
+    tag: Annotated[list[str] | None, typer.Option("--tag", help="Add this tag to the scene; may be repeated.")] = None,
+    untag: Annotated[
+        list[str] | None, typer.Option("--untag", help="Remove this tag from the scene; may be repeated.")
+    ] = None,
     metres_per_unit: Annotated[
         str | None,
         typer.Option(
             "--metres-per-unit",
             metavar="X",
-            help="One unit of its own frame is so many metres: a measured distance by the same in the capture; "
-            "`none` takes it back.",
+            help="Metres per unit of the scene frame: a measured distance divided by the same distance in the "
+            "capture; `none` removes it.",
         ),
     ] = None,
     label: Annotated[
-        str | None, typer.Option("--label", help="Of an object: what kind of thing it is; `none` takes it back.")
+        str | None, typer.Option("--label", help="Kind of the object, such as sofa; `none` removes it.")
     ] = None,
     same_as: Annotated[
         str | None,
-        typer.Option("--same-as", metavar="OBJECT", help="Of an object: it is one with this one; `none`: it is not."),
+        typer.Option("--same-as", metavar="OBJECT", help="Merge the object with this one; `none` separates them."),
     ] = None,
-    author: Annotated[str, typer.Option("--author", metavar="NAME", help="Who says so; kept in its history.")] = "",
+    author: Annotated[
+        str, typer.Option("--author", metavar="NAME", help="Author of the edit; kept in the history.")
+    ] = "",
     json: AsJson = False,
 ) -> None:
-    """Change what is said of a scene, or of an object (`gsmap graph`); what was said before stays in its history.
+    """Edit the annotations of a scene or of an object (`gsmap graph`). The history keeps the previous values.
 
     Example: `gsmap edit site.gsmap monday --captured-at 2024-05-31 --tag ground-floor`, or
     `gsmap edit site.gsmap o12 --name "grandmother's sofa" --label sofa`
@@ -49,8 +53,8 @@ def command(
     of_object = label is not None or same_as is not None
     if name is None and note is None and not of_scene and not of_object:
         raise ConfigError(
-            "say what to change: --name, --note, of a scene --captured-at, --tag, --untag or --metres-per-unit, of an "
-            "object --label or --same-as",
+            "nothing to change: pass --name or --note; for a scene --captured-at, --tag, --untag or --metres-per-unit; "
+            "for an object --label or --same-as",
             code="nothing_requested",
         )
     metres = None if metres_per_unit is None else _metres(metres_per_unit)
@@ -58,7 +62,8 @@ def command(
         if m.is_object(scene) or of_object:
             if of_scene:
                 raise ConfigError(
-                    f"{scene} is an object: dates, tags and metres are of scenes", code="option_not_applicable"
+                    f"{scene} is an object: only scenes have dates, tags and a metric scale",
+                    code="option_not_applicable",
                 )
             done = m.edit_object(scene, name=name, label=label, note=note, same_as=same_as, author=author)
             print_rows("edit OBJECT", done, json, "object")
@@ -77,15 +82,15 @@ def command(
 
 
 def _metres(text: str) -> float:
-    """A positive number; 0 for `none`."""
+    """Parse a positive number; 0 for `none`."""
     from gsmap.errors import ConfigError
 
     try:
         metres = 0.0 if text.strip().lower() == "none" else float(text)
     except ValueError as error:
         raise ConfigError(
-            f"--metres-per-unit is a number such as 0.3, or none, got {text!r}", code="invalid_metre"
+            f"--metres-per-unit takes a number such as 0.3, or none, got {text!r}", code="invalid_metre"
         ) from error
     if metres == 0.0 and text.strip().lower() != "none":
-        raise ConfigError("--metres-per-unit must be positive; none takes back what was said", code="invalid_metre")
+        raise ConfigError("--metres-per-unit must be positive, or none to remove it", code="invalid_metre")
     return metres

@@ -1,4 +1,4 @@
-"""gsmap evaluate: the field's metrics against ground truth."""
+"""gsmap evaluate: errors of edges, poses and renders against ground truth."""
 
 from __future__ import annotations
 
@@ -11,34 +11,43 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, 
 
 def command(
     map: MapPath,
-    truth: Annotated[str, typer.Option("--truth", help="Folder of NAME.json files holding `T_scene_world` (4x4).")],
+    truth: Annotated[str, typer.Option("--truth", help="Folder of NAME.json files with `T_scene_world` (4x4).")],
     images: Annotated[
         str | None, typer.Option("--images", help="Folder of NAME_CAMERA.jpg frames to compare renders with.")
     ] = None,
     tiles: Annotated[
         str | None,
-        typer.Option("--tiles", metavar="DIR", help="Also compare what `gsmap export` wrote there with the images."),
+        typer.Option(
+            "--tiles", metavar="DIR", help="Also compare renders of the tiles in this folder with the images."
+        ),
     ] = None,
     lpips: Annotated[
         str | None,
-        typer.Option("--lpips", metavar="FILE", help="Also compare images by this LPIPS network, an ONNX file."),
+        typer.Option("--lpips", metavar="FILE", help="Also compute LPIPS with this ONNX network."),
     ] = None,
     max_rre: Annotated[
-        float | None, typer.Option("--max-rre", metavar="DEG", help="An edge that is turned by more is wrong; 1 else.")
+        float | None,
+        typer.Option(
+            "--max-rre", metavar="DEG", help="Rotation error above which an edge counts as wrong; default: 1."
+        ),
     ] = None,
     max_rte: Annotated[
         float | None,
-        typer.Option("--max-rte", metavar="M", help="An edge off by more metres is wrong; 0.05 else."),
+        typer.Option(
+            "--max-rte", metavar="M", help="Translation error above which an edge counts as wrong; default: 0.05."
+        ),
     ] = None,
     truth_sigma: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            "--truth-sigma", metavar="DEG M", help="How exactly the truth of a scene is known: degrees and metres."
+            "--truth-sigma",
+            metavar="DEG M",
+            help="Standard deviations of the true pose of a scene, in degrees and metres.",
         ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Compare edges and poses with ground truth (and renders with the captures' own images).
+    """Compare edges and poses with ground truth, and renders with the images of the captures.
 
     Example: `gsmap evaluate house.gsmap --truth captures/truth`
     """
@@ -46,7 +55,7 @@ def command(
 
     if images is None and (tiles is not None or lpips is not None):
         option = "--tiles" if tiles is not None else "--lpips"
-        raise ConfigError(f"{option} compares images: give --images too", code="missing_option")
+        raise ConfigError(f"{option} needs --images DIR", code="missing_option")
     with opened(map, bars=images is not None) as m:
         report = m.evaluate(
             truth,

@@ -34,72 +34,79 @@ _TILE_SIZE_M = 10.0
 
 def command(
     map: MapPath,
-    out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; exporting there again updates it.")],
+    out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; a later export to it updates it.")],
     format: Annotated[
         str,
         typer.Option(
             "--format",
-            help="ply, compressed.ply, splat, spz, sog, glb, usdc, 3dtiles or streamed-sog; html: one file to look at.",
+            help="ply, compressed.ply, splat, spz, sog, glb, usdc, 3dtiles, streamed-sog, or html (one page to view).",
         ),
     ] = "ply",
     tile_size: Annotated[
-        float, typer.Option("--tile-size", help="Edge of a tile in metres; 0 is one file.")
+        float, typer.Option("--tile-size", help="Edge length of a tile in metres; 0 writes one file.")
     ] = _TILE_SIZE_M,
     bbox: Annotated[
         tuple[float, float, float, float, float, float] | None,
-        typer.Option(
-            "--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only this box of the map, in its unit, as poses are."
-        ),
+        typer.Option("--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Export only this box of the map, in map units."),
     ] = None,
     merge: Annotated[
         str | None,
-        typer.Option("--merge", help="tto, voxel, union or distance; what the setting merge.method says else."),
+        typer.Option("--merge", help="Merge method: tto, voxel, union or distance; default: the setting merge.method."),
     ] = None,
-    revision: Annotated[int | None, typer.Option("--revision", help="Poses of this revision; the newest else.")] = None,
-    component: Annotated[int | None, typer.Option("--component", help="Only this connected component.")] = None,
+    revision: Annotated[
+        int | None, typer.Option("--revision", help="Use the poses of this revision; default: the newest.")
+    ] = None,
+    component: Annotated[int | None, typer.Option("--component", help="Export only this connected component.")] = None,
     steps: Annotated[
-        int | None, typer.Option("--steps", help="Optimisation steps per tile; chosen by size else.")
+        int | None, typer.Option("--steps", help="Optimization steps per tile; default: by its size.")
     ] = None,
     budget: Annotated[
         str | None,
         typer.Option(
             "--budget",
             metavar="SECONDS|SIZE",
-            help="Ceiling in seconds per tile; a tile it cuts short is marked. With --for localize a size, as 50MB.",
+            help="Time limit per tile in seconds; tiles cut short are marked. With --for localize: a size, as 50MB.",
         ),
     ] = None,
     purpose: Annotated[
         Purpose,
-        typer.Option("--for", help="What the export is for: view (tiles), or localize (a small map, see --budget)."),
+        typer.Option("--for", help="Purpose: view (tiles) or localize (a small map of at most --budget)."),
     ] = Purpose.view,
     provenance: Annotated[
         bool,
-        typer.Option("--provenance", help="Add the property `scene` to .ply: which capture each Gaussian is from."),
+        typer.Option(
+            "--provenance",
+            help="Add the property `scene` to .ply files: the index of the source capture of each Gaussian.",
+        ),
     ] = False,
     uncompressed: Annotated[
-        bool, typer.Option("--uncompressed", help="3dtiles as float32, for viewers that read no SPZ in glTF.")
+        bool, typer.Option("--uncompressed", help="Write 3dtiles as float32, for viewers without SPZ in glTF.")
     ] = False,
     prefer: Annotated[
         str | None,
-        typer.Option("--prefer", help="Where captures disagree: newest, best (who saw it best) or both; newest else."),
+        typer.Option(
+            "--prefer",
+            help="Capture to keep where captures disagree: newest, best (best-observed) or both; default: newest.",
+        ),
     ] = None,
     as_of: AsOf = None,
     static: Annotated[
-        bool, typer.Option("--static", help="Only what persists: without things that moved, or came and went.")
+        bool,
+        typer.Option(
+            "--static", help="Export static content only, without objects that moved, appeared or disappeared."
+        ),
     ] = False,
-    wait: Annotated[
-        bool, typer.Option("--wait", help="If another export is at work in OUT, wait for it; refused else.")
-    ] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait for another export to OUT to end; default: fail.")] = False,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
     scheduler: Scheduler = None,
     page_mb: Annotated[
-        float, typer.Option("--page-mb", help="Of --format html: megabytes of levels of detail, the finest that fit.")
+        float, typer.Option("--page-mb", help="With --format html: maximum size of the levels of detail, in megabytes.")
     ] = 20.0,
     json: AsJson = False,
 ) -> None:
-    """Write merged tiles; only what changed since the last export to OUT is computed.
+    """Write merged tiles. Only tiles that changed since the last export to OUT are computed.
 
     Example: `gsmap export site.gsmap tiles --format spz --as-of 2024-05-31`
     """
@@ -166,19 +173,19 @@ def command(
     else:
         columns = {"path": "file", "component": "component", "num_gaussians": "Gaussians", "truncated": "truncated"}
         print_table(f"tiles in {out}", columns, report.tiles)
-    say(f"{report.recomputed} tiles made, {report.reused} unchanged, {report.removed} removed")
+    say(f"{report.recomputed} tiles computed, {report.reused} unchanged, {report.removed} removed")
 
 
 def _write_page(
     map: str, out: str, megabytes: float, sets: Sets, preset: Preset, json: bool, asked: Mapping[str, object]
 ) -> None:
-    """The page with the map as it is, in one file: there is nothing to merge or to choose from."""
+    """Write the page with the unmerged captures of the map as one file."""
     from gsmap.errors import ConfigError
     from gsmap.types.rows import ExportReport
 
-    if said := [option for option, value in asked.items() if value is not None]:
+    if useless := [option for option, value in asked.items() if value is not None]:
         raise ConfigError(
-            f"{said[0]} is of merged tiles; html shows the captures as the map has them: leave it out",
+            f"{useless[0]} does not apply to --format html, which shows the captures without merging them",
             code="conflicting_options",
         )
     with opened(map, bars=True, sets=sets, preset=preset) as m:
@@ -188,7 +195,7 @@ def _write_page(
     if json:
         report = ExportReport(out=out, tiles=(), recomputed=0, reused=0, removed=0, notes=written.notes)
         print_rows("export", report, json)
-    say(f"{written.num_bytes:,} bytes in {out}: open it with a double click")
+    say(f"{written.num_bytes:,} bytes in {out}: open it in a browser")
 
 
 def _seconds(text: str) -> float:
@@ -198,5 +205,6 @@ def _seconds(text: str) -> float:
         return float(text)
     except ValueError:
         raise ConfigError(
-            f"--budget of tiles is in seconds, got {text!r}; a size goes with --for localize", code="invalid_budget"
+            f"--budget takes seconds per tile, got {text!r}; pass a size with --for localize only",
+            code="invalid_budget",
         ) from None

@@ -1,4 +1,4 @@
-"""gsmap find: places that are like what is asked for."""
+"""gsmap find: search objects of all captures."""
 
 from __future__ import annotations
 
@@ -14,25 +14,31 @@ def command(
     map: MapPath,
     text: Annotated[
         str | None,
-        typer.Argument(metavar="[TEXT]", help="A name or label that people gave, or words for `clip-text`."),
+        typer.Argument(metavar="[TEXT]", help="Name or label of an object, or a description for `clip-text`."),
     ] = None,
     picture: Annotated[
-        str | None, typer.Option("--picture", metavar="FILE", help="A picture that shows such a thing.")
+        str | None, typer.Option("--picture", metavar="FILE", help="Search for the object in this picture.")
     ] = None,
     like: Annotated[
         str | None,
-        typer.Option("--like", metavar="SCENE:NODE", help="An object of a scene (`show --picture`), or of `graph`."),
+        typer.Option(
+            "--like",
+            metavar="SCENE:NODE",
+            help="Search for objects like this node of a scene (`show --picture`) or object (`graph`).",
+        ),
     ] = None,
-    at: Annotated[str | None, typer.Option("--at", metavar="X,Y,Z", help="What stands at a point of the map.")] = None,
-    top: Annotated[int, typer.Option("--top", help="How many hits at most.")] = 10,
+    at: Annotated[
+        str | None, typer.Option("--at", metavar="X,Y,Z", help="Search for the objects at this point of the map.")
+    ] = None,
+    top: Annotated[int, typer.Option("--top", help="Maximum number of hits.")] = 10,
     pictures: Annotated[
-        str | None, typer.Option("--pictures", metavar="DIR", help="Draw each hit in this folder.")
+        str | None, typer.Option("--pictures", metavar="DIR", help="Draw each hit into this folder.")
     ] = None,
     sets: Sets = None,
     preset: Preset = None,
     json: AsJson = False,
 ) -> None:
-    """Find things in all captures: by name, one of them, a point, a picture, or words. Ranked, with place and dates.
+    """Find objects in all captures by name, description, picture, example or point. Hits have a place and dates.
 
     Example: `gsmap find site.gsmap --like monday:12 --pictures found`
     """
@@ -46,7 +52,7 @@ def command(
         print_rows("find", report, json)
         return
     known = f"{report.described} of {report.placed} captures"
-    by = "name" if report.by == "name" else f"{report.by} of things, embedder {report.embedder}"
+    by = "name" if report.by == "name" else f"{report.by} of objects, embedder {report.embedder}"
     say(f"{report.query}: by {by}, {known}")
     columns = dict(FindHit.columns)
     if pictures is None:
@@ -58,4 +64,4 @@ def _point(text: str | None) -> list[float] | None:
     try:
         return None if text is None else [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {text!r}", code="invalid_point") from error
+        raise ConfigError(f"--at takes three numbers such as 1.5,0,2, got {text!r}", code="invalid_point") from error

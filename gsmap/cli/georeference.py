@@ -1,4 +1,4 @@
-"""gsmap georeference: tie a map to the world."""
+"""gsmap georeference: estimate the pose of a map in the world."""
 
 from __future__ import annotations
 
@@ -16,16 +16,20 @@ def command(
     map: MapPath,
     crs: Annotated[
         str | None,
-        typer.Option("--crs", metavar="EPSG:N", help="The coordinate reference system that the map speaks in."),
+        typer.Option("--crs", metavar="EPSG:N", help="Coordinate reference system of the map."),
     ] = None,
     gcp: Annotated[
         str | None,
-        typer.Option("--gcp", metavar="FILE", help="Control points in photos, as OpenDroneMap has them: gcp_list.txt."),
+        typer.Option(
+            "--gcp", metavar="FILE", help="Control points marked in photos, in OpenDroneMap's format gcp_list.txt."
+        ),
     ] = None,
     photos: Annotated[
         str | None,
         typer.Option(
-            "--photos", metavar="DIR", help="Where photos of --gcp lie that are of no capture; localised first."
+            "--photos",
+            metavar="DIR",
+            help="Folder of photos named by --gcp that belong to no capture; they are localized first.",
         ),
     ] = None,
     exif: Annotated[
@@ -33,39 +37,52 @@ def command(
         typer.Option(
             "--exif",
             metavar="DIR",
-            help="Photos of the captures with positions in EXIF, in folders called as the scenes where names repeat.",
+            help="Folder of the captures' photos with EXIF positions; repeated file names need a subfolder per scene.",
         ),
     ] = None,
     scale_bar: Annotated[
         tuple[str, str, float] | None,
         typer.Option(
-            "--scale-bar", metavar="A B METRES", help="A distance between SCENE:X,Y,Z or SCENE:CAMERA@COLUMN,ROW."
+            "--scale-bar",
+            metavar="A B METRES",
+            help="Measured distance between two points, each SCENE:X,Y,Z or SCENE:CAMERA@COLUMN,ROW.",
         ),
     ] = None,
     check: Annotated[
         str | None,
-        typer.Option("--check", metavar="NAME,...", help="Control points to hold out and compare with; '' for none."),
+        typer.Option("--check", metavar="NAME,...", help="Control points to hold out as check points; '' for none."),
     ] = None,
     sigma: Annotated[
-        float | None, typer.Option("--sigma", metavar="M", help="Of control points or the scale bar; .01, or .2 %.")
+        float | None,
+        typer.Option(
+            "--sigma",
+            metavar="M",
+            help="Standard deviation of control points or of the scale bar; default: 0.01 m, or 0.2 %.",
+        ),
     ] = None,
     height_sigma: Annotated[
-        float | None, typer.Option("--height-sigma", metavar="M", help="Of heights of control points; as --sigma.")
+        float | None,
+        typer.Option(
+            "--height-sigma", metavar="M", help="Standard deviation of the heights of control points; default: --sigma."
+        ),
     ] = None,
     photo_size: Annotated[
         tuple[int, int] | None,
         typer.Option(
-            "--photo-size", metavar="WIDTH HEIGHT", help="Of the photos that pixels of --gcp are of, if larger."
+            "--photo-size",
+            metavar="WIDTH HEIGHT",
+            help="Size of the photos marked in --gcp, if larger than the photos of the capture.",
         ),
     ] = None,
-    remove: Annotated[bool, typer.Option("--remove", help="Take back what was observed: all, or --name.")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove observations: those of --name, or all.")] = False,
     name: Annotated[
-        list[str] | None, typer.Option("--name", help="With --remove: a control point, photo, or scale bar.")
+        list[str] | None,
+        typer.Option("--name", help="With --remove: name of a control point, photo or scale bar; may be repeated."),
     ] = None,
     sets: Sets = None,
     json: AsJson = False,
 ) -> None:
-    """Tie a map to the world by control points, positions of photos and lengths; alone, show how well they fit.
+    """Georeference a map by control points, photo positions and scale bars. Without options, show the residuals.
 
     Example: `gsmap georeference site.gsmap --crs EPSG:25832 --gcp gcp_list.txt --check P4,P7`
     """
@@ -73,16 +90,14 @@ def command(
     from gsmap.map.photo_poses import photo_localizer
     from gsmap.map.stages.georeference import Request
 
-    said = any(one is not None for one in (crs, gcp, exif, scale_bar, check))
-    if remove and said:
-        raise ConfigError(
-            "--remove takes back what was observed: leave out the other options, but --name", code="conflicting_options"
-        )
+    given = any(one is not None for one in (crs, gcp, exif, scale_bar, check))
+    if remove and given:
+        raise ConfigError("--remove can only be combined with --name", code="conflicting_options")
     if name and not remove:
-        raise ConfigError("--name goes with --remove", code="conflicting_options")
-    if not said and (sigma is not None or height_sigma is not None or photo_size is not None):
+        raise ConfigError("--name needs --remove", code="conflicting_options")
+    if not given and (sigma is not None or height_sigma is not None or photo_size is not None):
         raise ConfigError(
-            "--sigma, --height-sigma and --photo-size go with --gcp or --scale-bar", code="conflicting_options"
+            "--sigma, --height-sigma and --photo-size need --gcp or --scale-bar", code="conflicting_options"
         )
     for value in (sigma, height_sigma, *(photo_size or ())):
         if value is not None and not value > 0:
@@ -99,11 +114,11 @@ def command(
         photo_size_px=photo_size,
     )
     if photos is not None and gcp is None:
-        raise ConfigError("--photos goes with --gcp", code="conflicting_options")
+        raise ConfigError("--photos needs --gcp", code="conflicting_options")
     with opened(map, bars=True, sets=sets) as m:
         localise = None if photos is None else photo_localizer(m.store, m.localize, photos)
         taken_back = tuple(name or ()) if remove else None
-        report = m.georeference(request if said else None, remove=taken_back, localise=localise)
+        report = m.georeference(request if given else None, remove=taken_back, localise=localise)
     for note in report.notes:
         say(note)
     if json:
@@ -135,4 +150,4 @@ def _print(map: str, report: WorldReport) -> None:
         for one in tie.contradictions if not tie.problem else ():
             say(f"component {tie.component}: {one.text} Left out: {one.group}, reason {one.cause}")
         if tie.problem:
-            say(f"component {tie.component} is not tied to the world: {tie.problem}")
+            say(f"component {tie.component} is not georeferenced: {tie.problem}")

@@ -1,4 +1,4 @@
-"""gsmap graph: the scene graph of the whole map."""
+"""gsmap graph: objects of the map and their relations."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows,
 
 def command(
     map: MapPath,
-    out: Annotated[str | None, typer.Argument(metavar="[OUT]", help="The file to write it to.")] = None,
+    out: Annotated[str | None, typer.Argument(metavar="[OUT]", help="File to write.")] = None,
     format: Annotated[
         str | None,
-        typer.Option("--format", help="`json` (what --json prints) or `graphml`; by default by the file's name."),
+        typer.Option("--format", help="`json` (as --json) or `graphml`; default: by the suffix of OUT."),
     ] = None,
     sets: Sets = None,
     preset: Preset = None,
     json: AsJson = False,
 ) -> None:
-    """Show the objects of the map, over all captures, and how they stand to each other; or write them to a file.
+    """Show the objects of the map over all captures, their relations and rooms, or write them to a file.
 
     Example: `gsmap graph site.gsmap site.graphml`
     """
@@ -29,7 +29,7 @@ def command(
 
     if format is not None and out is None:
         raise ConfigError(
-            f"name a file to write as {format}: gsmap graph {map} OUT --format {format}", code="missing_option"
+            f"--format needs a file to write: gsmap graph {map} OUT --format {format}", code="missing_option"
         )
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         if out is None:

@@ -1,4 +1,4 @@
-"""gsmap history: what stood where, and when."""
+"""gsmap history: objects at a place over time."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ def command(
     map: MapPath,
     place: Annotated[
         str | None,
-        typer.Argument(metavar="[OBJECT|X,Y,Z]", help="An object's id or name (gsmap graph), or a point."),
+        typer.Argument(metavar="[OBJECT|X,Y,Z]", help="Id or name of an object (gsmap graph), or a point."),
     ] = None,
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
-        typer.Option("--box", metavar="X0 Y0 Z0 X1 Y1 Z1", help="All that ever stood in this box."),
+        typer.Option("--box", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Show all objects that were ever in this box."),
     ] = None,
     sets: Sets = None,
     preset: Preset = None,
     json: AsJson = False,
 ) -> None:
-    """Show what stood at a place: when it was seen, when it was gone, and which captures did not look there.
+    """Show the objects at a place over time: seen, absent or unobserved in each capture.
 
     Example: `gsmap history site.gsmap 1.5,0.2,0.8`
     """

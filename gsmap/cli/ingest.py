@@ -1,4 +1,4 @@
-"""gsmap ingest: add scenes."""
+"""gsmap ingest: add scenes to a map."""
 
 from __future__ import annotations
 
@@ -11,17 +11,23 @@ import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
-Paths = Annotated[list[str] | None, typer.Argument(metavar="FILE_OR_FOLDER...", help="Captures: files or folders.")]
-CamerasFile = Annotated[str | None, typer.Option("--cameras", help="Cameras of the one capture given.")]
-Name = Annotated[str | None, typer.Option("--name", help="Name of the one capture given.")]
+Paths = Annotated[list[str] | None, typer.Argument(metavar="FILE_OR_FOLDER...", help="Files or folders of captures.")]
+CamerasFile = Annotated[
+    str | None, typer.Option("--cameras", help="Camera file of the capture; only with one capture.")
+]
+Name = Annotated[str | None, typer.Option("--name", help="Name of the scene; only with one capture.")]
 CapturedAt = Annotated[
-    str | None, typer.Option("--captured-at", help="When all of these were captured, ISO 8601; found beside each else.")
+    str | None,
+    typer.Option("--captured-at", help="Date of all these captures, ISO 8601; default: as found beside each."),
 ]
 Scale = Annotated[
-    str, typer.Option("--scale", help="`known` (metres), `unknown` (any unit) or `auto` (registration finds out).")
+    str,
+    typer.Option(
+        "--scale", help="Unit of the captures: `known` (metres), `unknown`, or `auto` (registration decides)."
+    ),
 ]
 NoCreate = Annotated[
-    bool, typer.Option("--no-create", help="Fail if MAP is missing. For scripts: its disk may not be mounted.")
+    bool, typer.Option("--no-create", help="Fail if MAP is missing, for example because its disk is not mounted.")
 ]
 
 
@@ -37,14 +43,13 @@ def command(
         typer.Option(
             "--supersedes",
             metavar="SCENE",
-            help="The one capture given was trained again of this scene's frames: it takes its place.",
+            help="Replace this scene by the capture, which was trained again from the same frames.",
         ),
     ] = None,
     no_create: NoCreate = False,
     json: AsJson = False,
 ) -> None:
-    """Make MAP if it is missing, and add scenes: Gaussians with the cameras found beside them. The same content twice
-    is a no-op that says so.
+    """Add scenes to MAP, with the cameras found beside them. Creates MAP if it is missing; skips scenes it has.
 
     Example: `gsmap ingest site.gsmap monday.ply tuesday/`
     """
@@ -53,7 +58,7 @@ def command(
     refuse_capture_as_map("ingest", map, paths or [])
     if not paths:
         raise ConfigError(
-            f"name the files or folders of captures: gsmap ingest {shlex.quote(map)} FILE_OR_FOLDER...",
+            f"no captures given: gsmap ingest {shlex.quote(map)} FILE_OR_FOLDER...",
             code="nothing_requested",
         )
     create = False
@@ -78,7 +83,7 @@ def makes_map(
     name: str | None = None,
     scale: str = "auto",
 ) -> bool:
-    """Return whether MAP is missing and these captures make one; those that would be refused make none.
+    """Return true if MAP is missing and these captures can be ingested into a new map.
 
     Raises:
         GsmapError: see `gsmap.map.Map.ingest`.
@@ -93,12 +98,12 @@ def makes_map(
 
 
 def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
-    """Refuse a capture, or a folder of captures, that is named where MAP belongs, with the command that was meant.
+    """Refuse a capture, or a folder of captures, in the place of MAP, and suggest the right command.
 
-    The map is guessed: one that is named behind, or the only one in the working folder.
+    The suggested map is one named after it, or the only map in the working folder.
 
     Raises:
-        ConfigError: MAP is no map, but holds captures or photographs.
+        ConfigError: MAP is not a map, but holds captures or photos.
     """
     from gsmap.errors import ConfigError, InputError
     from gsmap.ingest import search_captures
@@ -108,7 +113,7 @@ def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
     if not given.exists() or given.suffix == ".gsmap" or has_catalog(given):
         return
     if given.is_dir() and ((given / "arrays").is_dir() or not any(given.iterdir())):
-        return  # a damaged map, or the place for one
+        return  # a damaged map, or an empty folder for a new one
     try:
         search_captures([given])
     except InputError as error:
@@ -119,6 +124,6 @@ def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
     meant = ["gsmap", verb, guess, map, *(path for path in paths if path not in named)]
     also = f" (MAP is one of {', '.join(near)})" if len(near) > 1 else ""
     raise ConfigError(
-        f"{map} holds captures and is no map; MAP comes first. Did you mean: {shlex.join(meant)}{also}",
+        f"{map} holds captures and is not a map; MAP comes first. Did you mean: {shlex.join(meant)}{also}",
         code="map_argument_first",
     )

@@ -1,4 +1,4 @@
-"""gsmap init: make an empty map."""
+"""gsmap init: create an empty map."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def command(
         typer.Option(
             "--catalog",
             metavar="URL",
-            help="Keep the catalog in this empty PostgreSQL database (an SQLAlchemy URL), for many writers.",
+            help="Keep the catalog in this empty PostgreSQL database (SQLAlchemy URL), for concurrent writers.",
         ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Make an empty map: in a folder, or in a bucket (s3://BUCKET/PREFIX, with --catalog).
+    """Create an empty map in a folder, or in a bucket (s3://BUCKET/PREFIX, with --catalog).
 
     Example: `gsmap init site.gsmap`
     """
@@ -30,7 +30,7 @@ def command(
     from gsmap.types.rows import InitReport
 
     gsmap.map.create(map, catalog_url=catalog).close()
-    say(f"made an empty map at {map}; next: gsmap update {map} CAPTURES...")
+    say(f"created an empty map at {map}; next: gsmap update {map} CAPTURES...")
     if json:
         report = InitReport(map=map, catalog=None if catalog is None else url_without_password(catalog))
         print_rows("init", report, json)

@@ -1,4 +1,4 @@
-"""gsmap list: tables of what the map holds."""
+"""gsmap list: tables of scenes, edges, revisions, tiles and photos."""
 
 from __future__ import annotations
 
@@ -28,27 +28,31 @@ def command(
     what: Annotated[ListKind, typer.Argument(help="Kind of rows to list.")],
     component: Annotated[
         int | None,
-        typer.Option("--component", "--island", help="Only scenes, edges and tiles of this connected component."),
+        typer.Option(
+            "--component", "--island", help="List only scenes, edges, tiles and photos of this connected component."
+        ),
     ] = None,
     status: Annotated[
         str | None,
-        typer.Option("--status", help="Only scenes or edges of this status; of edges also used, tentative, undecided."),
+        typer.Option(
+            "--status", help="List only scenes or edges of this status; for edges also used, tentative or undecided."
+        ),
     ] = None,
     after: Annotated[
         str | None,
         typer.Option(
             "--after",
             metavar="DATE",
-            help="Only scenes captured, edges registered and revisions made after this, ISO 8601.",
+            help="List only scenes captured, edges registered or revisions computed after this, ISO 8601.",
         ),
     ] = None,
     tag: Annotated[
-        str | None, typer.Option("--tag", help="Only scenes with this tag, and edges between such scenes.")
+        str | None, typer.Option("--tag", help="List only scenes with this tag, and edges between such scenes.")
     ] = None,
     as_of: AsOf = None,
     json: AsJson = False,
 ) -> None:
-    """List scenes, edges, revisions, tiles, or photographs that the map keeps.
+    """List scenes, edges, revisions, tiles, or photos kept by `localize --add`.
 
     Example: `gsmap list site.gsmap edges --status accepted --json`
     """
@@ -86,7 +90,7 @@ def _rows(
         useless = {"--status": status, "--component": component, "--tag": tag, "--as-of": as_of}
     for option, value in useless.items():
         if value is not None:
-            raise ConfigError(f"{what} are not chosen by {option}: leave it out", code="conflicting_options")
+            raise ConfigError(f"{option} does not apply to {what}", code="conflicting_options")
     if what is ListKind.photos:
         return [row for row in m.photo_rows() if component is None or row.component == component]
     if what is ListKind.tiles:

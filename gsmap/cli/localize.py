@@ -1,4 +1,4 @@
-"""gsmap localize: where photographs were taken, and where scans lie."""
+"""gsmap localize: estimate the poses of photos and scans in the map."""
 
 from __future__ import annotations
 
@@ -28,59 +28,63 @@ def command(
     map: MapPath,
     files: Annotated[
         list[str] | None,
-        typer.Argument(metavar="FILE...", help="Photographs, point clouds, meshes, splats.", show_default=False),
+        typer.Argument(metavar="FILE...", help="Photos, point clouds, meshes or splats.", show_default=False),
     ] = None,
     intrinsics: Annotated[
         str | None,
-        typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="Of all photos, in pixels of the upright picture."),
+        typer.Option(
+            "--intrinsics", metavar="FX,FY,CX,CY", help="Intrinsics of all photos, in pixels of the upright image."
+        ),
     ] = None,
     focal: Annotated[
         str | None,
         typer.Option(
             "--focal",
             metavar="auto|PX",
-            help="Focal length in pixels; auto solves for it, whatever the file says. By default the file's (EXIF).",
+            help="Focal length in pixels, or auto to estimate it; default: from EXIF.",
         ),
     ] = None,
     near: Annotated[
         str | None,
-        typer.Option("--near", metavar="SCENE|X,Y,Z,R", help="Look only at what this scene shows, or around a point."),
+        typer.Option("--near", metavar="SCENE|X,Y,Z,R", help="Search only near this scene, or within R of a point."),
     ] = None,
     together: Annotated[
         bool,
-        typer.Option("--together", help="The photos show one place: whoever is placed helps the others."),
+        typer.Option("--together", help="Localize the photos of one place jointly: localized photos help the others."),
     ] = False,
     video: Annotated[
-        str | None, typer.Option("--video", metavar="FILE", help="A clip: its sharpest frames, together.")
+        str | None, typer.Option("--video", metavar="FILE", help="Localize the sharpest frames of this video jointly.")
     ] = None,
     masks: Annotated[
         str | None,
         typer.Option(
-            "--masks", metavar="DIR", help="A mask of each photo, black where people stand: PHOTO.jpg.png, as COLMAP's."
+            "--masks",
+            metavar="DIR",
+            help="Folder of masks as in COLMAP, PHOTO.jpg.png, black where pixels are to be ignored.",
         ),
     ] = None,
     depth: Annotated[
         str | None,
-        typer.Option("--depth", metavar="PNG", help="A depth picture of the one photo's view; needs --intrinsics."),
+        typer.Option("--depth", metavar="PNG", help="Depth image of the view of the single photo; needs --intrinsics."),
     ] = None,
-    depth_scale: Annotated[
-        float, typer.Option("--depth-scale", help="Values of the depth picture that make a metre.")
-    ] = 1000.0,
+    depth_scale: Annotated[float, typer.Option("--depth-scale", help="Depth values per metre.")] = 1000.0,
     changes: Annotated[
-        bool, typer.Option("--changes", help="Say where placed photos show something else than the map.")
+        bool, typer.Option("--changes", help="Show where localized photos differ from the map.")
     ] = False,
     pictures: Annotated[
-        str | None, typer.Option("--pictures", metavar="DIR", help="With --changes: draw these parts, in this folder.")
+        str | None,
+        typer.Option("--pictures", metavar="DIR", help="With --changes: draw the differences into this folder."),
     ] = None,
     add: Annotated[
         bool,
         typer.Option(
-            "--add", help="Keep placed photos: evidence of what stood there, and what merged captures are to look like."
+            "--add",
+            help="Keep localized photos in the map: as object observations, and as reference photos of merged tiles.",
         ),
     ] = False,
     captured_at: Annotated[
         str | None,
-        typer.Option("--captured-at", metavar="DATE", help="With --add: when they were taken. By default EXIF's."),
+        typer.Option("--captured-at", metavar="DATE", help="With --add: date of the photos; default: from EXIF."),
     ] = None,
     sets: Sets = None,
     preset: Preset = None,
@@ -88,7 +92,9 @@ def command(
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Find where photographs were taken and scans lie, or say why not. What scenes are found by is made once, and kept.
+    """Estimate the poses of photos and scans in the map, or reject them with a reason.
+
+    The first run computes an index of the scenes, which the map keeps.
 
     Example: `gsmap localize site.gsmap phone.jpg`
     """
@@ -100,7 +106,8 @@ def command(
     if is_small(map):
         if changes or add or pictures is not None or captured_at is not None or depth is not None:
             raise ConfigError(
-                "a small map places photographs, and no more: ask the map that it is of", code="not_in_small_map"
+                "a small map only localizes photos: for --changes, --add and --depth use the map it was exported from",
+                code="not_in_small_map",
             )
         with progress_bars() as progress:
             report = localize_small(
@@ -136,7 +143,7 @@ def command(
         )
     _tell(report, json)
     if add and not json:
-        say(f"{sum(bool(row.added) for row in report.results)} kept: gsmap list {map} photos")
+        say(f"{sum(bool(row.added) for row in report.results)} photos kept; gsmap list {map} photos lists them")
 
 
 def _tell(report: LocalizeReport, json: bool) -> None:
@@ -150,7 +157,7 @@ def _tell(report: LocalizeReport, json: bool) -> None:
         if row.changes:
             print_table(f"{row.file} differs, component {row.component}", row.changes[0].columns, row.changes)
         elif row.changes is not None:
-            say(f"{row.file} shows what the map does, as far as it could be compared ({row.compared:.0%} of it)")
+            say(f"{row.file} shows no difference from the map in the compared {row.compared:.0%} of it")
         if row.picture is not None:
             say(f"drawn in {row.picture}")
     say(f"{sum(row.status == 'placed' for row in report.results)} of {len(report.results)} placed")

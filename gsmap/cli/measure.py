@@ -1,4 +1,4 @@
-"""gsmap measure: a distance in metres."""
+"""gsmap measure: measure a distance in metres."""
 
 from __future__ import annotations
 
@@ -15,16 +15,20 @@ _POINT = "X,Y,Z in the map; SCENE:X,Y,Z; SCENE:CAMERA@COLUMN,ROW; world:X,Y,Z or
 def command(
     map: MapPath,
     a: Annotated[str, typer.Argument(metavar="A", help=_POINT)],
-    b: Annotated[str, typer.Argument(metavar="B", help="Another one.")],
+    b: Annotated[str, typer.Argument(metavar="B", help="The second point, in the same forms.")],
     component: Annotated[
-        int | None, typer.Option("--component", "--island", help="Of points given in the map, where it has several.")
+        int | None,
+        typer.Option(
+            "--component", "--island", help="Component of points given in map coordinates, if the map has several."
+        ),
     ] = None,
     crs: Annotated[
-        str | None, typer.Option("--crs", metavar="EPSG:N", help="Of the world coordinates shown; else the map's own.")
+        str | None,
+        typer.Option("--crs", metavar="EPSG:N", help="CRS of the printed world coordinates; default: that of the map."),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Measure how far two points are apart, in metres, with the standard deviation of that.
+    """Measure the distance of two points in metres, with its standard deviation.
 
     Example: `gsmap measure site.gsmap monday:1.2,0.4,2.0 monday:0007.jpg@812,410`
     """

@@ -1,4 +1,4 @@
-"""gsmap merge: take in all that another map knows."""
+"""gsmap merge: merge another map into a map."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 def command(
     map: MapPath,
     source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="The map, branch or tag to take in; it stays as it is.")
+        str, typer.Argument(metavar="SOURCE", help="The map, branch or tag to merge; it is not changed.")
     ],
     json: AsJson = False,
 ) -> None:
-    """Take all that another map knows into MAP: scenes, graphs, edges, what people said, revisions.
+    """Merge another map into MAP: its scenes, scene graphs, edges, annotations, reviews and revisions.
 
-    Nothing is computed. `gsmap update MAP` then registers only pairs across the two.
+    Nothing is computed. The next `gsmap update MAP` registers only pairs across the two maps.
 
     Example: `gsmap merge site.gsmap site.gsmap@what-if`
     """
@@ -27,5 +27,5 @@ def command(
     for note in report.notes:
         say(note)
     for old, new in report.renamed.items():
-        say(f"{old} is called {new} here: its name was taken")
+        say(f"scene {old} was renamed to {new}, because {map} has a scene {old}")
     print_rows("merge", report, json, f"from {source}")

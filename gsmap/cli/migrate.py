@@ -1,4 +1,4 @@
-"""gsmap migrate: bring an older map up to date."""
+"""gsmap migrate: upgrade a map to the current schema."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from gsmap.cli.console import AsJson, MapPath, print_rows, say
 
 
 def command(map: MapPath, json: AsJson = False) -> None:
-    """Upgrade a map made by an older gsmap to this version's schema.
+    """Upgrade a map of an older gsmap to the schema of this version.
 
     Example: `gsmap migrate site.gsmap`
     """

@@ -1,4 +1,4 @@
-"""gsmap models: ONNX models a map describes its scenes with."""
+"""gsmap models: ONNX models with which a map describes its scenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="ONNX models for masks (`sam`), image features (`clip`), words (`clip-text`), local features (`extractor`).",
+    help="Manage ONNX models: masks (`sam`), image and text features (`clip`), local features (`extractor`).",
 )
 
 
@@ -24,18 +24,20 @@ def add(
         ),
     ],
     path: Annotated[
-        str, typer.Argument(metavar="FILE", help="The .onnx file; of `clip-tokenizer` the tokenizer.json.")
+        str, typer.Argument(metavar="FILE", help="The .onnx file; for `clip-tokenizer` the tokenizer.json.")
     ],
     preset: Annotated[
         str,
-        typer.Option("--preset", help="Pixel scaling: `clip`, `imagenet`, `unit`, or `mean=..,..,..;std=..,..,..`."),
+        typer.Option(
+            "--preset", help="Pixel normalization: `clip`, `imagenet`, `unit`, or `mean=..,..,..;std=..,..,..`."
+        ),
     ] = "clip",
     reference: Annotated[
-        bool, typer.Option("--reference", help="Leave the file where it is; keep its digest.")
+        bool, typer.Option("--reference", help="Store the path and digest instead of a copy of the file.")
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Register a model: checked, copied into the map, and used by every later describe.
+    """Check a model, copy it into the map, and use it in every later describe.
 
     Example: `gsmap models add site.gsmap clip mobilenet.onnx --preset imagenet`
     """
@@ -49,7 +51,7 @@ def add(
 
 @app.command(name="list")
 def list_models(map: MapPath, json: AsJson = False) -> None:
-    """List the map's models.
+    """List the models of a map.
 
     Example: `gsmap models list site.gsmap`
     """

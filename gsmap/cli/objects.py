@@ -95,4 +95,4 @@ OBJECTS: dict[str, Object] = {
     "view": OneRow(rows.ViewReport),
     "demo": OneRow(rows.DemoReport),
 }
-"""By verb, with what tells its forms apart."""
+"""JSON object by verb; verbs with several forms have one entry per form."""

@@ -1,4 +1,4 @@
-"""gsmap optimize: a new revision of all scene poses."""
+"""gsmap optimize: solve the pose graph."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows,
 
 
 def command(map: MapPath, sets: Sets = None, preset: Preset = None, json: AsJson = False) -> None:
-    """Solve for all scene poses and keep them as a new revision.
+    """Estimate all scene poses from the edges, and store them as a new revision.
 
     Example: `gsmap optimize site.gsmap`
     """

@@ -1,4 +1,4 @@
-"""gsmap poses: poses for other programs."""
+"""gsmap poses: print scene poses, or write them in formats of other programs."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ def command(
     out: Annotated[
         str | None,
         typer.Argument(
-            metavar="[OUT]", help="The file to write (for colmap a folder); each component its own where several are."
+            metavar="[OUT]", help="File to write (for colmap a folder); one per component if there are several."
         ),
     ] = None,
     format: Annotated[
         str | None,
         typer.Option(
             "--format",
-            help="`tum` (a pose per scene), `g2o` (with edges), `colmap` or `nerfstudio` (a camera each), or `json`; "
-            "by default `json`.",
+            help="`tum` (scene poses), `g2o` (scene poses and edges), `colmap` or `nerfstudio` (camera poses), "
+            "or `json`; default: json.",
         ),
     ] = None,
     crs: Annotated[
         str | None,
         typer.Option(
-            "--crs", metavar="EPSG:N", help="Of the world coordinates shown; by default that of `gsmap georeference`."
+            "--crs", metavar="EPSG:N", help="CRS of the world coordinates; default: that of `gsmap georeference`."
         ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Show where the scenes lie, and write it for other programs.
+    """Show the poses of the scenes, or write them to a file for other programs.
 
     Example: `gsmap poses site.gsmap site.tum --format tum`
     """
@@ -41,7 +41,7 @@ def command(
 
     if format is not None and out is None:
         raise ConfigError(
-            f"name a file to write as {format}: gsmap poses {map} OUT --format {format}", code="missing_option"
+            f"--format needs a file to write: gsmap poses {map} OUT --format {format}", code="missing_option"
         )
     with opened(map) as m:
         rows = m.pose_rows(crs)

@@ -1,4 +1,4 @@
-"""gsmap prior: what is known of a scene's pose from outside."""
+"""gsmap prior: set a pose prior of a scene."""
 
 from __future__ import annotations
 
@@ -8,38 +8,44 @@ import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
-# An anchor gives way to nothing; a tape measures to a percent.
+# Standard deviations: an anchor is practically fixed; a tape measure is exact to one percent.
 _ANCHOR_RAD, _ANCHOR_M, _SCALE_SIGMA = 1e-4, 1e-4, 0.01
 
 
 def command(
     map: MapPath,
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id of the scene.")],
     position: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--position", metavar="X Y Z", help="Where the scene's origin lies in the map (GPS, survey)."),
+        typer.Option(
+            "--position", metavar="X Y Z", help="Position of the origin of the scene frame, in the map frame."
+        ),
     ] = None,
     sigma: Annotated[
         float,
-        typer.Option("--sigma", help="Standard deviation of the position, per axis; of one in the world in metres."),
+        typer.Option(
+            "--sigma", help="Standard deviation of the position per axis, in map units; of a world position in metres."
+        ),
     ] = 1.0,
     latitude: Annotated[
-        float | None, typer.Option("--latitude", help="Where the scene's origin lies in the world, degrees north.")
+        float | None, typer.Option("--latitude", help="Latitude of the origin of the scene frame, in degrees north.")
     ] = None,
-    longitude: Annotated[float | None, typer.Option("--longitude", help="The same, degrees east.")] = None,
+    longitude: Annotated[float | None, typer.Option("--longitude", help="Its longitude, in degrees east.")] = None,
     height: Annotated[
-        float | None, typer.Option("--height", help="The same, metres above the WGS 84 ellipsoid (not sea level).")
+        float | None, typer.Option("--height", help="Its height in metres above the WGS 84 ellipsoid (not sea level).")
     ] = None,
-    scale: Annotated[float | None, typer.Option("--scale", help="Map units per unit of the scene, to 1 %.")] = None,
+    scale: Annotated[
+        float | None, typer.Option("--scale", help="Map units per scene unit, with a standard deviation of 1 %.")
+    ] = None,
     up: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--up", metavar="X Y Z", help="The direction against gravity in the scene's frame."),
+        typer.Option("--up", metavar="X Y Z", help="Direction opposite to gravity, in the scene frame."),
     ] = None,
-    anchor: Annotated[bool, typer.Option("--anchor", help="The map's frame is this scene's own.")] = False,
-    remove: Annotated[bool, typer.Option("--remove", help="Take back what was said.")] = False,
+    anchor: Annotated[bool, typer.Option("--anchor", help="Make the scene frame the map frame.")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the prior.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Tell where a scene lies, in place of what was said of it before. The next optimize weighs it with the edges.
+    """Set a pose prior for a scene, replacing the previous one. The next optimize combines it with the edges.
 
     Example: `gsmap prior site.gsmap monday --position 12.5 3.0 0.8 --sigma 0.5`
     """
@@ -51,12 +57,12 @@ def command(
     world = [latitude, longitude, height]
     in_world = any(one is not None for one in world)
     if in_world and None in world:
-        raise ConfigError("a position in the world has --latitude, --longitude and --height", code="missing_option")
-    said = [position is not None or scale is not None or up is not None, anchor, remove, in_world]
-    if sum(said) != 1:
+        raise ConfigError("a world position needs all of --latitude, --longitude and --height", code="missing_option")
+    kinds = [position is not None or scale is not None or up is not None, anchor, remove, in_world]
+    if sum(kinds) != 1:
         raise ConfigError(
-            "say where the scene lies (--position, --scale, --up, or --latitude, --longitude and --height), or "
-            "--anchor, or --remove",
+            "pass exactly one kind of prior: --position, --scale and --up; or --latitude, --longitude and --height; or "
+            "--anchor; or --remove",
             code="nothing_requested",
         )
     if not sigma > 0 or (scale is not None and not scale > 0):

@@ -1,4 +1,4 @@
-"""gsmap prune: reclaim what nothing names."""
+"""gsmap prune: delete unused files of a map."""
 
 from __future__ import annotations
 
@@ -14,14 +14,12 @@ def command(
     map: MapPath,
     keep_revisions: Annotated[
         int | None,
-        typer.Option(
-            "--keep-revisions", help="Keep only the newest N revisions; of older ones their line in the list."
-        ),
+        typer.Option("--keep-revisions", help="Keep the poses of the newest N revisions only; older ones stay listed."),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Delete nothing: only say what would go.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be deleted.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Delete leftovers of interrupted work and arrays of removed scenes that no kept revision names.
+    """Delete leftovers of interrupted runs, and arrays of removed scenes that no remaining revision uses.
 
     Example: `gsmap prune site.gsmap --dry-run`
     """
@@ -39,7 +37,7 @@ def command(
 
 
 def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """First and last of numbers that follow one another."""
+    """Return first and last number of each run of consecutive numbers."""
     out: list[tuple[int, int]] = []
     for number in sorted(numbers):
         if out and number == out[-1][1] + 1:

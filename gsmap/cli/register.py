@@ -1,4 +1,4 @@
-"""gsmap register: edges for candidate pairs that lack one."""
+"""gsmap register: register candidate pairs of scenes."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def command(
         typer.Option(
             "--pairs",
             metavar="auto|all|A:B|FILE",
-            help="`auto` (candidates), `all`, one pair `A:B`, or a file with a pair a line, `A B` or `A:B`; "
-            "pairs that are named are done again.",
+            help="`auto` (candidates), `all`, one pair `A:B`, or a file with one pair per line, `A B` or `A:B`; "
+            "pairs given by name are registered again.",
         ),
     ] = "auto",
     sets: Sets = None,
@@ -27,7 +27,7 @@ def command(
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Register candidate pairs of scenes that lack an edge.
+    """Register candidate pairs of scenes that have not been registered.
 
     Example: `gsmap register site.gsmap --pairs monday:tuesday`
     """

@@ -1,4 +1,4 @@
-"""gsmap reject: a person's review of an edge or a change."""
+"""gsmap reject: rule out an edge or a change by review."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 def command(
     map: MapPath,
     what: Annotated[
-        str, typer.Argument(metavar="A:B|CHANGE", help="The pair, by names or ids; or a change, such as c12.")
+        str, typer.Argument(metavar="A:B|CHANGE", help="Pair of scenes, by names or ids, or a change such as c12.")
     ],
-    note: Annotated[str, typer.Option("--note", help="Why, for whoever asks later.")] = "",
+    note: Annotated[str, typer.Option("--note", help="Reason; kept in the history.")] = "",
     withdraw: Annotated[
-        bool, typer.Option("--withdraw", help="Take back the last review, or else the pair's own measurement.")
+        bool,
+        typer.Option(
+            "--withdraw", help="Withdraw the last review, or the measured edge (`gsmap edge`) if there is none."
+        ),
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Rule out an edge, so that it is never used; or a change that is none. Kept in history.
+    """Reject an edge, so that optimize never uses it, or reject a change that is not real.
 
     Example: `gsmap reject site.gsmap monday:tuesday`
     """

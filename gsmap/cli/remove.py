@@ -1,4 +1,4 @@
-"""gsmap remove: take a scene out of the map."""
+"""gsmap remove: remove a scene or a photo."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ if TYPE_CHECKING:
 
 def command(
     map: MapPath,
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id of the scene.")],
     purge: Annotated[
         bool,
-        typer.Option("--purge", help="Forget it for good: rows, arrays, tiles made with it. There is no way back."),
+        typer.Option("--purge", help="Delete the scene with all its results and tiles. This cannot be undone."),
     ] = False,
     branches: Annotated[
-        bool, typer.Option("--branches", help="With --purge: from the branches and tags of the map, too.")
+        bool, typer.Option("--branches", help="With --purge: also purge it from the branches and tags of the map.")
     ] = False,
     photo: Annotated[
-        bool, typer.Option("--photo", help="It names a photograph that is kept: by file, number (p3) or digest.")
+        bool,
+        typer.Option("--photo", help="Remove a photo kept by `localize --add`, given by file, number (p3) or digest."),
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Take a scene out of the map. Older revisions keep it; `gsmap prune` reclaims bytes nothing names.
+    """Remove a scene from the map. Older revisions keep it; `gsmap prune` frees the space of unused files.
 
-    With --purge nothing keeps it, and the receipt says where else it may live. Interrupted, the same command goes on.
+    With --purge it is deleted everywhere in the map, and the output lists other places that may hold it. If
+    interrupted, run the same command again.
 
     Example: `gsmap remove site.gsmap monday`
     """
     from gsmap.errors import ConfigError
 
     if branches and not purge:
-        raise ConfigError(
-            "--branches goes with --purge: without it a branch keeps its own scenes", code="conflicting_options"
-        )
+        raise ConfigError("--branches needs --purge: remove alone does not change branches", code="conflicting_options")
     if photo and (purge or branches):
         raise ConfigError(
-            "--photo goes alone: gsmap prune reclaims the picture of one that was taken back",
+            "--photo cannot be combined with --purge or --branches: gsmap prune deletes the files of removed photos",
             code="conflicting_options",
         )
     with opened(map) as m:
         if photo:
-            taken_back = m.remove_photo(scene)
-            say(f"removed photo {taken_back.file}")
+            removed = m.remove_photo(scene)
+            say(f"removed photo {removed.file}")
             if json:
-                print_rows("remove --photo", taken_back, json)
+                print_rows("remove --photo", removed, json)
             return
         if purge:
             report = m.purge(scene, branches=branches)
@@ -65,14 +65,14 @@ def command(
 def _tell(report: PurgeReport, map: str) -> None:
     """Print the remaining steps and their commands."""
     for name in report.branches:
-        say(f"{name} still has it: gsmap remove {map} {report.scene_id} --purge --branches")
+        say(f"{name} still has the scene: gsmap remove {map} {report.scene_id} --purge --branches")
     for name in report.backups:
-        say(f"the backup {name} may hold it")
+        say(f"the backup {name} may hold the scene")
     for name in report.exports:
-        say(f"tiles or pictures were deleted in {name}: export again to fill the places of tiles")
+        say(f"tiles or pictures were deleted in {name}: export again to replace the tiles")
     for name in report.unreachable:
-        say(f"tiles made with it may lie in {name}")
+        say(f"tiles made from the scene may lie in {name}")
     for name in report.mentions:
-        say(f"{name} mentions it: people wrote that, so it stays")
+        say(f"{name} mentions the scene; annotations by people are kept")
     if report.linked_files:
-        say("its files have other names on this disk: a map that it was merged or split into, or a clone, has it")
+        say("a clone, or a map that the scene was merged or split into, shares its files through hard links")

@@ -1,4 +1,4 @@
-"""gsmap report: the map on one page."""
+"""gsmap report: a summary of the map as one HTML page."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 def command(
     map: MapPath,
-    out: Annotated[str, typer.Argument(metavar="OUT.html", help="The page; a report that is there is replaced.")],
+    out: Annotated[str, typer.Argument(metavar="OUT.html", help="Page to write; replaces an older report.")],
     since: Annotated[
-        str | None, typer.Option("--since", metavar="DATE", help="Also tell what is new since then, ISO 8601.")
+        str | None, typer.Option("--since", metavar="DATE", help="Also list what is new since this date, ISO 8601.")
     ] = None,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw doubtful pairs and changes.")] = True,
     json: AsJson = False,
 ) -> None:
-    """Write one page that shows the map, what is doubtful and what to do; it holds all it shows and loads nothing.
+    """Write a self-contained HTML page that shows the map, doubtful edges and open tasks.
 
     Example: `gsmap report site.gsmap monday.html --since 2026-11-01`
     """

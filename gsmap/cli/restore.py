@@ -1,4 +1,4 @@
-"""gsmap restore: a map from a backup."""
+"""gsmap restore: restore a map from a backup."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from gsmap.cli.console import AsJson, print_rows, progress_bars, say
 
 def command(
     dest: Dest,
-    map: Annotated[str, typer.Argument(metavar="MAP", help="The map to make.", show_default=False)],
+    map: Annotated[str, typer.Argument(metavar="MAP", help="The map to create.", show_default=False)],
     at: Annotated[
         str | None,
         typer.Option(
-            "--at", metavar="TIME|SNAPSHOT", help="The last snapshot at or before a time, or one by its name."
+            "--at",
+            metavar="TIME|SNAPSHOT",
+            help="Restore the last snapshot at or before this time, or the snapshot of this name.",
         ),
     ] = None,
     catalog: Annotated[
@@ -25,11 +27,10 @@ def command(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Make a map from a backup, by default from its newest snapshot.
+    """Restore a map from a backup; default: from its newest snapshot.
 
-    Every byte is verified; MAP appears whole or not at all, and nothing that exists is overwritten.
-
-    It is the same map, with the same id. For another one that begins with the same content: `gsmap clone`.
+    Every byte is verified. MAP is created completely or not at all, and no existing file is overwritten. The restored
+    map has the id of the original; use `gsmap clone` to create a different map with the same content.
 
     Example: `gsmap restore /mnt/backup/site site.gsmap --at 2026-11-20`
     """
@@ -39,6 +40,6 @@ def command(
         report = gsmap.map.restore(dest, map, at, progress, catalog_url=catalog)
     say(f"restored {map} as of {report.snapshot.created_at} (snapshot {report.snapshot.snapshot})")
     if report.needs_migration:
-        say(f"it was written by an older gsmap: run gsmap migrate {map}")
+        say(f"the backup is from an older gsmap: run gsmap migrate {map}")
     if json:
         print_rows("restore", report, json)

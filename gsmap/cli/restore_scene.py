@@ -1,4 +1,4 @@
-"""gsmap restore-scene: a removed scene lives again."""
+"""gsmap restore-scene: restore a removed scene."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 def command(
     map: MapPath,
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Last name, id, or the beginning of an id.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Last name, id, or start of the id.")],
     source: Annotated[
         str | None,
-        typer.Option("--from", metavar="OTHERMAP", help="Take it from this map, branch, tag or restored backup."),
+        typer.Option(
+            "--from", metavar="OTHERMAP", help="Copy the scene from this map, branch, tag or restored backup."
+        ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Bring back a removed scene whose arrays are still there, or take a scene of another map.
+    """Restore a removed scene whose arrays still exist, or copy a scene from another map.
 
-    It comes with its graphs, its edges to scenes that are here, and what people said of it. With --from, arrays of it
-    that are here and damaged are mended.
+    The scene comes with its scene graphs, its annotations and its edges to scenes of MAP. With --from, damaged arrays
+    of the scene in MAP are repaired.
 
     Example: `gsmap restore-scene site.gsmap monday`
     """
     with opened(map) as m:
         row = m.restore_scene(scene, source)
-    say(f"{row.name} is here and whole; run: gsmap update {map}")
+    say(f"{row.name} is restored; run: gsmap update {map}")
     print_rows("restore-scene", row, json, "scene")

@@ -1,4 +1,4 @@
-"""gsmap settings: every parameter, its value and its meaning."""
+"""gsmap settings: settings with their values and meanings."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ def command(
     map: MapPath,
     sets: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="A.B=VALUE", help="Change a setting of this map from now on; may be repeated."),
+        typer.Option("--set", metavar="A.B=VALUE", help="Change a setting of this map permanently; may be repeated."),
     ] = None,
     preset: Annotated[
-        str | None, typer.Option("--preset", help="The preset to start from, from now on: `default` or `paper`.")
+        str | None, typer.Option("--preset", help="Preset of this map from now on: `default` or `paper`.")
     ] = None,
     unset: Annotated[
         list[str] | None,
-        typer.Option("--unset", metavar="A.B", help="Let a setting have its default again; may be repeated."),
+        typer.Option("--unset", metavar="A.B", help="Reset a setting to its default; may be repeated."),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Show all settings of a map, or change some in its `settings.toml`. Results that they influence are made again.
+    """Show the settings of a map, or change some in its `settings.toml`. Affected results are computed again.
 
     Example: `gsmap settings site.gsmap --set register.verdict.max_log_nfa=-6`
     """

@@ -1,4 +1,4 @@
-"""gsmap show: everything known about one thing."""
+"""gsmap show: details of a scene, a pair or a change."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gsmap.types.metric_scale import MetricScale
     from gsmap.types.rows import ChangeDetail, PairReport, SceneReport
 
-_SHOWN = 8  # edges, notes and events shown of many, so that everything fits a screen
+_SHOWN = 8  # maximum number of edges, notes and events, so that everything fits a screen
 
 
 def command(
@@ -24,21 +24,21 @@ def command(
         str,
         typer.Argument(
             metavar="SCENE|A:B|CHANGE",
-            help="A scene, a pair of scenes, or a change such as c12; a scene of that name first.",
+            help="A scene, a pair of scenes, or a change such as c12; scene names take precedence.",
         ),
     ],
-    nodes: Annotated[bool, typer.Option("--nodes", help="Also list the nodes of the scene's graph.")] = False,
+    nodes: Annotated[bool, typer.Option("--nodes", help="Also list the nodes of the scene graph.")] = False,
     picture: Annotated[
         str | None,
         typer.Option(
             "--picture",
             metavar="FILE.png",
-            help="Also draw a scene's graph, both captures of a pair from the same cameras, or a change, to here.",
+            help="Also draw the scene graph, both captures of the pair from the same cameras, or the change.",
         ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Show everything known about one scene, one pair or one change.
+    """Show all details of one scene, one pair of scenes or one change.
 
     Example: `gsmap show site.gsmap monday --picture monday.png`
     """
@@ -66,7 +66,7 @@ def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail:
     from gsmap.map.changes import change_number
 
     try:
-        return m.show_scene(thing)  # whose name may hold a colon, or look like that of a change
+        return m.show_scene(thing)  # a scene name may contain a colon, or look like a change
     except NotFoundError:
         if change_number(thing) is not None:
             return m.show_change(thing)
@@ -86,7 +86,7 @@ def _print_scene(scene: SceneReport, nodes: bool) -> None:
         "component": scene.component,
         "pose in the map (map units)": _pose(scene.S_map_scene),
         "its sigmas": sigmas,
-        "known from outside": prior and f"{_pose(prior.S_map_scene)}; {prior.outcome}",
+        "pose prior": prior and f"{_pose(prior.S_map_scene)}; {prior.outcome}",
         "captured": _captured(scene),
         "ingested": scene.ingested_at,
         "read from": scene.origin,
@@ -97,7 +97,7 @@ def _print_scene(scene: SceneReport, nodes: bool) -> None:
         "size": f"{shown(size)} units",
         "scale": scene.scale_policy + ("" if scene.unit_m is None else f", about {shown(scene.unit_m)} m a unit"),
         "map": None if metre is None else metre.text(),
-        "note on the metre": scene.metre_note or None,
+        "note on the metric scale": scene.metre_note or None,
         "up": scene.up,
         "nodes": None if scene.num_nodes is None else _layers(scene),
         **{f"note {i}": note for i, note in enumerate(scene.notes[:_SHOWN], 1)},
@@ -142,7 +142,7 @@ def _print_change(change: ChangeDetail) -> None:
         "to": f"{change.newer_name}, {change.newer_at}",
         "status": change.status,
         "confidence": change.confidence,
-        "middle (m)": change.at_m,
+        "centre (m)": change.at_m,
         "size (m)": change.size_m,
         "component": change.component,
         "moved": _pose(change.S_after_before),
@@ -177,12 +177,12 @@ def _captured(scene: SceneReport) -> str | None:
     """Format the capture date and its source."""
     if scene.captured_at is None:
         return None
-    said = [fact.author for fact in scene.history if fact.fact == "captured_at"]
-    return f"{scene.captured_at}, said by {(said and said[-1]) or 'a person'}"
+    authors = [fact.author for fact in scene.history if fact.fact == "captured_at"]
+    return f"{scene.captured_at}, specified by {(authors and authors[-1]) or 'a person'}"
 
 
 def _metre(scene: SceneReport) -> MetricScale | None:
-    """Of the frame that it is placed in."""
+    """Return the metric scale of the component frame of a scene."""
     from gsmap.types.metric_scale import MetricScale, as_known_by
 
     if not scene.metre_known_by:

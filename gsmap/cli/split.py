@@ -1,4 +1,4 @@
-"""gsmap split: part of a map as a map of its own."""
+"""gsmap split: copy part of a map to a new map."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 def command(
     map: MapPath,
-    out: Annotated[str, typer.Argument(metavar="OUT", help="The map to make.")],
+    out: Annotated[str, typer.Argument(metavar="OUT", help="The map to create.")],
     island: Annotated[
-        int | None, typer.Option("--island", "--component", help="The scenes of this connected component.")
+        int | None, typer.Option("--island", "--component", help="Take the scenes of this connected component.")
     ] = None,
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
             "--box",
             metavar="X0 Y0 Z0 X1 Y1 Z1",
-            help="The scenes that reach into this box of the component of --island, else of the largest.",
+            help="Take the scenes that reach into this box of the component --island; default: of the largest.",
         ),
     ] = None,
-    by_name: Annotated[bool, typer.Option("--scenes", help="The scenes that follow.")] = False,
-    scenes: Annotated[list[str] | None, typer.Argument(metavar="[SCENES]...", help="Names or ids.")] = None,
+    by_name: Annotated[bool, typer.Option("--scenes", help="Take the scenes named after OUT.")] = False,
+    scenes: Annotated[list[str] | None, typer.Argument(metavar="[SCENES]...", help="Names or ids of scenes.")] = None,
     json: AsJson = False,
 ) -> None:
-    """Make a new map of some scenes of MAP, with all that is known of and among them. MAP stays as it is.
+    """Copy some scenes of MAP, with their results and annotations, to a new map. MAP is not changed.
 
-    Nothing is computed. Of the history the newest poses come along.
+    Nothing is computed. The new map has the newest poses only, without older revisions.
 
     Example: `gsmap split site.gsmap hall.gsmap --scenes monday tuesday`
     """

@@ -1,14 +1,14 @@
-"""gsmap status: what to do next."""
+"""gsmap status: open tasks of a map."""
 
 from __future__ import annotations
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table
 
-_SHOWN = 4  # components whose metre is told: the largest
+_SHOWN = 4  # number of components whose metric scale is printed, largest first
 
 
 def command(map: MapPath, json: AsJson = False) -> None:
-    """Show what is missing, stale or wants a person, each with the command that helps.
+    """Show missing and stale results and open reviews, each with the command to run.
 
     Example: `gsmap status site.gsmap`
     """
@@ -24,7 +24,7 @@ def command(map: MapPath, json: AsJson = False) -> None:
     components = f"{report.components} component{'s' * (report.components != 1)}"
     whole = [
         row for row in report.at_work if row.what.split(" ")[0] not in ("graph", "edge", "comparison")
-    ]  # and not each job
+    ]  # without single jobs
     if whole:
         print_table("at work", whole[0].columns, whole)
     print(

@@ -1,4 +1,4 @@
-"""gsmap tag: a state of a map that stays."""
+"""gsmap tag: a read-only snapshot of a map under a name."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from gsmap.cli.console import AsJson, MapPath
 
 def command(
     map: MapPath,
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="What to call it.", show_default=False)] = None,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Name of the tag.", show_default=False)] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Delete the tag NAME.")] = False,
     list_all: Annotated[bool, typer.Option("--list", help="List the tags of the map.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Tag a map: its state as of now, which cannot change any more, opened as MAP@NAME wherever a map is given.
+    """Tag the current state of a map. A tag cannot change; open it as MAP@NAME in any command.
 
-    It shares the arrays of the map, which keep as long as the tag does. Without NAME the tags are listed.
+    It shares the arrays of the map, which are kept as long as the tag exists. Without NAME, the tags are listed.
 
     Example: `gsmap tag site.gsmap handover-2024`
     """

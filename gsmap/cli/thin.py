@@ -1,4 +1,4 @@
-"""gsmap thin: keep captures compact that newer ones supersede."""
+"""gsmap thin: reduce captures that newer ones supersede."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _UNITS = {"": 1, "B": 1} | {
 def command(
     map: MapPath,
     keep_days: Annotated[
-        float | None, typer.Option("--keep-days", help="Captures of the last N days stay as they are.")
+        float | None, typer.Option("--keep-days", help="Do not thin captures of the last N days.")
     ] = None,
     budget: Annotated[
-        str | None, typer.Option("--budget", help="Thin only until the captures fit into this, such as 2GiB.")
+        str | None, typer.Option("--budget", help="Stop when the captures fit into this size, such as 2GiB.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Change nothing: only say what would be thinned.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be thinned.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Keep old captures compact where newer ones looked at all they show; poses, edges and words stay.
+    """Reduce old captures whose surfaces newer captures show. Poses, edges and annotations are kept.
 
-    A thinned capture is exported, also as of its date, as before to within 0.1 dB, in about a sixth of the bytes. Its
-    graph goes, and with it its things in `gsmap graph`: the newer captures stand for it when others are registered.
-    This cannot be undone but by ingesting the capture again.
+    A thinned capture takes about a sixth of the bytes, and its exports differ by at most 0.1 dB. Its scene graph is
+    deleted, with its objects in `gsmap graph`: other scenes are registered with the newer captures instead. To undo
+    thinning, ingest the capture again.
 
     Example: `gsmap thin site.gsmap --keep-days 365 --dry-run`
     """
@@ -46,19 +46,19 @@ def command(
             verb = "would be thinned" if dry_run else "is thinned"
             say(f"{row.scene_name} {verb}: {row.num_bytes_before / 1e6:.1f} to {row.num_bytes_after / 1e6:.1f} MB")
         else:
-            say(f"{row.scene_name} stays as it is: {row.reason}")
+            say(f"{row.scene_name} is not thinned: {row.reason}")
     if report.num_undated:
-        say(f"{report.num_undated} captures have no date and stay: gsmap edit MAP SCENE --captured-at DATE gives one")
-    print(f"{'would hold' if dry_run else 'holds'} {report.num_bytes / 1e6:.1f} MB")
+        say(f"{report.num_undated} undated captures are not thinned; gsmap edit MAP SCENE --captured-at DATE sets one")
+    print(f"{'captures would take' if dry_run else 'captures take'} {report.num_bytes / 1e6:.1f} MB")
     if not report.fits:
-        say(f"that is more than {budget}: nothing else is old, superseded and dated")
+        say(f"that is more than {budget}: no other capture can be thinned")
 
 
 def parse_size(text: str) -> int:
-    """Bytes of a size such as ``500MB``, ``2GiB`` or ``1.5G``.
+    """Parse a size such as ``500MB``, ``2GiB`` or ``1.5G`` into bytes.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: The text is not a size.
     """
     number = text.strip().rstrip("KMGTiB").strip()
     unit = text.strip()[len(text.strip().rstrip("KMGTiB")) :]

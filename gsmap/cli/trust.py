@@ -1,4 +1,4 @@
-"""gsmap trust: allow a map to connect to the server that it names."""
+"""gsmap trust: allow connections to the catalog server of a map."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from gsmap.texts import shown
 
 def command(
     map: MapPath,
-    yes: Annotated[bool, typer.Option("--yes", help="Trust it without asking.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Trust the server without a prompt.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Show which server a map keeps its catalog on, and trust it: from then on it is connected to, with your password.
+    """Show the catalog server of a map, and allow gsmap to connect to it with your password from now on.
 
     Example: `gsmap trust site.gsmap`
     """
@@ -27,12 +27,12 @@ def command(
         print_rows("trust", report, json, map)
     if not report.trusted:
         if not yes and sys.stdin.isatty():
-            question = f"connect to {report.server} as {report.user or 'yourself'}, from now on?"
+            question = f"allow connections to {report.server} as {report.user or 'yourself'} from now on?"
             yes = typer.confirm(shown(question), err=True)
         if yes:
             report = gsmap.map.trust(map)
         else:
-            say(f"nothing was sent; gsmap trust {map} --yes trusts it")
+            say(f"not trusted, and nothing was sent; to trust the server: gsmap trust {map} --yes")
     if json:
         print_rows("trust", report, json)
     if not report.trusted:

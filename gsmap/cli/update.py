@@ -1,4 +1,4 @@
-"""gsmap update: everything that is missing."""
+"""gsmap update: ingest captures and compute all missing results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def command(
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Make MAP if it is missing, ingest the files, then describe, register and optimize whatever is missing.
+    """Ingest captures, then describe, register and optimize what is missing. Creates MAP if it is missing.
 
     Example: `gsmap update house.gsmap captures/*.ply`
     """
@@ -36,11 +36,11 @@ def command(
     from gsmap.ingest import given_date
     from gsmap.store import Store
 
-    given_date(captured_at)  # refuses what is none before a map is made
+    given_date(captured_at)  # fail before a map is created
     refuse_capture_as_map("update", map, paths or [])
     if not no_create and not paths and not Store.exists(map):
         raise NotFoundError(
-            f"no map at {map}: name captures to make one of, or run gsmap init {map}", code="map_not_found"
+            f"no map at {map}: pass captures to create it, or run gsmap init {map}", code="map_not_found"
         )
     create = not no_create and makes_map(map, paths or [], captured_at)
     with opened(map, create=create, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
@@ -71,7 +71,7 @@ def command(
 
 
 def print_map(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
-    """The closing tables of a whole map, and a line that sums them up."""
+    """Print the tables of scenes and edges of a map, with a summary line."""
     print_rows_of(scenes, edges)
     placed = [row for row in scenes if row.S_map_scene is not None]
     components = {row.component for row in placed}
@@ -83,7 +83,7 @@ def print_map(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
 
 
 def print_rows_of(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
-    """Tables of scenes and of edges with reasons, of which there may be none."""
+    """Print a table of scenes and a table of edges with reasons, each only if it has rows."""
     columns = {
         "name": "scene",
         "status": "status",

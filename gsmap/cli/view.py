@@ -1,4 +1,4 @@
-"""gsmap view: the map in a browser."""
+"""gsmap view: show a map in a browser."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ from gsmap.cli.stopping import StopSignal
 
 def command(
     map: MapPath,
-    port: Annotated[int, typer.Option("--port", help="Port on this machine; 0 takes a free one.")] = 0,
+    port: Annotated[int, typer.Option("--port", help="Port on this machine; 0 selects a free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
     tiles: Annotated[
         Path | None,
-        typer.Option("--tiles", metavar="DIR", help="3D Tiles that this map was exported to, shown beside the scenes."),
+        typer.Option(
+            "--tiles", metavar="DIR", help="Also show the 3D Tiles in this folder, to which the map was exported."
+        ),
     ] = None,
-    read_only: Annotated[
-        bool, typer.Option("--read-only", help="Nothing can be judged or changed from the page.")
-    ] = False,
+    read_only: Annotated[bool, typer.Option("--read-only", help="Disable reviews and edits on the page.")] = False,
     export: Annotated[
         Path | None,
         typer.Option(
-            "--export", metavar="DIR", help="Write the page as files that any web server can host; serve nothing."
+            "--export", metavar="DIR", help="Write the page as files for any web server, instead of serving it."
         ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Serve a page on this machine that shows the map and lets you judge it: its captures at every level of detail,
-    edges with what speaks for them, changes, objects, revisions. Ctrl-C ends it.
+    """Serve a page on this machine that shows the map, until Ctrl-C.
+
+    The page shows the captures at every level of detail, edges with their evidence, changes, objects and revisions,
+    and takes reviews.
 
     Example: `gsmap view site.gsmap`
     """
@@ -47,11 +49,11 @@ def command(
         print_rows("view", report, json) if json else say(f"{report.num_bytes:,} bytes in {report.path}")
         return
 
-    # A signal is the way to end it, and no interruption.
+    # A signal is the normal way to end the server.
     with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, suppress(StopSignal):
         if json:
             print_rows("view", ViewReport(url=server.url), json)
-        else:  # with -q too: without it nobody finds the page
+        else:  # also with -q: the user needs the address
             print(f"{server.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
         if browser:
             import webbrowser

@@ -1,4 +1,4 @@
-"""gsmap why: why a pair is an edge of the map, or is not."""
+"""gsmap why: explain the decision on a pair of scenes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, 
 
 def command(
     map: MapPath,
-    pair: Annotated[str, typer.Argument(metavar="A:B", help="The pair of scenes.")],
+    pair: Annotated[str, typer.Argument(metavar="A:B", help="Pair of scenes, by names or ids.")],
     pictures: Annotated[
         str | None,
-        typer.Option("--pictures", metavar="DIR", help="Also draw both captures from the same cameras into a folder."),
+        typer.Option(
+            "--pictures", metavar="DIR", help="Also draw both captures from the same cameras into this folder."
+        ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Show what was asked of a pair of scenes, step by step, what was found, and what would settle what is open.
+    """Explain why a pair of scenes is, or is not, an edge.
 
     Example: `gsmap why site.gsmap monday:tuesday --pictures why`
     """
@@ -29,7 +31,7 @@ def command(
     if json:
         print_rows("why A:B", report, json)
         return
-    print_facts(report.pair, {"status": report.status, "reason": report.reason, "what would settle it": report.advice})
+    print_facts(report.pair, {"status": report.status, "reason": report.reason, "advice": report.advice})
     print_table("steps", ExplanationStep.columns, report.steps)
     if report.picture:
         say(f"wrote {report.picture}")

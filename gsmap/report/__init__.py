@@ -1,8 +1,7 @@
-"""A map on one page: what it holds, what is certain and what is not, drawn and told for people.
+"""Report of a map on one self-contained HTML page: scenes, edges, uncertainty, changes and open tasks.
 
-`page` makes one HTML file of a `Report`. It holds everything it shows: no script, no link to anything outside,
-and a Content-Security-Policy that lets a browser load nothing. What a report says is put together in
-`gsmap.map.report_builder`; here is how it is drawn.
+`page` formats a `Report` as one HTML file without scripts or external links; its Content-Security-Policy lets a
+browser load nothing. `gsmap.map.report_builder` collects the content.
 """
 
 from gsmap.report.content import (

@@ -21,16 +21,16 @@ CHI2_95, CHI2_999 = 14.067, 24.322
 
 @dataclass(frozen=True, eq=False)
 class SceneEntry:
-    """A scene, and how surely it lies where it lies.
+    """Row of a scene with the uncertainty of its pose.
 
     Args:
-        row: as `gsmap list` has it.
-        num_cameras: how many cameras it has.
-        num_bytes: of its arrays, as they were written.
-        middle: (3,) the point where its pose is judged, frame and unit of its component: the middle of its cameras,
-            else of what it shows; None where it has no pose.
-        covariance_m2: (3, 3) of that point, axes of the component's frame; None where it is not known.
-        rotation_sigma_deg: largest standard deviation of its rotation; None where it is not known.
+        row: Row of the scene as in `gsmap list`.
+        num_cameras: Number of cameras.
+        num_bytes: Size of the stored arrays.
+        middle: (3,) reference point of the uncertainty in the component frame: centre of the cameras, or of the
+            Gaussians if there are no cameras; None if the scene has no pose.
+        covariance_m2: (3, 3) covariance of the reference point in the component frame; None if unknown.
+        rotation_sigma_deg: Largest standard deviation of the rotation; None if unknown.
     """
 
     row: SceneRow
@@ -42,7 +42,7 @@ class SceneEntry:
 
     @property
     def position_sigma_m(self) -> float | None:
-        """Standard deviation of that point along the axis where it is largest, metres; None where it is not known."""
+        """Largest standard deviation of the reference point over all directions, metres; None if unknown."""
         if self.covariance_m2 is None:
             return None
         return float(np.sqrt(max(0.0, np.linalg.eigvalsh(self.covariance_m2)[-1])))
@@ -50,16 +50,15 @@ class SceneEntry:
 
 @dataclass(frozen=True, eq=False)
 class EdgeEntry:
-    """An edge, and what the newest poses leave of it.
+    """Row of an edge with its residual under the newest poses.
 
     Args:
-        row: as `gsmap list` has it.
-        chi2: of its residual under the newest poses, `CHI2_DOF` degrees of freedom; None where it has none.
-        translation_m: how far the source's middle lies from where the edge alone would have it; None where the poses
-            share no frame.
-        rotation_deg: how far the source is turned from what the edge alone says; None as above.
-        probability: that its pose is right, of all evidence (`gsmap.types.Registration`); None where unknown.
-        component: of both its scenes; None where they share none.
+        row: Row of the edge as in `gsmap list`.
+        chi2: Chi-square of the residual, `CHI2_DOF` degrees of freedom; None if there is no residual.
+        translation_m: Translation residual at the centre of the source; None if the scenes share no component.
+        rotation_deg: Rotation residual; None if the scenes share no component.
+        probability: Probability that the pose is right (`gsmap.types.Registration`); None if unknown.
+        component: Common component of both scenes; None if they share none.
     """
 
     row: EdgeRow
@@ -71,7 +70,7 @@ class EdgeEntry:
 
     @property
     def use(self) -> str:
-        """``undecided``, ``tentative``, ``used``, ``unused`` (accepted, but no part of the answer), or its status."""
+        """``undecided``, ``tentative``, ``used``, ``unused`` (accepted, but not in the solution), or the status."""
         if self.row.undecided:
             return "undecided"
         if self.row.used == "tentative":
@@ -97,11 +96,11 @@ class Island:
     """A component of the newest poses.
 
     Args:
-        component: its index.
-        scenes: names, of those it holds.
-        metre: how long a metre is in its frame.
-        plan: its floor plan; None where it is not drawn.
-        note: why it is not, or how it was drawn; empty where there is nothing to say.
+        component: Index of the component.
+        scenes: Names of its scenes.
+        metre: Metric scale of the component frame.
+        plan: Floor plan; None if it is not drawn.
+        note: Note on the plan, or the reason why there is none; may be empty.
     """
 
     component: int
@@ -141,10 +140,10 @@ class Additions:
     """Additions to the map since a date.
 
     Args:
-        since: ISO 8601.
-        scenes: names of the captures that were ingested.
-        num_tried: pairs that were registered.
-        num_accepted: of these, accepted ones.
+        since: The date, ISO 8601.
+        scenes: Names of the scenes ingested since then.
+        num_tried: Number of pairs registered since then.
+        num_accepted: Number of these pairs that were accepted.
     """
 
     since: str
@@ -164,30 +163,30 @@ class StorageEntry:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Everything that a page tells of a map.
+    """Content of a report of a map.
 
     Args:
-        title: name of the map.
-        map_id: id of the map.
-        made_at: when the report was made, ISO 8601 with zone.
-        version: of gsmap.
-        status: what is to be done.
-        scenes: the living scenes, oldest first.
-        edges: the current edge of every pair that was tried.
-        islands: the components, the largest first.
-        revisions: the newest ones, oldest first.
-        num_revisions: how many there are.
-        moved: between each revision and the one before it, the newest first.
-        moved_since: between the newest revision and the last one made before the date of ``news``; None where nobody
-            asked, or there is none.
-        changes: None before the first poses.
-        objects: things and rooms of the map as they are kept; None where none are.
-        pair_pictures, change_pictures: those that were drawn.
-        storage: by kind, most bytes first.
-        seconds: wall seconds that registering took, by step, as far as they are kept.
-        news: what is new since a date; None where nobody asked.
-        notes: what a person should know of the report itself.
-        params: how much is shown.
+        title: Name of the map.
+        map_id: Id of the map.
+        made_at: Date of the report, ISO 8601 with zone.
+        version: Version of gsmap.
+        status: Status of the map with its open tasks.
+        scenes: Scenes that are not removed, oldest first.
+        edges: Current edge of every registered pair.
+        islands: Components, largest first.
+        revisions: The newest revisions, oldest first.
+        num_revisions: Number of all revisions.
+        moved: Pose differences between each revision and the previous one, newest first.
+        moved_since: Pose differences between the newest revision and the last one before the date of ``news``; None
+            without such a revision or date.
+        changes: Changes between scenes; None if there are no poses.
+        objects: Stored objects and rooms; None if there are none.
+        pair_pictures, change_pictures: Pictures of doubtful edges and of changes.
+        storage: Stored data by kind, largest first.
+        seconds: Wall-clock seconds of registration by step.
+        news: Additions since a date; None if no date was given.
+        notes: Notes on the report itself.
+        params: Settings that bound the size of the report.
     """
 
     title: str
@@ -214,5 +213,5 @@ class Report:
 
     @property
     def revision(self) -> RevisionRow | None:
-        """The newest one; None before the first."""
+        """Newest revision; None if there is none."""
         return self.revisions[-1] if self.revisions else None

@@ -1,4 +1,4 @@
-"""A floor plan as SVG: the picture, outlines, walks, edges by use, and how surely each scene lies."""
+"""Floor plan as SVG: top view, outlines, camera paths, edges by use, and error ellipses."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _WIDTH = 900.0
 _MOST_HEIGHT = 760.0
 _FOOT = 34.0
 _COLOURS = 8  # classes c0 to c7 of style.css
-_MANY = 30  # scenes above which only names of doubtful ones are drawn
+_MANY = 30  # number of scenes above which only doubtful scenes are labelled
 _LINE_PX = 17.0
 _CHARACTER_PX = 8.0
-_JUMP, _STRIDE_M = 2.5, 1.0  # times the median step, and metres: what is longer is no step
-_QUANTILE_95 = 5.991  # of chi-square with 2 degrees of freedom
+_JUMP, _STRIDE_M = 2.5, 1.0  # longest step of a path, in median steps and in metres
+_QUANTILE_95 = 5.991  # 95 % quantile of chi-square with 2 degrees of freedom
 _MAGNIFIED = tuple(step * 10**power for power in range(5) for step in (1, 2, 5))
-_ELLIPSE_SHARE = 0.08  # of the plan's diagonal that a magnified ellipse's half axis has at most, as a rule
+_ELLIPSE_SHARE = 0.08  # usual maximum of the half axis of an ellipse, as a fraction of the plan diagonal
 
 
 def draw_plan(plan: Plan, title: str) -> tuple[Markup, int]:
-    """The drawing, and how many times its ellipses are magnified; 0 where it has none."""
+    """Draw a plan; return the drawing and the magnification of its error ellipses (0 without ellipses)."""
     low, high = plan.bounds
     span = high - low
     scale = min(_WIDTH / span[0], _MOST_HEIGHT / span[1])
@@ -73,7 +73,7 @@ def draw_plan(plan: Plan, title: str) -> tuple[Markup, int]:
 
 
 def _walked(track: np.ndarray) -> np.ndarray:
-    """Places of the cameras from which somebody walked on to the next: not where pictures were left out between."""
+    """Return indices of cameras with a short step to the next one, so that gaps of the path stay open."""
     steps = np.linalg.norm(np.diff(track, axis=0), axis=1)
     walked = steps[steps > 0]
     found: np.ndarray = np.flatnonzero(steps <= min(_JUMP * (np.median(walked) if len(walked) else 0.0), _STRIDE_M))
@@ -88,7 +88,7 @@ def _colour(index: int) -> str:
 
 
 def ellipse(covariance: np.ndarray, num: int = 48) -> np.ndarray:
-    """(num, 2) around zero: what holds a point of this covariance (2, 2) with 95 %."""
+    """Return the 95 % confidence ellipse (num, 2) of a covariance (2, 2), around zero."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     angles = np.linspace(0, 2 * np.pi, num, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)])
@@ -97,7 +97,7 @@ def ellipse(covariance: np.ndarray, num: int = 48) -> np.ndarray:
 
 
 def _magnification(plan: Plan) -> int:
-    """The round factor by which most ellipses can just be seen, or 1; 0 where there are none."""
+    """Choose a round factor at which most ellipses are visible, at least 1; 0 without ellipses."""
     largest = [np.sqrt(max(float(np.linalg.eigvalsh(c)[-1]), 0.0)) for c in plan.covariances if c is not None]
     known = [2.4477 * value for value in largest if value > 0]
     if not known:
@@ -110,7 +110,7 @@ def _magnification(plan: Plan) -> int:
 
 
 def _names(plan: Plan, middles: np.ndarray, size: np.ndarray) -> Markup:
-    """Names beside their dots, moved down or up where others stand."""
+    """Draw labels beside their dots, shifted up or down to avoid overlap."""
     taken: list[tuple[float, float, float]] = []
     out = []
     crowded = len(plan.names) > _MANY

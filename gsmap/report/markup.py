@@ -1,8 +1,8 @@
-"""HTML and SVG put together as elements, so that no text of a map can become markup.
+"""HTML and SVG composed of elements, so that text of a map cannot become markup.
 
-A map's names, notes and reasons come from strangers. Every text passes `text_markup`: control characters and those that
-turn the direction of writing are shown as escapes (a line feed is white space in HTML, and stays), and what HTML gives
-a meaning is quoted. Only `Markup` goes into a page as it is, and only `tag`, `text_markup` and `joined` make it.
+Names, notes and reasons of a map are untrusted. All text passes `text_markup`, which escapes control and bidirectional
+characters (line feeds stay) and quotes HTML's special characters. Only `Markup` enters a page unchanged, and only
+`tag`, `text_markup` and `joined` create it.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ Part = Markup | str | int | float | None
 
 
 def text_markup(text: object) -> Markup:
-    """A text that a page shows as it reads, whatever it holds."""
+    """Escape a text so that a page shows it literally."""
     return Markup(html.escape(escaped(str(text), lines=True), quote=True))
 
 
 def joined(*parts: Part | Iterable[Part]) -> Markup:
-    """Parts one after the other; None is nothing."""
+    """Concatenate parts, skipping None."""
     return Markup("".join(_html(parts)))
 
 
 def tag(name: str, /, *parts: Part | Iterable[Part], **attributes: object) -> Markup:
-    """An element. Of an attribute's name ``_`` is ``-`` and a ``_`` at its end is dropped; None leaves it out.
+    """Create an element. In attribute names ``_`` becomes ``-``, and a trailing ``_`` and None values are dropped.
 
-    An attribute that tells a browser to load or run something is for this room's own values only.
+    Pass attributes that make a browser load or run something only with constant values of this package.
     """
-    told = "".join(
+    text = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{text_markup(value).html}"'
         for key, value in attributes.items()
         if value is not None
     )
     if name in _VOID:
-        return Markup(f"<{name}{told}>")
-    return Markup(f"<{name}{told}>{''.join(_html(parts))}</{name}>")
+        return Markup(f"<{name}{text}>")
+    return Markup(f"<{name}{text}>{''.join(_html(parts))}</{name}>")
 
 
 def _html(parts: Iterable[Part | Iterable[Part]]) -> Iterable[str]:

@@ -1,4 +1,4 @@
-"""The page: sections put together from a report, one HTML file that loads nothing."""
+"""HTML page of a report: one self-contained file, composed of sections."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ from gsmap.report.words import (
 )
 
 _MARK = re.compile(rb'<meta name="gsmap-map" content="([0-9a-f]{32,64})">')
-_HEAD_BYTES = 4096  # of a report, within which it says whose it is
-_BARS = 24  # in a plot, the largest
-_CHANGES = 200  # rows in the tables of changes and objects
-_MATRIX_SCENES = 300  # in the matrix of registered pairs
-_FEW = 12  # rows of a table that are open; the others fold away
+_HEAD_BYTES = 4096  # start of a report file that contains the id of its map
+_BARS = 24  # maximum number of bars in a plot
+_CHANGES = 200  # maximum number of rows in the tables of changes and objects
+_MATRIX_SCENES = 300  # maximum number of scenes in the matrix of registered pairs
+_FEW = 12  # rows of a long table that are visible; the remaining rows are folded
 _STANDING = {
     "good": "In order",
-    "look": "Wants a look",
-    "act": "Wants work",
+    "look": "Needs review",
+    "act": "Needs computation",
     "empty": "Empty",
 }
 _ORDER = ("undecided", "tentative", "unused", "used", "rejected", "no_match", "never registered")
 
 
 def page(report: Report) -> str:
-    """A report as HTML.
+    """Format a report as HTML.
 
-    The same report gives the same bytes. The page's policy forbids scripts and every request; its one style sheet is
-    named by its digest, pictures are part of it.
+    The same report gives the same bytes. The page's policy forbids scripts and all requests; its style sheet is
+    allowed by its digest, and pictures are embedded.
     """
     style = resources.files("gsmap.report").joinpath("style.css").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
@@ -68,7 +68,7 @@ def page(report: Report) -> str:
         tag("meta", name="generator", content=f"gsmap {report.version}"),
         tag("meta", name="gsmap-map", content=report.map_id),
         tag("title", f"{report.title}: map report"),
-        Markup(f"<style>{style}</style>"),  # our own, as the policy has its digest
+        Markup(f"<style>{style}</style>"),  # allowed by its digest in the policy
     )
     links = [tag("a", title, href=f"#{name}") for name, title, _ in sections]
     body = tag(
@@ -82,7 +82,7 @@ def page(report: Report) -> str:
 
 
 def owner_of(path: Path) -> str | None:
-    """The id of the map whose report a file is; None where it is none."""
+    """Return the id of the map of a report file; None if the file is not a report."""
     if not path.is_file():  # opening a pipe would wait for its writer
         return None
     try:
@@ -107,7 +107,7 @@ def _head(report: Report) -> Markup:
     alone = len(report.islands) - len(islands)
     facts: list[tuple[str, Part, str]] = [
         ("Scenes", f"{len(rows):,}", _statuses(report)),
-        ("Islands", f"{len(report.islands):,}", count(alone, "scene") + " alone" if alone else ""),
+        ("Components", f"{len(report.islands):,}", count(alone, "single scene") if alone else ""),
         ("Gaussians", _short(sum(row.num_gaussians for row in rows)), ""),
         ("On disk", size(sum(one.num_bytes for one in report.storage)), ""),
         ("Captured", day(dates[0]) if dates else "–", ", ".join(dated)),
@@ -116,8 +116,8 @@ def _head(report: Report) -> Markup:
     ]  # fmt: skip
     if report.islands:
         known = report.islands[0].metre
-        told = known.text().replace(f", {known.known_by}", "") if known.is_known else "lengths have no known unit"
-        facts.append(("Metre", known.known_by, told))
+        text = known.text().replace(f", {known.known_by}", "") if known.is_known else "lengths have no known unit"
+        facts.append(("Metric scale", known.known_by, text))
     return tag(
         "header",
         tag("p", "gsmap map report", class_="kicker"),
@@ -159,10 +159,10 @@ def _todo(report: Report) -> Markup | None:
     if not status.todo and not status.at_work:
         return None
     rows = [(row.count, row.meaning, tag("code", row.verb)) for row in status.todo]
-    parts: list[Part] = [_table(("count", "what", "the command that helps"), rows, (0,), (1, 2)) if rows else None]
+    parts: list[Part] = [_table(("count", "task", "command"), rows, (0,), (1, 2)) if rows else None]
     if status.at_work:
         working = [(row.what, row.task, row.host, moment(row.since)) for row in status.at_work[:_FEW]]
-        parts += [tag("h3", "At work now"), _table(("what", "by", "on", "since"), working)]
+        parts += [tag("h3", "Running jobs"), _table(("subject", "task", "host", "since"), working)]
     return joined(parts)
 
 
@@ -177,20 +177,23 @@ def _plans(report: Report) -> Markup | None:
     parts: list[Part] = [_plan(island, len(report.islands) > 1) for island in drawn]
     if others:
         rows = [(f"{i.component}", f"{len(i.scenes):,}", cut(", ".join(i.scenes), 80), i.note) for i in others]
-        parts += [tag("h3", "Islands without a plan"), _folded(("island", "scenes", "which", ""), rows, (0, 1), (2, 3))]
+        parts += [
+            tag("h3", "Components without a plan"),
+            _folded(("component", "scenes", "names", ""), rows, (0, 1), (2, 3)),
+        ]
     return joined(parts)
 
 
 def _plan(island: Island, many: bool) -> Markup:
     assert island.plan is not None
-    title = f"Floor plan of island {island.component}" if many else "Floor plan"
+    title = f"Floor plan of component {island.component}" if many else "Floor plan"
     drawing, magnified = draw_plan(island.plan, title)
     span = island.plan.bounds[1] - island.plan.bounds[0]
     tracks = any(len(track) for track in island.plan.tracks)
     words = [f"{count(len(island.scenes), 'scene')}, {length(span[0])} by {length(span[1])}; {metre(island.metre)}."]
     if magnified:
         times = "to scale" if magnified == 1 else f"drawn {magnified:,} times larger"
-        words.append(f"Ellipses hold a scene's position with 95 %, {times}.")
+        words.append(f"Ellipses contain the position of a scene with 95 % probability, {times}.")
     if tracks:
         words.append("Small dots are cameras.")
     if island.note:
@@ -199,7 +202,7 @@ def _plan(island: Island, many: bool) -> Markup:
     legend = [tag("span", tag("i", class_=f"swatch {use}"), name) for use, name in _LEGEND.items() if use in used]
     return tag(
         "figure",
-        tag("h3", f"Island {island.component}") if many else None,
+        tag("h3", f"Component {island.component}") if many else None,
         tag("div", drawing, class_="wide"),
         tag("p", legend, class_="legend") if legend else None,
         tag("figcaption", " ".join(words)),
@@ -208,12 +211,12 @@ def _plan(island: Island, many: bool) -> Markup:
 
 _LEGEND = {
     "used": "edge, used",
-    "strained": "used, but strained",
-    "tentative": "tentative: no loop confirms it",
-    "undecided": "undecided: contradicted by another",
-    "unused": "found, but not used",
+    "strained": "used, large residual",
+    "tentative": "tentative: no cycle confirms it",
+    "undecided": "undecided: contradicts another edge",
+    "unused": "accepted, but not used",
     "rejected": "rejected",
-    "no_match": "tried, no match",
+    "no_match": "registered, no match",
 }
 
 
@@ -228,14 +231,14 @@ def _doubt(report: Report) -> Markup | None:
     parts: list[Part] = []
     if doubtful:
         parts.append(
-            tag("p", "A tentative edge is one that no loop of other edges confirms: it may well be right, and nothing "
-                "but a look at it tells. An undecided one contradicts others, and the map cannot say which of them is "
-                "right. Each row shows one camera: the first scene, the second one, and in red where they differ. If "
-                "walls and furniture coincide, confirm; if not, reject.")
+            tag("p", "No cycle of other edges confirms a tentative edge: it may well be right, but needs a review. An "
+                "undecided edge contradicts other edges, and gsmap cannot decide which of them is right. Each row "
+                "shows one camera: the first scene, the second scene, and their differences in red. If walls and "
+                "furniture coincide, confirm the edge; if not, reject it.")
         )  # fmt: skip
     if strain:
         parts.append(
-            tag("p", f"{count(len(strain), 'edge')} pulled beyond 99.9 % of what its error lets expect: ",
+            tag("p", f"{count(len(strain), 'edge')} with a chi² above 99.9 % of correct edges: ",
                 ", ".join(f"{e.row.pair} (chi² {chi_square(e.chi2)})" for e in strain[:_FEW]), ".")
         )  # fmt: skip
     entries = {edge.row.pair: edge for edge in doubtful}
@@ -248,7 +251,7 @@ def _doubt(report: Report) -> Markup | None:
                 "figure",
                 tag("h3", one.row.target_name, tag("span", " : ", class_="quiet"), one.row.source_name),
                 tag("p", tag("span", one.row.target_name), tag("span", one.row.source_name),
-                    tag("span", "not the same in red"), class_="heads"),
+                    tag("span", "differences in red"), class_="heads"),
                 tag("img", src=_data(one.picture), alt=f"{one.row.pair} from the same cameras", width=width,
                     height=height, loading="lazy"),
                 tag("figcaption", f"{reason}. {count(one.row.num_inliers, 'inlier')}, overlap "
@@ -258,8 +261,8 @@ def _doubt(report: Report) -> Markup | None:
         )  # fmt: skip
     rest = len(doubtful) - len(report.pair_pictures)
     if rest > 0:
-        parts.append(tag("p", f"{count(rest, 'more such pair')} without a picture here: ",
-                         tag("code", "gsmap show MAP A:B --picture FILE"), " draws one.", class_="quiet"))  # fmt: skip
+        parts.append(tag("p", f"{count(rest, 'more such pair')} without a picture; to draw one: ",
+                         tag("code", "gsmap show MAP A:B --picture FILE"), class_="quiet"))  # fmt: skip
     return joined(parts)
 
 
@@ -281,27 +284,27 @@ def _edges(report: Report) -> Markup | None:
         return None
     solved = [edge for edge in report.edges if edge.chi2 is not None and edge.use in ("used", "tentative", "undecided")]
     checked = [edge for edge in solved if edge.use == "used"]
-    plots_: list[Part] = [_figure(_matrix(report), "Who was tried with whom, and what came of it.")]
+    plots_: list[Part] = [_figure(_matrix(report), "Registered pairs by outcome.")]
     if plots.pulled(solved):
         plots_.append(
             _figure(
                 plots.residual_bars(solved, _BARS),
                 f"{_largest(plots.pulled(solved), _BARS)}. Dashed: 95 % and 99.9 % of correct edges lie below. "
-                "An edge that no loop checks has no residual, whether right or wrong.",
+                "An edge in no cycle has no residual, whether right or wrong.",
             )
         )
     if len(checked) > 1:
         plots_.append(
             _figure(
                 plots.residual_distribution(checked),
-                "Steps: this map. Curve: chi² with 7 degrees of freedom. Left of the curve, the edges are better than "
-                "they claim (or no loop checks them); right of it, worse.",
+                "Steps: this map. Curve: chi² with 7 degrees of freedom. Left of the curve, residuals are smaller than "
+                "the standard deviations predict (or the edges are in no cycle); right of it, larger.",
             )
         )
     if any(edge.translation_m is not None for edge in plots.pulled(solved)):
         plots_.append(
-            _figure(plots.offset_bars(solved, _BARS), "How far the poses leave what each edge measured, at the "
-                    "middle of the second scene.")
+            _figure(plots.offset_bars(solved, _BARS), "Distance between the poses and each edge's measurement, at "
+                    "the centre of the second scene.")
         )  # fmt: skip
     parts: list[Part] = [_redundancy(report), tag("div", plots_, class_="plots"), _statistics(checked)]
     parts.append(_edge_table(report))
@@ -309,7 +312,7 @@ def _edges(report: Report) -> Markup | None:
 
 
 def _largest(edges: Sequence[EdgeEntry], most: int) -> str:
-    return f"The {most} largest of {len(edges):,}" if len(edges) > most else "All edges that a loop checks"
+    return f"The {most} largest of {len(edges):,}" if len(edges) > most else "All edges in cycles"
 
 
 def _redundancy(report: Report) -> Markup | None:
@@ -324,21 +327,21 @@ def _redundancy(report: Report) -> Markup | None:
         return None
     total = sum(edge.chi2 or 0.0 for edge in used)
     if spare <= 0:
-        return tag("p", f"{count(len(used), 'edge is', 'edges are')} used, and none more than it takes to place the "
-                   "scenes: nothing checks them.")  # fmt: skip
+        return tag("p", f"{count(len(used), 'edge is', 'edges are')} used, without redundancy: "
+                   "nothing checks them.")  # fmt: skip
     factor = total / spare
     verdict_ = (
-        "about what the edges claim of themselves"
+        "residuals agree with the standard deviations of the edges"
         if 0.25 <= factor <= 2
-        else "better than the edges claim: sigmas are on the safe side"
+        else "residuals are smaller than the standard deviations of the edges, which are conservative"
         if factor < 0.25
-        else "worse than the edges claim: sigmas are too small by about "
-        f"{number(factor**0.5, 2)} times, or an edge is wrong"
+        else f"the standard deviations of the edges are too small by a factor of about {number(factor**0.5, 2)}, or an "
+        "edge is wrong"
     )
     return tag(
         "p",
-        f"{count(len(used), 'edge is', 'edges are')} used; {spare:,} of their measured values are spare and check the "
-        f"others. Variance factor {number(factor)} (1 is expected): {verdict_}.",
+        f"{count(len(used), 'edge is', 'edges are')} used; {spare:,} of their measured values are redundant. Variance "
+        f"factor {number(factor)} (1 is expected): {verdict_}.",
     )
 
 
@@ -370,7 +373,7 @@ def _matrix(report: Report) -> Markup:
         if a is not None and b is not None:
             kind = _strained_kind(edge)
             cells.append((max(a, b), min(a, b), kind, f"{edge.row.pair}: {_LEGEND.get(kind, kind)}"))
-    return plots.matrix([known[i].name for i in order], cells, "Pairs of scenes that were tried")
+    return plots.matrix([known[i].name for i in order], cells, "Registered pairs of scenes")
 
 
 def _strained_kind(edge: EdgeEntry) -> str:
@@ -384,13 +387,13 @@ def _edge_table(report: Report) -> Markup:
         key=lambda e: (rank.get(e.use, len(rank)), -(e.chi2 or 0.0), e.probability or 0.0, e.row.pair),
     )
     shown = ordered[: report.params.edges]
-    head = ("pair", "what came of it", "chi²", "off by", "turned by", "inliers", "overlap", "probability", "why")
+    head = ("pair", "outcome", "chi²", "translation", "rotation", "inliers", "overlap", "probability", "reason")
     tried = [edge for edge in shown if edge.use not in ("rejected", "no_match")]
     refused = [edge for edge in shown if edge.use in ("rejected", "no_match")]
     numeric = (2, 3, 4, 5, 6, 7)
     parts: list[Part] = []
     if tried:
-        parts += [tag("h3", "Edges, doubt first"), _folded(head, [_edge_row(e) for e in tried], numeric, (8,))]
+        parts += [tag("h3", "Edges, most doubtful first"), _folded(head, [_edge_row(e) for e in tried], numeric, (8,))]
     if refused:
         rows = [_edge_row(e) for e in refused]
         summary = f"{count(len(refused), 'pair')} that did not match"
@@ -402,10 +405,10 @@ def _edge_table(report: Report) -> Markup:
 
 def _edge_row(edge: EdgeEntry) -> tuple[Part, ...]:
     kind = _strained_kind(edge)
-    said = f", {edge.row.review}ed by a person" if edge.row.review else ""
+    review = f", {edge.row.review}ed by a person" if edge.row.review else ""
     return (
         edge.row.pair,
-        tag("span", f"{kind.replace('_', ' ')}{said}", class_=f"tag {kind}"),
+        tag("span", f"{kind.replace('_', ' ')}{review}", class_=f"tag {kind}"),
         chi_square(edge.chi2),
         length(edge.translation_m),
         angle(edge.rotation_deg),
@@ -446,13 +449,25 @@ def _scenes(report: Report) -> Markup | None:
         )
         for entry in shown
     ]
-    head = ("scene", "status", "island", "captured", "sigma", "turn", "edges", "Gaussians", "cameras", "bytes", "notes")
+    head = (
+        "scene",
+        "status",
+        "component",
+        "captured",
+        "sigma",
+        "sigma, deg",
+        "edges",
+        "Gaussians",
+        "cameras",
+        "bytes",
+        "notes",
+    )
     parts: list[Part] = []
     known = [entry for entry in report.scenes if entry.position_sigma_m]
     if known:
         most = _BARS
         first = f"The {most} largest of {len(known):,}" if len(known) > most else "The largest first"
-        words = f"{first}. Of each scene's middle, along its worst axis, in the frame of its island."
+        words = f"{first}. At the centre of each scene, in the least certain direction, in the component frame."
         drawn = [_figure(plots.sigma_bars(known, most), words)]
         if len(known) > most:
             drawn.append(_figure(plots.sigma_distribution(known), "Share of the scenes up to each standard deviation."))
@@ -514,12 +529,12 @@ def _changes(report: Report) -> Markup | None:
 
 
 def _things(report: Report) -> Markup | None:
-    """Rooms, and objects: those that people named first."""
+    """Format rooms and objects, named objects first."""
     known = report.objects
     if known is None or not known.objects:
         return None
     there = sum(row.there for row in known.objects)
-    parts: list[Part] = [tag("p", f"{count(len(known.objects), 'object')}, {there:,} of them there still.")]
+    parts: list[Part] = [tag("p", f"{count(len(known.objects), 'object')}, {there:,} of them still in place.")]
     if known.rooms:
         rooms = [
             (row.id, f"{row.area_m2:.1f}", ", ".join(row.doors), f"{len(row.objects):,}") for row in known.rooms[:_FEW]
@@ -539,7 +554,7 @@ def _things(report: Report) -> Markup | None:
         for row in ordered
     ]
     parts.append(tag("h3", "Objects"))
-    parts.append(_folded(("object", "called", "room", "", "seen in looks", "first seen", "last seen"), rows, ()))
+    parts.append(_folded(("object", "name", "room", "", "seen", "first seen", "last seen"), rows, ()))
     if len(known.objects) > len(rows):
         parts.append(_more(len(known.objects) - len(rows), "objects", "gsmap graph MAP"))
     return joined(parts)
@@ -550,7 +565,7 @@ def _history(report: Report) -> Markup | None:
         return None
     parts: list[Part] = []
     if len(report.revisions) > 2:
-        caption = "Grey: scenes. Blue: edges used. Amber: edges that no loop confirms."
+        caption = "Grey: scenes. Blue: edges used. Amber: edges that no cycle confirms."
         parts.append(tag("div", _figure(plots.growth(report.revisions), caption), class_="plots"))
     moved = {one.after: one for one in report.moved}
     rows = [
@@ -570,15 +585,15 @@ def _history(report: Report) -> Markup | None:
     ]
     head = (
         "revision",
-        "made",
+        "created",
         "solver",
         "scenes",
-        "islands",
+        "components",
         "used",
         "tentative",
         "refused",
-        "poses that moved",
-        "why",
+        "pose changes",
+        "note",
     )
     parts.append(_folded(head, rows, (3, 4, 5, 6, 7), (9,)))
     if report.num_revisions > len(report.revisions):
@@ -596,22 +611,22 @@ def _moves(moved: PoseDifferences | None) -> str:
     went = [row.translation_m for row in moved.rows if row.change == "moved" and row.translation_m is not None]
     new = sum(row.change == "added" for row in moved.rows)
     gone = sum(row.change == "removed" for row in moved.rows)
-    told = [f"{len(went):,} moved by up to {length(max(went))}"] if went else ["none moved"]
-    told += [f"{new:,} new"] * (new > 0) + [f"{gone:,} gone"] * (gone > 0)
-    return f"{', '.join(told)} since {moved.before}"
+    parts = [f"{len(went):,} moved by up to {length(max(went))}"] if went else ["none moved"]
+    parts += [f"{new:,} new"] * (new > 0) + [f"{gone:,} gone"] * (gone > 0)
+    return f"{', '.join(parts)} since {moved.before}"
 
 
 def _moved_table(moved: PoseDifferences) -> Markup:
     changed = [row for row in moved.rows if row.change != "same"]
     changed.sort(key=lambda row: -(row.translation_m or float("inf")))
-    title = tag("h3", f"What moved from revision {moved.before} to {moved.after}")
+    title = tag("h3", f"Pose changes from revision {moved.before} to {moved.after}")
     if not changed:
-        return joined(title, tag("p", "Every scene lies where it lay.", class_="quiet"))
+        return joined(title, tag("p", "No pose changed.", class_="quiet"))
     rows = [
         (row.scene_name, row.change, length(row.translation_m), angle(row.rotation_deg), row.status_after or "–")
         for row in changed[:200]
     ]
-    return joined(title, _folded(("scene", "what", "by", "turned", "now"), rows, (2, 3)))
+    return joined(title, _folded(("scene", "change", "translation", "rotation", "status"), rows, (2, 3)))
 
 
 def _cost(report: Report) -> Markup | None:
@@ -630,19 +645,19 @@ def _cost(report: Report) -> Markup | None:
     ]
     parts: list[Part] = [
         plots.stacked(kept, "Bytes by kind"),
-        _table(("kept", "how many", "bytes", "share"), rows, (1, 2, 3)),
+        _table(("kind", "count", "bytes", "share"), rows, (1, 2, 3)),
     ]
     gaussians = sum(entry.row.num_gaussians for entry in report.scenes)
     if gaussians:
         own = sum(entry.num_bytes for entry in report.scenes)
-        parts.append(tag("p", f"{own / gaussians:.1f} bytes a Gaussian in the scenes' own arrays.", class_="quiet"))
+        parts.append(tag("p", f"{own / gaussians:.1f} bytes per Gaussian in the arrays of the scenes.", class_="quiet"))
     if report.seconds:
         spent = sum(report.seconds.values())
         tried = sum(1 for edge in report.edges if edge.row.status != "never registered")
         words = ", ".join(f"{name} {duration(value)}" for name, value in report.seconds.items() if value > 0)
         parts.append(
-            tag("p", f"Registering the {count(tried, 'pair')} took {duration(spent)} of work: {words}. What describing "
-                "and solving took is not kept.")
+            tag("p", f"Registering the {count(tried, 'pair')} took {duration(spent)}: {words}. Times of other stages "
+                "are not stored.")
         )  # fmt: skip
     return joined(parts)
 
@@ -656,34 +671,32 @@ def _reading(report: Report) -> Markup:
 
 
 _GLOSSARY = (
-    ("scene", "One capture: the Gaussians of one visit, in a frame of its own."),
+    ("scene", "A capture in the map: its Gaussians and cameras in the scene frame."),
     (
-        "island",
-        "Scenes that edges tie together; gsmap calls it a component. Two islands share no frame: how they lie to each "
-        "other is not known.",
+        "component",
+        "Scenes that edges connect. Components share no frame: their relative poses are unknown.",
     ),
-    ("edge", "A registration of two scenes: how one lies in the other, with an error of its own."),
-    ("placed", "A loop of edges agrees about where the scene lies, or a prior or a person vouches for it."),
+    ("edge", "An accepted registration of two scenes: their relative pose with its covariance."),
+    ("placed", "A scene whose pose is confirmed by a cycle of edges, a pose prior or a review."),
     (
         "tentative",
-        "The scene or edge hangs on registrations that nothing else confirms. It is drawn where it most likely is; do "
-        "not measure across it before somebody has looked.",
+        "A scene or edge that depends on registrations that nothing else confirms. It is drawn at its most likely "
+        "pose; do not measure across it before a review.",
     ),
     (
         "undecided",
-        "Two groups of edges contradict each other and nothing tells which is right: confirm one, reject the other, or "
-        "capture what lies between.",
+        "Edges that contradict each other without evidence for one of them: confirm one, reject the other, or capture "
+        "the space between them.",
     ),
     (
         "chi²",
-        "How far the solution pulls an edge, in units of the edge's own error, squared and summed over its seven "
-        "degrees of freedom. About 7 is normal for an edge that many loops check; beyond 24 lies fewer than one in a "
-        "thousand.",
+        "Squared residual of an edge in units of its standard deviations, summed over its seven degrees of freedom. "
+        "About 7 is normal for an edge in many cycles; fewer than one in a thousand correct edges lies above 24.",
     ),
     (
         "sigma",
-        "Standard deviation of a scene's position in the frame of its island, which one scene or its priors hold, as "
-        "far as the edges' errors tell. Errors that all captures share, such as a wrong metre, are not in it.",
+        "Standard deviation of a scene's position in the component frame, which one scene or the pose priors fix. It "
+        "excludes errors that all captures share, such as a wrong metric scale.",
     ),
 )
 
@@ -692,8 +705,8 @@ def _foot(report: Report) -> Markup:
     return tag(
         "footer",
         [tag("p", note) for note in report.notes],
-        tag("p", f"Map {report.map_id[:12]}. This page loads nothing and runs nothing. Commands call the map "
-            f"{report.title}; places of files are left out."),
+        tag("p", f"Map {report.map_id[:12]}. This page has no scripts and loads nothing. Commands name the "
+            f"map {report.title}, without its folder."),
     )  # fmt: skip
 
 
@@ -703,7 +716,7 @@ def _foot(report: Report) -> Markup:
 def _table(
     head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = (), long: Sequence[int] = ()
 ) -> Markup:
-    """A table that scrolls sideways where it is too wide; ``long`` columns hold sentences, which may break."""
+    """Return a table that scrolls sideways if too wide; columns in ``long`` may wrap."""
     kinds = {**dict.fromkeys(numeric, "num"), **dict.fromkeys(long, "long")}
     titles = [tag("th", name, scope="col", class_=kinds.get(k)) for k, name in enumerate(head)]
     lines = [tag("tr", [tag("td", cell, class_=kinds.get(k)) for k, cell in enumerate(row)]) for row in rows]
@@ -713,7 +726,7 @@ def _table(
 def _folded(
     head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = (), long: Sequence[int] = ()
 ) -> Markup:
-    """A table whose later rows fold away where there are many."""
+    """Return a table whose later rows are folded if there are many."""
     if len(rows) <= 2 * _FEW:
         return _table(head, rows, numeric, long)
     rest = tag("details", tag("summary", f"{len(rows) - _FEW:,} more"), _table(head, rows[_FEW:], numeric, long))
@@ -729,15 +742,15 @@ def _figure(drawing: Markup, caption: str) -> Markup:
 
 
 SECTIONS: dict[str, tuple[str, Callable[[Report], Markup | None]]] = {
-    "todo": ("What to do", _todo),
+    "todo": ("Open tasks", _todo),
     "plan": ("Floor plan", _plans),
-    "doubt": ("Where doubt lies", _doubt),
+    "doubt": ("Doubtful edges", _doubt),
     "edges": ("Edges and residuals", _edges),
     "scenes": ("Scenes", _scenes),
     "changes": ("Changes", _changes),
-    "things": ("Things", _things),
+    "things": ("Objects", _things),
     "history": ("History", _history),
     "cost": ("Storage and cost", _cost),
     "reading": ("How to read this page", _reading),
 }
-"""The sections by their ids, in order; one without content is left out."""
+"""Sections by id, in order; empty sections are left out."""

@@ -9,7 +9,7 @@ from gsmap.errors import ConfigError
 
 @dataclass(frozen=True)
 class Params:
-    """Settings of the report, a page of a few megabytes that is made in seconds.
+    """Settings of the report, a page of a few megabytes that is computed in seconds.
 
     Args:
         islands: Number of components with a floor plan, at least 0, the largest first; more take longer.

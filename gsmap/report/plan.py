@@ -1,4 +1,4 @@
-"""A floor plan: an island from straight above, in metres, walls along the page where there are walls."""
+"""Floor plan of a component: vertical projection in metres, aligned with its walls."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-_KEPT = (0.02, 0.98)  # quantiles of what a scene shows that its footprint holds: what flies about is left out
+_KEPT = (0.02, 0.98)  # quantiles of the points that a footprint contains, without floaters
 _YAWS_DEG = np.arange(0.0, 90.0, 1.0)
-_MARGIN = 0.05  # around everything, as a share of the longer side
+_MARGIN = 0.05  # margin as a fraction of the longer side
 _LEAST_M = 1e-3
-_CELLS = 90  # of the longer side, that outlines follow
-_REACH = 3  # corners to either side that an outline is smoothed over
-_FEW = 50  # points below which an outline is their hull
-_LEAST_PART, _LEAST_HOLE = 0.1, 0.03  # of the largest part, of what is shown: smaller parts and holes are left out
+_CELLS = 90  # grid cells of outlines along the longer side
+_REACH = 3  # corners on either side over which an outline is smoothed
+_FEW = 50  # number of points below which an outline is their convex hull
+# Smallest part, as a fraction of the largest part, and smallest hole, as a fraction of the footprint.
+_LEAST_PART, _LEAST_HOLE = 0.1, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +23,12 @@ class PlanScene:
     """A scene on a plan, in the frame and unit of its component.
 
     Args:
-        name: of the scene.
+        name: Name of the scene.
         status: ``placed``, ``tentative`` or ``isolated``.
-        points: (K, 3) of what it shows: a sample of its Gaussians, its landmarks, or the corners of its box.
-        track: (T, 3) its cameras in the order of the capture; empty where it has none of its own.
-        middle: (3,) where its name stands and its edges end.
-        covariance_m2: (3, 3) of that point in square metres; None where it is not known.
+        points: (K, 3) sampled means of its Gaussians, its landmarks, or the corners of its bounding box.
+        track: (T, 3) camera centres in the order of the capture; empty if the capture has no cameras.
+        middle: (3,) position of the label and of the ends of edges.
+        covariance_m2: (3, 3) covariance of ``middle`` in square metres; None if unknown.
     """
 
     name: str
@@ -40,7 +41,7 @@ class PlanScene:
 
 @dataclass(frozen=True)
 class PlanEdge:
-    """An edge on a plan: places of its scenes, how it is used, and what is said of it where it is pointed at."""
+    """An edge on a plan: indices of its scenes, its use (`EdgeEntry.use`) and its tooltip."""
 
     a: int
     b: int
@@ -50,21 +51,20 @@ class PlanEdge:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """An island from above. Lengths in metres; x to the right, y up the page.
+    """Floor plan of a component, in metres, x to the right, y up the page.
 
     Args:
-        names, statuses: of its scenes.
-        footprints: of each the outlines, closed lines (K, 2), of where it shows anything; what lies in an even number
-            of them is outside.
-        tracks: of each its cameras (T, 2).
-        middles: (N, 2) where their names stand.
-        covariances: of each (2, 2), square metres; None where it is not known.
-        edges: between them.
+        names, statuses: Names and statuses of the N scenes.
+        footprints: Outlines of the footprint of each scene, closed polygons (K, 2), by the even-odd rule.
+        tracks: Camera centres (T, 2) of each scene.
+        middles: (N, 2) positions of the labels.
+        covariances: Covariance (2, 2) of each position in square metres; None if unknown.
+        edges: Edges between the scenes.
         bounds: (2, 2) lowest and highest corner of the drawing.
-        R_plan_map: (3, 3) takes directions of the map to the plan; its third row is up.
-        metres_per_unit: of the map's frame.
-        picture: WebP of the island from above that fills ``bounds``; None where there is none.
-        picture_kind: ``rendered`` (Gaussians) or ``landmarks`` (how densely they lie); empty where there is none.
+        R_plan_map: (3, 3) rotation from the map frame to the plan; its third row is the up direction.
+        metres_per_unit: Metres per unit of the map frame.
+        picture: WebP of the component from above that fills ``bounds``; None if there is none.
+        picture_kind: ``rendered`` (Gaussians) or ``landmarks`` (their density); empty without a picture.
     """
 
     names: tuple[str, ...]
@@ -81,7 +81,7 @@ class Plan:
     picture_kind: str = ""
 
     def place(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) points of the map in metres along the plan's axes: right, up the page, height."""
+        """Return map points (N, 3) in plan axes, metres: right, up the page, height."""
         found: np.ndarray = np.asarray(points, np.float64).reshape(-1, 3) @ self.R_plan_map.T * self.metres_per_unit
         return found
 
@@ -89,10 +89,13 @@ class Plan:
 def make_plan(
     shown: Sequence[PlanScene], edges: Sequence[PlanEdge], up: np.ndarray | None, metres_per_unit: float = 1.0
 ) -> Plan | None:
-    """Lay scenes of one component out on a page; None where nothing of them has a place in space.
+    """Compute the floor plan of the scenes of one component; None without finite points.
 
     Args:
-        up: (3,) direction against gravity in the component's frame; its third axis where None.
+        shown: The scenes.
+        edges: Edges between them, by index.
+        up: (3,) direction opposite to gravity in the component frame; default: its third axis.
+        metres_per_unit: Metres per unit of the component frame.
     """
     level = _level(np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, np.float64))
     every = [np.concatenate([one.points, one.track, one.middle[None]]) for one in shown]
@@ -128,7 +131,7 @@ def make_plan(
 
 
 def _level(up: np.ndarray) -> np.ndarray:
-    """A rotation whose third row is up."""
+    """Return a rotation whose third row is the up direction."""
     up = up / max(float(np.linalg.norm(up)), 1e-12)
     x = np.cross([0, 1.0, 0] if abs(up[1]) < 0.9 else [1.0, 0, 0], up)
     x /= np.linalg.norm(x)
@@ -136,7 +139,7 @@ def _level(up: np.ndarray) -> np.ndarray:
 
 
 def _turned(level: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The rotation turned about up so that a box around the points is smallest, its longer side along x."""
+    """Rotate about the up direction to the smallest bounding box, with its longer side along x."""
     if len(points) < 2:
         return level
     turns = [_turn(np.radians(angle)) for angle in _YAWS_DEG]
@@ -155,7 +158,7 @@ def _turn(angle: float) -> np.ndarray:
 
 
 def _inner(points: np.ndarray) -> np.ndarray:
-    """Points without the outermost of each axis, where there are enough."""
+    """Return the points without the outermost ones on each axis; few points are returned unchanged."""
     if len(points) < 50:
         return points
     low, high = np.quantile(points[:, :2], _KEPT, axis=0)
@@ -164,7 +167,7 @@ def _inner(points: np.ndarray) -> np.ndarray:
 
 
 def _outlines(points: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:
-    """Closed lines (K, 2) around where points lie, gaps of a few cells bridged, small islands and holes left out."""
+    """Compute closed outlines (K, 2) of points, closing small gaps and removing small parts and holes."""
     from scipy import ndimage
     from scipy.spatial import ConvexHull, QhullError
 
@@ -199,7 +202,7 @@ def _without_holes(mask: np.ndarray) -> np.ndarray:
 
 
 def rings(mask: np.ndarray) -> list[np.ndarray]:
-    """The boundary of the true cells of a grid, as closed lines of its corners, (K, 2), the true cells on the left."""
+    """Return the boundary of the true cells of a grid as closed polygons (K, 2), with the true cells on the left."""
     padded = np.pad(mask, 1)
     steps: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for (dx, dy), (ax, ay), (bx, by) in (
@@ -229,7 +232,7 @@ def rings(mask: np.ndarray) -> list[np.ndarray]:
 
 
 def _smooth(ring: np.ndarray) -> np.ndarray:
-    """A line of cell sides without its steps: the mean over a few corners, every other one kept."""
+    """Smooth the steps of an outline by a moving mean over corners, keeping every other corner."""
     reach = min(_REACH, (len(ring) - 1) // 4)
     mean: np.ndarray = np.mean([np.roll(ring, k, axis=0) for k in range(-reach, reach + 1)], axis=0)
     found = mean[::2] if len(mean) > 8 else mean

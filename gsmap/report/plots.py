@@ -1,4 +1,4 @@
-"""The plots of a report, in the manner of evo's: plain axes, every value named where it is pointed at."""
+"""Plots of a report, in the style of evo: plain axes, a tooltip for each value."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from gsmap.report.words import NOT_PULLED, cut, cut_pair, length, number
 from gsmap.types.rows import RevisionRow
 
 _ROW = 17.0
-_NAMES, _CHARACTERS = 150.0, 19  # room for names, and how many characters fit
+_NAMES, _CHARACTERS = 150.0, 19  # width of the column of names, in pixels and characters
 
 
 def residual_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
-    """The chi-square of each edge, the largest first, against what its own error lets expect."""
+    """Plot the chi-square of each edge, largest first, with quantiles of the expected distribution."""
     chosen = sorted(pulled(edges), key=lambda e: -(e.chi2 or 0.0))[:most]
     values = [max(e.chi2 or 0.0, 1e-2) for e in chosen]
     frame = Frame(_ROW * len(chosen) + 62, _NAMES)
@@ -34,7 +34,7 @@ def residual_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
 
 
 def pulled(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
-    """The edges that others pull at."""
+    """Return the edges with a residual, which are those in cycles."""
     return [edge for edge in edges if edge.chi2 is not None and edge.chi2 > NOT_PULLED]
 
 
@@ -88,7 +88,7 @@ def offset_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
 
 
 def sigma_bars(scenes: Sequence[SceneEntry], most: int) -> Markup:
-    """Standard deviation of each scene's position, the largest first."""
+    """Plot the standard deviation of each scene's position, largest first."""
     chosen = sorted((s for s in scenes if s.position_sigma_m), key=lambda s: -(s.position_sigma_m or 0.0))[:most]
     values = [s.position_sigma_m or 0.0 for s in chosen]
     names = [s.row.name for s in chosen]
@@ -132,7 +132,7 @@ def _unit(values: Sequence[float]) -> tuple[str, float]:
 
 
 def growth(revisions: Sequence[RevisionRow]) -> Markup:
-    """Scenes, and edges by use, of each revision."""
+    """Plot the number of scenes and of edges by use over revisions."""
     frame = Frame(230)
     first, last = revisions[0].number, revisions[-1].number
     x = Axis(first - 0.5, last + 0.5, *frame.x_span)
@@ -151,7 +151,7 @@ def growth(revisions: Sequence[RevisionRow]) -> Markup:
 
 
 def stacked(parts: Sequence[tuple[str, float, str]], title: str) -> Markup:
-    """Shares of a whole in one bar: (name, value, tip)."""
+    """Plot shares of a whole, (name, value, tooltip), as one stacked bar."""
     total, x, width = sum(value for _, value, _ in parts), 0.0, svg.WIDTH
     drawn = []
     for i, (_, value, tip) in enumerate(parts):
@@ -165,7 +165,9 @@ def matrix(names: Sequence[str], cells: Sequence[tuple[int, int, str, str]], tit
     """Plot the matrix of pairs by outcome: one square per pair, below the diagonal.
 
     Args:
-        cells: (row, column, kind, tip), the row the larger.
+        names: Names of the scenes, in the order of rows and columns.
+        cells: (row, column, kind, tooltip) of each pair, with row > column.
+        title: Title of the plot.
     """
     count = len(names)
     room = 130.0 if count <= 40 else 8.0

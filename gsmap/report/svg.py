@@ -1,6 +1,6 @@
-"""Axes, ticks and frame of the plots, in the units of an SVG view box.
+"""SVG axes, ticks and frames of plots, in units of the view box.
 
-Colours and fonts are classes of ``style.css``, so that one drawing serves light, dark and paper.
+Colours and fonts are classes of ``style.css``, so that one drawing serves light and dark pages and print.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, 14.0, 12.0, 40.0
 
 @dataclass(frozen=True)
 class Axis:
-    """Values along a line of a drawing.
+    """Axis of a plot.
 
     Args:
-        low, high: the values at its ends.
-        start, end: where these lie.
-        log: by powers of ten.
+        low, high: Values at the ends.
+        start, end: Positions of the ends in the drawing.
+        log: Logarithmic scale.
     """
 
     low: float
@@ -40,7 +40,7 @@ class Axis:
         return self.start + min(1.0, max(0.0, share)) * (self.end - self.start)
 
     def ticks(self, most: int = 6) -> list[float]:
-        """Round values, at most about so many."""
+        """Return about ``most`` round values."""
         if self.log:
             low, high = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
             every = max(1, -(-(high - low + 1) // most))
@@ -61,7 +61,7 @@ def _least(axis: Axis) -> float:
 
 
 def log_axis(values: Sequence[float], start: float, end: float) -> Axis:
-    """An axis by powers of ten around positive values."""
+    """Return a logarithmic axis from power of ten to power of ten that contains the positive values."""
     found = np.array([v for v in values if np.isfinite(v) and v > 0] or [1.0])
     low, high = 10.0 ** np.floor(np.log10(found.min())), 10.0 ** np.ceil(np.log10(found.max()))
     return Axis(float(low), float(high if high > low else low * 10), start, end, log=True)
@@ -69,11 +69,11 @@ def log_axis(values: Sequence[float], start: float, end: float) -> Axis:
 
 @dataclass(frozen=True)
 class Frame:
-    """A plot's box: a view of ``WIDTH`` by ``height``, with room for labels.
+    """Frame of a plot: a view of ``WIDTH`` by ``height`` with margins for labels.
 
     Args:
-        height: of the view.
-        left: room for the labels of the y axis.
+        height: Height of the view.
+        left: Left margin for the labels of the y axis.
     """
 
     height: float = 260.0
@@ -91,7 +91,7 @@ class Frame:
 def plot(
     frame: Frame, x: Axis, y: Axis | None, labels: tuple[str, str], title: str, *parts: Part | Iterable[Part]
 ) -> Markup:
-    """A framed drawing with grid, ticks and axis labels; ``title`` is read to those who cannot see it."""
+    """Draw a frame with grid, ticks and axis labels; ``title`` is for screen readers."""
     (left, right), (bottom, top) = frame.x_span, frame.y_span
     lines: list[Markup] = []
     for value in x.ticks():
@@ -121,10 +121,14 @@ def drawing(
     class_: str = "plot",
     stretched: bool = False,
 ) -> Markup:
-    """An SVG that grows with the page.
+    """Return an SVG element that scales with the page.
 
     Args:
-        stretched: it fills whatever box it is given.
+        width, height: Size of the view box.
+        title: Title for screen readers.
+        parts: Content.
+        class_: Class of the style sheet.
+        stretched: Fill the box without keeping the aspect ratio.
     """
     return tag(
         "svg", tag("title", title), *parts, viewBox=f"0 0 {f(width)} {f(height)}", class_=class_, role="img",
@@ -152,34 +156,34 @@ def bar(x: float, y: float, width: float, height: float, class_: str, tip: str =
 
 
 def path(points: np.ndarray, class_: str, *, closed: bool = False, tip: str = "") -> Markup:
-    """Straight lines through (N, 2) points."""
+    """Draw straight lines through (N, 2) points."""
     if len(points) == 0:
         return Markup("")
-    told = "M" + "L".join(f"{f(x)} {f(y)}" for x, y in points) + "Z" * closed
-    return tag("path", tag("title", tip) if tip else None, d=told, class_=class_)
+    data = "M" + "L".join(f"{f(x)} {f(y)}" for x, y in points) + "Z" * closed
+    return tag("path", tag("title", tip) if tip else None, d=data, class_=class_)
 
 
 def paths(lines: Sequence[np.ndarray], class_: str, *, closed: bool = True, tip: str = "") -> Markup:
-    """Several lines as one element; where they are closed, what lies in an even number of them is outside."""
-    told = "".join("M" + "L".join(f"{f(x)} {f(y)}" for x, y in points) + "Z" * closed for points in lines)
-    if not told:
+    """Draw several lines as one element; closed lines are filled by the even-odd rule."""
+    data = "".join("M" + "L".join(f"{f(x)} {f(y)}" for x, y in points) + "Z" * closed for points in lines)
+    if not data:
         return Markup("")
-    return tag("path", tag("title", tip) if tip else None, d=told, class_=class_, fill_rule="evenodd")
+    return tag("path", tag("title", tip) if tip else None, d=data, class_=class_, fill_rule="evenodd")
 
 
 def marks(points: np.ndarray, class_: str, tip: str = "") -> Markup:
-    """A round mark at each of (N, 2) points, as one element: lines of no length with round ends."""
-    told = "".join(f"M{f(x)} {f(y)}h0" for x, y in points)
-    return tag("path", tag("title", tip) if tip else None, d=told, class_=class_) if told else Markup("")
+    """Draw a round mark at each of (N, 2) points as one element, by zero-length lines with round ends."""
+    data = "".join(f"M{f(x)} {f(y)}h0" for x, y in points)
+    return tag("path", tag("title", tip) if tip else None, d=data, class_=class_) if data else Markup("")
 
 
 def tick_text(value: float) -> str:
-    """A tick's number, as short as it goes."""
+    """Format the number of a tick as short as possible."""
     if value == 0:
         return "0"
     return f"{value:g}" if 1e-3 <= abs(value) < 1e5 else f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
 
 
 def f(value: float) -> str:
-    """A coordinate, to a tenth."""
+    """Format a coordinate with one decimal."""
     return f"{value:.1f}".removesuffix(".0")

@@ -1,4 +1,4 @@
-"""Pictures of an island from straight above, see-through where nothing is, to lie under a floor plan."""
+"""Top views of a component with a transparent background, for floor plans."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from gsmap.geometry.transforms import transform_gaussians
 from gsmap.report.plan import Plan
 from gsmap.types import Cameras, Gaussians, Sim3
 
-_FAR = 60.0  # times the plan's size that the camera stands above it: lines of sight are parallel but for a degree
-_ABOVE_EYES = 0.3  # of what lies between floor and cameras is shown above these; ceilings are not
-_FINER = 1.6  # rendered so much finer than shown
+_FAR = 60.0  # height of the camera in sizes of the plan: rays are parallel to within a degree
+_ABOVE_EYES = 0.3  # height shown above the cameras, as a fraction of their height above the floor
+_FINER = 1.6  # supersampling factor of renders
 _INK = 128
 
 
 def top_picture(parts: Sequence[Gaussians], plan: Plan, eyes: np.ndarray, longest_px: int) -> bytes:
-    """Gaussians from above without ceilings, as WebP that fills the plan's bounds.
+    """Render Gaussians from above without ceilings, as WebP that fills the bounds of the plan.
 
     Args:
-        parts: of every scene, in the frame and unit of the component.
-        eyes: (T, 3) cameras, same frame; what lies well above them is cut away. Nothing is cut where there are none.
+        parts: Gaussians of each scene in the component frame.
+        plan: The floor plan.
+        eyes: (T, 3) camera centres in the component frame; Gaussians well above them are left out.
+        longest_px: Longer side of the picture in pixels.
     """
     from PIL import Image
 
@@ -68,14 +70,14 @@ def density_picture(points: np.ndarray, plan: Plan, longest_px: int) -> bytes:
 
 
 def picture_webp(picture: np.ndarray) -> bytes:
-    """A picture (H, W, 3) uint8 as a page carries it."""
+    """Encode a picture (H, W, 3) uint8 as WebP."""
     from PIL import Image
 
     return _webp(Image.fromarray(picture))
 
 
 def _camera(plan: Plan, heights: np.ndarray, longest_px: int) -> Cameras:
-    """Far above the middle of the plan, looking down, the top of the picture up the page."""
+    """Return a camera far above the centre of the plan that looks down, with y up the page."""
     size = np.array(_size_px(plan, round(_FINER * longest_px)))
     (low, high), far = plan.bounds, _FAR * float((plan.bounds[1] - plan.bounds[0]).max())
     pose = np.eye(4)
@@ -86,7 +88,7 @@ def _camera(plan: Plan, heights: np.ndarray, longest_px: int) -> Cameras:
 
 
 def _size_px(plan: Plan, longest_px: int) -> tuple[int, int]:
-    """Width and height of a picture that fills the plan."""
+    """Return width and height of a picture that fills the plan."""
     span = plan.bounds[1] - plan.bounds[0]
     width, height = np.maximum(1, np.round(span / span.max() * longest_px)).astype(int)
     return int(width), int(height)

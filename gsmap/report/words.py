@@ -1,4 +1,4 @@
-"""Numbers, dates and the state of a map as people say them."""
+"""Formatting of numbers, dates and the state of a map for readers."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from gsmap.report.content import CHI2_999, EdgeEntry, Report
 from gsmap.types.metric_scale import KnownBy, MetricScale
 from gsmap.types.rows.maps import TodoKind
 
-_SHOWN = 3  # names in a sentence
+_SHOWN = 3  # maximum number of names in a sentence
 
 
 def count(number: int, one: str, many: str = "") -> str:
-    """``1 scene``, ``2,000 scenes``."""
+    """Format a number with its noun: ``1 scene``, ``2,000 scenes``."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number in so many significant digits; a dash where there is none."""
+    """Format a number with significant digits; a dash for None."""
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -32,7 +32,7 @@ def _large_or_small(value: float, digits: int) -> str:
 
 
 def length(metres: float | None) -> str:
-    """A length as surveyors write it: millimetres below a decimetre, metres, kilometres."""
+    """Format a length in millimetres (below 0.1 m), metres or kilometres."""
     if metres is None or not math.isfinite(metres):
         return "–"
     size_m = abs(metres)
@@ -46,29 +46,29 @@ def length(metres: float | None) -> str:
 
 
 def _two(value: float) -> str:
-    """Two digits, or whole numbers."""
+    """Format a number with two significant digits, or as an integer."""
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}".removesuffix(".0")
 
 
 def angle(degrees: float | None) -> str:
-    """An angle in degrees."""
+    """Format an angle in degrees."""
     if degrees is None or not math.isfinite(degrees):
         return "–"
     return f"{degrees:.2g}°" if degrees == 0 or abs(degrees) >= 1e-3 else "< 0.001°"
 
 
 def chi_square(value: float | None) -> str:
-    """A chi-square; what is left by rounding where nothing pulls an edge is 0."""
+    """Format a chi-square; rounding errors of edges in no cycle are 0."""
     return "0" if value is not None and abs(value) < NOT_PULLED else number(value)
 
 
 def probability(value: float | None) -> str:
-    """In three digits, and never 1: nothing is that sure."""
+    """Format a probability with three digits, at most 0.999."""
     return "–" if value is None or not math.isfinite(value) else number(min(value, 0.999))
 
 
 def size(num_bytes: int) -> str:
-    """``12.3 MB``; a megabyte is a million bytes."""
+    """Format a size: ``12.3 MB``; a megabyte is a million bytes."""
     for power, unit in ((9, "GB"), (6, "MB"), (3, "kB")):
         if num_bytes >= 10**power:
             return f"{num_bytes / 10**power:.3g} {unit}"
@@ -76,36 +76,36 @@ def size(num_bytes: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """``3.2 s``, ``4 min``, ``2.5 h``."""
+    """Format a duration: ``3.2 s``, ``4 min``, ``2.5 h``."""
     if seconds < 90:
         return f"{seconds:.2g} s"
     return f"{seconds / 60:.3g} min" if seconds < 5400 else f"{seconds / 3600:.3g} h"
 
 
 def day(when: str | None) -> str:
-    """The day of an ISO 8601 date; a dash where nobody knows."""
+    """Return the day of an ISO 8601 date; a dash if unknown."""
     return when[:10] if when else "–"
 
 
 def moment(when: str | None) -> str:
-    """The minute of an ISO 8601 date."""
+    """Return an ISO 8601 date down to the minute; a dash if unknown."""
     return when[:16].replace("T", " ") if when else "–"
 
 
 def some(names: Sequence[str]) -> str:
-    """``a, b, c and 4 more``."""
+    """Join names to a list such as ``a, b, c and 4 more``."""
     if len(names) > _SHOWN:
         return f"{', '.join(names[:_SHOWN])} and {len(names) - _SHOWN} more"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
 
 
 def cut(name: str, most: int = 22) -> str:
-    """A name that fits a drawing."""
+    """Shorten a name for a drawing."""
     return name if len(name) <= most else f"{name[: most - 1]}…"
 
 
 def cut_pair(pair: tuple[str, str], most: int = 22) -> str:
-    """Two names that fit a drawing together; what tells names apart is mostly their end."""
+    """Shorten two names for a drawing, keeping their ends, in which names mostly differ."""
     if sum(map(len, pair)) + 1 <= most:
         return ":".join(pair)
     half = (most - 1) // 2
@@ -125,15 +125,15 @@ def metre(one: MetricScale) -> str:
 def _how(known_by: KnownBy) -> str:
     match known_by:
         case "surveyed":
-            return "lengths are surveyed, by control points, positions or scale bars"
+            return "lengths are measured by control points, position fixes or scale bars"
         case "measured":
-            return "lengths are measured by captures that are in metres"
+            return "lengths are measured by captures in metres"
         case "told":
-            return "lengths follow metres that a person gave"
+            return "lengths follow a metric scale that a person specified"
         case "assumed":
-            return "lengths assume that the captures' own unit is the metre, which nobody has said"
+            return "lengths assume that the captures are in metres"
         case "guessed":
-            return "lengths are a guess, from how far cameras stand from what they see"
+            return "lengths are estimated from the distances between cameras and surfaces"
         case "unknown":
             return "lengths have no known unit"
         case _:
@@ -147,7 +147,7 @@ def _percent(share: float) -> str:
 def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
     """Return the state of a map (``good``, ``look``, ``act`` or ``empty``) and the sentences that explain it.
 
-    ``act``: it is not solved as it is, or work failed. ``look``: something waits for a person's judgement.
+    ``act``: the poses are missing or outdated, or a job failed. ``look``: something needs a review.
     """
     scenes, status = [entry.row for entry in report.scenes], report.status
     if not scenes:
@@ -157,21 +157,21 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
     alone = [row.name for row in scenes if row.status == "isolated"]
     if report.revision is None:
         return "act", (
-            f"The map holds {count(len(scenes), 'scene')}, and none has a place yet: poses were never solved.",
+            f"The map holds {count(len(scenes), 'scene')} without poses: poses were never solved.",
             *_next_step(report),
         )
     sentences = []
     tied = len({row.component for row in scenes if row.status in ("placed", "tentative")})
     if placed:
-        islands = " in one island" if tied == 1 else f" in {tied:,} islands, which share no frame" if tied else ""
+        parts = " in one component" if tied == 1 else f" in {tied:,} components, which share no frame" if tied else ""
         all_of = "All" if len(placed) == len(scenes) and len(scenes) > 1 else f"{len(placed):,} of"
         are = "is" if len(placed) == 1 else "are"
         sentences.append(
-            f"{all_of} {count(len(scenes), 'scene')} {are} placed{islands}: agreeing loops of registrations, a prior "
-            "or a person confirm where they lie."
+            f"{all_of} {count(len(scenes), 'scene')} {are} placed{parts}: a cycle of edges, a pose prior "
+            "or a review confirms each pose."
         )
     else:
-        sentences.append(f"The map holds {count(len(scenes), 'scene')}; none is placed beyond doubt.")
+        sentences.append(f"The map holds {count(len(scenes), 'scene')}; no pose is confirmed.")
     sigmas = sorted(
         (entry.position_sigma_m, entry.row.name) for entry in report.scenes if entry.position_sigma_m is not None
     )
@@ -184,29 +184,28 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
         )
     if report.islands:
         largest = report.islands[0]
-        name = "" if len(report.islands) == 1 else " In the largest island"
-        said = metre(largest.metre)
-        sentences.append(f"{name} {said}.".strip() if name else f"{said[0].upper()}{said[1:]}.")
+        name = "" if len(report.islands) == 1 else "In the largest component, "
+        text = metre(largest.metre)
+        sentences.append(f"{name}{text}." if name else f"{text[0].upper()}{text[1:]}.")
     if tentative:
         rest = "rests" if len(tentative) == 1 else "rest"
         sentences.append(
-            f"Doubtful: {some(tentative)} {rest} on registrations that no loop confirms: have a look at them, and "
-            "confirm or reject."
+            f"Doubtful: {some(tentative)} {rest} on edges that no cycle confirms; review them and confirm or reject."
         )
     undecided = [edge.row.pair for edge in report.edges if edge.use == "undecided"]
     if undecided:
-        sentences.append(f"Contradictory: nothing could decide {some(undecided)}; a person has to.")
+        sentences.append(f"Contradictory: {some(undecided)}; a review has to decide.")
     if alone and len(scenes) > 1:
-        sentences.append(f"Alone: nothing ties {some(alone)} to the others.")
+        sentences.append(f"Isolated: no edge connects {some(alone)} to other scenes.")
     behind = [row.name for row in scenes if row.status in ("ingested", "described")]
     if behind:
         has = "has" if len(behind) == 1 else "have"
-        sentences.append(f"Not in the solution yet: {some(behind)} {has} no place.")
+        sentences.append(f"Not in the solution yet: {some(behind)} {has} no pose.")
     strain = strained(report.edges)
     if strain:
         sentences.append(
-            f"Strained: {count(len(strain), 'edge that is used is', 'edges that are used are')} pulled further than "
-            f"{'its' if len(strain) == 1 else 'their'} own error explains ({some([e.row.pair for e in strain])})."
+            f"Large residuals: {count(len(strain), 'used edge has a residual', 'used edges have residuals')} beyond "
+            f"{'its' if len(strain) == 1 else 'their'} standard deviations ({some([e.row.pair for e in strain])})."
         )
     sentences += _next_step(report)
     wants = {_wants(row.what) for row in status.todo}
@@ -216,7 +215,7 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
 
 
 def _wants(what: TodoKind) -> Literal["act", "look"]:
-    """Return true if a task is computation rather than a person's review."""
+    """Return ``act`` for a task of computation, ``look`` for a review by a person."""
     match what:
         case "undescribed" | "unregistered" | "unsolved" | "set_aside" | "contradicted_priors":
             return "act"
@@ -230,18 +229,18 @@ def _wants(what: TodoKind) -> Literal["act", "look"]:
 
 def _next_step(report: Report) -> list[str]:
     if not report.status.todo:
-        return ["Nothing waits to be done."]
+        return ["Nothing to do."]
     first = report.status.todo[0]
     rest = len(report.status.todo) - 1
-    more = f" {count(rest, 'more thing is', 'more things are')} listed below." if rest else ""
+    more = f" {count(rest, 'more task is', 'more tasks are')} listed below." if rest else ""
     return [f"Next: {first.meaning} ({first.count:,}).{more}"]
 
 
 def strained(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
-    """Edges that are used and whose residual is one of the largest thousandth of what their error lets expect."""
+    """Return used edges with a chi-square above the 99.9 % quantile, largest first."""
     found = [edge for edge in edges if edge.use == "used" and edge.chi2 is not None and edge.chi2 > CHI2_999]
     return sorted(found, key=lambda edge: -(edge.chi2 or 0.0))
 
 
 NOT_PULLED = 1e-6
-"""Chi-square below which an edge lies as it likes: no loop checks it."""
+"""Chi-square below which an edge counts as unchecked by any cycle."""

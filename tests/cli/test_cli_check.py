@@ -39,7 +39,7 @@ def test_a_catalog_that_another_program_changed(path, capfd):
     code, _, err = said(capfd, "check", str(path), "--accept-catalog")
     assert code == 0
     assert "nothing to accept" in err
-    assert f"{path} is whole" in said(capfd, "check", str(path))[2]
+    assert f"{path} is intact" in said(capfd, "check", str(path))[2]
 
 
 def test_a_catalog_that_cannot_be_verified_is_not_called_whole(path, capfd):
@@ -47,7 +47,7 @@ def test_a_catalog_that_cannot_be_verified_is_not_called_whole(path, capfd):
     code, out, err = said(capfd, "check", str(path))
     assert code == 0
     assert out.startswith("cannot verify the catalog: ")
-    assert "is whole" not in err
+    assert "is intact" not in err
 
 
 def test_revisions_that_follow_one_another_are_dropped_in_one_line(path, capfd):

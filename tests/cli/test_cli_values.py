@@ -139,7 +139,7 @@ def test_a_damaged_scene_is_mended_from_another_map(site: Path, cli: Run, tmp_pa
     assert cli("check", site).code == 1
     done = cli("restore-scene", site, "odd:one", "--from", tmp_path / "copy.gsmap")
     assert done.code == 0
-    assert "odd:one is here and whole" in done.stderr
+    assert "odd:one is restored" in done.stderr
     assert cli("check", site).code == 0
 
 

@@ -91,7 +91,7 @@ def test_the_exit_code_says_that_something_is_left(site: Map, capsys: pytest.Cap
         with pytest.raises(SystemExit) as ended:
             run(["describe", site.store.location])
         assert ended.value.code == expected
-        assert "1 job is set aside" in capsys.readouterr().err
+        assert "1 job is quarantined" in capsys.readouterr().err
     assert not console.left()
     with pytest.raises(SystemExit) as ended:
         run(["list", site.store.location, "scenes"])

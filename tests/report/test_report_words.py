@@ -82,18 +82,18 @@ def report(*scenes: SceneEntry, edges: tuple[EdgeEntry, ...] = (), solved: bool 
     [
         (report(solved=False), "empty", "This map is empty"),
         (report(scene("a", "described", None), solved=False, unsolved=1), "act", "poses were never solved"),
-        (report(scene("a"), scene("b")), "good", "All 2 scenes are placed in one island"),
+        (report(scene("a"), scene("b")), "good", "All 2 scenes are placed in one component"),
         (report(scene("a"), scene("b", "tentative"), tentative=1), "look", "Doubtful: b rests on"),
-        (report(scene("a"), scene("b", component=1)), "good", "in 2 islands, which share no frame"),
-        (report(scene("a"), scene("b", "isolated", 1), isolated=1), "look", "nothing ties b to the others"),
-        (report(scene("a"), scene("b", "described", None), unsolved=1), "act", "b has no place"),
+        (report(scene("a"), scene("b", component=1)), "good", "in 2 components, which share no frame"),
+        (report(scene("a"), scene("b", "isolated", 1), isolated=1), "look", "no edge connects b to other scenes"),
+        (report(scene("a"), scene("b", "described", None), unsolved=1), "act", "b has no pose"),
         (report(scene("a"), set_aside=1), "act", "Next: set_aside"),
         (
             report(scene("a"), scene("b"), edges=(edge("a", "b", undecided=True),), undecided=1),
             "look",
-            "could decide a:b",
+            "Contradictory: a:b",
         ),
-        (report(scene("a"), scene("b"), edges=(edge("a", "b", chi2=99.0),)), "good", "Strained: 1 edge"),
+        (report(scene("a"), scene("b"), edges=(edge("a", "b", chi2=99.0),)), "good", "Large residuals: 1 used edge"),
     ],
 )
 def test_the_verdict_says_how_a_map_stands(made: Report, standing: str, says: str) -> None:
@@ -121,7 +121,7 @@ def test_nothing_checks_edges_in_no_loop() -> None:
     chain = report(scene("a"), scene("b"), scene("c"), edges=(edge("a", "b"), edge("b", "c")))
     assert "nothing checks them" in page(chain)
     loop = replace(chain, edges=(*chain.edges, edge("a", "c", chi2=8.0)))
-    assert "7 of their measured values are spare" in page(loop)
+    assert "7 of their measured values are redundant" in page(loop)
     assert "Variance factor 2 (1 is expected)" in page(loop)
 
 
