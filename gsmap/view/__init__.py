@@ -1,7 +1,7 @@
-"""A page in the browser that shows a map, and pictures of it.
+"""Browser page of a map, and pictures of scenes, edges and changes.
 
-Nothing here imports the store: `gsmap.view.page_source` is the interface of a map, and `ViewServer` serves it on this
-machine only::
+This package does not import the store. `gsmap.view.page_source` is the interface of a map, and `ViewServer` serves it
+on this machine only::
 
     with ViewServer(page_source, cache) as server:
         print(server.url)

@@ -1,4 +1,4 @@
-"""Answers of the page's server by address; `gsmap/view/page/src/contract.ts` defines their content."""
+"""Responses of the page's server by address; `gsmap/view/page/src/contract.ts` defines their content."""
 
 from __future__ import annotations
 
@@ -24,19 +24,24 @@ from gsmap.view.page_source import PageSource, PairPictures
 from gsmap.view.trees import FILE_NAME
 
 JSON, BYTES, JPEG = "application/json", "application/octet-stream", "image/jpeg"
-_RETRY_S, _EACH_S, _LONGEST_S = 0.5, 0.1, 10.0  # what has many before it is asked for less often
+# Delay before the page asks again for a pending result: base, increment per job ahead of it, maximum.
+_RETRY_S, _EACH_S, _LONGEST_S = 0.5, 0.1, 10.0
 _JPEG_QUALITY = 88
-_PICTURES_KEPT = 64  # in memory
+_PICTURES_KEPT = 64  # maximum number of pictures in memory
 _ID = r"[0-9a-f]{32}"
 _MERGED = re.compile(r"(?:[A-Za-z0-9_-][A-Za-z0-9._-]{0,200}/){0,4}[A-Za-z0-9_-][A-Za-z0-9._-]{0,200}\.(?:json|glb)")
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A body with what is said of it.
+    """Response body with its metadata.
 
     Args:
-        etag: names these bytes, where they never change under their address.
+        body: Content.
+        kind: MIME type.
+        status: HTTP status.
+        etag: Entity tag of bytes that never change under their address; empty otherwise.
+        headers: Further headers.
     """
 
     body: bytes
@@ -55,11 +60,11 @@ class Answer:
 
 
 class Answers:
-    """The addresses of one map's page.
+    """Responses to the addresses of one map's page.
 
     Args:
-        page_source: to the map.
-        levels: what is drawn of it.
+        page_source: Content of the map.
+        levels: Levels of detail of its scenes.
     """
 
     def __init__(self, page_source: PageSource, levels: Levels) -> None:
@@ -87,26 +92,26 @@ class Answers:
         ]
 
     def get(self, path: str, asked: Mapping[str, str]) -> Answer:
-        """The answer to an address.
+        """Return the response to an address.
 
         Args:
-            path: from ``/`` on.
-            asked: what stands behind its question mark.
+            path: Path of the address, from ``/`` on.
+            asked: Query parameters.
 
         Raises:
-            GsmapError: why there is none.
+            GsmapError: The response cannot be made.
         """
         for pattern, route in self._routes:
             if (found := pattern.fullmatch(path)) is not None:
                 return route(*found.groups(), **({"asked": asked} if route in self._asking else {}))
-        raise NotFoundError(f"there is no {path}", code="page_not_found")
+        raise NotFoundError(f"no page at {path}", code="page_not_found")
 
     @property
     def _asking(self) -> tuple[Callable[..., Answer], ...]:
         return self._tileset, self._history
 
     def content(self) -> ViewMap:
-        """The map as it is now; read again when it has changed."""
+        """Return the current map, read again if it has changed."""
         state = self._page_source.state()
         with self._reading:
             if self._content is None or self._content[0] != state:
@@ -114,7 +119,7 @@ class Answers:
             return self._content[1]
 
     def summary(self) -> dict[str, Any]:
-        """``map.json`` as it is now."""
+        """Return the current ``map.json``."""
         view = self.content()
         overviews, levels = self._levels.overviews(view)
         served = ServerState(bool(self._page_source.actions), self._levels.boxes(), overviews)
@@ -126,12 +131,12 @@ class Answers:
     def _state(self) -> Answer:
         return Answer.json({"state": _state(self.content().state, self._levels.state())})
 
-    # --- what is drawn -----------------------------------------------------------------------------------------------
+    # --- levels of detail --------------------------------------------------------------------------------------------
 
     def _entry(self, key: str) -> ViewScene:
         found = next((one for one in self.content().scenes if one.key == key), None)
         if found is None:
-            raise NotFoundError("no scene has this content now: ask for map.json again", code="content_outdated")
+            raise NotFoundError("no scene has this content any more: fetch map.json again", code="content_outdated")
         return found
 
     def _tileset(self, key: str, asked: Mapping[str, str]) -> Answer:
@@ -158,7 +163,7 @@ class Answers:
             raise NotFoundError(f"there is no merged/{component}/{name}", code="page_not_found") from error
         return Answer(data, JSON if path.suffix == ".json" else "model/gltf-binary")
 
-    # --- what is told ------------------------------------------------------------------------------------------------
+    # --- data --------------------------------------------------------------------------------------------------------
 
     def _extras(self, scene: str) -> Answer:
         return Answer.json(self._page_source.extras(scene))
@@ -172,14 +177,14 @@ class Answers:
     def _history(self, asked: Mapping[str, str]) -> Answer:
         component = asked.get("component", "0")
         if not component.isdecimal() or len(component) > 8:
-            raise ConfigError(f"a component is a number, got {component!r}", code="invalid_request")
+            raise ConfigError(f"the component must be a number, got {component!r}", code="invalid_request")
         return Answer.json(self._page_source.history(asked.get("at", ""), int(component)))
 
     def _edge(self, target: str, source: str) -> Answer:
         return Answer.json(self.edge(target, source))
 
     def edge(self, target: str, source: str) -> dict[str, Any]:
-        """`EdgeDetail` of a pair of scene ids."""
+        """Return the `EdgeDetail` of a pair of scene ids."""
         detail = self._page_source.edge(target, source)
         at = f"edges/{target}-{source}"
         names = ("target", "source", "difference")
@@ -208,7 +213,7 @@ class Answers:
         return self._drawn(change, lambda: {change: self._page_source.change_picture(change)})
 
     def _drawn(self, name: str, draw: Callable[[], Mapping[str, np.ndarray]]) -> Answer:
-        """A picture from memory, or drawn now with those that come with it; one at a time."""
+        """Return a picture from memory, or draw it with the pictures of the same call, one call at a time."""
         state = self._page_source.state()
         with self._drawing:
             found = self._pictures.get(f"{state} {name}")
@@ -221,12 +226,12 @@ class Answers:
             else:
                 self._pictures.move_to_end(f"{state} {name}")
         if found is None:
-            raise NotFoundError(f"there is no such picture of {name.partition(' ')[0]}", code="page_not_found")
+            raise NotFoundError(f"no such picture of {name.partition(' ')[0]}", code="page_not_found")
         return Answer(found, JPEG)
 
 
 def jpeg(picture: np.ndarray) -> bytes:
-    """(H, W, 3) uint8 as a JPEG."""
+    """Encode a picture (H, W, 3) uint8 as JPEG."""
     from PIL import Image
 
     out = io.BytesIO()
@@ -240,13 +245,13 @@ def _state(of_map: str, of_levels: str) -> str:
 
 def _waiting(found: PendingResult) -> Answer:
     retry_s = min(_LONGEST_S, _RETRY_S + _EACH_S * found.waiting)
-    said = {"progress": round(found.progress, 4), "waiting": found.waiting, "retry_s": round(retry_s, 2)}
-    return Answer.json(said, HTTPStatus.ACCEPTED)
+    status = {"progress": round(found.progress, 4), "waiting": found.waiting, "retry_s": round(retry_s, 2)}
+    return Answer.json(status, HTTPStatus.ACCEPTED)
 
 
 def _number(text: str) -> float:
     try:
         value = float(text)
     except ValueError as error:
-        raise ConfigError(f"a rank is a number, got {text!r}", code="invalid_request") from error
+        raise ConfigError(f"the rank must be a number, got {text!r}", code="invalid_request") from error
     return value if np.isfinite(value) else 0.0

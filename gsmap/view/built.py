@@ -1,4 +1,4 @@
-"""The page of `gsmap view`, as it was built."""
+"""Location of the built page of `gsmap view`."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ FOLDER = "built"
 
 
 def built_page() -> Path:
-    """The folder of the built page: ``index.html``, its script, its style, and the licences of what is in it.
+    """Return the folder of the built page: ``index.html``, script, style and licences.
 
     Raises:
-        ConfigError: it is not built.
+        ConfigError: The page is not built.
     """
     folder = Path(str(resources.files("gsmap.view"))) / FOLDER
     if not (folder / "index.html").is_file() or not (folder / "page.js").is_file():
         raise ConfigError(
-            "the page of gsmap view is not built: in a checkout run tools/build_page.sh (Node.js with npm); a package "
-            "has it where npm was there when it was built",
+            "the page of gsmap view is not built: in a checkout run tools/build_page.sh (needs Node.js with npm); a "
+            "package contains the page if npm was installed when the package was built",
             code="page_not_built",
         )
     return folder

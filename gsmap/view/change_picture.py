@@ -1,4 +1,4 @@
-"""Pictures of a change for a person to judge: the same look at both captures, side by side."""
+"""Pictures of a change for review: both captures from the same camera, side by side."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
 from gsmap.types import Cameras, PosedScene
 
-_TRIED = 6  # cameras that are looked through before one is chosen
+_TRIED = 6  # maximum number of cameras that are rendered to choose one
 _TRIED_PX = 120
-_NEAR = 0.15  # metres within which a surface is the one that changed
-_MARGIN = 1.0  # around the box, as a share of it
-_LEAST_SHARE = 0.15  # of the camera's picture: a small thing is shown with what is around it
+_NEAR = 0.15  # maximum distance in metres from a rendered surface to a changed point
+_MARGIN = 1.0  # margin around the box, as a fraction of its size
+_LEAST_SHARE = 0.15  # smallest crop as a fraction of the image, so that small changes have context
 _GAP_PX = 4
-_POINTS = 500  # of what lies in a box, by which a camera is chosen
+_POINTS = 500  # maximum number of points in a box by which a camera is chosen
 _FRAME = (255, 64, 64)
 
 
 @dataclass(frozen=True, eq=False)
 class _Crop:
-    """A camera that shows a part of another's picture."""
+    """Camera of a cropped image, with a score of how well it shows the box."""
 
     camera: Cameras
     score: float
@@ -33,13 +33,13 @@ class _Crop:
 def draw_change(
     older: PosedScene, newer: PosedScene, box: np.ndarray, points: np.ndarray, side_px: int = 320
 ) -> np.ndarray:
-    """Before on the left, after on the right, (H, W, 3) uint8; the box of the change is outlined.
+    """Draw a change, before on the left and after on the right, with its box outlined: (H, W, 3) uint8.
 
     Args:
-        older, newer: both captures, in one metric frame.
-        box: (2, 3) around what changed.
-        points: (K, 3) where it changed; the view is chosen that shows most of them.
-        side_px: of each of the two pictures, the longer side.
+        older, newer: Both captures in one metric frame.
+        box: (2, 3) bounding box of the change.
+        points: (K, 3) changed points; the camera that shows most of them is chosen.
+        side_px: Longer side of each of the two pictures, in pixels.
     """
     camera = _sized(_best(older, newer, box, points), side_px)
     halves = [_picture(scene, camera, box) for scene in (older, newer)]
@@ -51,9 +51,9 @@ def draw_place(scene: PosedScene, box: np.ndarray, side_px: int = 320) -> np.nda
     """Render a scene in a box from the camera that sees most of it, (H, W, 3) uint8, with the box outlined.
 
     Args:
-        scene: in a metric frame.
-        box: (2, 3) in that frame.
-        side_px: the longer side.
+        scene: Scene in a metric frame.
+        box: (2, 3) box in that frame.
+        side_px: Longer side in pixels.
     """
     points = scene.gaussians.means[((scene.gaussians.means >= box[0]) & (scene.gaussians.means <= box[1])).all(1)]
     points = points[:: max(1, len(points) // _POINTS)] if len(points) else box
@@ -74,7 +74,7 @@ def _picture(scene: PosedScene, camera: Cameras, box: np.ndarray) -> np.ndarray:
 
 
 def _best(older: PosedScene, newer: PosedScene, box: np.ndarray, points: np.ndarray) -> Cameras:
-    """Of the cameras of both captures the one that sees most of what changed, cut to where it is."""
+    """Return the camera of either capture that sees most of the change, cropped to the change."""
     cameras = [
         scene.cameras[i] for scene in (older, newer) if scene.cameras is not None for i in range(len(scene.cameras))
     ]
@@ -86,7 +86,7 @@ def _best(older: PosedScene, newer: PosedScene, box: np.ndarray, points: np.ndar
 
 
 def _crop(camera: Cameras, box: np.ndarray, points: np.ndarray) -> _Crop | None:
-    """The part of a camera's picture around a box; None where it shows none of the points."""
+    """Crop a camera to the image region around a box; None if it shows none of the points."""
     pixels, depth = _project(points, camera)
     shown = in_image(pixels, depth, camera.sizes_px[0])
     if not shown.any():
@@ -102,7 +102,7 @@ def _crop(camera: Cameras, box: np.ndarray, points: np.ndarray) -> _Crop | None:
     fx, fy, cx, cy = camera.intrinsics_px[0]
     intrinsics = np.array([[fx, fy, cx - low[0], cy - low[1]]])
     cut = Cameras(camera.T_frame_camera, intrinsics, np.array([[width, height]]), camera.names)
-    # Most of it in the picture, and from near, where nothing but it is shown.
+    # Prefer cameras that show all points, and close ones.
     return _Crop(cut, float(shown.mean()) + min(1.0, float(half * 2 / size.max())))
 
 
@@ -121,7 +121,7 @@ def _project(points: np.ndarray, camera: Cameras) -> tuple[np.ndarray, np.ndarra
 
 
 def _sized(camera: Cameras, longest_side_px: int) -> Cameras:
-    """The same view, larger or smaller."""
+    """Return the camera scaled to another image size."""
     sizes = np.maximum(1, np.round(camera.sizes_px * (longest_side_px / camera.sizes_px.max()))).astype(np.int64)
     ratio = sizes / camera.sizes_px
     intrinsics = camera.intrinsics_px * np.concatenate([ratio, ratio], axis=1)
@@ -129,7 +129,7 @@ def _sized(camera: Cameras, longest_side_px: int) -> Cameras:
 
 
 def _from_outside(box: np.ndarray) -> Cameras:
-    """A camera that looks at a box from aside and above; where no capture's own camera saw it."""
+    """Return a camera that looks at a box from the side and above, for boxes that no capture camera saw."""
     middle, size = box.mean(0), float(np.linalg.norm(box[1] - box[0])) + 0.5
     ahead = np.array([1.0, 1.0, -0.7]) / np.linalg.norm([1.0, 1.0, -0.7])
     right = np.cross(ahead, [0.0, 0.0, 1.0])

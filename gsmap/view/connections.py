@@ -1,5 +1,4 @@
-"""Connections to this machine's own address: from this user only where that can be told, a bounded number, none idle
-for long."""
+"""Local connections: a bounded number with timeouts, on Linux from the same user only."""
 
 from __future__ import annotations
 
@@ -15,9 +14,9 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
-# A browser opens six; a second window and a reload beside it fit. Each holds a thread.
+# A browser opens six; this suffices for a second window and a reload. Each occupies a thread.
 MAX_CONNECTIONS = 16
-# To send a whole request, or the next one: what is slower is no browser on this machine.
+# Timeout for a whole request, or the next one; a browser on this machine is faster.
 REQUEST_S = 10.0
 _ESTABLISHED = "01"
 
@@ -26,25 +25,28 @@ Address = tuple[str, int]
 
 @dataclass(eq=False)
 class Connection:
-    """One client.
+    """Connection of one client.
 
     Args:
-        socket: to it.
-        waiting_since: `time.monotonic` when its next request was first waited for; None while it is answered.
+        socket: Socket of the client.
+        waiting_since: `time.monotonic` since which the server waits for a request; None while it answers one.
     """
 
     socket: socket.socket
     waiting_since: float | None = field(default_factory=time.monotonic)
 
     def drop(self) -> None:
-        """End it, whoever waits for it."""
+        """Shut the connection down, which also ends blocked reads."""
         with contextlib.suppress(OSError):  # it has ended already
             self.socket.shutdown(socket.SHUT_RDWR)
 
 
 class LocalServer(HTTPServer):
-    """Answers at most `MAX_CONNECTIONS` at once, with as many threads. When one more comes, the one that has kept a
-    thread waiting for longest is dropped, so that half requests cannot keep the page out."""
+    """HTTP server with at most `MAX_CONNECTIONS` connections, one thread each.
+
+    A further connection replaces the one that has been idle for longest, so that incomplete requests cannot block the
+    page.
+    """
 
     request_queue_size = 64
 
@@ -73,14 +75,14 @@ class LocalServer(HTTPServer):
         self._accepted.put((request, client_address))
 
     def service_actions(self) -> None:
-        """Called twice a second by `serve_forever`: ends what has waited for too long."""
+        """Drop connections that have been idle for too long; `serve_forever` calls this twice a second."""
         with self._lock:
             late = time.monotonic() - REQUEST_S
             for one in [c for c in self.open.values() if c.waiting_since is not None and c.waiting_since < late]:
                 self._forget(one)
 
     def handle_error(self, request: object, client_address: Any) -> None:
-        """A client that goes away is no error, and nothing below the command line prints."""
+        """Ignore errors: a client that disconnects is not an error."""
 
     def server_close(self) -> None:
         super().server_close()
@@ -108,12 +110,14 @@ class LocalServer(HTTPServer):
 
 
 def is_of_another_user(client: Address, server: Address) -> bool:
-    """Return true if the other end of a local connection belongs to a user other than this one and root. Known on Linux
-    only, and not for a socket that is closing: then false."""
+    """Return true if the client of a local connection is a user other than this one and root.
+
+    Returns false if unknown: outside Linux, or for a socket that is closing.
+    """
     if not sys.platform.startswith("linux"):
         return False
     here, there = _hexadecimal(*client), _hexadecimal(*server)
-    for name, prefix in (("tcp", ""), ("tcp6", "0000000000000000FFFF0000")):  # an IPv6 socket may speak IPv4
+    for name, prefix in (("tcp", ""), ("tcp6", "0000000000000000FFFF0000")):  # IPv4 connections of IPv6 sockets
         try:
             rows = Path("/proc/net", name).read_text(encoding="ascii").splitlines()[1:]
         except OSError:
@@ -126,5 +130,5 @@ def is_of_another_user(client: Address, server: Address) -> bool:
 
 
 def _hexadecimal(host: str, port: int) -> str:
-    """An IPv4 address as the kernel lists it: the address in the machine's byte order."""
+    """Format an IPv4 address as in /proc/net: in the byte order of the machine."""
     return f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"

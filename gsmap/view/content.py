@@ -1,6 +1,6 @@
 """Content of the page as `gsmap/view/page/src/contract.ts` defines it, and its conversion to JSON.
 
-Nothing here reads anything: `gsmap.view.page_source` says what is loaded when the page asks for it.
+This module reads no files; `gsmap.view.page_source` loads what the page requests.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from gsmap.types import Scene, ScenePose, Sim3
 
 SCHEMA = 1
 UNPLACED_UP = (0.0, -1.0, 0.0)
-"""Against gravity in the frame of a scene of which nothing is known: trainers' frames are right, down, front."""
+"""Up direction assumed for a scene without one: frames of trainers are right, down, front."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewScene:
-    """One scene.
+    """A scene on the page.
 
     Args:
-        key: names its present content, in addresses and in the cache.
-        pose: None where nothing placed it; it is then a component of its own.
-        up: (3,) against gravity in its frame; None where nobody knows.
-        prior: what was told of where it lies, in words; None where nothing was.
-        prior_number: which of what was ever told that is.
+        scene: The scene.
+        key: Key of its current content, in addresses and in the cache.
+        pose: Estimated pose; None if the scene is not placed, and a component of its own.
+        up: (3,) direction opposite to gravity in the scene frame; None if unknown.
+        prior: Description of its pose prior; None if there is none.
+        prior_number: Number of that prior in the history of priors.
     """
 
     scene: Scene
@@ -47,16 +48,20 @@ class ViewScene:
 
 @dataclass(frozen=True)
 class ViewEdge:
-    """One pair that was tried.
+    """A registered pair of scenes on the page.
 
     Args:
-        target, source: scene ids.
-        status: ``accepted``, ``rejected`` or ``no_match``, a review included.
-        used: what the last optimize made of it: True, False or ``"tentative"``; None before.
-        undecided: whether nothing could tell if it is right.
-        review: a person's standing word, ``confirm`` or ``reject``, and what they noted of it.
-        probability: that it is right; None where unknown.
-        doubt: how much a person is needed, 0 to 1.
+        target, source: Scene ids.
+        status: ``accepted``, ``rejected`` or ``no_match``, after any review.
+        reason: Reason for the status.
+        used: Use in the newest revision: True, False or ``"tentative"``; None if it has not been optimized.
+        undecided: The edge contradicts others, without evidence for either.
+        review: Current review, ``confirm`` or ``reject``; None if unreviewed.
+        note: Note of the review.
+        probability: Probability that the pose is right; None if unknown.
+        overlap: Overlap of the scenes, in [0, 1].
+        num_inliers: Number of inliers.
+        doubt: Urgency of a review, in [0, 1].
     """
 
     target: str
@@ -75,7 +80,7 @@ class ViewEdge:
 
 @dataclass(frozen=True)
 class ViewRevision:
-    """One answer of the optimiser; ``is_kept``: whether its poses are still there."""
+    """A revision on the page; ``is_kept`` if its poses are still stored."""
 
     id: int
     created_at: str
@@ -86,11 +91,18 @@ class ViewRevision:
 
 @dataclass(frozen=True, eq=False)
 class ViewChange:
-    """Change between two scenes (ids).
+    """A change between two scenes on the page.
 
     Args:
-        box: (2, 3) map frame.
-        note: of the review.
+        id: Id of the change, such as ``c12``.
+        kind: Kind of the change.
+        component: Component of the scenes.
+        box: (2, 3) bounding box in the map frame.
+        before, after: Scene ids.
+        at: Date of the later scene.
+        confidence: Confidence in [0, 1].
+        status: Status of its review.
+        note: Note of the review.
     """
 
     id: str
@@ -107,12 +119,15 @@ class ViewChange:
 
 @dataclass(frozen=True, eq=False)
 class ViewPhoto:
-    """A photograph that was localised.
+    """A localized photo on the page.
 
     Args:
-        T_map_camera: (4, 4) pose.
+        file: File name.
+        component: Component of the pose.
+        T_map_camera: (4, 4) pose in the map frame.
         intrinsics_px: (4,) fx, fy, cx, cy.
-        size_px: width and height.
+        size_px: Width and height.
+        captured_at: Date of the photo.
     """
 
     file: str
@@ -125,15 +140,17 @@ class ViewPhoto:
 
 @dataclass(frozen=True, eq=False)
 class ViewMap:
-    """A map at one moment.
+    """Content of the page at one time.
 
     Args:
-        state: another one whenever the map has changed.
-        revision: whose poses these are; None before the first.
-        metres_per_unit: of each component of the poses.
-        merged: components of which merged tiles were given.
-        has_objects: whether anything is told of objects.
-        stale: whether `gsmap optimize` would see anything that these poses have not.
+        title: Name of the map.
+        scenes, edges, revisions, changes, photos: Content of the map.
+        state: Opaque text that differs after every change of the map.
+        revision: Revision of the poses; None before the first.
+        metres_per_unit: Metres per map unit of each component.
+        merged: Components with merged tiles.
+        has_objects: The map has objects.
+        stale: The poses are outdated, because edges or priors changed after the revision.
     """
 
     title: str
@@ -150,21 +167,22 @@ class ViewMap:
     stale: bool = False
 
     def components(self) -> list[int]:
-        """The island of every scene; scenes that nothing placed come after the others, one each."""
+        """Return the component of each scene; each scene without a pose gets a further component of its own."""
         last = 1 + max((s.pose.component for s in self.scenes if s.pose is not None), default=-1)
         return [s.pose.component if s.pose else last + i for i, s in enumerate(self.scenes)]
 
 
 @dataclass(frozen=True)
 class ViewOverview:
-    """The coarsest levels of an island's scenes in one file.
+    """Overview of a component: the coarsest levels of its scenes in one file.
 
     Args:
-        scenes: by their place in the map's list.
-        counts: Gaussians of each.
-        pending: scenes that are not in it yet.
-        heights: of floor and ceiling of each, along the component's up: nearly all of it lies between.
-        size: length, width and height of it all, map units; None while nothing is in it.
+        uri: Address of the file.
+        scenes: Indices of its scenes in the map's list.
+        counts: Number of Gaussians of each scene.
+        pending: Number of scenes that the overview still lacks.
+        heights: Heights of floor and ceiling of each scene along the up direction of the component.
+        size: Length, width and height of all scenes in map units; None if the overview is empty.
     """
 
     uri: str
@@ -177,14 +195,14 @@ class ViewOverview:
 
 @dataclass(frozen=True, eq=False)
 class ServerState:
-    """State that a server or a static page adds to a map: its answers, and its levels of detail.
+    """Content that a server or a static page adds to a map.
 
     Args:
-        actions: true if reviews are allowed.
-        boxes: (2, 3) of what a scene shows, without floaters, scene frame, by key; the scene's bounds elsewhere.
-        overviews: by component.
-        live: true for a server, which computes more on request; false for a static page.
-        drawn: ids of the changes with pictures on a static page.
+        actions: The page offers reviews and edits.
+        boxes: Bounding boxes (2, 3) of scenes by key, scene frame, without floaters; default: the scene's bounds.
+        overviews: Overviews by component.
+        live: A server computes further content on request.
+        drawn: Changes with pictures on a static page.
     """
 
     actions: bool = False
@@ -195,7 +213,7 @@ class ServerState:
 
 
 def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
-    """``map.json``: everything the page lists."""
+    """Return ``map.json``, the lists of the page."""
     components = view.components()
     at = {entry.scene.id: index for index, entry in enumerate(view.scenes)}
     boxes = [served.boxes.get(entry.key, entry.scene.bounds) for entry in view.scenes]
@@ -274,10 +292,12 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
 
 
 def up_of(scenes: Sequence[ViewScene]) -> list[float]:
-    """Against gravity in the frame of an island, by what most of its scenes say; where none does, z of the map, or what
-    trainers use."""
-    told = [entry.S_map_scene.rotation @ entry.up for entry in scenes if entry.up is not None]
-    middle = np.median(np.array(told), axis=0) if told else np.zeros(3)
+    """Return the up direction of a component: the median over its scenes.
+
+    Default: z of the map, or `UNPLACED_UP` for a single scene without edges.
+    """
+    ups = [entry.S_map_scene.rotation @ entry.up for entry in scenes if entry.up is not None]
+    middle = np.median(np.array(ups), axis=0) if ups else np.zeros(3)
     size = float(np.linalg.norm(middle))
     if size > 1e-3:
         return [float(value) for value in middle / size]
@@ -337,9 +357,9 @@ def _edge(edge: ViewEdge, at: Mapping[str, int]) -> dict[str, Any]:
 def _overview(one: ViewOverview | None) -> dict[str, Any] | None:
     if one is None:
         return None
-    told = {"uri": one.uri, "pending": one.pending, "scenes": list(one.scenes), "counts": list(one.counts)}
+    data = {"uri": one.uri, "pending": one.pending, "scenes": list(one.scenes), "counts": list(one.counts)}
     size = None if one.size is None else list(one.size)
-    return told | {"heights": [list(pair) for pair in one.heights], "size": size}
+    return data | {"heights": [list(pair) for pair in one.heights], "size": size}
 
 
 def _number(value: float | None) -> float | None:

@@ -1,4 +1,4 @@
-"""A picture of a scene graph for a person to judge."""
+"""Picture of a scene graph for inspection."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
 from gsmap.types.views import View
 
 _MAX_LANDMARKS = 150
-_EDGES = 4  # drawn per object
+_EDGES = 4  # number of lines drawn per object
 
 
 def draw_graph(
@@ -27,7 +27,7 @@ def draw_graph(
     width_px: int = 960,
     local_distance_m: float = 1.5,
 ) -> np.ndarray:
-    """The graph over a render: (H, W, 3) uint8.
+    """Draw the graph over a render: (H, W, 3) uint8.
 
     Objects are discs with their number (the row of the layer), joined to the nearest of the visible neighbours that
     their context is counted over; a disc is a small ring where the object is hidden. The strongest landmarks are small
@@ -35,10 +35,15 @@ def draw_graph(
     blue along a* and b*, magenta for density.
 
     Args:
-        camera: index or name of the view to draw; the one that sees most nodes where None.
+        gaussians, cameras: The scene.
+        graph: Its scene graph.
+        camera: Index or name of the camera; default: the camera that sees most nodes.
+        width_px: Width of the picture.
+        local_distance_m: Maximum length of the lines between objects, in metres.
 
     Raises:
-        InputError: no cameras. NotFoundError: no camera of that name.
+        InputError: The scene has no cameras.
+        NotFoundError: No camera has the name.
     """
     if len(cameras) == 0:
         raise InputError("a picture of the graph needs a camera to look through", code="nothing_to_draw")
@@ -64,7 +69,7 @@ def draw_graph(
 
 
 def _best_view(gaussians: Gaussians, cameras: Cameras, graph: SceneGraph, width_px: int) -> View:
-    """Of a few sampled views, the one with most nodes on its visible surface."""
+    """Render the camera, of a few sampled ones, that sees most nodes."""
     nodes = np.concatenate([layer.positions for layer in graph.layers.values()] or [np.zeros((0, 3))])
     some = cameras.evenly(12)
     seen = [_visible(nodes, _render(gaussians, some[i], 240), 0.1).sum() for i in range(len(some))]
@@ -108,20 +113,20 @@ def _draw_landmarks(draw: ImageDraw.ImageDraw, layer: NodeLayer, view: View) -> 
 
 
 def _wide(camera: Cameras, width_px: int) -> Cameras:
-    """The camera with a picture of another width, larger or smaller."""
+    """Return the camera scaled to another image width."""
     ratio = width_px / camera.sizes_px[0, 0]
     size = np.maximum(1, np.round(camera.sizes_px * ratio)).astype(np.int64)
     return Cameras(camera.T_frame_camera, camera.intrinsics_px * ratio, size, camera.names)
 
 
 def _visible(points: np.ndarray, view: View, tolerance: float) -> np.ndarray:
-    """(N,) bool: on the surface the view sees, to within a share of its depth."""
+    """Return a mask (N,) of points on the visible surface, within a relative depth tolerance."""
     camera = view.camera
     rows, _ = on_surface(points, camera.T_camera_frame[0], camera.intrinsics_px[0], view.depth, tolerance)
     return np.isin(np.arange(len(points)), rows)
 
 
 def _pixels(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions (N, 2) float and which are ahead of the camera and inside the picture."""
+    """Return pixel positions (N, 2) and a mask of points inside the image."""
     at, z = project(points, view.camera.T_camera_frame[0], view.camera.intrinsics_px[0])
     return at, in_image(at, z, view.camera.sizes_px[0], 1e-6)

@@ -1,4 +1,4 @@
-"""Levels of detail of scenes and overviews of components, from the cache or made in the background."""
+"""Levels of detail of scenes and overviews of components, from a cache or computed in the background."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from gsmap.view.page_source import PageSource
 from gsmap.view.tree_cache import TreeCache
 from gsmap.view.trees import Sketch, TreeParams, sketch, write_tree
 
-_SPZ_BYTES = 19  # of a Gaussian of SH degree 0 before it is compressed, and grids that are not quite full
-_OVERVIEW_BYTES = 5e6  # of the first picture of an island, in which every scene has a share
-OVERVIEW_GAUSSIANS = 32_768  # of one scene in it, at most
-_STEP = 8  # between the sizes of sketches, so that few of them are kept of a scene
+_SPZ_BYTES = 19  # bytes of a Gaussian of SH degree 0 before compression
+_OVERVIEW_BYTES = 5e6  # approximate maximum size of the overview of a component
+OVERVIEW_GAUSSIANS = 32_768  # maximum number of Gaussians of one scene in an overview
+_STEP = 8  # factor between sizes of sketches, so that each scene has few of them
 _LEAST = 16
-_FIRST = -1.0  # rank of what everybody waits for: before any tree
-_ISLANDS_KEPT = 8  # whose sketches are in memory
+_FIRST = -1.0  # rank of overviews, before all trees
+_COMPONENTS_KEPT = 8  # maximum number of components with sketches in memory
 _TRIES = 3
-_STRAYS = 0.02  # share of a sketch below the floor of its scene, above the ceiling, and beyond each side
-_FILES_KEPT = 4  # overviews as bytes
+_STRAYS = 0.02  # fraction of Gaussians left out below the floor, above the ceiling and at each side
+_FILES_KEPT = 4  # maximum number of overview files in memory
 
 _T = TypeVar("_T")
 
 
 def sketch_size(num_scenes: int) -> int:
-    """Gaussians of a scene in the overview of an island of so many."""
+    """Return the number of Gaussians per scene in the overview of a component of ``num_scenes`` scenes."""
     share = _OVERVIEW_BYTES / _SPZ_BYTES / max(1, num_scenes)
     size = OVERVIEW_GAUSSIANS
     while size > share and size > _LEAST:
@@ -50,7 +50,7 @@ def sketch_size(num_scenes: int) -> int:
 
 
 def overview_file(parts: Sequence[tuple[ViewScene, Sketch]]) -> bytes:
-    """An SPZ of sketches, one after the other, in the map frame, its numbers as they are."""
+    """Pack sketches as one SPZ in the map frame, in order."""
     placed = [transform_gaussians(one.gaussians, entry.S_map_scene) for entry, one in parts]
     return spz.pack("overview.spz", Gaussians.concatenate(placed))
 
@@ -66,24 +66,24 @@ def extent_of(
 
 
 @dataclass(eq=False)
-class _Island:
-    """The sketches of one component that are at hand, and those of them that the page was told of."""
+class _ComponentSketches:
+    """Sketches of one component, and those of them in the overview that the page has."""
 
     size: int
     sketches: dict[str, Sketch] = field(default_factory=dict)
-    told: frozenset[str] = frozenset()
+    published: frozenset[str] = frozenset()
     looked: set[str] = field(default_factory=set)
-    told_of: ViewOverview | None = None
+    overview: ViewOverview | None = None
 
 
 class Levels:
-    """Trees and overviews of one map, for all who look at it.
+    """Trees and overviews of one map.
 
     Args:
-        page_source: to the map.
-        cache: where they are kept.
-        workers: threads that make them.
-        tree: sizes of the levels.
+        page_source: Content of the map.
+        cache: Cache of trees and sketches.
+        workers: Number of threads that compute them.
+        tree: Sizes of the levels.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Levels:
         self._page_source, self._cache, self._tree = page_source, cache, tree or TreeParams()
         self._maker = Maker(workers)
         self._lock = threading.RLock()
-        self._islands: OrderedDict[int, _Island] = OrderedDict()
+        self._components: OrderedDict[int, _ComponentSketches] = OrderedDict()
         self._files: OrderedDict[str, tuple[tuple[ViewScene, Sketch], ...] | bytes] = OrderedDict()
 
     def close(self) -> None:
@@ -101,13 +101,14 @@ class Levels:
     # --- trees -------------------------------------------------------------------------------------------------------
 
     def tree(self, entry: ViewScene, rank: float = 0.0) -> Path | PendingResult:
-        """The folder of a scene's tree, or how far it is.
+        """Return the folder of a scene's tree, or the progress of computing it.
 
         Args:
-            rank: of those that are asked for, the lowest is made first.
+            entry: The scene.
+            rank: Trees of lower rank are computed first.
 
         Raises:
-            GsmapError: why it cannot be made.
+            GsmapError: The tree cannot be computed.
         """
         if (found := self._cache.tree(entry.key)) is not None:
             return found
@@ -115,26 +116,27 @@ class Levels:
         return self._maker.ask(f"tree {entry.key}", work, rank=max(0.0, rank))
 
     def tile(self, entry: ViewScene, uri: str) -> bytes:
-        """The bytes of a tile of a tree.
+        """Return the bytes of a tile.
 
         Raises:
-            NotFoundError: there is none of that name now; asking for the tree makes it again.
+            NotFoundError: The cache has no such tile any more; requesting the tree computes it again.
         """
         data = self._cache.tile(entry.key, uri)
         if data is None:
             raise NotFoundError(
-                f"{entry.scene.name} has no tile {uri} now: ask for its tileset again", code="content_outdated"
+                f"{entry.scene.name} has no tile {uri} any more: fetch its tileset again", code="content_outdated"
             )
         return data
 
     def read(self, entry: ViewScene, read: Callable[[Path], _T]) -> _T:
-        """Read from the folder of a scene's tree, which is made in this thread if missing.
+        """Read from the folder of a scene's tree, which is computed in this thread if missing.
 
         Args:
-            read: again where the tree made room for another one meanwhile.
+            entry: The scene.
+            read: Function of the folder; called again if the cache evicted the tree meanwhile.
 
         Raises:
-            GsmapError: why it cannot be made.
+            GsmapError: The tree cannot be computed.
         """
         for _ in range(_TRIES):
             found = self._cache.tree(entry.key)
@@ -145,7 +147,8 @@ class Levels:
                 if found is not None:
                     return read(found)
         raise NotFoundError(
-            f"the levels of detail of {entry.scene.name} are gone again: raise view.cache_gib", code="content_outdated"
+            f"the levels of detail of {entry.scene.name} do not fit into the cache: raise view.cache_gib",
+            code="content_outdated",
         )
 
     def _make_tree(self, scene: str, key: str, progress: Progress) -> None:
@@ -156,7 +159,7 @@ class Levels:
         self._forget_if_gone(scene)
 
     def _forget_if_gone(self, scene: str) -> None:
-        """Discard levels of a scene that was purged while they were made."""
+        """Discard levels of a scene that was purged while they were computed."""
         try:
             self._page_source.source(scene)
         except NotFoundError:
@@ -166,79 +169,82 @@ class Levels:
     # --- overviews ---------------------------------------------------------------------------------------------------
 
     def boxes(self) -> dict[str, np.ndarray]:
-        """(2, 3) of what scenes show, by key, of those that were looked at."""
+        """Return bounding boxes (2, 3) by scene key, for scenes with a sketch in memory."""
         with self._lock:
-            return {key: one.box for island in self._islands.values() for key, one in island.sketches.items()}
+            return {key: one.box for group in self._components.values() for key, one in group.sketches.items()}
 
     def overviews(self, view: ViewMap) -> tuple[dict[int, ViewOverview], str]:
-        """The overview of every component, as far as it is known, and the `state` of that; those of the largest are
-        made without being asked."""
-        out, islands = {}, members(view)
+        """Return the overview of each component as far as it exists, and its `state`.
+
+        This starts the overview of the largest component.
+        """
+        out, inside_of = {}, members(view)
         with self._lock:
-            for component, inside in islands.items():
-                if component == min(islands) or component in self._islands:
+            for component, inside in inside_of.items():
+                if component == min(inside_of) or component in self._components:
                     out[component] = self._overview(component, inside)
                 else:
                     out[component] = ViewOverview(f"overviews/{component}/none.spz", pending=len(inside))
             return out, self.state()
 
     def look_at(self, view: ViewMap, scene: str) -> None:
-        """Have the overview of a scene's island made, too: somebody is there."""
+        """Start the overview of a scene's component, because a user views the scene."""
         place = next((i for i, entry in enumerate(view.scenes) if entry.scene.id == scene), None)
         if place is not None:
             component = view.components()[place]
             with self._lock:
-                if component not in self._islands:
+                if component not in self._components:
                     self._overview(component, members(view)[component])
 
     def overview(self, view: ViewMap, component: int, name: str) -> bytes | PendingResult:
-        """The file of an overview by its name, or how far it is.
+        """Return the file of an overview by name, or the progress of computing it.
 
         Raises:
-            NotFoundError: no such component, or the overview is another by now.
+            NotFoundError: The component does not exist, or the overview has changed.
         """
         inside = members(view).get(component)
         if inside is None:
-            raise NotFoundError(f"there is no component {component}", code="component_not_found")
+            raise NotFoundError(f"no component {component}", code="component_not_found")
         with self._lock:
-            told = self._overview(component, inside)
+            overview = self._overview(component, inside)
             if name == "none":
-                done = len(inside) - told.pending
-                return PendingResult(done / len(inside), told.pending)
+                done = len(inside) - overview.pending
+                return PendingResult(done / len(inside), overview.pending)
             parts = self._files.get(name)
             if parts is None:
-                raise NotFoundError("this overview is another by now: ask for map.json again", code="content_outdated")
+                raise NotFoundError("this overview has changed: fetch map.json again", code="content_outdated")
             if not isinstance(parts, bytes):
                 parts = self._files[name] = overview_file(parts)
             self._files.move_to_end(name)
             return parts
 
     def state(self) -> str:
-        """Another text whenever the page is to be told of another overview."""
+        """Return a text that differs whenever the page has to load another overview."""
         with self._lock:
-            told = [f"{component} {len(island.told)}" for component, island in self._islands.items()]
-        return " ".join(sorted(told))
+            parts = [f"{component} {len(group.published)}" for component, group in self._components.items()]
+        return " ".join(sorted(parts))
 
     def whole(
         self, inside: Mapping[int, ViewScene], size: int | None = None
     ) -> tuple[bytes, ViewOverview, dict[str, np.ndarray]]:
-        """The overview of an island, made in this thread; and the boxes of its scenes, by key.
+        """Compute the overview of a component in this thread, with bounding boxes of its scenes by key.
 
         Args:
-            size: Gaussians of each at most; by default what fits.
+            inside: Scenes of the component by index.
+            size: Maximum number of Gaussians per scene; default: by the number of scenes.
         """
         size = size or sketch_size(len(inside))
         parts, places, boxes = [], [], {}
         for place, entry in inside.items():
             try:
                 made = self._cache.sketch(entry.key, size) or self._make_sketch(entry.scene.id, entry.key, size)
-            except InputError:  # nothing of it can be seen
+            except InputError:  # no opaque Gaussians
                 continue
             parts.append((entry, made))
             places.append(place)
             boxes[entry.key] = made.box
         if not parts:
-            raise InputError("nothing of it can be seen", code="no_opaque_gaussians")
+            raise InputError("the component has no opaque Gaussians", code="no_opaque_gaussians")
         counts = tuple(len(one.gaussians) for _, one in parts)
         heights, sides = extent_of(parts, up_of(list(inside.values())))
         return overview_file(parts), ViewOverview("", tuple(places), counts, 0, heights, sides), boxes
@@ -246,29 +252,29 @@ class Levels:
     def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
         """Return the overview of one component as far as it exists, and request the rest."""
         size = sketch_size(len(inside))
-        island = self._islands.get(component)
-        if island is None or island.size != size:
-            island = self._islands[component] = _Island(size)
-        self._islands.move_to_end(component)
-        while len(self._islands) > _ISLANDS_KEPT:
-            self._islands.popitem(last=False)
+        group = self._components.get(component)
+        if group is None or group.size != size:
+            group = self._components[component] = _ComponentSketches(size)
+        self._components.move_to_end(component)
+        while len(self._components) > _COMPONENTS_KEPT:
+            self._components.popitem(last=False)
         keys, failed = {entry.key for entry in inside.values()}, 0
-        island.sketches = {key: one for key, one in island.sketches.items() if key in keys}
+        group.sketches = {key: one for key, one in group.sketches.items() if key in keys}
         for entry in inside.values():
-            if entry.key in island.sketches:
+            if entry.key in group.sketches:
                 continue
-            if entry.key not in island.looked:
-                island.looked.add(entry.key)
+            if entry.key not in group.looked:
+                group.looked.add(entry.key)
                 if (kept := self._cache.sketch(entry.key, size)) is not None:
-                    island.sketches[entry.key] = kept
+                    group.sketches[entry.key] = kept
                     continue
             work = partial(self._add_sketch, component, entry.scene.id, entry.key, size)
             try:
                 self._maker.ask(f"sketch {entry.key} {size}", work, rank=_FIRST, lasting=True)
-            except GsmapError:  # the page says why when it asks for its tree
+            except GsmapError:  # the page reports the error when it requests the tree
                 failed += 1
-        self._tell(island, len(keys) - failed)
-        parts = tuple((entry, island.sketches[e]) for entry in inside.values() if (e := entry.key) in island.told)
+        self._publish(group, len(keys) - failed)
+        parts = tuple((entry, group.sketches[e]) for entry in inside.values() if (e := entry.key) in group.published)
         pending = max(0, len(inside) - len(parts) - failed)
         if not parts:
             return ViewOverview(f"overviews/{component}/none.spz", pending=pending)
@@ -277,30 +283,30 @@ class Levels:
             self._files[name] = parts
             while len(self._files) > _FILES_KEPT:
                 self._files.popitem(last=False)
-        places = tuple(place for place, entry in inside.items() if entry.key in island.told)
+        places = tuple(place for place, entry in inside.items() if entry.key in group.published)
         counts = tuple(len(one.gaussians) for _, one in parts)
         uri = f"overviews/{component}/{name}.spz"
-        if island.told_of is None or island.told_of.uri != uri:
+        if group.overview is None or group.overview.uri != uri:
             heights, sides = extent_of(parts, up_of(list(inside.values())))
-            island.told_of = ViewOverview(uri, places, counts, pending, heights, sides)
-        island.told_of = replace(island.told_of, scenes=places, pending=pending)
-        return island.told_of
+            group.overview = ViewOverview(uri, places, counts, pending, heights, sides)
+        group.overview = replace(group.overview, scenes=places, pending=pending)
+        return group.overview
 
-    def _tell(self, island: _Island, num_scenes: int) -> None:
-        """Have the page ask again once all are there, and whenever twice as many are: not for every one of hundreds."""
-        found = island.sketches.keys()
-        if len(found) >= num_scenes or len(found) >= 2 * len(island.told & found):
-            island.told = frozenset(found)
+    def _publish(self, group: _ComponentSketches, num_scenes: int) -> None:
+        """Publish the sketches when all are there or their number has doubled, so that the page reloads rarely."""
+        found = group.sketches.keys()
+        if len(found) >= num_scenes or len(found) >= 2 * len(group.published & found):
+            group.published = frozenset(found)
         else:
-            island.told &= found
+            group.published &= found
 
     def _add_sketch(self, component: int, scene: str, key: str, size: int, progress: Progress) -> None:
         made = self._make_sketch(scene, key, size)
         with self._lock:
-            island = self._islands.get(component)
-            if island is not None and island.size == size:
-                island.sketches[key] = made
-                self._tell(island, len(island.looked))
+            group = self._components.get(component)
+            if group is not None and group.size == size:
+                group.sketches[key] = made
+                self._publish(group, len(group.looked))
 
     def _make_sketch(self, scene: str, key: str, size: int) -> Sketch:
         source: GaussianSource = self._page_source.source(scene)
@@ -311,7 +317,7 @@ class Levels:
 
 
 def members(view: ViewMap) -> dict[int, dict[int, ViewScene]]:
-    """The scenes of every component by their place in the list."""
+    """Return the scenes of each component, by index in the list of scenes."""
     out: dict[int, dict[int, ViewScene]] = {}
     for place, (component, entry) in enumerate(zip(view.components(), view.scenes, strict=True)):
         out.setdefault(component, {})[place] = entry
@@ -319,7 +325,7 @@ def members(view: ViewMap) -> dict[int, dict[int, ViewScene]]:
 
 
 def _digest(parts: Sequence[tuple[ViewScene, Sketch]]) -> str:
-    """Names an overview by what is in it and where it lies."""
+    """Return a digest of the content and poses of an overview."""
     out = hashlib.sha256()
     for entry, one in parts:
         out.update(f"{entry.key} {len(one.gaussians)}".encode())

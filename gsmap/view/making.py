@@ -1,5 +1,4 @@
-"""Work that a page waits for, done in the background: what is asked for most urgently first, what is no longer asked
-for not at all."""
+"""Background jobs of the page, by priority; jobs that are no longer requested are dropped."""
 
 from __future__ import annotations
 
@@ -11,8 +10,8 @@ from dataclasses import dataclass, field
 from gsmap.errors import GsmapError
 from gsmap.types.progress import Progress
 
-_FORGOTTEN_S = 15.0  # a page asks again every second or so
-_FAILED_S = 20.0  # before what failed is tried again
+_FORGOTTEN_S = 15.0  # age of the last request after which a job is dropped; pages ask about every second
+_FAILED_S = 20.0  # delay before a failed job is tried again
 
 Work = Callable[[Progress], object]
 
@@ -22,8 +21,8 @@ class PendingResult:
     """Result that is not available yet.
 
     Args:
-        progress: 0 to 1; 0 while it has not begun.
-        waiting: how many are before it.
+        progress: Completed fraction of its job, in [0, 1].
+        waiting: Number of jobs that run before it.
     """
 
     progress: float
@@ -42,11 +41,11 @@ class _Job:
 
 
 class _ShutdownRequest(Exception):
-    """Request to the threads of a maker to end."""
+    """Raised in jobs to stop them when the maker closes."""
 
 
 class Maker:
-    """Threads that run named jobs, each once, in order of rank."""
+    """Threads that run named jobs, each once, lowest rank first."""
 
     def __init__(self, workers: int) -> None:
         self._jobs: dict[str, _Job] = {}
@@ -57,16 +56,16 @@ class Maker:
             thread.start()
 
     def ask(self, name: str, work: Work, *, rank: float = 0.0, lasting: bool = False) -> PendingResult:
-        """Have something done; again and again, until it is there.
+        """Request a job; call again until its result exists.
 
         Args:
-            name: of it; what is asked for under this name already is not done twice.
-            work: does it, from a thread of this maker.
-            rank: of the jobs that wait, the one with the lowest is next.
-            lasting: done even where nobody asks again.
+            name: Name of the job; a pending job of the same name is not started twice.
+            work: Function that runs in a thread of this maker.
+            rank: Jobs of lower rank run first.
+            lasting: Keep the job even if it is not requested again.
 
         Raises:
-            GsmapError: why it could not be done, for a while after it was tried.
+            GsmapError: The job failed recently.
         """
         with self._changed:
             job = self._jobs.get(name)
@@ -84,12 +83,12 @@ class Maker:
             return PendingResult(job.progress, 0 if job.state == "working" else before)
 
     def wait(self, done: Callable[[], bool], timeout_s: float) -> bool:
-        """Until something is true that finished jobs make true; whether it is."""
+        """Wait until a condition that finished jobs change is true; return false after the timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: self._closed or done(), timeout_s) and done()
 
     def close(self) -> None:
-        """End: what is being done is given up at its next sign of progress."""
+        """Stop the threads; running jobs end at their next progress report."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -97,7 +96,7 @@ class Maker:
             thread.join(timeout=5)
 
     def _next(self) -> tuple[str, _Job] | None:
-        """The most urgent job; None where there is none. What nobody asks for any more goes."""
+        """Return the waiting job of lowest rank, or None, after dropping jobs that are no longer requested."""
         now = time.monotonic()
         for name, job in list(self._jobs.items()):
             if job.state == "waiting" and not job.lasting and now - job.asked_at > _FORGOTTEN_S:
@@ -119,7 +118,7 @@ class Maker:
                 name, job = found
                 job.state = "working"
             try:
-                job.work(lambda fraction, text, job=job: self._told(job, fraction))  # type: ignore[misc]
+                job.work(lambda fraction, text, job=job: self._report(job, fraction))  # type: ignore[misc]
             except _ShutdownRequest:
                 return
             except GsmapError as error:
@@ -133,7 +132,7 @@ class Maker:
                     job.state, job.asked_at = "failed", time.monotonic()
                 self._changed.notify_all()
 
-    def _told(self, job: _Job, fraction: float) -> None:
+    def _report(self, job: _Job, fraction: float) -> None:
         if self._closed:
             raise _ShutdownRequest
         job.progress = fraction

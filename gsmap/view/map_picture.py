@@ -1,4 +1,4 @@
-"""A picture of a map: the site at an angle and straight from above, ceilings and near walls off, walks drawn in."""
+"""Picture of a map: oblique view and top view without ceilings and near walls, with the camera paths."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def map_picture(
     title: str = "",
     width_px: int = 1400,
 ) -> np.ndarray:
-    """Draw placed scenes: at an angle with the near walls off, from above with the walks, and what is tied to what.
+    """Draw placed scenes: an oblique view without near walls, and a top view with camera paths and edges.
 
     Args:
-        parts: (name, Gaussians in the map frame, cameras in the map frame) of every placed scene.
-        edges: pairs of names that registration tied together.
-        up: direction against gravity in the map frame; by default what the cameras and floors agree on.
-        title: a line above the picture.
-        width_px: of the picture; everything in it grows along.
+        parts: (name, Gaussians, cameras) of each placed scene, in the map frame.
+        edges: Pairs of names of scenes that edges connect.
+        up: (3,) direction opposite to gravity in the map frame; default: estimated from cameras and floors.
+        title: Title above the picture.
+        width_px: Width of the picture; its content scales along.
 
     Returns:
         (H, W, 3) uint8.
 
     Raises:
-        InputError: no parts.
+        InputError: There are no parts.
     """
     from PIL import Image, ImageDraw
 
@@ -69,7 +69,7 @@ def map_picture(
 
 
 def _upright(parts: Sequence[Part], up: np.ndarray | None) -> list[Part]:
-    """The parts turned so that z is up, walls run along x and y, and the longer side lies along x."""
+    """Rotate the parts so that z is up, walls are along x and y, and the longer side is along x."""
     up = _find_up(parts) if up is None else np.asarray(up, np.float64) / np.linalg.norm(up)
     x = np.cross([0, 1.0, 0] if abs(up[1]) < 0.9 else [1.0, 0, 0], up)
     x /= np.linalg.norm(x)
@@ -88,7 +88,7 @@ def _upright(parts: Sequence[Part], up: np.ndarray | None) -> list[Part]:
 
 
 def _find_up(parts: Sequence[Part]) -> np.ndarray:
-    """Mean up axis of the cameras, then the mean normal of what lies nearly level by it."""
+    """Estimate the up direction: mean up axis of the cameras, refined by normals of nearly level surfaces."""
     up = -np.concatenate([cameras.T_frame_camera[:, :3, 1] for *_, cameras in parts]).mean(0)
     up /= max(np.linalg.norm(up), 1e-12)
     normals = np.concatenate([_normals(g) for _, g, _ in parts])
@@ -102,7 +102,7 @@ def _find_up(parts: Sequence[Part]) -> np.ndarray:
 
 
 def _normals(gaussians: Gaussians) -> np.ndarray:
-    """Shortest axes of the flat Gaussians, the ones that lie along surfaces."""
+    """Return the shortest axes of flat Gaussians, which lie along surfaces."""
     log_scales = np.sort(gaussians.log_scales, axis=1)
     flat = gaussians[(log_scales[:, 1] - log_scales[:, 0] > 1.0) & (gaussians.opacities > 0.5)]
     rotation = quats_to_matrices(flat.quats)
@@ -110,7 +110,7 @@ def _normals(gaussians: Gaussians) -> np.ndarray:
 
 
 def _bounds(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
-    """Box of what is drawn: sides and floor hold 99 % of the Gaussians, the top is a little above the cameras."""
+    """Return the drawn box: 99 % of the Gaussians, with its top slightly above the cameras."""
     means = np.concatenate([g.means for _, g, _ in parts])
     low, high = np.quantile(means, [0.005, 0.995], axis=0)
     eyes = np.median(np.concatenate([cameras.centers[:, 2] for *_, cameras in parts]))
@@ -119,7 +119,7 @@ def _bounds(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _view(low: np.ndarray, high: np.ndarray, elevation_deg: float, size_px: tuple[int, int]) -> Cameras:
-    """A far camera whose image just holds the box, seen from the south at an elevation."""
+    """Return a distant camera at an elevation in the south whose image just contains the box."""
     width, height = size_px
     tilt = np.radians(elevation_deg)
     forward = np.array([0, np.cos(tilt), -np.sin(tilt)])
@@ -143,7 +143,7 @@ def _view(low: np.ndarray, high: np.ndarray, elevation_deg: float, size_px: tupl
 
 
 def _render(parts: Sequence[Part], view: Cameras, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: the parts without ceilings and without surfaces whose inside faces away, on paper."""
+    """Render the parts without ceilings and without surfaces that face away: (H, W, 3) uint8."""
     from PIL import Image
 
     from gsmap.render import render
@@ -165,7 +165,7 @@ def _render(parts: Sequence[Part], view: Cameras, low: np.ndarray, high: np.ndar
 
 
 def _faces(gaussians: Gaussians, cameras: Cameras, eye: np.ndarray) -> np.ndarray:
-    """(N,) whether the side of a Gaussian that its scene's cameras saw is turned to the eye.
+    """Return a mask (N,) of Gaussians whose side seen by the scene's cameras faces the eye.
 
     The side seen is the one towards the cameras in whose renders the Gaussian dominates a pixel.
     """
@@ -185,12 +185,12 @@ def _faces(gaussians: Gaussians, cameras: Cameras, eye: np.ndarray) -> np.ndarra
 
 
 def _project(points: np.ndarray, view: Cameras, corner: tuple[int, int]) -> np.ndarray:
-    """(n, 2) page positions of map points drawn in a panel."""
+    """Project map points to page positions (n, 2) in a panel."""
     return project(points, view.T_camera_frame[0], view.intrinsics_px[0])[0] + corner
 
 
 def _draw_walks(draw, parts: Sequence[Part], view: Cameras, corner, unit: float, full: bool) -> None:
-    """Each scene's cameras in its colour: the path, and (``full``) where they stood and looked."""
+    """Draw the camera path of each scene in its colour and, with ``full``, the viewing directions."""
     for k, (_, _, cameras) in enumerate(parts):
         colour = _COLOURS[k % len(_COLOURS)]
         path = [tuple(p) for p in _project(cameras.centers, view, corner)]
@@ -211,7 +211,7 @@ def _draw_walks(draw, parts: Sequence[Part], view: Cameras, corner, unit: float,
 def _draw_ties(
     draw, parts: Sequence[Part], edges: Sequence[tuple[str, str]], view: Cameras, corner, unit: float
 ) -> None:
-    """Scenes as labelled discs at the middle of their walks, and the edges between them."""
+    """Draw scenes as labelled discs at the centres of their cameras, and the edges between them."""
     middle = {name: _project(cameras.centers.mean(0)[None], view, corner)[0] for name, _, cameras in parts}
     for a, b in edges:
         if a in middle and b in middle:

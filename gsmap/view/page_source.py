@@ -1,4 +1,4 @@
-"""Interface of a map to the page's server, read anew for each request so that other processes' changes are seen."""
+"""Interface of a map to the page's server, read for each request so that changes by other processes are visible."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsmap.types import GaussianSource
 from gsmap.view.content import ViewMap
 
 Action = Callable[[Mapping[str, Any]], None]
-"""Does what a person asked for, by the names of `contract.ts`; raises a `gsmap.errors.GsmapError` that says why not."""
+"""Function that applies an action of the page, with the fields of `contract.ts`; raises `gsmap.errors.GsmapError`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +21,8 @@ class PairPictures:
     """Both captures of a pair from the same cameras.
 
     Args:
-        cameras: what each is called.
-        target, source, difference: (H, W, 3) uint8 of each camera.
+        cameras: Names of the cameras.
+        target, source, difference: One picture (H, W, 3) uint8 per camera.
     """
 
     cameras: tuple[str, ...] = ()
@@ -32,19 +32,22 @@ class PairPictures:
 
 
 class PageSource(Protocol):
-    """A map as the page sees it. Every method may be called from any thread, and may raise `GsmapError`; what is named
-    and not there is a `NotFoundError`. What is returned as a dict is JSON of `contract.ts`."""
+    """Content of a map for the page.
+
+    Every method is thread-safe and may raise `GsmapError`, for missing items `NotFoundError`. Returned dicts are JSON
+    of `contract.ts`.
+    """
 
     def state(self) -> str:
-        """Another text whenever the map has changed; quick."""
+        """Return a text that differs after every change of the map; fast."""
         ...
 
     def content(self) -> ViewMap:
-        """The map as it is now."""
+        """Return the current content of the map."""
         ...
 
     def source(self, scene: str) -> GaussianSource:
-        """The Gaussians of a living scene, by id, along their Morton curve."""
+        """Return the Gaussians of a scene by id, in Morton order."""
         ...
 
     def extras(self, scene: str) -> dict[str, Any]: ...
@@ -52,13 +55,13 @@ class PageSource(Protocol):
     def revision(self, number: int) -> dict[str, Any]: ...
 
     def edge(self, target: str, source: str) -> dict[str, Any]:
-        """`EdgeDetail` without its views."""
+        """Return the `EdgeDetail` of a pair without its views."""
         ...
 
     def pair_pictures(self, target: str, source: str) -> PairPictures: ...
 
     def pair_cameras(self, target: str, source: str) -> tuple[str, ...]:
-        """Of `pair_pictures`, without drawing: what each camera is called."""
+        """Return the names of the cameras of `pair_pictures` without drawing."""
         ...
 
     def change_picture(self, change: str) -> np.ndarray: ...
@@ -68,7 +71,7 @@ class PageSource(Protocol):
     def history(self, at: str, component: int) -> dict[str, Any]: ...
 
     def merged(self, component: int) -> Path:
-        """The folder of merged tiles of a component."""
+        """Return the folder of merged tiles of a component."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""A picture of a pair for a person to judge: both captures from the same cameras, and where they are not the same."""
+"""Picture of a pair of scenes for review: both captures from the same cameras, and their differences."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.render import render
 from gsmap.types import Cameras, PosedScene
 
-_TOLERANCE_M, _TOLERANCE = 0.10, 0.02  # depths that differ by more, and this share of the depth, are not the same
+_TOLERANCE_M, _TOLERANCE = 0.10, 0.02  # tolerance of depth differences: metres plus a fraction of the depth
 _GAP_PX = 4
 _MARK = np.array([1.0, 0.25, 0.25])
 
@@ -17,13 +17,13 @@ _MARK = np.array([1.0, 0.25, 0.25])
 def draw_pair(
     target: PosedScene, source: PosedScene, cameras: Sequence[Cameras], unit_m: float = 1.0, side_px: int = 320
 ) -> np.ndarray:
-    """A row for each camera, (H, W, 3) uint8: the target, the source, and the target with what is not the same marked.
+    """Draw a row per camera, (H, W, 3) uint8: the target, the source, and the target with differences marked.
 
     Args:
-        target, source: both captures, in one frame.
-        cameras: one camera each, in that frame; without any the picture is blank.
-        unit_m: metres per unit of that frame.
-        side_px: longer side of each of the three pictures.
+        target, source: Both captures, in one frame.
+        cameras: Single cameras in that frame; without cameras the picture is blank.
+        unit_m: Metres per unit of that frame.
+        side_px: Longer side of each of the three pictures.
     """
     rows = [_row(target, source, camera.resized(side_px), unit_m) for camera in cameras]
     if not rows:
@@ -37,10 +37,11 @@ def draw_pair(
 def looks_at(
     target: PosedScene, source: PosedScene, camera: Cameras, unit_m: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The target, the source, and the target with what is not the same marked, from one camera: (H, W, 3) uint8 each.
+    """Draw target, source, and the target with differences marked, from one camera: (H, W, 3) uint8 each.
 
     Args:
-        target, source, unit_m: as in `draw_pair`.
+        target, source, unit_m: As in `draw_pair`.
+        camera: The camera, in the same frame.
     """
     one, other = (render(scene.gaussians, camera) for scene in (target, source))
     looks = [np.clip(np.nan_to_num(seen.colour[0]), 0, 1) for seen in (one, other)]

@@ -12,8 +12,8 @@ class Params:
     """Settings of the page; its levels of detail are kept in the user's cache folder, not in the map.
 
     Args:
-        cache_gib: Size in GiB that cached levels of detail may take, positive; a larger cache makes fewer levels anew.
-        workers: Number of threads that make levels of detail, at least 1; more are faster and need more memory.
+        cache_gib: Size in GiB that cached levels of detail may take, positive; more avoids computing levels again.
+        workers: Number of threads that compute levels of detail, at least 1; more are faster and need more memory.
         picture_gaussians: Largest number of Gaussians of a pair of scenes for which a picture is drawn, at least 0; a
             larger number draws larger pairs and needs more memory.
         site_pairs: Number of pairs with pictures on a static page, at least 0, the most doubtful first; more pairs make

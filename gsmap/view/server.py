@@ -1,4 +1,4 @@
-"""An HTTP server on this machine's own address, for one page and for those who were told its address."""
+"""Local HTTP server of the page, protected by a token in its address."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ _SECURITY = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
-    # What was purged from a map must not stay in a browser's files.
+    # Purged content must not stay in the browser's cache.
     "Cache-Control": "no-store",
 }
 _MAX_HEADER_BYTES = 16 << 10
 _MAX_BODY_BYTES = 64 << 10
-_WORTH_BYTES = 1000  # less is not worth compressing
+_WORTH_BYTES = 1000  # minimum size of compressed responses
 _ACTION = re.compile(r"/actions/([a-z_]{1,40})")
 _FILE = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})+")
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
@@ -68,26 +68,26 @@ _STATUS: Mapping[type[GsmapError], int] = {
     InputError: HTTPStatus.BAD_REQUEST,
     ConfigError: HTTPStatus.BAD_REQUEST,
 }
-_SEND_S = 30.0  # for a browser to take one part of an answer
+_SEND_S = 30.0  # timeout for sending one part of a response
 _PART_BYTES = 1 << 20
 
 
 class ViewServer:
-    """Serves a map on 127.0.0.1 until it is closed; a context manager.
+    """Server of a map's page on 127.0.0.1; a context manager.
 
-    Only who knows the token in `url`, new with every server, is answered; the first answer is a cookie that stands for
-    it. On Linux other users' connections are closed unread. Requests must name this machine as their host, so no other
-    site can read the map through the visitor's browser; what changes the map must come from the page itself.
+    Requests need the token in `url`, which is new for every server; the first response sets it as a cookie. On Linux
+    connections of other users are closed unread. Requests must name this machine as their host, so that no other site
+    can read the map through the browser; actions must come from the page itself.
 
     Args:
-        page_source: to the map.
-        cache: where levels of detail are kept; a folder of its own.
-        params: how the map is looked at.
-        port: 0 takes a free one.
-        page: the folder of the built page; the one that came with gsmap by default.
+        page_source: Content of the map.
+        cache: Folder of cached levels of detail, used for nothing else.
+        params: Settings of the page.
+        port: Port; 0 selects a free one.
+        page: Folder of the built page; default: the one installed with gsmap.
 
     Raises:
-        ConfigError: the port is taken or not allowed, or the page is not built.
+        ConfigError: The port is taken or not allowed, or the page is not built.
     """
 
     def __init__(
@@ -120,11 +120,11 @@ class ViewServer:
 
     @cached_property
     def url(self) -> str:
-        """The page's address with the token that opens it."""
+        """Address of the page with its token."""
         return f"http://127.0.0.1:{self.port}/?token={self.token}"
 
     def start(self) -> ViewServer:
-        """Serve from a thread of its own."""
+        """Serve from a new thread."""
         self._thread = threading.Thread(target=self._http.serve_forever, daemon=True)
         self._thread.start()
         return self
@@ -202,7 +202,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_own_host() or not self._is_token(self._cookie()):
             self.send_error(HTTPStatus.FORBIDDEN, "Open the address that gsmap view printed")
         elif self.headers.get("Origin") != own or self.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
-            self.send_error(HTTPStatus.FORBIDDEN, "Only the page itself may ask for this")
+            self.send_error(HTTPStatus.FORBIDDEN, "Only the page itself may send actions")
         elif self.headers.get_content_type() != "application/json" or "Transfer-Encoding" in self.headers:
             self.send_error(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Actions are JSON")
         elif not length.isdecimal() or len(length) > 9 or int(length) > _MAX_BODY_BYTES:
@@ -213,28 +213,28 @@ class _Handler(BaseHTTPRequestHandler):
     def _act(self, body: bytes) -> Answer:
         named = _ACTION.fullmatch(self.path)
         if named is None:
-            raise NotFoundError(f"there is no {self.path}", code="page_not_found")
+            raise NotFoundError(f"no page at {self.path}", code="page_not_found")
         action = self.page_source.actions.get(named[1])
         if action is None:
             if not self.page_source.actions:
-                raise ReadOnlyError("this map was opened to be looked at: nothing can be changed from this page")
-            raise NotFoundError(f"there is no action {named[1]}", code="page_not_found")
+                raise ReadOnlyError("this page is read-only; start gsmap view without --read-only to review or edit")
+            raise NotFoundError(f"unknown action {named[1]}", code="page_not_found")
         try:
-            said = json.loads(body)
+            data = json.loads(body)
         except (ValueError, RecursionError) as error:
-            raise InputError(f"an action is JSON: {error}", code="invalid_request") from error
-        if not isinstance(said, dict):
-            raise InputError("an action is a JSON object", code="invalid_request")
+            raise InputError(f"the action is not valid JSON: {error}", code="invalid_request") from error
+        if not isinstance(data, dict):
+            raise InputError("an action must be a JSON object", code="invalid_request")
         if not self.acting.acquire(blocking=False):
-            raise BusyError("another action is at work: wait until it is done", code="server_busy")
+            raise BusyError("another action is running; try again when it has ended", code="server_busy")
         try:
-            action(said)
+            action(data)
         finally:
             self.acting.release()
         return Answer.json({"map": self.answers.summary()})
 
     def _guarded(self, answer: Any) -> None:
-        """An answer, or why there is none."""
+        """Send an answer, or the error that prevents it."""
         try:
             found = answer()
         except GsmapError as error:
@@ -243,8 +243,8 @@ class _Handler(BaseHTTPRequestHandler):
         except (ConnectionError, TimeoutError):
             raise
         except Exception as error:
-            said = {"error": f"{type(error).__name__}: {error}", "code": "internal_error"}
-            found = Answer.json(said, HTTPStatus.INTERNAL_SERVER_ERROR)
+            data = {"error": f"{type(error).__name__}: {error}", "code": "internal_error"}
+            found = Answer.json(data, HTTPStatus.INTERNAL_SERVER_ERROR)
         self._answer(found)
 
     def _is_own_host(self) -> bool:
@@ -252,7 +252,7 @@ class _Handler(BaseHTTPRequestHandler):
         return host.lower() in ("127.0.0.1", "localhost") and port in ("", str(self.server.server_port))
 
     def _file_of_page(self, path: str) -> Path | None:
-        """The file of the built page that an address names; what else lies there is none."""
+        """Return the file of the built page at an address; None for all other files."""
         name = "index.html" if path == "/" else path[1:]
         file = self.page / name
         return file if _FILE.fullmatch(name) and file.suffix in _KINDS and file.is_file() else None
@@ -267,7 +267,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     @property
     def _cookie_name(self) -> str:
-        """Browsers send a cookie to every port of a host, so each server has a name of its own."""
+        """Name of the cookie: differs by port, because browsers send cookies to every port of a host."""
         return f"gsmap_view_{self.server.server_port}"
 
     def _cookie(self) -> str:
@@ -278,7 +278,7 @@ class _Handler(BaseHTTPRequestHandler):
         return "" if found is None else found.value
 
     def _welcome(self) -> None:
-        """The token becomes a cookie, and leaves the address bar."""
+        """Set the token as a cookie, and redirect to the address without it."""
         self.send_response(HTTPStatus.SEE_OTHER)
         self.send_header("Location", "/")
         self.send_header("Set-Cookie", f"{self._cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/")
@@ -313,11 +313,11 @@ class _Handler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def log_message(self, *_: object) -> None:
-        """Nothing below the command line prints."""
+        """Print nothing."""
 
 
 class _BoundedStream:
-    """Stream of requests of bounded length."""
+    """Request stream with a limit on the length of each request."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -331,7 +331,7 @@ class _BoundedStream:
         return line
 
     def body(self, size: int) -> bytes:
-        """The body of a request, of a size that was judged already."""
+        """Read the body of a request; the caller has checked its size."""
         data = self._stream.read(size)
         if len(data) < size:
             raise ConnectionError("the request ended early")
@@ -346,7 +346,7 @@ class _BoundedStream:
 
 
 def _range(text: str | None, size: int) -> slice | None:
-    """The one range of bytes that is asked for; None for all, and for what is no range of these."""
+    """Parse a Range header with one range; None without a header or with an invalid range."""
     found = _RANGE.fullmatch(text or "")
     if found is None or found[1] == found[2] == "":
         return None

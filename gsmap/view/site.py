@@ -1,7 +1,7 @@
-"""A map's page without a server: a folder that any web server can host, and one file that opens by a double click.
+"""Static page of a map: a folder for any web server, or one HTML file.
 
-Both hold what `gsmap.view.answers` answers to every GET, as files under the same addresses, but for what is computed
-when somebody asks for it. A folder has every scene's whole tree; a file as much of the trees as fits.
+Both contain the responses of `gsmap.view.answers` to GET requests, under the same addresses, except for those computed
+on request. A folder has the whole tree of each scene; a file the part of the trees that fits.
 """
 
 from __future__ import annotations
@@ -40,14 +40,13 @@ CSP = {
     "base-uri": "'none'",
     "form-action": "'none'",
 }
-"""What the page needs and no more: Spark decodes and sorts by WebAssembly that lies in its script, in workers that it
-makes of its own text."""
+"""Content-Security-Policy of the page. Spark needs WebAssembly from its script, and workers from blobs."""
 
 _MERGED_SUFFIXES = (".json", ".glb")
 _HEAD = re.compile(r"<head[^>]*>", re.IGNORECASE)
 _SCRIPT = re.compile(r'<script type="module"[^>]*\bsrc="(?:\./)?([^"]+)"[^>]*>\s*</script>')
 _STYLE = re.compile(r'<link rel="stylesheet"[^>]*\bhref="(?:\./)?([^"]+)"[^>]*/?>')
-# What the page fetches comes from the file itself, and nothing is asked of anybody else.
+# Serve the fetches of the page from the file itself, and block all others.
 _EMBEDDED = """
 (() => {
   const files = JSON.parse(document.getElementById("gsmap-files").textContent);
@@ -73,9 +72,9 @@ class SiteContents:
     """Summary of a written site.
 
     Args:
-        num_bytes: in all.
-        num_scenes: with their levels of detail.
-        notes: what a person should know, such as scenes that could not be read.
+        num_bytes: Total size.
+        num_scenes: Number of scenes with levels of detail.
+        notes: Notes for the user, such as scenes that could not be read.
     """
 
     num_bytes: int
@@ -91,18 +90,20 @@ class _Maker:
     progress: Progress
     notes: list[str] = field(default_factory=list)
 
-    def told(self, view: ViewMap, *, size: int | None = None, pictures: bool = True) -> Iterator[tuple[str, bytes]]:
-        """Address and bytes of everything but trees and merged tiles; ``map.json`` last.
+    def files(self, view: ViewMap, *, size: int | None = None, pictures: bool = True) -> Iterator[tuple[str, bytes]]:
+        """Yield address and bytes of all files except trees and merged tiles; ``map.json`` last.
 
         Args:
-            size: Gaussians of a scene in an overview; by the size of its island where None.
+            view: Content of the map.
+            size: Number of Gaussians per scene in an overview; default: by the size of the component.
+            pictures: Include pictures of pairs and changes.
         """
         overviews: dict[int, ViewOverview] = {}
         boxes: dict[str, np.ndarray] = {}
         inside_of = members(view)
         for i, (component, inside) in enumerate(inside_of.items()):
             self.progress(0.5 + 0.2 * i / len(inside_of), f"overview {component}")
-            made = self.tried(f"the overview of island {component}", lambda c=inside: self.levels.whole(c, size))  # type: ignore[misc]
+            made = self.tried(f"the overview of component {component}", lambda c=inside: self.levels.whole(c, size))  # type: ignore[misc]
             if made is None:
                 continue
             data, overview, more = made
@@ -176,7 +177,11 @@ def write_site(
     """Write a static page into an empty folder.
 
     Args:
-        page: the folder of the built page.
+        folder: The folder.
+        page_source, levels: Content of the map, and its levels of detail.
+        params: Settings of the page.
+        page: Folder of the built page.
+        progress: Callback of the progress.
     """
     view, maker = page_source.content(), _Maker(page_source, levels, params, progress)
     num_scenes = 0
@@ -191,7 +196,7 @@ def write_site(
             target = folder / "merged" / str(component) / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
-    for address, data in maker.told(view):
+    for address, data in maker.files(view):
         target = folder / address
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(data)
@@ -214,17 +219,22 @@ def write_page(
     progress: Progress,
     mark: str = "",
 ) -> SiteContents:
-    """Write one file that is the page with a map in it.
+    """Write the page with its map as one HTML file.
 
     Args:
-        max_bytes: of levels of detail, before they are written as text, which takes a third more; the finest that fit.
-        mark: stands in the head, to know the file again.
+        path: The file.
+        page_source, levels: Content of the map, and its levels of detail.
+        params: Settings of the page.
+        page: Folder of the built page.
+        max_bytes: Maximum size of the levels of detail in bytes; base64 text takes a third more.
+        progress: Callback of the progress.
+        mark: HTML for the head, by which the file is recognized.
     """
     view, maker = page_source.content(), _Maker(page_source, levels, params, progress)
     files: dict[str, bytes] = {}
-    # A twentieth for what stands behind everything until the trees are there.
+    # A twentieth for the overviews, which are shown until the trees are loaded.
     size = max(1, min(OVERVIEW_GAUSSIANS, max_bytes // (20 * 20 * max(1, len(view.scenes)))))
-    for address, data in maker.told(view, size=size, pictures=False):
+    for address, data in maker.files(view, size=size, pictures=False):
         files[address] = data
     left = max_bytes - sum(len(data) for address, data in files.items() if address.startswith("overviews/"))
     trees: dict[str, tuple[dict[str, Any], dict[str, int]]] = {}
@@ -240,10 +250,10 @@ def write_page(
             files[f"scenes/{entry.key}/{FILE_NAME}"] = _json(tileset)
             for uri, data in levels.read(entry, partial(_tiles, uris=tiles)).items():
                 files[f"scenes/{entry.key}/{uri}"] = data
-    said = json.loads(files["map.json"])
-    for component in said["components"]:
+    listing = json.loads(files["map.json"])
+    for component in listing["components"]:
         component["merged"] = None
-    files["map.json"] = _json(said)
+    files["map.json"] = _json(listing)
     text = _one_file(page, files, mark)
     path.write_text(text, encoding="utf-8")
     return SiteContents(len(text.encode()), len(trees), tuple(maker.notes))
@@ -259,7 +269,7 @@ def _copy_tree(tree: Path, target: Path) -> bool:
 
 
 def _listed(tree: Path) -> tuple[dict[str, Any], dict[str, int]]:
-    """The tileset of a tree, and the bytes of each of its tiles."""
+    """Return the tileset of a tree and the size of each of its tiles."""
     sizes = {f"{CONTENT_FOLDER}/{tile.name}": tile.stat().st_size for tile in (tree / CONTENT_FOLDER).iterdir()}
     return json.loads((tree / FILE_NAME).read_bytes()), sizes
 
@@ -271,7 +281,7 @@ def _tiles(tree: Path, uris: Iterable[str]) -> dict[str, bytes]:
 def _fitting(
     trees: Mapping[str, tuple[dict[str, Any], dict[str, int]]], max_bytes: int
 ) -> dict[str, tuple[dict[str, Any], list[str]]]:
-    """Of every tree as much as fits, coarse tiles of all before finer ones: its tileset, and the tiles it names."""
+    """Choose tiles within a size limit, coarse tiles of all trees first; return tilesets with their tiles."""
     kept: dict[str, set[str]] = {key: set() for key in trees}
     waiting: list[tuple[float, int, str, list[dict[str, Any]]]] = []
     for place, (key, (tileset, _)) in enumerate(trees.items()):
@@ -280,7 +290,7 @@ def _fitting(
     while waiting:
         error, _, key, tiles = heapq.heappop(waiting)
         size = sum(trees[key][1][tile["content"]["uri"]] for tile in tiles)
-        if size > left and error != -float("inf"):  # something of every scene
+        if size > left and error != -float("inf"):  # keep the root of every scene
             continue
         left -= size
         kept[key] |= {tile["content"]["uri"] for tile in tiles}
@@ -292,19 +302,19 @@ def _fitting(
 
 
 def _cut(tile: dict[str, Any], kept: set[str]) -> dict[str, Any]:
-    """A tile without the children that are not there: all of a tile's are, or none."""
+    """Return a tile without omitted children; either all children of a tile are kept, or none."""
     children = [_cut(child, kept) for child in tile.get("children", ()) if child["content"]["uri"] in kept]
     rest = {name: value for name, value in tile.items() if name != "children"}
     return rest | ({"children": children} if children else {})
 
 
 def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
-    """The page with its style, its script and everything it fetches inside."""
+    """Return the page as one text, with style, script and all files embedded."""
     html = (page / "index.html").read_text(encoding="utf-8")
     script, style = _SCRIPT.search(html), _STYLE.search(html)
     if script is None:
         raise GsmapError(
-            f"{page / 'index.html'} has no script of its own: build the page again (tools/build_page.sh)",
+            f"{page / 'index.html'} has no script: build the page again (tools/build_page.sh)",
             code="page_not_built",
         )
     code = (page / script[1]).read_text(encoding="utf-8").replace("</script", "<\\/script").replace("<!--", "<\\!--")
@@ -332,13 +342,13 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
 
 
 def _with_policy(html: str, policy: Mapping[str, str], mark: str = "") -> str:
-    said = "; ".join(f"{name} {value}" for name, value in policy.items())
+    content = "; ".join(f"{name} {value}" for name, value in policy.items())
     head = _HEAD.search(html)
     if head is None:
         raise GsmapError(
-            "the page has no head of its own: build the page again (tools/build_page.sh)", code="page_not_built"
+            "the page has no head element: build the page again (tools/build_page.sh)", code="page_not_built"
         )
-    meta = f'{mark}<meta http-equiv="Content-Security-Policy" content="{said}" />'
+    meta = f'{mark}<meta http-equiv="Content-Security-Policy" content="{content}" />'
     return html[: head.end()] + meta + html[head.end() :]
 
 
@@ -347,7 +357,7 @@ def _hash(code: str) -> str:
 
 
 def _merged(folder: Path) -> Iterator[tuple[str, Path]]:
-    """The files of 3D Tiles in a component's folder of an export, by their addresses."""
+    """Yield the files of the 3D Tiles of a component in an export folder, with their addresses."""
     for path in sorted(folder.rglob("*")):
         if path.is_file() and not path.is_symlink() and path.suffix in _MERGED_SUFFIXES:
             yield path.relative_to(folder).as_posix(), path

@@ -1,8 +1,8 @@
-"""Trees and sketches of scenes, kept on this machine outside any map, so that a page opens at once the next time.
+"""Cache of trees and sketches of scenes, outside the maps, so that a page opens immediately the next time.
 
-Entries are named by what they were made of and how (``KEY.tree``, a folder; ``KEY.N.sketch``, a file), so that maps
-share what they have in common. An entry appears whole, by one rename; one that is damaged counts as missing; those that
-were used longest ago go first. Anything here may be deleted at any time.
+Entries are named by content and method (``KEY.tree``, a folder; ``KEY.N.sketch``, a file), so that maps share them. An
+entry is created by one rename; a damaged entry counts as missing; the least recently used entries are evicted first.
+Entries may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from gsmap.view.trees import FILE_NAME, Sketch
 _MANIFEST = "files.json"
 _TILE = re.compile(rf"{CONTENT_FOLDER}/[0-9a-z]+-([0-9a-f]{{16}})\.glb")
 _COLUMNS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "sh": 3}
-_STALE_S = 3600.0  # what has been in the making for so long was left by a process that died
+_STALE_S = 3600.0  # age after which a staged entry counts as left over by a process that died
 
 
 class TreeCache:
     """Cache of levels of detail below one folder; several processes may use it at once.
 
     Args:
-        root: a folder; made when something is kept.
-        max_bytes: of all entries together. One that is larger than that is kept until another comes.
+        root: Folder of the cache; created with the first entry.
+        max_bytes: Maximum size of all entries. A larger single entry is kept until the next one.
     """
 
     def __init__(self, root: Path, max_bytes: int) -> None:
@@ -47,7 +47,7 @@ class TreeCache:
     # --- sketches ----------------------------------------------------------------------------------------------------
 
     def sketch(self, key: str, max_count: int) -> Sketch | None:
-        """The sketch of a scene; None where there is none that can be read."""
+        """Return the sketch of a scene; None if it is missing or damaged."""
         path = self._sketch(key, max_count)
         try:
             with open(path, "rb") as file:
@@ -65,7 +65,7 @@ class TreeCache:
         return Sketch(Gaussians(**parts), table[:2, :3].astype(np.float64))
 
     def keep_sketch(self, key: str, max_count: int, made: Sketch) -> None:
-        """Keep a sketch."""
+        """Store a sketch."""
         table = np.zeros((2 + len(made.gaussians), sum(_COLUMNS.values())), np.float32)
         table[:2, :3] = made.box
         columns = [getattr(made.gaussians, name).reshape(len(table) - 2, -1) for name in _COLUMNS]
@@ -82,7 +82,7 @@ class TreeCache:
     # --- trees -------------------------------------------------------------------------------------------------------
 
     def tree(self, key: str) -> Path | None:
-        """The folder of a scene's tree; None where there is none, or its files are not those that were written."""
+        """Return the folder of a scene's tree; None if it is missing or damaged."""
         folder = self._tree(key)
         try:
             listed = json.loads((folder / _MANIFEST).read_bytes())
@@ -102,8 +102,7 @@ class TreeCache:
             return None
 
     def tile(self, key: str, uri: str) -> bytes | None:
-        """The bytes of a tile of a tree; None where there is none of that name, or they are not those that were
-        written: the tree is forgotten then."""
+        """Return the bytes of a tile; None if it is missing or damaged, in which case the tree is deleted."""
         named = _TILE.fullmatch(uri)
         if named is None:
             return None
@@ -117,9 +116,9 @@ class TreeCache:
         return data
 
     def make_tree(self, key: str, write: Callable[[Path], object]) -> Path:
-        """Let ``write`` fill a folder that does not exist yet, and keep it as the tree of a scene.
+        """Let ``write`` create a folder, and store it as the tree of a scene.
 
-        Where another process was faster its tree is the one.
+        If another process was faster, its tree is kept.
         """
         self._make_folder()
         staged = self._staged()
@@ -131,13 +130,13 @@ class TreeCache:
             digest = hashlib.sha256((staged / FILE_NAME).read_bytes()).hexdigest()
             (staged / _MANIFEST).write_text(json.dumps({FILE_NAME: digest, "tiles": tiles}))
             self._make_room(sum(tiles.values()))
-            with contextlib.suppress(OSError):  # there is one already
+            with contextlib.suppress(OSError):  # another process was faster
                 os.rename(staged, self._tree(key))
         finally:
             shutil.rmtree(staged, ignore_errors=True)
         return self._tree(key)
 
-    # --- all of it ---------------------------------------------------------------------------------------------------
+    # --- all entries -------------------------------------------------------------------------------------------------
 
     def num_files(self, scene: str) -> int:
         """Return the number of cached files of a scene, by the prefix of its keys."""
@@ -145,7 +144,7 @@ class TreeCache:
         return sum(sum(f.is_file() for f in path.rglob("*")) if path.is_dir() else 1 for path in found)
 
     def forget(self, scene: str) -> None:
-        """Delete all that is kept of a scene, by the beginning of its keys."""
+        """Delete all entries of a scene, by the prefix of its keys."""
         for path in self.root.glob(f"{glob.escape(scene)}*"):
             self._drop(path)
 
@@ -162,7 +161,7 @@ class TreeCache:
         self.root.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _drop(self, path: Path) -> None:
-        """Delete an entry, in one rename as far as others can see."""
+        """Delete an entry, atomically for other processes."""
         grave = self._staged()
         try:
             os.rename(path, grave)
@@ -174,7 +173,7 @@ class TreeCache:
             grave.unlink(missing_ok=True)
 
     def _make_room(self, size_bytes: int) -> None:
-        """Delete what was used longest ago until so many bytes more are within bounds, and what dead processes left."""
+        """Evict the least recently used entries until the given bytes fit, and leftovers of dead processes."""
         kept = []
         for entry in os.scandir(self.root):
             with contextlib.suppress(OSError):
@@ -193,7 +192,7 @@ class TreeCache:
 
 
 def _num_bytes(path: Path) -> int:
-    """Of an entry; of a tree by its list of files, which is quicker than looking at each."""
+    """Return the size of an entry; for a tree from its manifest, which is faster than its files."""
     if not path.is_dir():
         return path.stat().st_size
     try:

@@ -1,9 +1,9 @@
-"""Levels of detail of one scene, for looking at it: a 3D Tiles tree whose leaves are its own Gaussians, and a sketch.
+"""Levels of detail of one scene for viewing: a 3D Tiles tree with the original Gaussians as leaves, and a sketch.
 
-A scene lies in the store along a space-filling curve, so that every cell of an octree is a range of its rows. The tree
-is made in one pass over them, from the leaves up, each level by merging what shares a cell of a grid, moments kept
-(`gsmap.geometry.voxels`): a second or two of CPU a million, where the pairwise merging of an export
-(`gsmap.geometry.decimate`) takes five. Memory is bounded by eight tiles a level.
+Stored Gaussians are ordered along a space-filling curve, so that each octree cell is a range of rows. The tree is built
+in one pass from the leaves up; each level merges the Gaussians of a grid cell and keeps their moments
+(`gsmap.geometry.voxels`). This takes one or two CPU seconds per million Gaussians; the pairwise merging of an export
+(`gsmap.geometry.decimate`) takes five. Memory is bounded by eight tiles per level.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.progress import Progress
 
 VERSION = 4
-"""Of what is made: another one makes all trees and sketches anew."""
+"""Version of trees and sketches; a new version invalidates cached ones."""
 
 FILE_NAME = "tileset.json"
-LEAST_OPACITY = 1 / 255  # what no renderer draws
+LEAST_OPACITY = 1 / 255  # opacity below which no renderer draws a Gaussian
 _FANOUT = 8
 _SIGMAS = 3.0
-_STRAYS = 0.001  # share of the light of a tile beyond a side of its box
-_STRAYS_OF_SCENE = 0.02  # share of the Gaussians of a scene beyond a side of its box
-_EXTENT_ROWS = 2048  # by which the box of a tile is found
+_STRAYS = 0.001  # fraction of the light of a tile beyond each side of its box
+_STRAYS_OF_SCENE = 0.02  # fraction of the Gaussians of a scene beyond each side of its box
+_EXTENT_ROWS = 2048  # maximum number of Gaussians by which the box of a tile is computed
 _ERROR_QUANTILE = 0.95
 
 
@@ -42,9 +42,9 @@ class TreeParams:
     """Sizes of the levels of detail of a scene.
 
     Args:
-        leaf_gaussians: largest number of original Gaussians in one tile; about half as many on average.
-        coarsening: number of Gaussians that become one from one level to the next.
-        root_gaussians: largest number of Gaussians of the coarsest level.
+        leaf_gaussians: Maximum number of original Gaussians per tile; the average is about half.
+        coarsening: Number of Gaussians merged into one between levels.
+        root_gaussians: Maximum number of Gaussians of the coarsest level.
     """
 
     leaf_gaussians: int = 32_768
@@ -57,8 +57,8 @@ class Sketch:
     """Coarse approximation of a scene, and its extent.
 
     Args:
-        gaussians: a few, SH degree 0, scene frame.
-        box: (2, 3) around what the scene shows, without floaters, scene frame.
+        gaussians: Merged Gaussians of SH degree 0, scene frame.
+        box: (2, 3) bounding box of the scene without floaters, scene frame.
     """
 
     gaussians: Gaussians
@@ -76,10 +76,10 @@ class _Cell:
 
 @dataclass(frozen=True, eq=False)
 class _Extent:
-    """Lowest and highest corners (K, 3) of some of the Gaussians below a tile, and the light that each stands for (K,).
+    """Corners (K, 3) of sampled Gaussians below a tile, and the light (K,) that each represents.
 
-    Light, not number: what a viewer leaves out because it lies beyond a box must not be missed, and one large haze that
-    reaches into the picture is, where a hundred specks that fly about are not.
+    The weight is light, not number, because a viewer skips content outside the box: one large haze would be missed,
+    a hundred small floaters would not.
     """
 
     low: np.ndarray
@@ -100,7 +100,7 @@ class _Extent:
         return cls(low, high, weight).few()
 
     def few(self) -> _Extent:
-        """The brightest as they are, and every few of the others, which stand for the rest."""
+        """Return the brightest entries, and a sample of the remaining entries with increased weights."""
         if len(self.weight) <= _EXTENT_ROWS:
             return self
         order = np.argsort(-self.weight, kind="stable")
@@ -112,13 +112,13 @@ class _Extent:
         return _Extent(self.low[rows], self.high[rows], weight)
 
     def core(self) -> np.ndarray:
-        """(2, 3) around all but the strays: a share of the light on every side."""
+        """Return the box (2, 3) that contains all but a fraction of the light on each side."""
         low, high = (robust_box(corners, self.weight, _STRAYS) for corners in (self.low, self.high))
         return np.stack([low[0], high[1]])
 
     def extras(self, content: Gaussians) -> dict[str, float]:
-        """Return the extras of a tile: how many Gaussians it draws, so that a viewer knows its cost before it loads
-        it, and the box of what matters, from which its distance is taken."""
+        """Return the extras of a tile: its number of Gaussians, which is its cost, and its box without outliers, from
+        which viewers compute its distance."""
         low, high = self.core().round(4).tolist()
         corners = zip(("core_x0", "core_y0", "core_z0", "core_x1", "core_y1", "core_z1"), (*low, *high), strict=True)
         return {"num_gaussians": len(content), **dict(corners)}
@@ -136,9 +136,9 @@ class _FinishedTile:
 def write_tree(
     folder: Path, source: GaussianSource, params: TreeParams | None = None, progress: Progress | None = None
 ) -> TileNode:
-    """Write the tree of a scene into a folder that does not exist: ``tileset.json`` and the tiles that it names.
+    """Write the tree of a scene into a new folder: ``tileset.json`` and its tiles.
 
-    Every tile's name ends with the beginning of the digest of its bytes.
+    The name of each tile ends with the start of its digest.
 
     Args:
         source: along the Morton curve of its means (`gsmap.stream.sorted_along_morton_curve`), as scenes are stored.
@@ -155,7 +155,7 @@ def write_tree(
     builder = _Builder(folder, _Rows(source), params, progress or (lambda fraction, text: None), source.num_gaussians)
     made = builder.build(_octree(_codes(source), params.leaf_gaussians), "0")
     if made is None:
-        raise InputError("no Gaussian of it can be seen", code="no_opaque_gaussians")
+        raise InputError("the scene has no opaque Gaussians", code="no_opaque_gaussians")
     while len(made.content) > params.root_gaussians:
         made = builder.coarser([made], f"r{len(made.content)}", max(params.root_gaussians, 1))
     tiles3d.write_tileset(folder / FILE_NAME, made.node, transform=np.eye(4))
@@ -163,10 +163,10 @@ def write_tree(
 
 
 def sketch(source: GaussianSource, max_count: int) -> Sketch:
-    """Approximate a scene coarsely from a sample of its Gaussians: at least four times as many as are requested.
+    """Approximate a scene by at most ``max_count`` Gaussians, merged from a sample of at least four times as many.
 
     Raises:
-        InputError: no Gaussian that can be seen.
+        InputError: The scene has no opaque Gaussians.
     """
     every = max(1, source.num_gaussians // max(4 * max_count, 8192))
     parts, at = [], 0
@@ -176,8 +176,8 @@ def sketch(source: GaussianSource, max_count: int) -> Sketch:
         at += len(chunk)
     found = Gaussians.concatenate(parts)
     if not len(found):
-        raise InputError("no Gaussian of it can be seen", code="no_opaque_gaussians")
-    # Those that are left stand for the others: each stops as much light as all of them did.
+        raise InputError("the scene has no opaque Gaussians", code="no_opaque_gaussians")
+    # Each remaining Gaussian is scaled to block as much light as those it represents.
     scales = found.log_scales + np.float32(np.log(every) / 2 if every > 1 else 0)
     box = robust_box(found.means, None, _STRAYS_OF_SCENE)
     return Sketch(_merged(replace(found, log_scales=scales), max_count)[0], box)
@@ -192,7 +192,7 @@ def shown(gaussians: Gaussians) -> Gaussians:
 
 
 class _Rows:
-    """The rows of a source one after the other, as many as are asked for."""
+    """Sequential reader of the rows of a source."""
 
     def __init__(self, source: GaussianSource) -> None:
         self._chunks: Iterator[Gaussians] = source.chunks()
@@ -218,7 +218,7 @@ class _Builder:
     num_gaussians: int
 
     def build(self, cell: _Cell, name: str) -> _FinishedTile | None:
-        """The tile of a cell with all below it; None where nothing of it can be seen."""
+        """Build the tile of a cell with all tiles below it; None without opaque Gaussians."""
         if not cell.children:
             content = shown(self.rows.take(cell.stop - cell.start))
             self.progress(cell.stop / self.num_gaussians, "")
@@ -233,22 +233,22 @@ class _Builder:
         return self.coarser(made, name, 1) if made else None
 
     def coarser(self, below: list[_FinishedTile], name: str, least: int) -> _FinishedTile:
-        """The tile that is drawn in place of some."""
+        """Build the tile that replaces its children at a distance."""
         finer = Gaussians.concatenate([one.content for one in below])
         level, error = _merged(finer, max(least, len(finer) // self.params.coarsening))
         extent = _Extent.joined([one.extent for one in below])
         error += max(one.node.error_m for one in below)
-        # Whole, strays too: what is left out of a picture because its box is not in sight must not be missed.
+        # The box contains outliers, too, so that viewers do not cull visible content.
         uri, own = self._write(level, name)
         boxes = np.stack([own, *(one.node.box for one in below)])
         box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
-        # A level that nothing was merged for must still count as coarser than what it stands for.
+        # A level without merged Gaussians must still count as coarser than its children.
         error = max(error, 1e-6 * float(np.linalg.norm(box[1] - box[0])))
         node = TileNode(box, error, uri, tuple(one.node for one in below), extent.extras(level))
         return _FinishedTile(node, level, extent)
 
     def _write(self, content: Gaussians, name: str) -> tuple[str, np.ndarray]:
-        """Write the file of a tile; its uri, and the box (2, 3) of what it draws."""
+        """Write the file of a tile; return its uri and the box (2, 3) of its content."""
         staged = self.folder / CONTENT_FOLDER / f"{name}.glb"
         tiles3d.write_content(staged, content)
         with open(staged, "rb") as file:
@@ -259,14 +259,16 @@ class _Builder:
 
 
 def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
-    """At most so many: those that share a cell of the finest grid that has no more of them; and the distance that a
-    twentieth of the Gaussians lie beyond from the one that stands for them."""
+    """Merge Gaussians per cell of the finest grid with at most ``max_count`` occupied cells.
+
+    Returns the merged Gaussians, and the 95 % quantile of the distance from a Gaussian to its merged one.
+    """
     if len(gaussians) <= max_count:
         return gaussians, 0.0
     codes = morton_codes(gaussians.means, box_around(gaussians.means))
     ordered = np.sort(codes)
     low, high = 0, 3 * BITS
-    while low < high:  # the least shift that leaves few enough
+    while low < high:  # find the smallest shift with few enough cells
         middle = (low + high) // 2
         if 1 + np.count_nonzero(np.diff(ordered >> np.uint64(middle))) <= max_count:
             high = middle
@@ -279,14 +281,14 @@ def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
 
 
 def _codes(source: GaussianSource) -> np.ndarray:
-    """(N,) uint64 places along the curve, in ascending order."""
+    """Return ascending Morton codes (N,) uint64 of the rows."""
     means = np.concatenate(list(source.columns("means")))
-    # A thinned scene's means are rounded, so that neighbours may have changed places.
+    # Means of thinned scenes are rounded, so neighbours may be out of order.
     return np.maximum.accumulate(morton_codes(means, box_around(means)))
 
 
 def _octree(codes: np.ndarray, max_leaf: int) -> _Cell:
-    """Cells of which none without children has more than ``max_leaf`` rows."""
+    """Return an octree whose leaves have at most ``max_leaf`` rows."""
 
     def divide(start: int, stop: int, bit: int) -> _Cell:
         if stop - start <= max_leaf:
@@ -303,7 +305,7 @@ def _octree(codes: np.ndarray, max_leaf: int) -> _Cell:
 
 
 def _halves(codes: np.ndarray, start: int, stop: int, bit: int) -> list[tuple[int, int, int]]:
-    """Rows of a cell divided where their codes first differ; in the middle where they are all one."""
+    """Split the rows of a cell where their codes first differ, or in the middle if all are equal."""
     for at in range(bit, -1, -1):
         shift = np.uint64(at)
         boundary = ((codes[start] >> shift) | np.uint64(1)) << shift

@@ -147,7 +147,7 @@ def test_a_purge_says_where_else_it_may_live(site: Path, cli: Run) -> None:
     cli("tag", site, "v1")
     assert cli("remove", site, "odd:one", "--branches").code == 2
     done = cli("remove", site, "odd:one", "--purge")
-    assert f"{site}@v1 still has it: gsmap remove {site} " in done.stderr
+    assert f"{site}@v1 still has the scene: gsmap remove {site} " in done.stderr
     scene = cli("remove", site, names(cli, f"{site}@v1")[0], "--purge", "--json").json["scene_id"]
     assert len(scene) == 32
     done = cli("remove", site, "odd:one", "--purge", "--branches", "--json")

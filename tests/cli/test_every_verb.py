@@ -325,7 +325,7 @@ def test_evaluate_says_plainly_that_a_map_failed(site: Path, captures: Path, cli
     for option in ("--tiles", "--lpips"):
         refused = cli("evaluate", site, *truth, option, site)
         assert (refused.code, refused.stdout) == (2, "")
-        assert f"{option} compares images: give --images too" in refused.stderr
+        assert f"{option} needs --images DIR" in refused.stderr
 
 
 def test_a_point_may_begin_with_a_minus(site: Path, cli: Run) -> None:
