@@ -29,7 +29,7 @@ _Part = TypeVar("_Part")
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str | None:
-    """The longest known suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None.
+    """Return the longest known suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None.
 
     One without a dot (``tileset.json``) is a whole name: that of a file whose folder is the scene.
     """
@@ -44,8 +44,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     Positions that float32 cannot hold, such as map coordinates, are about an origin (`Gaussians.origin`).
 
     Raises:
-        NotFoundError: no such file.
-        InputError: unknown suffix, a file that is not what its suffix says, or positions that its single precision has
+        NotFoundError: The file is missing.
+        InputError: Unknown suffix, content that does not match the suffix, or positions that its single precision has
             rounded together; values are checked by `gsmap.ingest`.
     """
     path = Path(path)
@@ -56,10 +56,10 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def stream(path: str | os.PathLike[str]) -> GaussianSource:
-    """The Gaussians of a file of any known format, read a chunk at a time where the format can; else all at once.
+    """Open a file of Gaussians of any known format; its chunks are read one at a time if the format permits it.
 
     Raises:
-        NotFoundError, InputError: as `read`; the chunks may raise them too.
+        NotFoundError, InputError: As `read`; reading chunks may raise them, too.
     """
     path = Path(path)
     module = _load(_layout(path, _suffix(path, "read")))
@@ -121,11 +121,11 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
     What is still to be read is written a chunk at a time by formats that can (``.ply``), and is loaded for others.
 
     Args:
-        options: of the format; see the ``write`` of its module.
+        options: Options of the format; see ``write`` of its module.
 
     Raises:
-        NotFoundError: the folder does not exist; that of a ``tileset.json`` and its like is made.
-        InputError: unknown suffix, a format that is only read, a path that cannot be written, or positions about an
+        NotFoundError: The folder does not exist; that of a ``tileset.json`` or the like is created.
+        InputError: Unknown suffix, a format that is only read, a path that cannot be written, or positions about an
             origin in a format that holds no distances between neighbours there.
     """
     path = Path(path)
@@ -136,7 +136,7 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
             path.parent.mkdir(parents=True, exist_ok=True)
         if is_stream(path):
             raise InputError(
-                f"cannot write {path}: a pipe or device holds one file, and {suffix} has others beside it",
+                f"cannot write {path}: {suffix} consists of several files, and this is a pipe or a device",
                 code="not_writable",
             )
     with _explained(path, "write"):
@@ -155,7 +155,7 @@ def read_cameras(path: str | os.PathLike[str]) -> Cameras:
 
 
 def known(verb: str) -> list[str]:
-    """The suffixes that can be read (``verb="read"``) or written (``"write"``)."""
+    """Return the suffixes that can be read (``verb="read"``) or written (``"write"``)."""
     return [suffix for suffix in _suffixes(tuple(sys.path)) if _can(suffix, verb)]
 
 
@@ -183,7 +183,7 @@ def _can(suffix: str, verb: str) -> bool:
 
 
 def _suffix(path: Path, verb: str) -> str:
-    """The suffix of a path that can be read or written."""
+    """Return the suffix of a path, or raise an error if it cannot be read or written."""
     suffix = suffix_of(path)
     if suffix is None:
         what = f"has the unknown suffix {path.suffix!r}" if path.suffix else "has no suffix"
@@ -197,7 +197,7 @@ def _suffix(path: Path, verb: str) -> str:
 
 
 def _layout(path: Path, suffix: str) -> str:
-    """The suffix that stands for what is in the file: some programs call a ``.compressed.ply`` a ``.ply``."""
+    """Return the suffix of the actual content: some programs name a ``.compressed.ply`` file ``.ply``."""
     if suffix != ".ply":
         return suffix
     from gsmap.formats import ply
@@ -207,7 +207,7 @@ def _layout(path: Path, suffix: str) -> str:
 
 @contextlib.contextmanager
 def _explained(path: Path, verb: str) -> Iterator[None]:
-    """Turn what the operating system says into a typed error."""
+    """Convert errors of the operating system into typed errors."""
     if verb == "read" and path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(f"cannot read {path}: it is a pipe or a device, not a file", code="not_a_plain_file")
     try:

@@ -20,12 +20,12 @@ _LETTERS = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "
 
 
 def axes_matrix(a: str, b: str) -> np.ndarray:
-    """The signed permutation M (3, 3) float64 with ``x_a = M x_b`` for points in conventions a and b."""
+    """Return the signed permutation M (3, 3) float64 with ``x_a = M x_b`` for points in conventions a and b."""
     return _from_letters(a).T @ _from_letters(b)
 
 
 def change_axes(gaussians: Gaussians, a: str, b: str) -> Gaussians:
-    """The Gaussians of convention b in convention a; a mirrored convention is mirrored back."""
+    """Convert Gaussians from convention b to convention a, including mirrored conventions."""
     M = axes_matrix(a, b)
     if np.array_equal(M, np.eye(3)):
         return gaussians
@@ -58,7 +58,7 @@ def _turn_sh(sh: np.ndarray, M: np.ndarray) -> np.ndarray:
 
 
 def _from_letters(convention: str) -> np.ndarray:
-    """Columns: where each axis of the convention points, in right-down-front coordinates."""
+    """Return the axes of the convention as columns, in right-down-front coordinates."""
     out = np.zeros((3, 3))
     for column, letter in enumerate(convention):
         row, sign = _LETTERS[letter]

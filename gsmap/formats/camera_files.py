@@ -19,7 +19,7 @@ def load_json(path: Path) -> Any:
 
 
 def unique(names: list[str]) -> tuple[str, ...]:
-    """The names, with ``#2`` and so on where one comes again."""
+    """Return the names, with ``#2`` and so on appended to repeated ones."""
     seen: dict[str, int] = {}
     out = []
     for name in names:

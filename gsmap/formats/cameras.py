@@ -1,4 +1,4 @@
-"""Cameras, in whichever of the usual ways they lie on disk."""
+"""Camera files and folders: ``cameras.json``, ``transforms.json`` and COLMAP models."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def read(path: str | os.PathLike[str]) -> Cameras:
     ``dataparser_transforms.json`` beside ``transforms.json`` is applied. Frames: the Gaussians' own.
 
     Raises:
-        NotFoundError: no such file or folder.
-        NotPinholesError: no pinhole stands for any of its cameras (panoramas, wide fisheyes).
-        InputError: neither of the three, or damaged.
+        NotFoundError: The file or folder is missing.
+        NotPinholesError: No camera can be approximated by a pinhole (panoramas, wide fisheyes).
+        InputError: Another format, or damaged.
     """
     path = Path(path)
     try:
@@ -44,4 +44,4 @@ def read(path: str | os.PathLike[str]) -> Cameras:
         if isinstance(error, GsmapError) and str(path) in str(error):
             raise
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{path} does not hold cameras: {what}", code="invalid_cameras") from error
+        raise InputError(f"{path} is not a camera file: {what}", code="invalid_cameras") from error

@@ -43,7 +43,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read the Gaussians of a checkpoint.
 
     Raises:
-        InputError: not a checkpoint in torch's ZIP layout, one that holds more than weights, no Gaussians in it, or
+        InputError: Not a checkpoint in torch's ZIP layout, content other than weights, no Gaussians, or
             tensors that do not fit together.
     """
     found = _tensors(path, _loaded(path))
@@ -84,7 +84,7 @@ def _loaded(path: str | os.PathLike[str]) -> Any:
             entries = archive.infolist()
     except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, EOFError, *MALFORMED) as error:
         raise InputError(
-            f"{path} is no checkpoint that gsmap reads: not a ZIP as torch has written since 1.6 ({error}); "
+            f"{path} is not a checkpoint in the ZIP layout of torch 1.6 or newer ({error}); "
             "load it with torch and save it again, or export a .ply",
             code="wrong_file_type",
         ) from error
@@ -117,13 +117,13 @@ def _loaded(path: str | os.PathLike[str]) -> Any:
     ) as error:
         text = str(error).split("\n")[0]
         raise InputError(
-            f"{path} cannot be read as weights alone, and gsmap runs no code of a file: {text}; export a .ply",
+            f"{path} contains more than weights, and gsmap does not run code from files: {text}; export a .ply",
             code="unsupported_pickle",
         ) from error
 
 
 def _tensors(path: str | os.PathLike[str], loaded: Any) -> dict[str, Any]:
-    """The tensors of Gaussians in a checkpoint by our names, wherever the trainer keeps them."""
+    """Find the tensors of Gaussians in a checkpoint, by field of `Gaussians`."""
     if isinstance(loaded, tuple | list) and loaded and isinstance(loaded[0], tuple | list):  # (capture(), iteration)
         loaded = dict(zip(_TUPLE, loaded[0], strict=False))
     names = {name: ours for ours, all_names in _FIELDS.items() for name in all_names}
@@ -152,7 +152,7 @@ def _tensors(path: str | os.PathLike[str], loaded: Any) -> dict[str, Any]:
 def _array(
     path: str | os.PathLike[str], name: str, tensor: Any, n: int, shape: tuple[int, ...], size: int
 ) -> np.ndarray:
-    """(n, *shape) of a tensor, where the file holds as many numbers; -1 in a shape is any; positions are float64."""
+    """Return a tensor as (n, *shape), checked against the size of the file; -1 matches any size."""
     import torch
 
     if tensor.layout != torch.strided or not tensor.is_floating_point() or tensor.dtype.itemsize not in (2, 4, 8):

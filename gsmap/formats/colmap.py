@@ -25,7 +25,7 @@ _PLACES = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder with the model's files: the folder itself, ``sparse/0`` or ``sparse``; None where there is none."""
+    """Return the folder with the files of the model: the folder, ``sparse/0`` or ``sparse``; None without a model."""
     for place in _PLACES:
         for suffix in ("bin", "txt"):
             if all((folder / place / f"{name}.{suffix}").is_file() for name in ("cameras", "images")):
@@ -40,8 +40,8 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
     (`gsmap.formats.lenses`).
 
     Raises:
-        NotPinholesError: no pinhole stands for any of its cameras.
-        InputError: damaged, or without images.
+        NotPinholesError: No camera can be approximated by a pinhole.
+        InputError: Damaged, or without images.
     """
     from scipy.spatial.transform import Rotation
 
@@ -85,8 +85,8 @@ def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
     intrinsics share a camera. White space in a name becomes ``_``: COLMAP's text format ends a name there.
 
     Raises:
-        InputError: the folder holds a binary model, which every program would read instead.
-        NotFoundError: no folder to put it in.
+        InputError: The folder holds a binary model, which programs would read instead.
+        NotFoundError: The parent folder is missing.
     """
     folder = Path(folder)
     if (folder / "cameras.bin").exists() or (folder / "images.bin").exists():

@@ -37,7 +37,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a ``.compressed.ply``, with or without bounds of the colours (older files), SH degree 0 to 3.
 
     Raises:
-        InputError: another kind of PLY, truncated, or counts that do not fit together.
+        InputError: Another kind of PLY, truncated, or with inconsistent counts.
     """
     header = ply.read_header(path)
     if not ply.is_compressed(header):
@@ -138,13 +138,13 @@ def _require(path: str | os.PathLike[str], rows: np.ndarray, names: list[str], k
 
 
 def _between(t: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Values at fractions t (N, 3) between the bounds (C, 3) of each chunk."""
+    """Return the values at fractions t (N, 3) between the bounds (C, 3) of each chunk."""
     chunk = np.arange(len(t)) // _CHUNK
     return low[chunk] * (1 - t) + high[chunk] * t
 
 
 def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fractions (N, 3) of values within the bounds of their chunk, and those bounds (C, 3)."""
+    """Return values (N, 3) as fractions of the bounds of their chunk, and the bounds (C, 3)."""
     starts = np.arange(0, len(values), _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     chunk = np.arange(len(values)) // _CHUNK

@@ -1,4 +1,4 @@
-"""``.g2o`` pose graphs: ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` lines, so that other people's solvers can check ours.
+"""``.g2o`` pose graphs: ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` lines, for exchange with other solvers.
 
 ``VERTEX_SE3:QUAT id x y z qx qy qz qw`` and ``EDGE_SE3:QUAT i j x y z qx qy qz qw`` followed by the 21 numbers of the
 upper triangle, row by row, of a 6x6 information matrix ordered [translation, rotation]. ``i j`` measures the pose of j
@@ -41,11 +41,11 @@ def read_graph(path: str | os.PathLike[str], *, confirmed: bool = True) -> G2o:
     """Read a 3D pose graph.
 
     Args:
-        confirmed: take every edge as someone's decision, which the optimiser never votes out; False lets it judge.
+        confirmed: Mark all edges as confirmed, so that robust optimization never excludes them.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: a line that cannot be read (named), a vertex type other than SE(3), or a vertex given twice.
+        NotFoundError: The file is missing.
+        InputError: An invalid line (named), a vertex type other than SE(3), or a repeated vertex.
     """
     path = Path(path)
     if not path.is_file():
@@ -99,14 +99,14 @@ def write_graph(
     Ids that are whole numbers already are kept where all are. The scale row of the information is left out.
 
     Args:
-        names: of scenes by id, each a comment line before its vertex.
-        remarks: on the whole file, comment lines before the vertices.
+        names: Names of scenes by id, written as comment lines before the vertices.
+        remarks: Comment lines at the start of the file.
 
     Returns:
         The number of each scene.
 
     Raises:
-        InputError: a pose or edge with a scale (the format has none), or an edge to a scene without a pose.
+        InputError: A pose or edge with a scale, which the format lacks, or an edge to a scene without a pose.
     """
     numeric = all(s.isascii() and s.isdigit() and str(int(s)) == s for s in poses)
     numbers = {scene: int(scene) if numeric else k for k, scene in enumerate(poses)}
@@ -152,7 +152,7 @@ def _pose(values: list[float], where: str) -> Sim3:
 def _values(pose: Sim3, name: str) -> str:
     if not pose.is_rigid:
         raise InputError(
-            f"{name} has scale {pose.scale:.6g}, which .g2o cannot say: export rigid components only",
+            f"{name} has scale {pose.scale:.6g}, which .g2o cannot store: export rigid components only",
             code="unsupported_output",
         )
     w, x, y, z = matrices_to_quats(pose.rotation[None])[0].tolist()

@@ -30,12 +30,12 @@ class GcpLine:
     """A control point in one photo.
 
     Args:
-        line: number in the file, from 1.
-        name: of the point; one made of its place where the file names none.
-        position: x, y, z in the file's system.
-        pixel: column, row.
-        image: name of the photo.
-        is_named: whether the file names the point.
+        line: Line number in the file, from 1.
+        name: Name of the point; derived from its position if the file has none.
+        position: x, y, z in the coordinate reference system of the file.
+        pixel: Column and row in the photo.
+        image: Name of the photo.
+        is_named: The file names the point.
     """
 
     line: int
@@ -51,7 +51,8 @@ class GcpList:
     """Content of a ``gcp_list.txt``.
 
     Args:
-        crs: as PROJ takes it. lines: in the file's order.
+        crs: Coordinate reference system in a form that PROJ accepts.
+        lines: Observations in the order of the file.
     """
 
     crs: str
@@ -62,8 +63,8 @@ def read(path: str | os.PathLike[str]) -> GcpList:
     """Read a file.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: the number of the first line that is wrong, and why; nothing is taken from such a file.
+        NotFoundError: The file is missing.
+        InputError: Invalid content; names the first invalid line.
     """
     path = Path(path)
     if not path.is_file():
@@ -73,7 +74,7 @@ def read(path: str | os.PathLike[str]) -> GcpList:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no text in UTF-8: {error.reason}", code="invalid_text") from error
+        raise InputError(f"{path} is not UTF-8 text: {error.reason}", code="invalid_text") from error
     return parse(text, str(path))
 
 
@@ -99,8 +100,8 @@ def parse(text: str, where: str = "gcp_list") -> GcpList:
         first = places.setdefault(one.name, one)
         if first.position != one.position:
             raise InputError(
-                f"{where}, line {one.line}: point {one.name} has other coordinates than on line {first.line}: one name "
-                "is one point",
+                f"{where}, line {one.line}: point {one.name} has other coordinates than on line {first.line}: use one "
+                "name per point",
                 code="duplicate",
             )
         before = seen.setdefault((one.name, one.image), one)
@@ -125,7 +126,7 @@ def _crs(line: str, where: str) -> str:
     if (utm := _UTM.fullmatch(line)) is not None:
         zone, half = int(utm[1]), utm[2].upper()
         if not 1 <= zone <= 60:
-            raise InputError(f"{where}: there is no UTM zone {zone}", code="gcp_crs_missing")
+            raise InputError(f"{where}: UTM zone {zone} does not exist", code="gcp_crs_missing")
         return f"EPSG:{(32600 if half == 'N' else 32700) + zone}"
     if line.startswith("+proj") or re.match(r"(?i)[a-z]+:\d+(\+\d+)?$", line) or line.endswith("]"):
         return line
@@ -135,7 +136,7 @@ def _crs(line: str, where: str) -> str:
             code="gcp_crs_missing",
         )
     raise InputError(
-        f"{where}: {line[:60]!r} is no coordinate system: write EPSG:25832, a PROJ string, or WGS84 UTM 32N",
+        f"{where}: {line[:60]!r} is not a coordinate system: write EPSG:25832, a PROJ string, or WGS84 UTM 32N",
         code="gcp_crs_missing",
     )
 
@@ -145,7 +146,7 @@ def _line(number: int, line: str, where: str) -> GcpLine:
     parts = [part.strip() for part in parts]
     if not _is_number(parts[0]):
         raise InputError(
-            f"{where} has {len(line.split())} fields and begins with {parts[0][:40]!r}, which is no finite number: a "
+            f"{where} has {len(line.split())} fields and begins with {parts[0][:40]!r}, not a finite number: a "
             "line is geo_x geo_y geo_z im_x im_y image_name [gcp_name], with pixels and photo, and the point's "
             "name last",
             code="invalid_line",
@@ -161,7 +162,7 @@ def _line(number: int, line: str, where: str) -> GcpLine:
     values = []
     for name, part in zip(_NUMBERS, parts, strict=False):
         if not _is_number(part):
-            raise InputError(f"{where}: {name} is {part[:40]!r}, which is no finite number", code="invalid_line")
+            raise InputError(f"{where}: {name} is {part[:40]!r}, not a finite number", code="invalid_line")
         values.append(float(part))
     if not parts[5]:
         raise InputError(f"{where} names no photo", code="invalid_line")

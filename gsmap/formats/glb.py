@@ -46,7 +46,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read all splats of the file's scene into one set, in the axes of a ``.ply``; node transforms are applied.
 
     Raises:
-        InputError: not a GLB, damaged, without splats, of a draft of the extension, compressed, or with buffers
+        InputError: Not a GLB, damaged, without splats, of a draft of the extension, compressed, or with buffers
             outside the file.
     """
     return change_axes(read_world(path), PLY, GLTF)
@@ -56,7 +56,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: boo
     """Write a ``.glb``, in the order given, with point colours for viewers that know no splats.
 
     Args:
-        compressed: pack it as SPZ: about a fifth of the bytes, for viewers that read `SPZ_EXTENSION`.
+        compressed: Pack the Gaussians as SPZ: about a fifth of the bytes, for viewers that read `SPZ_EXTENSION`.
     """
     require_writable(path, gaussians)
     writer = write_packed if compressed else write_world
@@ -67,7 +67,7 @@ def holds_splats(path: str | os.PathLike[str]) -> bool:
     """Return true if the file declares Gaussians; false for a mesh or a point cloud.
 
     Raises:
-        InputError: not a GLB, or damaged.
+        InputError: Not a GLB, or damaged.
     """
     used = _read_container(path)[0].get("extensionsUsed", [])
     return isinstance(used, list) and any("gaussian_splat" in str(name) for name in used)  # drafts, too: `read` says so

@@ -12,10 +12,10 @@ def file_inside(path: Path, uri: object, suffix: str = "") -> Path:
     """The file that a relative uri in the file at ``path`` names, which must lie in its folder, links followed.
 
     Args:
-        suffix: that it must have, with the dot; any if empty.
+        suffix: Required suffix with the dot; any if empty.
 
     Raises:
-        InputError: it lies elsewhere, has another suffix, or is not there.
+        InputError: The file is outside the folder, has another suffix, or is missing.
     """
     name = PurePosixPath(unquote(str(uri)))
     folder = path.parent.resolve()

@@ -43,7 +43,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read the finest level; the environment (``environment.bin``) is left out.
 
     Raises:
-        InputError: not the JSON of an ``.lcc``, files missing, or rows that are not in them.
+        InputError: Not the JSON of an ``.lcc``, missing files, or invalid row ranges.
     """
     return stream(path).load()
 
@@ -95,10 +95,10 @@ class LccSource:
     """The finest level of an ``.lcc``, read as it is asked for.
 
     Args:
-        path: of the JSON.
-        data, sh: the files of rows; no SH if None.
+        path: Path of the JSON.
+        data, sh: Files of the rows; ``sh`` is None without SH.
         runs: (R, 2) int64 first row and number of rows of each unit.
-        bounds: (2, 3) of scales and of SH.
+        bounds: (2, 3) bounds of scales and of SH.
     """
 
     path: Path

@@ -30,10 +30,10 @@ class Lens:
     """A camera model with its parameters, as the pinhole of its focal lengths and principal point.
 
     Args:
-        model: its name in COLMAP or nerfstudio.
-        size_px: width and height of the image.
+        model: Name of the model in COLMAP or nerfstudio.
+        size_px: Width and height of the image.
         intrinsics_px: ``fx fy cx cy`` of the pinhole; zeros where the model has none.
-        shift_px: largest distance at a corner of the image between a pixel and the pinhole's projection of its ray;
+        shift_px: Largest distance at a corner of the image between a pixel and the pinhole's projection of its ray;
             infinite where a corner has no ray in front of the camera.
     """
 
@@ -53,11 +53,11 @@ def lens_of(model: object, width: int, height: int, params: tuple[float, ...]) -
     """The lens of a camera model of COLMAP.
 
     Args:
-        model: its name or `pycolmap.CameraModelId`.
-        params: in COLMAP's order.
+        model: Name of the model, or its `pycolmap.CameraModelId`.
+        params: Parameters in COLMAP's order.
 
     Raises:
-        ValueError, RuntimeError: no such model, or other parameters than the model has.
+        ValueError, RuntimeError: Unknown model, or a wrong number of parameters.
     """
     import pycolmap
 
@@ -90,10 +90,10 @@ def keep_pinholes(lenses: Sequence[Lens], where: object) -> tuple[np.ndarray, tu
     """(C,) mask of the cameras that a pinhole stands for, and notes on the lenses of all.
 
     Args:
-        where: the file or folder that holds the cameras.
+        where: File or folder of the cameras, for messages.
 
     Raises:
-        NotPinholesError: a pinhole stands for none of them.
+        NotPinholesError: No camera can be approximated by a pinhole.
     """
     kept = np.array([lens.is_pinhole for lens in lenses], bool)
     notes = []

@@ -27,8 +27,8 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
     """Cameras of a parsed file, moved into the frame the splats were trained in.
 
     Args:
-        path: the file; image sizes and ``dataparser_transforms.json`` are looked up beside it.
-        dataparser: that file, where it lies elsewhere.
+        path: The file; image sizes and ``dataparser_transforms.json`` are looked up beside it.
+        dataparser: Path of ``dataparser_transforms.json``, if it is elsewhere.
 
     Nerfstudio trains in ``scale * (transform @ x)`` of the *original* coordinates, while the poses of
     ``transforms.json`` already had ``applied_transform`` and ``applied_scale`` done to them: both are taken back first.
@@ -37,8 +37,8 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
     (`gsmap.formats.lenses`).
 
     Raises:
-        NotPinholesError: no pinhole stands for any of its cameras.
-        InputError: without cameras, sizes or focal lengths.
+        NotPinholesError: No camera can be approximated by a pinhole.
+        InputError: Cameras, sizes or focal lengths are missing.
     """
     frames = content["frames"]
     if not frames:
@@ -74,7 +74,7 @@ def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
     ``--orientation-method none --center-method none --auto-scale-poses False`` keeps the frame.
 
     Raises:
-        NotFoundError: no folder to put it in.
+        NotFoundError: The parent folder is missing.
     """
     path = Path(path)
     if not path.parent.is_dir():

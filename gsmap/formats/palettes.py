@@ -83,9 +83,9 @@ def palette(vectors: np.ndarray, size: int, turns: int, weights: np.ndarray) -> 
 
     Args:
         vectors: (N, D) float32.
-        size: of the palette, at most.
-        turns: of k-means in each step.
-        weights: (N,) >= 0, how much each counts.
+        size: Maximum size of the palette.
+        turns: Number of k-means iterations in each step.
+        weights: (N,) weight of each vector, at least 0.
 
     Returns:
         (P, D) float32 with P <= size, and (N,) int64: which stands for each vector. Those of one coarse cluster are

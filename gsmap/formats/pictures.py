@@ -41,15 +41,15 @@ def open_picture(
     Whatever a damaged picture makes Pillow raise in the block becomes an `InputError`: decode there, and compute later.
 
     Args:
-        path: of its file.
-        data: its bytes, where it is no file; ``path`` then names it in errors.
-        formats: of `FORMATS`, those it may have.
-        max_pixels: the most that its header may claim.
+        path: Path of the image.
+        data: Bytes of the image, if it is not a file; ``path`` then names it in errors.
+        formats: Allowed formats, of `FORMATS`.
+        max_pixels: Maximum number of pixels in its header.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: another format, too many pixels, or damaged.
-        MissingDependencyError: a HEIC picture, and pillow-heif is not installed.
+        NotFoundError: The file is missing.
+        InputError: Another format, too many pixels, or damaged.
+        MissingDependencyError: A HEIC image, and pillow-heif is not installed.
     """
     from PIL import Image, UnidentifiedImageError
 

@@ -137,12 +137,12 @@ class PlySource:
     """The Gaussians of a ``.ply``, read as they are asked for.
 
     Args:
-        rows: of the file.
-        names: the properties that make each field of `Gaussians`.
-        rest: those of the spherical harmonics above degree 0, channel by channel.
-        filtered: there is a 3D filter to be folded in.
-        origin: (3,) that is taken off positions.
-        activated: opacities are in 0 to 1 and scales are lengths, in place of logits and logarithms.
+        rows: Rows of the file.
+        names: Properties of each field of `Gaussians`.
+        rest: Properties of the spherical harmonics above degree 0, channel by channel.
+        filtered: The file has a 3D filter, which is merged into scales and opacities.
+        origin: (3,) offset subtracted from positions.
+        activated: Opacities are in [0, 1] and scales are lengths, instead of logits and logarithms.
     """
 
     rows: Rows
@@ -215,7 +215,7 @@ def _is_activated(path: str | os.PathLike[str], source: PlySource) -> bool:
     not all positive unless its unit is small beside its Gaussians.
 
     Raises:
-        InputError: one of the two is without doubt activated and the other is not.
+        InputError: Only one of opacities and scales is activated.
     """
     opacity, scale = [np.inf, -np.inf], np.inf
     medians: list[float] = []
@@ -308,8 +308,8 @@ def write(
     Positions about an origin are written in full, in double precision.
 
     Args:
-        antialiased: note in a comment that it was trained with the 2D Mip filter.
-        extra: further float properties by name, (N,) each, such as the index of the capture each came from.
+        antialiased: Mark the file, in a comment, as trained with the 2D Mip filter.
+        extra: Further float properties (N,) by name, such as the index of the source capture.
     """
     extra = dict(extra or {})
     k = (gaussians.sh_degree + 1) ** 2
@@ -352,7 +352,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     """Parse a PLY header of at most 64 KiB.
 
     Raises:
-        InputError: not a PLY, no end of header, or a line that means nothing.
+        InputError: Not a PLY, a header without end, or an invalid header line.
     """
     with open(path, "rb") as file:
         head = file.read(HEADER_LIMIT_BYTES)
@@ -425,11 +425,11 @@ class Rows:
     """The rows of one element, read in parts; those of an ASCII file are in memory.
 
     Args:
-        count: of the rows.
-        dtype: of a row.
-        offset: where they begin in the file.
-        version: of the file, to see that it stays the same.
-        held: all of them, where they are in memory.
+        count: Number of rows.
+        dtype: Type of a row.
+        offset: Position of the first row in the file.
+        version: Version of the file, to detect changes.
+        held: All rows, if they are in memory.
     """
 
     path: Path

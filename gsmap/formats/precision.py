@@ -21,10 +21,10 @@ def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> Gauss
     """The Gaussians of a source about an origin, where they lie so far from zero that float32 needs one.
 
     Args:
-        where: what to call the source in messages (its file).
+        where: Name of the source in messages.
 
     Raises:
-        InputError: their positions were rounded to single precision before, and so coarsely that neighbours fall
+        InputError: Positions were rounded to single precision before, and so coarsely that neighbours fall
             together.
     """
     origin = origin_of_source(source)
@@ -61,10 +61,10 @@ def about_zero(
     """Gaussians about an origin with it added to their positions, for a format that holds single precision at most.
 
     Args:
-        step_of: the step in which the format holds positions (N, 3); None for single precision.
+        step_of: Function that returns the step of stored positions (N, 3); None for single precision.
 
     Raises:
-        InputError: the format does not hold the distances between neighbours there.
+        InputError: The format cannot represent the distances between neighbours at these positions.
     """
     positions = gaussians.positions
     step = (step_of or float32_step)(positions)

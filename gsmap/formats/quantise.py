@@ -20,7 +20,7 @@ def check_size(path: str | os.PathLike[str], expanded: int, compressed: int) -> 
     """Refuse to expand ``compressed`` bytes to more than 8 MiB and more than 32 times as many.
 
     Raises:
-        InputError: a decompression bomb, or a header that lies.
+        InputError: A decompression bomb, or an inconsistent header.
     """
     if expanded > max(_FREE_BYTES, _MAX_RATIO * compressed):
         raise InputError(

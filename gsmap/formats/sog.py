@@ -89,14 +89,14 @@ def write(
     """Write SOG version 2: a ``.sog``, or a folder by its ``meta.json``, with images named by their digests.
 
     Args:
-        palette_size: entries of the palette of SH, at most; no more than one for two Gaussians are made.
-        turns: of k-means that finds them.
-        ordered: keep the order of the Gaussians, which costs bytes; along a Morton curve else.
-        antialiased: trained with the 2D Mip filter.
+        palette_size: Maximum number of entries of the SH palette; at most half the number of Gaussians.
+        turns: Number of k-means iterations for the palette.
+        ordered: Keep the order of the Gaussians, which costs bytes; default: Morton order.
+        antialiased: Mark the file as trained with the 2D Mip filter.
 
     Raises:
-        InputError: no Gaussians, ones that are not finite, or more than an image can hold.
-        ConfigError: a palette of no or too many entries.
+        InputError: No Gaussians, values that are not finite, or more Gaussians than an image can hold.
+        ConfigError: The palette size is out of range.
     """
     path = Path(path)
     if not 1 <= palette_size <= _MAX_PALETTE:

@@ -25,7 +25,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a ``.splat``; scales of zero become the smallest there is.
 
     Raises:
-        InputError: empty, or not a whole number of rows.
+        InputError: The file is empty, or its size is not a multiple of a row.
     """
     size = Path(path).stat().st_size
     if size == 0 or size % _ROW.itemsize:

@@ -104,12 +104,12 @@ def write(
 
     Args:
         version: 3 (gzip, read everywhere) or 4 (zstd, faster; not every viewer reads it).
-        sh_bits: bits kept of SH degree 1 and of the higher degrees, 1 to 8; fewer make a smaller file.
-        antialiased: note that it was trained with the 2D Mip filter.
+        sh_bits: Bits of SH degree 1 and of the higher degrees, 1 to 8; fewer make a smaller file.
+        antialiased: Mark the file as trained with the 2D Mip filter.
 
     Raises:
-        ConfigError: another version or number of bits.
-        InputError: nothing to write, values that are not finite, or positions beyond 8388 km, or so far out that
+        ConfigError: Unsupported version or number of bits.
+        InputError: No Gaussians, values that are not finite, or positions beyond 8388 km, or so far out that
             neighbours fall together.
     """
     require_writable(path, gaussians)
@@ -126,10 +126,10 @@ def pack(
     sh_bits: tuple[int, int] = (5, 4),
     antialiased: bool = False,
 ) -> bytes:
-    """The bytes of an SPZ of Gaussians in the axes that they are in; see `write`.
+    """Pack Gaussians as the bytes of an SPZ without changing axes; see `write`.
 
     Args:
-        path: of the file that they are for, to say where something is wrong.
+        path: Path of the containing file, for messages.
     """
     if version not in (3, 4):
         raise ConfigError(f"cannot write SPZ version {version!r}: choose 3 or 4", code="unsupported_output")
@@ -153,10 +153,10 @@ def pack(
 
 
 def unpack(path: str | os.PathLike[str], data: bytes) -> Gaussians:
-    """The Gaussians of an SPZ within another file, in the axes that its bytes are in; see `read`.
+    """Unpack an SPZ inside another file without changing axes; see `read`.
 
     Args:
-        path: of that file, to say where something is wrong.
+        path: Path of the containing file, for messages.
     """
     header, streams, _ = _load(path, io.BytesIO(data), len(data))
     return _decode(header, streams)
@@ -292,14 +292,14 @@ def _zstd_content_size(frame: bytes) -> int | None:
 
 
 class _Inflater:
-    """Bytes of a gzip file as they are asked for, never more."""
+    """Bounded reader of a gzip file."""
 
     def __init__(self, path: str | os.PathLike[str], file) -> None:
         self._path, self._file, self._stream = path, file, zlib.decompressobj(wbits=31)
         self._file.seek(0)
 
     def take(self, size: int) -> bytes:
-        """Exactly ``size`` bytes; InputError where there are fewer."""
+        """Read exactly ``size`` bytes, or raise InputError."""
         data = self.rest(size)
         if len(data) < size:
             raise InputError(
@@ -330,7 +330,7 @@ def position_step(positions: np.ndarray) -> float:
 
 
 def _require_distances(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Refuse Gaussians that reach so far out that neighbours would fall together."""
+    """Reject Gaussians so far from the origin that the positions of neighbours would coincide."""
     bits = _fractional_bits(path, gaussians.means)
     apart = np.inf if bits >= _USUAL_BITS else neighbour_distance(gaussians)
     if apart < 2 * 2.0**-bits:
@@ -342,7 +342,7 @@ def _require_distances(path: str | os.PathLike[str], gaussians: Gaussians) -> No
 
 
 def _fractional_bits(path: str | os.PathLike[str], means: np.ndarray) -> int:
-    """12 bits (0.24 mm) as everybody writes, more for a small scene, fewer where the range asks for it."""
+    """Choose the fractional bits: 12 (0.24 mm) as usual, more for small scenes, fewer for a large range."""
     extent = float(np.abs(means).max())
     if extent > _MAX_FIXED:
         raise InputError(

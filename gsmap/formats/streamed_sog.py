@@ -46,9 +46,9 @@ class Run:
     """Run of Gaussians that a leaf draws at one level.
 
     Args:
-        uri: of the ``meta.json`` of a SOG, relative to ``lod-meta.json``, with ``/``.
-        offset, count: which of its Gaussians.
-        extras: numbers about them, by name, that viewers leave alone.
+        uri: Path of the ``meta.json`` of a SOG, relative to ``lod-meta.json``, with ``/``.
+        offset, count: Range of its Gaussians.
+        extras: Additional numbers by name, which viewers ignore.
     """
 
     uri: str
@@ -59,12 +59,12 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class LodNode:
-    """A place of the tree.
+    """Node of the tree.
 
     Args:
-        box: (2, 3) lowest and highest corner of what is drawn there at any level.
-        lods: by level, 0 is the finest; of leaves. A viewer takes the next finer one where a level is missing.
-        children: of the others.
+        box: (2, 3) bounding box of its Gaussians over all levels.
+        lods: Runs of a leaf by level, 0 is the finest; viewers replace a missing level by the next finer one.
+        children: Children of an inner node.
     """
 
     box: np.ndarray
@@ -116,7 +116,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, max_per_leaf: i
 
     Raises:
         InputError: as `gsmap.formats.sog.write`.
-        ConfigError: a leaf of none.
+        ConfigError: ``max_per_leaf`` is less than 1.
     """
     path = Path(path)
     if max_per_leaf < 1:

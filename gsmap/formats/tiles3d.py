@@ -47,11 +47,11 @@ class TileNode:
     """One tile of a tileset.
 
     Args:
-        box: (2, 3) lowest and highest corner of what it and its children draw, root frame.
-        error_m: how far, in the frame's unit, what it draws may be from the originals; 0 for the originals.
-        uri: its GLB, relative to ``tileset.json``, with ``/``; None where only its children draw.
-        children: finer tiles that replace it.
-        extras: numbers about it, by name, that viewers leave alone.
+        box: (2, 3) bounding box of the tile and its children, root frame.
+        error_m: Geometric error in the unit of the frame; 0 for the original Gaussians.
+        uri: Path of its GLB, relative to ``tileset.json``, with ``/``; None without content.
+        children: Finer tiles that replace it.
+        extras: Additional numbers by name, which viewers ignore.
     """
 
     box: np.ndarray
@@ -105,7 +105,7 @@ def write(
     Args:
         max_per_tile: Gaussians in one leaf; what is above costs about a third more bytes in all.
         transform: (4, 4) from the Gaussians' frame to the viewer's world; upright for right-down-front if None.
-        compressed: pack the content as SPZ, which CesiumJS asks for; float32 else, five times the bytes.
+        compressed: Pack the content as SPZ, which CesiumJS requires; otherwise float32, five times the bytes.
     """
     path = Path(path)
     if max_per_tile < 1:
@@ -139,7 +139,7 @@ def write_tileset(
     """Write ``tileset.json``; write it last, when the content that it names is there.
 
     Args:
-        compressed: whether the content is packed as SPZ.
+        compressed: The content is packed as SPZ.
         transform: (4, 4) from the root's frame to the viewer's world; upright for right-down-front if None.
         origin: (3,) in the root's frame that the nodes' boxes and content are about: a tile between the root and them
             has it as its transform, in double precision.

@@ -17,11 +17,11 @@ from gsmap.types import Sim3
 
 
 def read_trajectory(path: str | os.PathLike[str]) -> list[tuple[float, Sim3]]:
-    """Timestamps in seconds and poses ``T_map_scene``, in file order; ``#`` starts a comment.
+    """Read timestamps in seconds and poses ``T_map_scene``, in file order; ``#`` starts a comment.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: a line that does not hold eight finite numbers or whose quaternion is not a rotation (named).
+        NotFoundError: The file is missing.
+        InputError: A line (named) without eight finite numbers, or whose quaternion is not a rotation.
     """
     path = Path(path)
     if not path.is_file():
@@ -60,8 +60,8 @@ def write_trajectory(
     """Write poses in order, at ``timestamps_s`` or at 0, 1, 2, ...; a scale is left out, as the format has none.
 
     Args:
-        names: of the poses, each a comment line before its pose.
-        remarks: on the whole file, comment lines before the poses.
+        names: Names of the poses, written as comment lines before the poses.
+        remarks: Comment lines at the start of the file.
     """
     times = range(len(poses)) if timestamps_s is None else timestamps_s
     if len(times) != len(poses):

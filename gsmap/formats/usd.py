@@ -41,7 +41,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
     Raises:
         MissingDependencyError: usd-core is not installed.
-        InputError: not a stage, no splats in it, arrays that do not fit together, a transform that is no similarity, or
+        InputError: Not a stage, no splats, inconsistent arrays, a transform that is no similarity, or
             one that other files are to be read for.
     """
     path = Path(path)
@@ -69,11 +69,11 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, half: bool = Fa
     """Write a stage of one splat, y up, metres, its bounds three standard deviations wide.
 
     Args:
-        half: everything but the positions as half floats: 52 bytes a Gaussian at SH degree 1 instead of 92.
+        half: Store all values except positions as half floats: 52 bytes per Gaussian at SH degree 1 instead of 92.
 
     Raises:
         MissingDependencyError: usd-core is not installed.
-        InputError: no Gaussians, or ones that are not finite.
+        InputError: No Gaussians, or values that are not finite.
     """
     path = Path(path)
     _require_usd(path)
@@ -124,7 +124,7 @@ def _packed(values: np.ndarray, number: Any) -> np.ndarray:
 
 
 def _splat(path: Path, told: dict[str, np.ndarray], i: int) -> Gaussians:
-    """The Gaussians of one prim, in the stage's frame."""
+    """Read the Gaussians of one prim, in the frame of the stage."""
 
     def array(name: str) -> np.ndarray | None:
         return told.get(f"{i}.{name}")
