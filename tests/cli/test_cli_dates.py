@@ -35,12 +35,12 @@ def test_a_capture_that_is_in_the_map_takes_a_date(site: Path, left: Path, cli: 
     found = cli("ingest", site, left)
     assert "now dated 2026-05-30T09:00:00+02:00" in " ".join(found.stdout.split())
     assert "by left.meta.json" in found.stderr
-    assert "said by left.meta.json" in " ".join(cli("show", site, "left").stdout.split())
+    assert "specified by left.meta.json" in " ".join(cli("show", site, "left").stdout.split())
     told = cli("ingest", site, left, "--captured-at", "2026-06-01", "--json")
     (row,) = told.json["ingested"]
     assert (row["new"], row["dated"], row["captured_at"]) == (False, True, "2026-06-01T00:00:00+00:00")
     assert "taken as UTC" in told.stderr
-    assert "said by a person" in " ".join(cli("show", site, "left").stdout.split())
+    assert "specified by a person" in " ".join(cli("show", site, "left").stdout.split())
     kept = cli("ingest", site, left)
     assert "nothing changed" in " ".join(kept.stdout.split())
     assert "its date stays 2026-06-01T00:00:00+00:00" in kept.stderr

@@ -31,4 +31,4 @@ def test_status_says_who_is_at_work(cli: Callable[..., Any], site: Path) -> None
         (row,) = cli("status", site, "--json").json["at_work"]
         assert (row["what"], row["task"], row["process"]) == ("map", "update", os.getpid())
         assert str(os.getpid()) in cli("status", site).stdout
-        assert f"another gsmap update (process {os.getpid()} on " in cli("describe", site).stderr
+        assert f"gsmap update (process {os.getpid()} on " in cli("describe", site).stderr

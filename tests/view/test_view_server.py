@@ -369,7 +369,7 @@ def test_an_action_is_done_and_answered_with_the_map_as_it_is_then(server, page_
     assert told(server, "/state.json")["state"] == state
     act(server, "reject", {"what": "x"})
     assert told(server, "/state.json")["state"] != state
-    assert act(server, "confirm", {"what": "nonsense"}) == (400, {"error": "this makes no sense"})
+    assert act(server, "confirm", {"what": "nonsense"}) == (400, {"error": "this makes no sense", "code": "input"})
     assert act(server, "destroy", {})[0] == 404
 
 
@@ -409,7 +409,7 @@ def test_a_map_that_is_only_looked_at_cannot_be_changed(server, page_source):
     assert told(server, "/map.json")["actions"] is False
     status, said = act(server, "confirm", {"what": "x"})
     assert status == 403
-    assert "looked at" in said["error"]
+    assert "read-only" in said["error"]
 
 
 def test_one_action_at_a_time(server, page_source):
@@ -425,7 +425,7 @@ def test_one_action_at_a_time(server, page_source):
         thread.start()
         assert began.wait(20)
         status, said = act(server, "confirm", {})
-        assert (status, said["error"]) == (409, "another action is at work: wait until it is done")
+        assert (status, said["error"]) == (409, "another action is running; try again when it has ended")
         assert ask(server, "/state.json")[0] == 200  # reading goes on meanwhile
     finally:
         go_on.set()
