@@ -16,7 +16,7 @@ from tools.check.stop_sweep import alive
 
 ROOT = Path(__file__).parents[2]
 ASKED = {signal.SIGINT: "", signal.SIGTERM: " by SIGTERM", signal.SIGHUP: " by SIGHUP"}
-LINE = "gsmap: interrupted{}; what was finished is kept, run the same command again to go on\n"
+LINE = "gsmap: interrupted{}; finished results are kept, run the same command again to continue\n"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 

@@ -146,7 +146,7 @@ def test_who_is_interrupted_says_what_is_kept(site: Path, start: Start, stage: s
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=20)
     assert process.returncode == 130
-    said = re.search(rf"^gsmap: interrupted; (\d) {what} and kept, run the same command again to go on$", err, re.M)
+    said = re.search(rf"^gsmap: interrupted; (\d) {what} and kept, run the same command again to continue$", err, re.M)
     assert said is not None, err
     graphs, edges, _, leases = counts(site)
     assert int(said[1]) == (graphs if stage == "graph" else edges)
