@@ -19,8 +19,9 @@ class Params:
         voxel_m: Edge in metres, positive, of the voxels that a change is reported in; larger makes reports smaller and
             coarser.
         min_area_m2: Smallest changed surface in square metres that is reported, at least 0; larger drops small changes.
-        min_moved_fraction: Smallest fraction in [0, 1] of an object that must fit at its new place, and back, for it to
-            be reported as moved; larger reports fewer moves and more pairs of disappeared and appeared.
+        min_moved_fraction: Smallest fraction in [0, 1] of the points of an object in each scene that must fit its
+            points in the other scene for a move to be reported; larger reports fewer moves, and more pairs of
+            disappeared and appeared objects.
         min_confidence: Smallest probability in [0, 1] of a change that is reported; larger drops doubtful changes.
     """
 

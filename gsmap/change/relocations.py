@@ -139,7 +139,7 @@ def _is_stationary(move: Relocation) -> bool:
 
 
 def _overlap(move: Relocation, other: Relocation, a: _Capture, b: _Capture) -> bool:
-    """Return whether another relocation of the same object, or a different one to its place, has been found."""
+    """Return true if an earlier relocation moves the same object, or moves another object to the same place."""
     same = not _differ(move.S_after_before, other.S_after_before, a.points(move.older))
     for capture, mine, theirs in ((a, move.older, other.older), (b, move.newer, other.newer)):
         if len(np.intersect1d(mine.cells, theirs.cells)) > 0.3 * min(len(mine.cells), len(theirs.cells)):

@@ -34,7 +34,8 @@ class Params:
     """Settings of `describe`.
 
     Args:
-        landmarks: Make the landmark layers, which registration and retrieval match; without them only objects do.
+        landmarks: Make the landmark layers, which registration and retrieval match; without them only objects are
+            matched.
         objects: Make the object layer, which is rendered and segmented and takes most of the time.
         things: Group Gaussians into segments, one per physical object, for changes and objects over time.
         min_opacity: Opacity in [0, 1] below which a Gaussian is not part of the surface; larger ignores more haze.

@@ -143,7 +143,8 @@ def write_packed(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.
 
 
 def _from_origin(origin: np.ndarray, matrix: np.ndarray | None) -> np.ndarray | None:
-    """The transform of a node of positions about an origin, whose frame a matrix (4, 4) takes to glTF's world."""
+    """Return the node matrix (4, 4) of positions relative to an origin, given the matrix (4, 4) from their frame to
+    the glTF world."""
     if not origin.any():
         return matrix
     shift = np.eye(4)

@@ -20,11 +20,12 @@ class Params:
     """Settings of choosing frames of a video clip.
 
     Args:
-        interval_s: Length in seconds, positive, of the intervals of which the sharpest frame each is used; larger is
-            faster.
-        max_frames: Number of frames, at least 1, that are used; intervals of long clips are longer, and larger values
-            take longer.
-        max_side_px: Longer side in pixels, at least 64, to which larger frames are reduced; larger keeps more detail.
+        interval_s: Length in seconds, positive, of the intervals of a clip, of each of which the sharpest frame is
+            used; larger is faster.
+        max_frames: Largest number of frames of a clip, at least 1, that are used; larger localizes more frames of
+            long clips and takes longer.
+        max_side_px: Longer side in pixels, at least 64, to which larger frames of a clip are reduced; larger keeps
+            more detail.
     """
 
     interval_s: float = 0.5

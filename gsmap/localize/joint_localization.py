@@ -327,7 +327,7 @@ def _propose_to_neighbours(
     aliased_prior: float,
     links: Links,
 ) -> None:
-    """Resect a photo's neighbours from its lifted features, and keep poses that are more probable than theirs."""
+    """Resect a photo's neighbours from its lifted features, and replace their poses by more probable ones."""
     helper = states[k]
     assert helper.best is not None
     points, known = _lift_features(helper, helper.best)

@@ -38,8 +38,8 @@ class Params:
 
     Args:
         cell_m: Size in metres, positive, of the cells over which points are averaged; larger is faster and coarser.
-        max_scenes_by_shape: Scenes, at least 1, that a scan without colours is compared with; larger finds more and
-            takes longer.
+        max_scenes_by_shape: Largest number of scenes, at least 1, that a scan without colours is compared with;
+            larger finds more scans and takes longer.
         reading: Limits of the process that reads the file.
     """
 

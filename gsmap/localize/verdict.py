@@ -22,8 +22,8 @@ class Params:
     Args:
         min_probability: Probability, in [0, 1], that a pose must have from all evidence together; larger accepts fewer
             poses, and fewer wrong ones.
-        aliased_prior: Share of the candidate poses, in [0, 0.7), that are of a room which only looks like one of the
-            map; larger accepts fewer poses, as hotels and schools need (``docs/how-to/localize.md``).
+        aliased_prior: Fraction of the candidate poses, in [0, 0.7), that are expected in a room which only looks like
+            one of the map; larger accepts fewer poses, as hotels and schools need (``docs/how-to/localize.md``).
         max_rival_probability: Probability, in [0, 1], up to which another place of the map may explain the photo;
             larger accepts more poses, and more of similar rooms.
         max_rotation_sigma_deg: Standard deviation in degrees, positive, that the rotation may have; larger accepts less

@@ -29,8 +29,8 @@ class Params:
             for both to be one object; larger splits objects more often.
         max_views: Largest number of views of a scene, at least 1 and evenly spread, in which objects are looked up;
             larger leaves fewer objects unobserved and takes more time.
-        longest_side_px: Longest side in pixels, at least 1, of these views; larger resolves smaller objects and takes
-            more time.
+        longest_side_px: Longest side in pixels, at least 1, of the views in which objects are looked up; larger
+            resolves smaller objects and takes more time.
         min_room_area_m2: Smallest floor area of a room in square metres, at least 0; larger drops closets.
     """
 

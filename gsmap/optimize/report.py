@@ -1,4 +1,4 @@
-"""Pose graph for callers: scenes and edges by id, with reasons."""
+"""Conversion of a solution to a pose graph with scenes and edges by id, and the reasons for excluded edges."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ class Params:
         fallback_proposer: Method that proposes poses where a scene graph has few nodes.
         fallback: Use of the fallback proposer: ``auto`` where a scene graph has few nodes, ``never`` or ``always``.
         proposers: Settings of each proposer.
-        max_poses: Number of poses, at least 1, that are refined and verified in each round of proposals and as rivals
-            of an accepted pose; a larger value finds more matches and is slower.
+        max_poses: Number of poses, at least 1, that are refined and verified in each round of proposals, and again as
+            rivals of an accepted pose; a larger value finds more matches and is slower.
         coarse_refiner: Method of the first refinement, which brings a proposed pose near enough to be verified;
             ``none`` skips it.
         refiner: Method of the final refinement: ``colored_icp``, ``gicp``, ``icp`` (as Graph-GSReg) or ``none``.

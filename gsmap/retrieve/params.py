@@ -14,8 +14,9 @@ class Params:
     Args:
         top_k: Number of the best candidates, at least 0, that each scene is paired with; a larger value finds more
             edges and is slower.
-        max_edges_per_scene: Number of undisputed edges, at least 1, from which on both scenes of a pair need no further
-            edge if they share one or a neighbour; a larger value registers more pairs and stabilizes the map.
+        max_edges_per_scene: Number of undisputed edges, at least 1, that is enough for a scene: a pair is skipped if
+            both its scenes have as many and an edge or a common neighbour connects them; a larger value registers
+            more pairs and stabilizes the map.
         nodes_per_scene: Number of the strongest nodes of each layer, at least 1, that an index keeps of a scene; a
             larger value finds smaller overlaps, and takes more memory and time.
         num_neighbours: Number of the nearest scenes in its component, at least 0, that each scene with a pose is paired

@@ -393,7 +393,7 @@ def _rows(
 
 
 def _undecoded(column: Any) -> Any:
-    """Return a column without decoding its bytes, which is done for many at once, or not at all."""
+    """Return a column whose bytes stay encoded; callers decode many rows at once, or none."""
     return type_coerce(column, LargeBinary).label(column.name) if isinstance(column.type, PackedNumbers) else column
 
 

@@ -30,8 +30,8 @@ class Params:
             0.1 dB of that.
         max_views: Largest number of views, at least 1, evenly along the camera path, in which the PSNR is measured;
             larger is more reliable and slower.
-        longest_side_px: Longest side in pixels, at least 1, of these views; larger counts smaller Gaussians as visible
-            and is slower.
+        longest_side_px: Longest side in pixels, at least 1, of the views in which the PSNR is measured; larger counts
+            smaller Gaussians as visible and is slower.
     """
 
     min_seen_again: float = 0.9

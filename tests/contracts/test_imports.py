@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = {"gsmap": ROOT / "gsmap", "gsmap_synthetic": ROOT / "synthetic" / "gsmap_synthetic"}
 
 LAYERS = [
-    {"version", "errors", "texts"},
+    {"version", "reason_codes", "errors", "texts"},
     {"durable"},
     {"types"},
     {"geometry"},
@@ -181,12 +181,16 @@ def test_public_surface() -> None:
         _ = gsmap.nothing
 
 
-def test_names_in_the_readme_are_there() -> None:
-    """Every dotted name that the README says is there after ``import gsmap``."""
-    named = set(re.findall(r"`gsmap\.((?:\w+\.)*\w+)`", (SOURCES["gsmap"].parent / "README.md").read_text()))
+def test_names_in_documents_are_there() -> None:
+    """Every dotted name in the documents is there after ``import gsmap``."""
+    root = SOURCES["gsmap"].parent
+    pages = [*root.glob("*.md"), *(root / "docs").rglob("*.md")]
+    named = {name for page in pages for name in re.findall(r"`gsmap\.((?:\w+\.)*\w+)(?:\(\))?`", page.read_text())}
     assert named
     names = ", ".join(sorted(f"gsmap.{name}" for name in named))
-    subprocess.run([sys.executable, "-c", f"import gsmap; {names}"], check=True, timeout=120)
+    subprocess.run(
+        [sys.executable, "-c", f"import gsmap, gsmap._native, gsmap.durable; {names}"], check=True, timeout=120
+    )
 
 
 @pytest.mark.parametrize("arguments", [["-P", "-c", "import gsmap"], ["-P", "-m", "gsmap", "--help"]])

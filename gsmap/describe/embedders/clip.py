@@ -31,7 +31,7 @@ def make(context: SceneContext, params: Params) -> ClipEmbedder:
 
 
 def embed_text(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
-    """Compute the vector (F,) of a text, by the text tower of the same pack; see `gsmap.describe.onnx.text`."""
+    """Compute the vector (F,) of a text, by the text tower of the same model; see `gsmap.describe.onnx.text`."""
     from gsmap.describe.onnx import text as tower
 
     return tower.embed(text, models)

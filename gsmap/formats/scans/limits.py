@@ -15,8 +15,10 @@ class Params:
     """Limits of the process that reads a mesh or a LAS file.
 
     Args:
-        max_seconds: Wall time in seconds, positive, after which the process is ended; larger values admit larger files.
-        max_memory_mb: Memory in MiB, positive, that the process may take; larger values admit larger files.
+        max_seconds: Wall time in seconds, positive, after which the process that reads a scan is ended; larger values
+            admit larger files.
+        max_memory_mb: Memory in MiB, positive, that the process that reads a scan may take; larger values admit
+            larger files.
     """
 
     max_seconds: float = 120.0

@@ -385,7 +385,8 @@ def _put_aside(store: Store, out: Path, planned: ExportPlan, result: ExportResul
 
 
 def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Request]]:
-    """Return, per export folder, the number of tiles that the same export would make or remove, and that export.
+    """Return, for each export folder, the number of tiles that repeating its last export would make or remove, and
+    that export's row.
 
     Read from the catalog alone, which does not say which tiles are empty: new ones are not counted. A folder whose
     export named a revision stays as it is, whatever the map does.

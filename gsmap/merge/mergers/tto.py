@@ -61,8 +61,8 @@ class Params:
         kept_fraction: Largest number of Gaussians that a tile starts from, as a fraction in [0, 1] of its scenes'
             Gaussians; smaller merges more of the most similar pairs, and 1 merges none.
         voxel_m: Edge in metres, positive, of the voxels in which Gaussians are merged first; larger leaves fewer.
-        owner_cells: Whether each cell of half a metre belongs to the scene that shows most of it, so that two scenes of
-            one surface do not overlay each other.
+        owner_cells: Assign each cell of half a metre to the scene that shows most of it, so that two scenes of one
+            surface do not overlay each other.
         ssim_weight: Weight in [0, 1] of 1 - SSIM in the loss, the rest being Huber's loss; larger favours structure
             over colour.
         huber_delta: Difference of colours in [0, 1], at least 0, below which the loss is quadratic; 0 is the L1 loss.
@@ -79,8 +79,8 @@ class Params:
             first; larger takes more memory (3 MB per view of 960 pixels) and time.
         photo_weight: Number of uses of a kept photo in every pass, at least 0, relative to a rendered view; larger
             follows photos more closely, and 0 ignores them.
-        balance_exposure: Whether scenes are brought to one exposure first, which looks even but no longer reproduces
-            each scene.
+        balance_exposure: Bring all scenes to one exposure first, which looks even but no longer reproduces each
+            scene.
         prefer: Scene that is shown where scenes of different dates disagree: the ``newest``, the ``best`` observed one,
             or ``both``.
     """
