@@ -116,7 +116,7 @@ def test_trust_is_asked_for_and_given(home, bucket, tmp_path, monkeypatch):
 def test_what_is_missing_or_differs_is_told_and_mended(home, tmp_path):
     g, c = make_gaussians(), make_cameras()
     scene, _ = home.scenes.add(g, c, name="a")
-    place = home.arrays._remote
+    place = home.arrays._storage
     (name,) = place.list("arrays/")
     good = b"".join(place.get(name))
     flipped = good[:100] + bytes([good[100] ^ 1]) + good[101:]
@@ -144,7 +144,7 @@ def test_what_this_machine_keeps_may_rot(home, tmp_path):
 
 
 def test_prune_and_purge_reclaim_objects(home, tmp_path):
-    place = home.arrays._remote
+    place = home.arrays._storage
     first, _ = home.scenes.add(make_gaussians(), make_cameras(), name="a")
     home.graphs.save(graph(first.id), key("describe", first.id))
     home.scenes.add(make_gaussians(seed=1), make_cameras(), name="b")
