@@ -1,6 +1,6 @@
 #!/bin/sh
 # Everything CI checks: the README's own test command from a clean clone in a fresh environment, the linters, the types,
-# those of the page, and the documents (whose commands are run).
+# the measures of readability, the types of the page, and the documents (whose commands are run).
 #
 #   tools/check.sh            a clean clone of what is committed
 #   tools/check.sh --here     this checkout as it lies, in its own .venv
@@ -28,6 +28,7 @@ cat "$log"
 .venv/bin/ruff check . || status=1
 .venv/bin/ruff format --check . || status=1
 .venv/bin/mypy || status=1
+.venv/bin/python -m tools.check.readability --no-startup || status=1
 CHECK=1 tools/build_page.sh || status=1
 PATH=$PWD/.venv/bin:$PATH .venv/bin/python -m tools.make.docs --out build/site || status=1
 # The tests' closing line last, so that whoever reads only the end sees it.

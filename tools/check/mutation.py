@@ -30,20 +30,20 @@ ROOT = Path(__file__).resolve().parents[2]
 
 TESTS: Mapping[str, Mapping[str, str]] = {
     "store": {
+        "array_archive": "test_store_array_archive.py",
+        "array_encoding": "test_store_array_encoding.py",
         "backup/repository": "test_store_backup.py test_store_restore.py",
         "backup/saving": "test_store_backup.py",
         "change_rows": "test_store_changes.py",
         "compact": "test_store_compact.py",
-        "digests": "test_store_digests.py test_store_accepting.py",
         "facts": "test_store_facts.py",
         "leases": "test_store_leases.py",
         "matrices": "test_store_nouns.py test_store_revisions.py",
-        "narrow": "test_store_narrow.py",
-        "packed": "test_store_packed.py",
+        "page_digests": "test_store_page_digests.py test_store_accepting.py",
         "photos": "test_store_photos.py",
         "priors": "test_store_nouns.py",
-        "row_maps": "test_store_compact.py",
-        "superseding": "test_store_changes.py",
+        "row_index_maps": "test_store_compact.py",
+        "scene_replacement": "test_store_changes.py",
         "wal": "test_store_wal.py",
     },
     "optimize": {
