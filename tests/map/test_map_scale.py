@@ -148,14 +148,14 @@ def test_a_scene_placed_by_what_lies_around_it_lies_where_all_edges_put_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answers, read = [], []
-    usable = Registrations.usable
+    usable = Registrations.current_usable
 
     def counted(self: Registrations, among: Collection[str] | None = None) -> list[StoredRegistration]:
         found = usable(self, among)
         read.append(len(found))
         return found
 
-    monkeypatch.setattr(Registrations, "usable", counted)
+    monkeypatch.setattr(Registrations, "current_usable", counted)
     for name, inputs in (("around", optimize._inputs), ("all", optimize.pose_inputs)):
         with filled(tmp_path / name, 40, tiny_pattern()) as one, one.standing_in():
             one.map.with_settings({"optimize.max_full_scenes": 10})

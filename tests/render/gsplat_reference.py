@@ -36,7 +36,7 @@ def gsplat_on_cpu(monkeypatch):
         monkeypatch.setattr(package, name, function)
     monkeypatch.setattr(gsplat, "load", lambda: package)
     monkeypatch.setattr(gsplat, "device", lambda: torch.device("cpu"))
-    monkeypatch.setattr(gsplat, "_kept", gsplat._Kept())
+    monkeypatch.setattr(gsplat, "_device_cache", gsplat._DeviceCache())
     monkeypatch.setattr(backends, "gsplat_available", lambda: True)
     return package
 

@@ -266,11 +266,11 @@ def test_a_scene_is_moved_once_and_forgotten_with_the_object(device):
     gaussians, cameras = scene(views=2, size=(48, 33))
     gsplat._device_cache.clear()
     render(gaussians, cameras[0], backend="gsplat")
-    moved = gsplat._kept.get(gaussians)
+    moved = gsplat._device_cache.get(gaussians)
     render(gaussians, cameras[1], backend="gsplat")
-    assert gsplat._kept.get(gaussians) is moved
+    assert gsplat._device_cache.get(gaussians) is moved
     del gaussians
-    assert not gsplat._kept._entries
+    assert not gsplat._device_cache._entries
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="needs Triton")

@@ -459,7 +459,7 @@ def measure_memory(house: dict[str, Capture], options: argparse.Namespace) -> li
     rows, images = [], []
     for allowed in (None, 6e9, 2.5e9):
         if torch.cuda.is_available():
-            gsplat._kept.clear()
+            gsplat._device_cache.clear()
             torch.cuda.empty_cache()
             total = torch.cuda.get_device_properties(0).total_memory
             torch.cuda.set_per_process_memory_fraction(1.0 if allowed is None else allowed / total)

@@ -106,7 +106,7 @@ def boxes(folder: Path, g: Gaussians, share: float = 0.026, count: int = 12) -> 
     with Store.create(folder / "map") as store:
         store.scenes.add(g, one_camera(), name="scene")
         size = (next((folder / "map" / "arrays").rglob(array_archive.FILE))).stat().st_size
-        with mock.patch.object(arrays._Files, "expect", lambda self, file, ranges: asked.append(list(ranges))):
+        with mock.patch.object(arrays._FolderReader, "expect", lambda self, file, ranges: asked.append(list(ranges))):
             for name, shape in (("cube", (1.0, 1.0, 1.0)), ("wall", (1.0, 0.25, 1.0))):
                 rng, found = np.random.default_rng(5), []
                 for centre in g.means[rng.integers(len(g), size=count)].astype(np.float64):

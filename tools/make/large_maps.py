@@ -379,7 +379,7 @@ def _add_rows(one: Filled, count: int) -> None:
         if about:
             connection.execute(insert(graphs), about)
         recipe = recipe_key(one.map.settings.register)
-        digest = recipes.keep(connection, recipe)
+        digest = recipes.save_recipe(connection, recipe)
         rows = []
         for k in range(1, count + 1):
             for before in range(max(0, k - TRIED), k):
