@@ -167,7 +167,7 @@ def test_a_photo_is_kept_once_and_follows_its_scene(copy) -> None:
         assert row.changes is None
         report = m.localize(folder / "changed.jpg", intrinsics=lens, add=True)
         assert report.results[0].added is False
-        assert any("kept already" in note for note in report.notes)
+        assert any("stored already" in note for note in report.notes)
         (kept,) = m.photo_rows()
         assert kept.captured_at == "2026-05-04T10:00:00+00:00"
         assert (kept.file, kept.scene_name, kept.size_px) == ("changed.jpg", "room", (480, 360))
@@ -385,7 +385,7 @@ def test_the_index_of_views_is_made_once_and_grows_by_what_is_new(made, world, t
         assert before.num_nodes > 100
         asked = []
         put = m.store.indexes.save_segment
-        monkeypatch.setattr(m.store.indexes, "put", lambda *a, **k: asked.append(a) or put(*a, **k))
+        monkeypatch.setattr(m.store.indexes, "save_segment", lambda *a, **k: asked.append(a) or put(*a, **k))
         again = m.localize(folder / "photo.png", intrinsics=lens).results[0]
         assert np.array_equal(again.T_map_camera, report.results[0].T_map_camera)
         assert not asked

@@ -159,9 +159,9 @@ def test_nobody_guesses_which_capture_is_newer(site: Map, seen: Seen) -> None:
     site.edit("june", captured_at="none")
     report = site.changes()
     assert names(site, seen) == [("may", "july")]
-    assert report.notes == (
-        "june has no date: which one is newer is not known (gsmap edit MAP SCENE --captured-at DATE tells)",
-    )
+    (note,) = report.notes
+    assert note.startswith("june has no date")
+    assert "--captured-at" in note
     with raises(InputError, code="order_unknown"):
         site.changes("may:june")
     site.edit("june", captured_at=DATES["july"])
@@ -242,7 +242,8 @@ def test_a_map_that_cannot_be_written_tells_what_it_knows(
     with Map(gsmap.map.map.Store.open(site.store.home, "r")) as m:
         report = m.changes()
         assert [pair.pair for pair in report.pairs] == ["may:june"]
-        assert report.notes == ("1 pairs are not compared yet: gsmap changes does where the map can be written",)
+        (note,) = report.notes
+        assert note.startswith("1 pairs are not compared yet")
     assert seen.pairs == names_before
 
 
@@ -280,8 +281,9 @@ def test_without_poses_there_is_nothing_to_compare(tmp_path: Path, seen: Seen) -
         with raises(NotFoundError, code="scene_unplaced"):
             m.changes("a:b")
         place(m)
-        tells = "gsmap edit MAP SCENE --metres-per-unit X tells"
-        assert m.changes().notes == (f"component 0: nothing tells how long a metre is in it: {tells}",)
+        (note,) = m.changes().notes
+        assert note.startswith("component 0: ")
+        assert "--metres-per-unit" in note
 
 
 # -- which captures are compared

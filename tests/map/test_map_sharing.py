@@ -108,7 +108,7 @@ def test_two_updates_share_the_work(site: Path, start: Start, workers: int) -> N
     assert {run for run, _ in log(site)} == {process.pid for process in both}
     assert answers[0][0] == answers[1][0]  # the same final state
     assert "gsmap update (process" in answers[0][1] + answers[1][1]
-    assert "what is left is shared" in answers[0][1] + answers[1][1]
+    assert "the remaining jobs are shared" in answers[0][1] + answers[1][1]
 
 
 def test_the_share_of_a_killed_one_is_taken_over(site: Path, start: Start) -> None:
