@@ -206,7 +206,6 @@ def test_the_settings_file_is_honoured(site: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "code"),
     [
-        ("[optimize]\ngate_probabilty = 0.9\n", "unknown_setting"),
         ("[optimize]\ngate_probability = 'often'\n", "invalid_setting_value"),
         ("preset = 'napkin'\n", "unknown_preset"),
         ("[optimize\n", "invalid_settings_file"),
