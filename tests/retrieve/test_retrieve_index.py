@@ -19,6 +19,18 @@ def _voters(graphs):
     return [select_nodes(graph, f"{i:032x}", 400) for i, graph in enumerate(graphs)]
 
 
+def test_nodes_per_scene_keeps_the_strongest_of_each_layer():
+    (graph,) = walk(1)
+    nodes = graph.layers["landmarks"]
+    order = np.random.default_rng(4).permutation(len(nodes))
+    layers = {"landmarks": replace(nodes, weights=1.0 + order), "objects": replace(nodes, descriptor_id="other")}
+    kept = select_nodes(replace(graph, layers=layers), "", Params(nodes_per_scene=5).nodes_per_scene).index_nodes
+    strongest = coding.encode(nodes.embeddings[order >= len(nodes) - 5])
+    found = {tuple(code) for code in kept.codes.tolist()}
+    assert len(kept) == 2 * 5
+    assert {tuple(code) for code in strongest.tolist()} <= found
+
+
 def test_distances_of_codes_are_those_of_the_vectors():
     rng = np.random.default_rng(0)
     for dim in (24, 48, 112):
