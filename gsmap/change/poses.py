@@ -15,8 +15,8 @@ _LIGHT = 0.5  # weight of lightness relative to hue, as lighting differs from pl
 
 def tints(colours: np.ndarray) -> np.ndarray:
     """Return (N, 3) lightness and two hue coordinates of colours (N, 3) in [0, 1], for Euclidean comparison."""
-    lighting_spread, green = colours.mean(1), colours[:, 1]
-    return np.stack([_LIGHT * lighting_spread, 0.8 * (colours[:, 0] - green), 0.8 * (colours[:, 2] - green)], axis=1)
+    lightness, green = colours.mean(1), colours[:, 1]
+    return np.stack([_LIGHT * lightness, 0.8 * (colours[:, 0] - green), 0.8 * (colours[:, 2] - green)], axis=1)
 
 
 def features(points: np.ndarray, colours: np.ndarray) -> np.ndarray:

@@ -112,7 +112,7 @@ def find_relocations(
         if not news:
             break
         moves += news
-    return _merge_pieces(moves, a, b), a.segments, b.segments
+    return _merge_pieces(moves, a), a.segments, b.segments
 
 
 def _moves_from(
@@ -150,7 +150,7 @@ def _overlap(move: Relocation, other: Relocation, a: _Capture, b: _Capture) -> b
     return False
 
 
-def _merge_pieces(moves: list[Relocation], a: _Capture, b: _Capture) -> list[Relocation]:
+def _merge_pieces(moves: list[Relocation], a: _Capture) -> list[Relocation]:
     """Merge the relocations of neighbouring pieces with one motion."""
     kept: list[Relocation] = []
     for move in sorted(moves, key=lambda m: -len(m.older.cells) - len(m.newer.cells)):

@@ -196,13 +196,17 @@ def find_colour_changes(
     return found
 
 
-def is_recoloured(paint: ColourChange, lighting_spread: float) -> bool:
-    """Return whether a change of colour is paint, not lighting or texture that two trainings show differently."""
+def is_recoloured(paint: ColourChange, spread: float) -> bool:
+    """Return whether a change of colour is paint, not lighting or texture that two trainings show differently.
+
+    Args:
+        spread: of the lighting difference, see `lighting_spread`.
+    """
     if not paint.is_shell and paint.share >= _MUCH and sum(map(len, paint.cells)) >= _MANY:
         less = 0.6 if paint.share >= _MOST and paint.coherence >= _COHERENT else 0.75
         return paint.strength >= less * _MIN_PAINT and paint.leak <= 2.5 * _MAX_LEAK
     least = _MIN_PAINT
-    if lighting_spread > LIT_OTHERWISE:
+    if spread > LIT_OTHERWISE:
         least *= 1.6
     if paint.darkening > _DARK and paint.is_shell:
         least *= 1.8
