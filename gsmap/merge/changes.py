@@ -22,10 +22,10 @@ Prefer = Literal["newest", "best", "both"]
 """Preferred scene where scenes disagree: the ``newest``, the ``best`` observed one, or none, so that ``both`` show."""
 
 LOOKING_M = 10.0
-"""Distance around a tile, in metres, within which Gaussians and cameras are read for comparison."""
+"""Distance around a tile, in metres, within which Gaussians and cameras are read for comparison and reference views."""
 
 MIN_CAMERAS = 12
-"""Least number of cameras of each scene that are read for comparison, the nearest ones."""
+"""Least number of cameras of each scene that are read for these, the nearest ones, wherever they stand."""
 
 _SHOWS = 0.15  # blending weight of disputed Gaussians in a disputed pixel
 _NEAR_M = 0.25  # distance from a change within which fragments of it are searched

@@ -29,7 +29,7 @@ def balance_exposure(scenes: Sequence[PosedScene]) -> tuple[list[PosedScene], np
     Gains are the least-squares solution to the median log-ratios of colour on common surfaces of scene pairs; their
     mean over connected scenes is zero, which preserves the overall brightness.
     """
-    log_gains = _solve(len(scenes), _ratios(scenes), np.log(_MAX_GAIN))
+    log_gains = _solve(len(scenes), _ratios(scenes))
     if np.abs(log_gains).max(initial=0) < _NEGLIGIBLE_LOG_GAIN:
         return list(scenes), np.zeros_like(log_gains)
     balanced = [
@@ -104,7 +104,7 @@ def _same_surface(scene: PosedScene, other: PosedScene, camera: Cameras) -> np.n
     return ratios
 
 
-def _solve(count: int, ratios: list[tuple[int, int, np.ndarray, float]], largest: float) -> np.ndarray:
+def _solve(count: int, ratios: list[tuple[int, int, np.ndarray, float]]) -> np.ndarray:
     """Solve for log-gains (count, 3) with ``gain_i - gain_j = -ratio_ij`` by weighted least squares."""
     normal, right = np.zeros((count, count)), np.zeros((count, 3))
     for i, j, ratio, weight in ratios:
@@ -112,5 +112,6 @@ def _solve(count: int, ratios: list[tuple[int, int, np.ndarray, float]], largest
         normal[[i, j], [j, i]] -= weight
         right[i] -= weight * ratio
         right[j] += weight * ratio
+    largest = np.log(_MAX_GAIN)
     # The pseudo-inverse gives every group of connected scenes a mean of zero.
     return np.clip(np.linalg.pinv(normal, hermitian=True) @ right, -largest, largest)

@@ -121,7 +121,7 @@ def render_references(
             counts &= ~disputed
         if counts.mean() < _MIN_TILE_FRACTION:  # a weight is at most 1
             continue
-        window = _window(counts, _MARGIN_PX)
+        window = _window(counts)
         if shared is None and pieces[i] is scenes[i].gaussians:
             colour, alpha = seen.colour[0][window], seen.alpha[0][window]
         else:
@@ -144,7 +144,7 @@ def render_references(
         share = float(counts.mean())
         if share < _MIN_TILE_FRACTION:
             continue
-        window = _window(counts, _MARGIN_PX)
+        window = _window(counts)
         cameras.append(_cropped(one.camera, window))
         images.append(np.ascontiguousarray(one.image[window]))
         weights.append(np.where(counts[window], 255, 0).astype(np.uint8))
@@ -230,12 +230,12 @@ def _count(
     np.maximum(largest, seen.max_weight, out=largest)
 
 
-def _window(counts: np.ndarray, margin_px: int) -> tuple[slice, slice]:
+def _window(counts: np.ndarray) -> tuple[slice, slice]:
     """Return the bounding window of the valid pixels, with a margin for the windows of SSIM."""
     spans = []
     for axis in (1, 0):
         used = np.flatnonzero(counts.any(axis=axis))
-        low, high = int(used[0]) - margin_px, int(used[-1]) + 1 + margin_px
+        low, high = int(used[0]) - _MARGIN_PX, int(used[-1]) + 1 + _MARGIN_PX
         spans.append(slice(max(0, low), min(counts.shape[1 - axis], high)))
     return spans[0], spans[1]
 

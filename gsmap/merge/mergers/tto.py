@@ -20,7 +20,7 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge import references
-from gsmap.merge.changes import Prefer, ResolvedScenes, resolve_changes
+from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, ResolvedScenes, resolve_changes
 from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.overlap import clamp_inside, concatenate_scenes
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
@@ -35,16 +35,11 @@ STEPS: str | None = "steps"
 RENDERS = True
 
 _BESIDE_M = 0.025  # distance from new Gaussians within which no other scene's Gaussians stay
-
-
-_FIRST = LearningRates(
-    means=0.07, quats=8e-3, log_scales=4e-2, logit_opacities=0.25, sh_base=4e-2, sh_rest=5e-3
-)  # first steps of Adam, positions relative to the Gaussians' median size: as long as pays in few passes
+# First steps of Adam, positions relative to the Gaussians' median size: as long as pays in few passes.
+_FIRST = LearningRates(means=0.07, quats=8e-3, log_scales=4e-2, logit_opacities=0.25, sh_base=4e-2, sh_rest=5e-3)
 _LAST = 0.1  # last step relative to the first, reached exponentially
 _OWNER_CELL_M = 0.5  # edge of the owner cells
 _COVER_M = 0.1  # an owner's Gaussian this near replaces another scene's
-_CAMERA_REACH_M = 10.0  # around a tile's halo, within which cameras are used
-_MIN_CAMERAS = 12  # of each scene, the nearest, wherever they stand
 _SEED = 0  # of the order of views
 _MIN_PASS_STEPS = 20  # of a pass over all views, for a tile that few pixels show
 _SURE_FRACTION = 0.5  # of the steps, taken whatever they gain: the first, long ones may lose
@@ -123,15 +118,15 @@ def reach_m(params: Params) -> float:
 
 def reading_m(params: Params, dated: bool) -> float:
     compares = params.balance_exposure or (dated and uses_dates(params))
-    return params.halo_m + (_CAMERA_REACH_M if compares else 0.0)
+    return params.halo_m + (LOOKING_M if compares else 0.0)
 
 
 def looking_m(params: Params) -> float:
-    return params.halo_m + _CAMERA_REACH_M
+    return params.halo_m + LOOKING_M
 
 
 def min_cameras(params: Params) -> int:
-    return _MIN_CAMERAS
+    return MIN_CAMERAS
 
 
 def photos_m(params: Params) -> float | None:
