@@ -226,10 +226,7 @@ class _PyramidBuilder:
     def parent(self, below: Sequence[tuple[PyramidNode, Gaussians | None]], height: int) -> PyramidNode:
         """Return the level over its children, reused if it was made of the same inputs."""
         children = [child for child, _ in below]
-        fitted_by = backend()
-        recipe = f"levels {VERSION} {self.levels} {self.layout.key}"
-        if fitted_by != "native":  # names of levels that the CPU fitted have no backend
-            recipe += f" {fitted_by}"
+        recipe = f"levels {VERSION} {self.levels} {self.layout.key} {backend()}"
         made_of = [recipe, *(child.digest for child in children)]
         digest = hashlib.sha256("\n".join(made_of).encode()).hexdigest()
         uri = self.layout.level_uri(digest[:24])

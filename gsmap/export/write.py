@@ -149,9 +149,7 @@ def export_tiles(
     report = _ProgressReport(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     aside: list[tuple[PlannedTile, str]] = []
-    staging = (
-        out / _STAGING / secrets.token_hex(16)
-    )  # unique, as workers of an earlier export may still write to theirs
+    staging = out / _STAGING / secrets.token_hex(16)  # workers of an earlier export may still write to theirs
     try:
         if not (todo or gone or has_new_metadata or manifest.doomed) and out.exists():
             return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
