@@ -154,7 +154,7 @@ def spread_changes(labels: ChangeLabels) -> np.ndarray:
     for k in np.unique(segment[frames]):
         rows = frames[segment[frames] == k]
         changed = labels.points[labels.changed & (segment == k)]
-        out[rows[~in_hull(labels.points[rows], changed, MAX_OUTSIDE_HULL_M)]] = False
+        out[rows[~in_hull(labels.points[rows], changed)]] = False
     return out
 
 
@@ -207,7 +207,7 @@ def find_remnants(sides: tuple[SegmentedCapture, SegmentedCapture]) -> list[np.n
             theirs = other.points[other.changed & np.isin(other.segment, beside[beside >= 0])]
             changed = np.concatenate([one.points[one.changed & (segment == k)], theirs])
             rows = np.flatnonzero((segment[left] == k) & one.framed[left])
-            stays[rows] = ~in_hull(one.points[left[rows]], changed, MAX_OUTSIDE_HULL_M)
+            stays[rows] = ~in_hull(one.points[left[rows]], changed)
         score = _NEW_WEIGHT * new[nearest]
         for k in np.unique(segment[left]):
             changed, rows = one.colours[one.changed & (segment == k)], np.flatnonzero(segment[left] == k)
@@ -219,12 +219,12 @@ def find_remnants(sides: tuple[SegmentedCapture, SegmentedCapture]) -> list[np.n
     return found
 
 
-def in_hull(points: np.ndarray, others: np.ndarray, beyond_m: float) -> np.ndarray:
-    """Return (N,) bool, points (N, 3) in the convex hull of others (M, 3), or at most a distance beyond its planes."""
+def in_hull(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return (N,) bool, points (N, 3) in the convex hull of others (M, 3) or `MAX_OUTSIDE_HULL_M` beyond its planes."""
     if len(others) < _FEWEST or not len(points):
         return np.zeros(len(points), dtype=bool)
     planes = ConvexHull(others.astype(np.float64), qhull_options="QJ").equations
-    out: np.ndarray = (points @ planes[:, :3].T + planes[:, 3]).max(1) <= beyond_m
+    out: np.ndarray = (points @ planes[:, :3].T + planes[:, 3]).max(1) <= MAX_OUTSIDE_HULL_M
     return out
 
 

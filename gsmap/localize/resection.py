@@ -157,7 +157,7 @@ def refine(
     damping = 1e-6
     residuals, jacobian = linearize(pixels, points, pose, intrinsics, dim)
     for _ in range(ITERATIONS):
-        robust = given * robust_weights(residuals, ROBUST_SCALE_PX)
+        robust = given * robust_weights(residuals)
         J, w = jacobian.reshape(-1, dim), np.repeat(robust, 2)
         A, b = (J.T * w) @ J, J.T @ (w * residuals.ravel())
         cost = _cost(residuals, given, intrinsics, focal)
@@ -177,7 +177,7 @@ def refine(
         pose, intrinsics, residuals, jacobian, damping = next_pose, lens, after, J_after, damping / 10
         if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:6]).max() < 1e-7 * (1 + np.abs(pose[:3, 3]).max()):
             break
-    return LeastSquaresPose(pose, intrinsics, residuals, given * robust_weights(residuals, ROBUST_SCALE_PX), jacobian)
+    return LeastSquaresPose(pose, intrinsics, residuals, given * robust_weights(residuals), jacobian)
 
 
 def retract_pose(T_map_camera: np.ndarray, xi: np.ndarray) -> np.ndarray:
@@ -221,9 +221,9 @@ def linearize(
     return residuals, jacobian
 
 
-def robust_weights(residuals: np.ndarray, scale_px: float) -> np.ndarray:
+def robust_weights(residuals: np.ndarray) -> np.ndarray:
     """Return (K,) weights of Cauchy's loss."""
-    out: np.ndarray = 1 / (1 + (residuals**2).sum(1) / scale_px**2)
+    out: np.ndarray = 1 / (1 + (residuals**2).sum(1) / ROBUST_SCALE_PX**2)
     return out
 
 

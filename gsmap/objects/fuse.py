@@ -57,7 +57,7 @@ def fuse(
     Returns:
         Groups sorted by their first segment; segments within by scene.
     """
-    first, cells, lab = _cells(captures, _CELL_M)
+    first, cells, lab = _cells(captures)
     home = np.searchsorted(first, np.arange(first[-1]), "right") - 1
     sizes = np.bincount(cells[:, 1], minlength=first[-1])
     a, b, shared, differ = _overlaps(cells, lab, home)
@@ -74,13 +74,13 @@ def fuse(
     return [tuple((int(home[n]), int(n - first[home[n]])) for n in group) for group in groups]
 
 
-def _cells(captures: Sequence[PlacedSegments], cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cells(captures: Sequence[PlacedSegments]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (C + 1,) the first node of each scene, unique sorted rows (cell, node), and their mean colours."""
     first = np.concatenate([[0], np.cumsum([capture.count for capture in captures])]).astype(np.int64)
     points = np.concatenate([capture.points for capture in captures]).reshape(-1, 3)
     lab = np.concatenate([capture.lab for capture in captures]).reshape(-1, 3)
     nodes = np.concatenate([first[i] + capture.segments for i, capture in enumerate(captures)]).astype(np.int64)
-    label, _ = cell_labels(np.floor(points / cell_m))
+    label, _ = cell_labels(np.floor(points / _CELL_M))
     cells, row, counts = np.unique(np.column_stack([label, nodes]), axis=0, return_inverse=True, return_counts=True)
     return first, cells, group_means(lab, row.reshape(-1), counts)
 

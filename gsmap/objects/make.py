@@ -10,7 +10,7 @@ import numpy as np
 from gsmap import render as rendering
 from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse
-from gsmap.objects.visibility import RenderedViews, classify_observation, observe_points
+from gsmap.objects.visibility import LONGEST_SIDE_PX, MAX_VIEWS, RenderedViews, classify_observation, observe_points
 from gsmap.types import MapObject, ObjectObservation, ObservationState, Segments, Sim3
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
@@ -36,8 +36,8 @@ class Params:
 
     min_gaussians: int = 40
     min_overlap: float = 0.45
-    max_views: int = 32
-    longest_side_px: int = 128
+    max_views: int = MAX_VIEWS
+    longest_side_px: int = LONGEST_SIDE_PX
     min_room_area_m2: float = 1.5
 
 
