@@ -62,7 +62,7 @@ def unpack(scene: str, arrays: Mapping[str, np.ndarray], most: int) -> SceneFeat
     """Unpack the features of `pack`.
 
     Args:
-        most: number of features from which on the arrays are damaged.
+        most: largest possible number of features; arrays of more are damaged.
 
     Raises:
         ValueError, KeyError, InputError: the arrays are not those of `pack`.

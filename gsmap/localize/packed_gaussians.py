@@ -53,7 +53,7 @@ def unpack(arrays: Mapping[str, np.ndarray], most: int) -> Gaussians:
     """Unpack the Gaussians of `pack`.
 
     Args:
-        most: number of Gaussians from which on the arrays are damaged.
+        most: largest possible number of Gaussians; arrays of more are damaged.
 
     Raises:
         ValueError, KeyError: the arrays are not those of `pack`.
