@@ -13,9 +13,9 @@ from gsmap.world.params import Params
 
 _GPS = 0x8825
 _LATITUDE, _LONGITUDE, _ALTITUDE, _ERROR, _DATUM = 2, 4, 6, 31, 18
-HEIGHT_FACTOR = 2.0  # heights by satellites are so many times less accurate than horizontal positions
-SEA_LEVEL_SIGMA_M = 40.0  # of the height of the geoid above the ellipsoid, one value for a map
-CORRECTED_SIGMA_M = 0.5  # receivers with corrections report less; it covers the common error as well
+_HEIGHT_FACTOR = 2.0  # heights by satellites are so many times less accurate than horizontal positions
+_SEA_LEVEL_SIGMA_M = 40.0  # of the height of the geoid above the ellipsoid, one value for a map
+_CORRECTED_SIGMA_M = 0.5  # receivers with corrections report less; it covers the common error as well
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 
 
@@ -43,10 +43,10 @@ class PhotoPosition:
         and of the sea level."""
         own = self.sigma_m or params.gnss_sigma_m
         common = max(params.gnss_common_sigma_m, self.sigma_m or 0.0)
-        if self.sigma_m is not None and self.sigma_m < CORRECTED_SIGMA_M:
+        if self.sigma_m is not None and self.sigma_m < _CORRECTED_SIGMA_M:
             common = self.sigma_m
-        sea_level = 0.0 if self.above_ellipsoid else SEA_LEVEL_SIGMA_M
-        return (own, own * HEIGHT_FACTOR), (common, common * HEIGHT_FACTOR), sea_level
+        sea_level = 0.0 if self.above_ellipsoid else _SEA_LEVEL_SIGMA_M
+        return (own, own * _HEIGHT_FACTOR), (common, common * _HEIGHT_FACTOR), sea_level
 
 
 def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | None]:
