@@ -12,6 +12,7 @@ from gsmap.types import Cameras, Gaussians
 from gsmap.types.localization import Keypoints, SceneFeatures
 
 VERSION = 3
+"""Raised whenever the features of a scene change, its views (`gsmap.localize.views`), or `INDEXED_FEATURES`."""
 
 UNIT = 254.0
 """Length of quantized descriptors; unit vectors of 64 and more dimensions hardly have a component above a half."""

@@ -16,6 +16,7 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
 VERSION = 1
+"""Raised whenever the objects of the same scenes change, also by other modules of `gsmap.objects`."""
 
 
 @dataclass(frozen=True)

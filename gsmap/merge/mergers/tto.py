@@ -31,6 +31,7 @@ from gsmap.types import Gaussians, MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
 VERSION = 8
+"""Raised whenever the result for the same scenes changes, also by the modules of `gsmap.merge` that it calls."""
 STEPS: str | None = "steps"
 RENDERS = True
 
