@@ -316,7 +316,7 @@ ERRORS: Final[Mapping[str, str]] = {
     # Branches, transfer and backups.
     "backup_busy": "Another process deletes old snapshots.",
     "backup_damaged": "A backup is damaged.",
-    "backup_file_missing": "A file of a backup is missing.",
+    "backup_file_missing": "A file of a backup or a remote map is missing.",
     "backup_of_another_map": "The place holds the backup of another map.",
     "backup_of_branch": "A branch is backed up with its map.",
     "backup_version": "The backup was written by a newer gsmap.",
@@ -325,7 +325,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "lease_lost": "Another process took over the lease on the backup.",
     "no_branches_in_bucket": "A map in a bucket has no branches or tags.",
     "not_a_backup": "The place holds no backup of a map.",
-    "place_failed": "The place of a backup cannot be read or written.",
+    "place_failed": "The storage of a backup or a remote map cannot be read or written.",
     "place_inside_map": "The place of a backup lies inside the map.",
     "place_refused": "The object store refused access.",
     "same_map": "Two maps are needed, and one was given twice.",
@@ -345,10 +345,16 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
         "Refinement moves the pose away from its correspondences.",
         r"surfaces pull the pose away",
     ),
-    "free_space_violation": ("A scene has surface where the other scene saw free space.", r"free-space violation"),
+    "free_space_violation": (
+        "A scene has surface where the other scene saw free space.",
+        r"free-space violation|\S+% of the (surface|points) seen contradict",
+    ),
     "inconsistent_correspondences": ("The correspondences fit no single pose.", r"correspondences do not fit one pose"),
     "mirrored_correspondences": ("The correspondences fit a mirrored pose only.", r"correspondences are mirrored"),
-    "no_pose_proposed": ("No proposer found a pose.", r"no pose proposed|no pose under which"),
+    "no_pose_proposed": (
+        "No proposer found a pose.",
+        r"no pose (proposed|under which|that more nodes support)|no match that chance|too few nodes agree",
+    ),
     "not_significant": ("The correspondences may have arisen by chance.", r"not significant"),
     "package_missing": (
         "A package that the comparison needs is not installed.",
@@ -366,11 +372,16 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "pose_uncertain": ("The pose is known too imprecisely.", r"(the overlap|what it shows) fixes (the|its) pose only"),
     # Photos and scans that are refused.
     "no_match": ("Nothing in the map resembles it.", r"nothing in the map looks like it|no scene of the map has any"),
+    "no_views": ("The map has no views to compare a photo with.", r"the map shows nothing to compare it with"),
     "no_scene_matches": ("No scene that was compared shows it.", r"\d+ scenes were compared and none"),
     "not_confirmed": ("Too few patches of the map are found again in the photo.", r"what the map shows there is not"),
     "too_far": ("The pose lies outside the area given.", r"it was taken .* from there"),
+    "too_few_features": ("The photo has too few features.", r"it shows too little"),
     # Edges that are accepted, and that optimize does not use or does not rely on.
-    "aliased_places": ("Places that look alike cannot be told apart.", r"places that look alike\?"),
+    "aliased_places": (
+        "Places that look alike cannot be told apart.",
+        r"(places that look|a place that looks) alike\?",
+    ),
     "confirmed_by_person": ("A person confirmed the edge.", r"confirmed by a person"),
     "contradicting_groups": ("Two groups of edges contradict each other.", r"edges that agree among themselves"),
     "contradicts_component": (
@@ -384,8 +395,11 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "contradicts_edges": ("The edge contradicts the other edges.", r"contradicts the other edges"),
     "outvoted": ("Too few edges agree against those that contradict them.", r"\d+ edges agree and \d+ others"),
     "surfaces_differ": ("Both scenes saw different surfaces at the place.", r"\S+% of what both saw is not the same"),
-    "too_few_edges": ("Too few agreeing edges join two large components.", r"would join two components"),
-    "unconfirmed": ("No cycle of edges confirms the edge.", r"in no agreeing cycle"),
+    "too_few_edges": ("Too few agreeing edges join two large components.", r"would join two (components|islands)"),
+    "unconfirmed": (
+        "No cycle of edges confirms the edge.",
+        r"in no agreeing cycle|ties two islands that nothing else joins|the only tie to the rest",
+    ),
     # World observations.
     "contradicts_observations": (
         "The observation contradicts the others.",

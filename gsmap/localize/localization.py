@@ -166,7 +166,7 @@ def evaluate_candidates(
 ) -> tuple[list[EvaluatedPose], str]:
     """Return refined poses of the best candidates, the most probable first; and the reason why there are none."""
     if not len(index):
-        return [], "the map shows nothing to compare it with"
+        return [], reason("no_views", "the map shows nothing to compare it with")
     out: list[EvaluatedPose] = []
     rejection = ""
     parts: list[Keypoints] = []
@@ -176,7 +176,7 @@ def evaluate_candidates(
         found = concatenate_keypoints(parts)
         min_inliers = resection.min_inliers(photo.focal_sigma)
         if len(found) < min_inliers:
-            return [], f"it shows too little: {len(found)} features"
+            return [], reason("too_few_features", f"it shows too little: {len(found)} features")
         candidates, num_matches = _candidates(photo, found, index, scenes, max_views)
         rejection = reason(
             "no_match",

@@ -100,6 +100,30 @@ def test_reasons_are_registered_and_used() -> None:
     assert used == set(REASONS) - {"other"}
 
 
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("12% of the points seen contradict what cameras saw, allowed 5%", "free_space_violation"),
+        ("12% of the surface seen contradicts what cameras saw, allowed 5%", "free_space_violation"),
+        ("a place that looks alike? (others of this map that disagree so are)", "aliased_places"),
+        ("contradicts what else is known of the two islands", "contradicts_component"),
+        ("no match that chance would not explain (colours disagree)", "no_pose_proposed"),
+        (
+            "no pose proposed that the background model does not explain (the poorer graph has 7 nodes)",
+            "no_pose_proposed",
+        ),
+        ("no pose that more nodes support than chance would (the poorer graph has 7)", "no_pose_proposed"),
+        ("shapes are compared in metres, and a unit is not known", "unit_unknown"),
+        ("the only tie to the rest, and its own verdict is not strong enough to attach by itself", "unconfirmed"),
+        ("ties two islands that nothing else joins", "unconfirmed"),
+        ("too few nodes agree (the poorer graph has 7)", "no_pose_proposed"),
+        ("would join two islands of 5 or more scenes: needs 2 agreeing edges over 2 scene pairs", "too_few_edges"),
+    ],
+)
+def test_stored_reasons_of_earlier_releases_have_codes(text: str, code: str) -> None:
+    assert reason_code(text) == code
+
+
 def test_the_code_of_a_reason_is_that_of_its_text() -> None:
     assert reason_code("") == ""
     assert reason_code("something else") == "other"
