@@ -214,6 +214,8 @@ def _explained(path: Path, verb: str) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         what = "no such file" if verb == "read" else f"no such folder: {path.parent}"
-        raise NotFoundError(f"cannot {verb} {path}: {what}", code="file_not_found") from error
+        code = "file_not_found" if verb == "read" else "folder_not_found"
+        raise NotFoundError(f"cannot {verb} {path}: {what}", code=code) from error
     except OSError as error:
-        raise InputError(f"cannot {verb} {path}: {error.strerror or error}", code="file_unreadable") from error
+        code = "file_unreadable" if verb == "read" else "not_writable"
+        raise InputError(f"cannot {verb} {path}: {error.strerror or error}", code=code) from error

@@ -514,7 +514,7 @@ def _too_long(path: str | os.PathLike[str], element: Element, more: str) -> Inpu
     return InputError(
         f"{path}: its header promises {element.count} {element.name} rows, but {more}, follow: export it again, or "
         "correct the counts in its header",
-        code="file_truncated",
+        code="file_damaged",
     )
 
 

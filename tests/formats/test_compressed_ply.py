@@ -98,13 +98,13 @@ def test_damage_is_named(tmp_path):
     formats.write(path, random_gaussians(300, degree=1))
     data = path.read_bytes()
     for old, new, code in (
-        (b"element chunk 2", b"element chunk 1", "file_truncated"),
+        (b"element chunk 2", b"element chunk 1", "file_damaged"),
         (b"element vertex 300", b"element vertex 999999999999", "file_truncated"),
         (b"element chunk 2", b"element chunk 99999999999", "file_truncated"),
-        (b"element sh 300", b"element sh 299", "file_truncated"),
+        (b"element sh 300", b"element sh 299", "file_damaged"),
         (b"property uint packed_scale", b"property int packed_scale", "wrong_file_type"),
         (b"property float max_z", b"property double max_z", "wrong_file_type"),
-        (b"property uchar f_rest_0\n", b"", "file_truncated"),
+        (b"property uchar f_rest_0\n", b"", "file_damaged"),
         (b"property uchar f_rest_0\n", b"property uchar f_rest_9\n", "wrong_file_type"),
     ):
         path.write_bytes(data.replace(old, new, 1))

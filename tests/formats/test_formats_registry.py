@@ -103,7 +103,7 @@ def test_unknown_suffix_lists_what_is_known(tmp_path):
 def test_missing_file_and_folder(tmp_path):
     with raises(NotFoundError, code="file_not_found"):
         gsmap.read(tmp_path / "a.ply")
-    with raises(NotFoundError, code="file_not_found"):
+    with raises(NotFoundError, code="folder_not_found"):
         gsmap.write(tmp_path / "none" / "a.ply", one())
     (tmp_path / "d.ply").mkdir()
     with raises(InputError, code="file_unreadable"):
@@ -119,7 +119,7 @@ def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", replace)
-    with raises(InputError, code="file_unreadable"):
+    with raises(InputError, code="not_writable"):
         formats.write(path, one(5))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
