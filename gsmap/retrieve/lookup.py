@@ -50,10 +50,10 @@ def look_up(queries: Sequence[SceneNodes], segments: Sequence[Segment], params: 
     """
     members = _IndexedScenes(segments)
     found = [_NodeMatches(query, members, params) for query in queries]
-    for segment, open_storage in zip(segments, members.places, strict=True):
+    for segment, place_of in zip(segments, members.places, strict=True):
         for block in _blocks(found, segment):
             for matches in found:
-                _search(matches, block, open_storage)
+                _search(matches, block, place_of)
     return [_rank(matches, members, params) for matches in found]
 
 
@@ -67,10 +67,10 @@ class _IndexedScenes:
                 if member is not None:
                     first.setdefault(member.scene, (number, place, member))
         self.members = [first[scene][2] for scene in sorted(first)]
-        self.open_storage = {member.scene: place for place, member in enumerate(self.members)}
+        self.place_of = {member.scene: place for place, member in enumerate(self.members)}
         self.places = [np.full(len(segment.members), -1, dtype=np.int32) for segment in segments]
         for scene, (number, place, _) in first.items():
-            self.places[number][place] = self.open_storage[scene]
+            self.places[number][place] = self.place_of[scene]
 
     def are_few(self, params: Params) -> bool:
         """Return whether every scene is paired with every other."""
@@ -89,7 +89,7 @@ class _NodeMatches:
     """
 
     def __init__(self, query: SceneNodes, members: _IndexedScenes, params: Params) -> None:
-        self.query, self.own = query, members.open_storage.get(query.member.scene, -1)
+        self.query, self.own = query, members.place_of.get(query.member.scene, -1)
         self.probes = codes.probes(query.query_nodes.keys, query.query_nodes.codes, _FLIPPED_SIGNS)
         most = int(2 * codes.SCALE**2 * (1 - _MIN_SIMILARITY) + 1e-6)
         self.nearest = np.full((len(query.query_nodes), VOTES_PER_NODE), most, np.int32)
@@ -127,7 +127,7 @@ def _blocks(found: Sequence[_NodeMatches], segment: Segment) -> Iterator[_Block]
         yield _Block(keys[low:high], starts[low : high + 1] - starts[low], rows, len(segment.members))
 
 
-def _search(found: _NodeMatches, block: _Block, open_storage: np.ndarray) -> None:
+def _search(found: _NodeMatches, block: _Block, place_of: np.ndarray) -> None:
     """Compare a query's nodes with those of the inverted lists that they search.
 
     Squared distances of codes are integers, and all matches as near as the last of a node's nearest are kept, so the
@@ -141,7 +141,7 @@ def _search(found: _NodeMatches, block: _Block, open_storage: np.ndarray) -> Non
     which = at[node, column]
     order = np.argsort(which, kind="stable")
     node, begin, end = node[order], block.starts[which[order]], block.starts[which[order] + 1]
-    member_places = np.where(open_storage == found.own, np.int32(-1), open_storage)
+    member_places = np.where(place_of == found.own, np.int32(-1), place_of)
     try:
         matched, row, squared, place = near_codes(
             found.query.query_nodes.codes, node, begin, end, block.rows, member_places, found.nearest

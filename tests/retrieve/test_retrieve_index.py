@@ -283,21 +283,21 @@ def test_the_nearest_that_count_are_found_in_any_parts_with_all_that_are_as_near
     rows[:, : coding.NUM_DIMS] = theirs.view(np.uint8)
     of = rng.integers(0, 40, 900)
     write_places(rows, of)
-    open_storage = np.where(np.arange(40) % 4 == 0, -1, np.arange(40)).astype(np.int32)
+    place_of = np.where(np.arange(40) % 4 == 0, -1, np.arange(40)).astype(np.int32)
     squared = ((mine[:, None].astype(int) - theirs) ** 2).sum(2)
     ends = np.array([0, 250, 251, 700, 900])
     asking = np.repeat(np.arange(30), 4)
     begin, end = np.tile(ends[:-1], 30), np.tile(ends[1:], 30)
     nearest = np.full((30, votes), most, np.int32)
-    who, which, told, places = near_codes(mine, asking, begin, end, rows, open_storage, nearest)
+    who, which, told, places = near_codes(mine, asking, begin, end, rows, place_of, nearest)
     assert (told == squared[who, which]).all()
-    assert (places == open_storage[of[which]]).all()
+    assert (places == place_of[of[which]]).all()
     ties = 0
     for k in range(30):
-        counts = squared[k][open_storage[of] >= 0]
+        counts = squared[k][place_of[of] >= 0]
         bar = min(np.sort(counts)[votes - 1], most)
         assert nearest[k, 0] == bar
-        want = np.flatnonzero((squared[k] <= bar) & (open_storage[of] >= 0))
+        want = np.flatnonzero((squared[k] <= bar) & (place_of[of] >= 0))
         assert sorted(which[(who == k) & (told <= bar)]) == want.tolist()
         ties += len(want) > votes
     assert ties > 3
