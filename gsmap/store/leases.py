@@ -155,7 +155,7 @@ class Leases:
         """Lease free work in one transaction.
 
         Args:
-            whats: work to lease, most wanted first.
+            work: what to lease, most wanted first.
             limit: maximum number of leases; default: all.
             done: returns those of some free work that are done already; called within the transaction, so that no other
                 process can do and release work in between.

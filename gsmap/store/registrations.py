@@ -592,14 +592,14 @@ def _fingerprint(connection: Connection, upto: int) -> tuple[str, str] | None:
     return None if row is None else (row.key, row.created_at)
 
 
-def _add_summaries(standing: dict[str, EdgeSummary], rows: Iterable[Sequence[Any]]) -> None:
+def _add_summaries(summaries: dict[str, EdgeSummary], rows: Iterable[Sequence[Any]]) -> None:
     """Update the summaries of unreviewed pairs by later registrations, oldest first."""
     for number, target, source, pair, key, status, posed, evidence in rows:
-        before = standing.get(pair)
+        before = summaries.get(pair)
         keys = None if before is None else before.keys | {key} - {""}
         disagreement = _UNKNOWN if evidence is None else _disagreement(evidence)
         usable = bool(posed) and _is_usable(status, None)
-        standing[pair] = EdgeSummary(number, target, source, pair, key, None, usable, disagreement, keys)
+        summaries[pair] = EdgeSummary(number, target, source, pair, key, None, usable, disagreement, keys)
 
 
 def _unreviewed_summaries(connection: Connection, wanted: ColumnElement[bool]) -> list[EdgeSummary]:

@@ -294,12 +294,12 @@ class Transfer:
         names = {(side, row.number): _identity(row) for side, rows in (("a", mine), ("b", theirs)) for row in rows}
         rows = {names["a", row.number]: ("a", row) for row in mine}
         new = {names["b", row.number]: ("b", row) for row in theirs if names["b", row.number] not in rows}
-        words = {_review_key(row): ("a", row) for row in our_reviews}
-        new_words = {_review_key(row): ("b", row) for row in their_reviews if _review_key(row) not in words}
-        if not new and not new_words:
+        known_reviews = {_review_key(row): ("a", row) for row in our_reviews}
+        new_reviews = {_review_key(row): ("b", row) for row in their_reviews if _review_key(row) not in known_reviews}
+        if not new and not new_reviews:
             return
         self.counts["registrations"] += len(new)
-        self.counts["reviews"] += len(new_words)
+        self.counts["reviews"] += len(new_reviews)
         # Numbers give the order, so that all rows of the pair are renumbered.
         self.ours.execute(delete(reviews).where(of_review))
         self.ours.execute(delete(registrations).where(of_pair))
@@ -319,10 +319,10 @@ class Transfer:
             query = insert(registrations).returning(registrations.c.number)
             numbers[names[side, row.number]] = self.ours.execute(query, content).scalar_one()
         joined_reviews = merge_by_time(
-            words.values(),
+            known_reviews.values(),
             [("b", row) for row in their_reviews],
             time=lambda item: str(item[1].created_at),
-            is_new=lambda item: _review_key(item[1]) in new_words,
+            is_new=lambda item: _review_key(item[1]) in new_reviews,
         )
         for side, row in joined_reviews:
             number = numbers[names[side, row.registration]]
@@ -334,7 +334,7 @@ class Transfer:
         mine: dict[str, dict[str, Row[Any]]] = {}
         for row in self.ours.execute(query):
             mine.setdefault(row.scene, {})[_identity(row, "removed_at")] = row
-        standing_here = any(row.removed_at is None for rows in mine.values() for row in rows.values())
+        has_current = any(row.removed_at is None for rows in mine.values() for row in rows.values())
         for row in self.theirs.execute(query).all():
             if row.scene not in self.wanted:
                 continue
@@ -347,7 +347,7 @@ class Transfer:
                 self.ours.execute(update(priors).where(taken_back).values(removed_at=row.removed_at))
         if not self.counts["priors"]:
             return
-        if standing_here:
+        if has_current:
             self.notes.append("both maps have pose priors: they agree only if both use the same frame")
         for scene in self.wanted:
             current = (priors.c.scene == scene) & priors.c.removed_at.is_(None)

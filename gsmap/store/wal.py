@@ -66,26 +66,26 @@ def read_index_header(file: Path) -> IndexHeader | None:
     return IndexHeader(content[32:40], num_frames) if version == _INDEX_VERSION and is_init else None
 
 
-def read_log(path: Path, stored: IndexHeader | None = None, *, at_most: int | None = None) -> WalContent:
+def read_log(path: Path, header: IndexHeader | None = None, *, at_most: int | None = None) -> WalContent:
     """Read all frames of a log.
 
     A log has lost a commit if a later frame follows a commit beyond the first bad frame (frames are written only once
     the previous commit is on disk), or if its index has more frames than can be read. A torn end is no loss.
 
     Args:
-        noted: header of the index from before any connection.
+        header: of the index, read before this process connected.
         at_most: number of frames to read. Later frames may be of a commit whose fsync failed, which is complete but
             rolled back.
     """
     try:
         with open(path, "rb", buffering=0) as opened:
             size = os.fstat(opened.fileno()).st_size
-            return _read(opened.fileno(), size, stored, size if at_most is None else at_most)
+            return _read(opened.fileno(), size, header, size if at_most is None else at_most)
     except FileNotFoundError:
         return WalContent()
 
 
-def _read(handle: int, size: int, stored: IndexHeader | None, at_most: int) -> WalContent:
+def _read(handle: int, size: int, header: IndexHeader | None, at_most: int) -> WalContent:
     head = os.pread(handle, _HEADER, 0)
     if len(head) < _HEADER or not any(head):
         return WalContent()
@@ -95,7 +95,7 @@ def _read(handle: int, size: int, stored: IndexHeader | None, at_most: int) -> W
     sound = magic & ~1 == _MAGIC and version == _INDEX_VERSION and 512 <= page_size <= 65536
     if not sound or _summed(words[None, :6])[0].tolist() != list(struct.unpack(">II", seed)):
         return WalContent(problem="its header is damaged" if size > _HEADER else "")
-    committed = stored.num_frames if stored is not None and stored.salt == salt else 0
+    committed = header.num_frames if header is not None and header.salt == salt else 0
 
     frames: dict[int, int] = {}
     ahead: dict[int, int] = {}  # frames of a transaction without a commit so far

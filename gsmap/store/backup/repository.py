@@ -139,8 +139,8 @@ class Backup:
 
     def names(self) -> list[str]:
         """Return the names of the snapshots, oldest first."""
-        format_file_list = [name[len(SNAPSHOTS) :].removesuffix(".json") for name in self.storage.list(SNAPSHOTS)]
-        return sorted(name for name in format_file_list if _NAME.fullmatch(name))
+        listed = [name[len(SNAPSHOTS) :].removesuffix(".json") for name in self.storage.list(SNAPSHOTS)]
+        return sorted(name for name in listed if _NAME.fullmatch(name))
 
     def time_of_next(self, now: str) -> str:
         """Return the time of the next snapshot: ``now``, or the first time after the newest one if a clock was wrong.
@@ -236,8 +236,8 @@ class Backup:
         where = f"{self.storage.url}/{object_name(snapshot.files)}"
         if snapshot.files_bytes > _MAX_TEXT_BYTES:
             raise CorruptError(f"{where} is too long to be a list of files", code="backup_damaged")
-        format_file_list = StoredFile("", snapshot.files_bytes, snapshot.files)
-        text = b"".join(self.read(format_file_list)).decode("utf-8", errors="replace")
+        file_list = StoredFile("", snapshot.files_bytes, snapshot.files)
+        text = b"".join(self.read(file_list)).decode("utf-8", errors="replace")
         out: dict[str, StoredFile] = {}
         for line in text.splitlines():
             parts = _LINE.fullmatch(line)
