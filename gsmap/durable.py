@@ -181,9 +181,8 @@ def remove_tree(root: Path, *names: str) -> None:
             return
         if stat.S_ISDIR(mode):
             try:
-                shutil.rmtree(
-                    names[-1], dir_fd=parent
-                )  # by folder descriptors: follows no link, even if swapped in meanwhile
+                # By folder descriptors: follows no link, even if one is swapped in meanwhile.
+                shutil.rmtree(names[-1], dir_fd=parent)
             except RecursionError as error:
                 raise OSError(
                     f"{root.joinpath(*names)} has too many nested folders to be deleted: remove it by hand"

@@ -8,9 +8,8 @@ from typing import Any
 
 # Cc, Cs: escape sequences, line breaks, halves of characters. Zl, Zp: line breaks of another kind.
 _CATEGORIES = ("Cc", "Cs", "Zl", "Zp")
-_TURNING = frozenset(
-    "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
-)  # bidirectional overrides, which disguise a text
+# Bidirectional overrides, which disguise a text.
+_TURNING = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
 def control_characters(text: str, *, lines: bool = False) -> list[str]:

@@ -21,10 +21,8 @@ def chunk_boxes(gaussians: Gaussians, rows: int, *, sigmas: float = 3.0) -> np.n
 
 def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
     """Store the boxes (C, 2, 3) of a scene's chunks, replacing the previous ones."""
-    if number >= 1 << 24:
-        raise StoreError(
-            "a map holds at most 16 million scenes", code="too_many_scenes"
-        )  # float32 coordinates of the R*Tree represent integers exactly up to 2**24
+    if number >= 1 << 24:  # float32 coordinates of the R*Tree represent integers exactly up to 2**24
+        raise StoreError("a map holds at most 16 million scenes", code="too_many_scenes")
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
     rows = [
         {"s": number, "chunk": i}

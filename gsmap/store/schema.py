@@ -234,9 +234,8 @@ index_segments = _table(
     "index_segments",
     Column("number", Integer, primary_key=True),
     Column("key", KeyText, nullable=False),  # of the index recipe
-    Column(
-        "members", JsonText(is_member_list), nullable=False
-    ),  # each: scene, key of its graph, upright, metric, coarseness
+    # Each member: scene, key of its graph, upright, metric, coarseness.
+    Column("members", JsonText(is_member_list), nullable=False),
     Column("num_nodes", Integer, nullable=False),
     Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
@@ -273,9 +272,8 @@ comparisons = _table(
     Column("key", KeyText, nullable=False, index=True),  # RecipeKey.digest
     _recipe(),
     Column("S_newer_older", JsonText(is_pose), nullable=False),  # relative pose used for it
-    Column(
-        "S_frame_newer", JsonText(is_pose), nullable=False
-    ),  # takes the newer scene to the frame of boxes and voxels
+    # Takes the newer scene to the frame of boxes and voxels.
+    Column("S_frame_newer", JsonText(is_pose), nullable=False),
     Column("seen_share", Real, nullable=False),
     Column("gains", JsonText(is_direction), nullable=False),
     Column("notes", JsonText(is_text_list), nullable=False),
@@ -477,9 +475,8 @@ leases = _table(
     Column("what", Text, primary_key=True),
     Column("token", Text, nullable=False),  # of its owner; random
     Column("host", Text, nullable=False),
-    Column(
-        "process", Text, nullable=False
-    ),  # process id, and its start to tell it from a later process with the same id
+    # Process id, and its start to tell it from a later process with the same id.
+    Column("process", Text, nullable=False),
     Column("task", Text, nullable=False),  # the verb, for messages
     Column("since", Text, nullable=False),
     Column("expires_at", Text, nullable=False),
