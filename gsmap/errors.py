@@ -16,8 +16,8 @@
     │   └── DiskError                      the disk failed: an I/O error
     └── MissingDependencyError (ImportError)   an optional package is not installed
 
-`of_system` tells which of them an error of the operating system is. A message says what is wrong, where, and what to
-do, in one line; `GsmapError.code` names the cause for programs. "No overlap", "ambiguous" and "not enough nodes" are
+`of_system` maps an error of the operating system to one of them. A message states what is wrong, where, and what to do,
+in one line; `GsmapError.code` names the cause for programs. "No overlap", "ambiguous" and "not enough nodes" are
 results with a status and a reason, never errors.
 """
 
@@ -26,7 +26,7 @@ import errno
 MALFORMED = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 """What Python raises where parsed JSON or TOML is damaged, nested without end or of another shape than expected."""
 
-_MAX_MESSAGE = 1000  # characters; beyond it a message quotes what somebody put into a file
+_MAX_MESSAGE = 1000  # characters; longer messages quote the content of a file
 
 
 class GsmapError(Exception):

@@ -195,7 +195,7 @@ class FolderStorage:
                 raise NotFoundError(f"{self.url} has no {name}", code="backup_file_missing") from None
             with open(handle, "rb") as file:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
-                    raise StoreError(f"{self.url}: {name} is not a file", code="place_failed")
+                    raise StoreError(f"{self.url}: {name} is not a file", code="storage_failed")
                 while chunk := file.read(CHUNK_BYTES):
                     yield chunk
 
@@ -248,7 +248,7 @@ class FolderStorage:
                     code="link_refused",
                 ) from error
             raise StoreError(
-                f"{self.url}: {error.strerror or error} ({error.filename or 'no name'})", code="place_failed"
+                f"{self.url}: {error.strerror or error} ({error.filename or 'no name'})", code="storage_failed"
             ) from error
 
 
@@ -359,12 +359,12 @@ class BucketStorage:
         except (PermissionDeniedError, UnauthenticatedError) as error:
             raise StorageRequestError(
                 f"{self.url}: not allowed to {what} ({_first_line(error)}): check AWS_ACCESS_KEY_ID",
-                code="place_refused",
+                code="storage_refused",
             ) from error
         except (BaseError, OSError) as error:
             raise StorageRequestError(
                 f"{self.url}: cannot {what} ({_first_line(error)}): check AWS_ENDPOINT_URL, and try again",
-                code="place_failed",
+                code="storage_failed",
             ) from error
 
 

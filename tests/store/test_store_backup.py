@@ -414,7 +414,7 @@ def test_one_whose_lease_was_taken_away_stops(filled, place):
         with raises(StoreError, code="lease_lost"):
             lease.others()
         lease._renewed -= EXPIRES_S
-        with raises(StoreError, code="place_failed"):
+        with raises(StoreError, code="storage_failed"):
             lease.require()
 
 
@@ -462,7 +462,7 @@ def test_places_that_are_refused(filled, place, tmp_path):
             open_storage(target)
         assert "secret" not in str(caught.value)
     assert open_storage(f"file://{tmp_path}/a%20b").root == tmp_path / "a b"
-    with raises(ConfigError, code="place_inside_map"):
+    with raises(ConfigError, code="backup_inside_map"):
         save(filled, FolderStorage(filled.catalog.folder / "backup"))
     with raises(StoreError, code="folder_not_empty"):
         save(filled, FolderStorage(tmp_path))

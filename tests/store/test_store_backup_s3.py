@@ -111,7 +111,7 @@ def test_a_put_whose_last_answer_was_lost(filled, place, monkeypatch):
     assert len(failed) > 3
     monkeypatch.setattr(place._api, "put", _refuse)
     filled.scenes.add(make_gaussians(seed=5), make_cameras(), name="c")
-    with raises(StoreError, code="place_failed"):
+    with raises(StoreError, code="storage_failed"):
         save(filled, place)
 
 
@@ -127,7 +127,7 @@ def test_what_cannot_be_reached_is_said_in_one_line(filled, place, monkeypatch, 
     assert "\n" not in str(caught.value)
     assert "s3://nobody/x" in str(caught.value)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "a-wrong-secret")
-    with raises(StoreError, code="place_refused") as caught:
+    with raises(StoreError, code="storage_refused") as caught:
         save(filled, open_storage(place.url))
     assert "a-wrong-secret" not in str(caught.value)
     assert "\n" not in str(caught.value)

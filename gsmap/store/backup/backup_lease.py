@@ -66,7 +66,7 @@ class BackupLease:
         if time.monotonic() - self._renewed > EXPIRES_S / 2:
             raise StoreError(
                 f"{self._storage.url} could not be reached for {EXPIRES_S / 2:g} s: run the same command again",
-                code="place_failed",
+                code="storage_failed",
             )
 
     def others(self, task: str = "") -> list[str]:

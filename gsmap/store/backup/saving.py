@@ -80,7 +80,7 @@ def save(
     if isinstance(storage, FolderStorage) and storage.root.resolve().is_relative_to(home):
         raise ConfigError(
             f"{storage.url} lies inside the map, and would be lost with it: name another folder",
-            code="place_inside_map",
+            code="backup_inside_map",
         )
     backup = Backup.at_or_new(storage, store.id)
     with BackupLease(storage, SAVE) as lease:
