@@ -122,8 +122,8 @@ class _Section:
 
     @classmethod
     def of(cls, path: str | os.PathLike[str], header: np.void, level: int) -> _Section:
-        told = {name: header[name].item() for name in cls.__dataclass_fields__ if name != "level"}
-        section = cls(level=level, **told)
+        values = {name: header[name].item() for name in cls.__dataclass_fields__ if name != "level"}
+        section = cls(level=level, **values)
         if section.sh_degree >= len(_SH_VALUES):
             raise InputError(
                 f"{path}: SH degree {section.sh_degree}; a .ksplat has 0 to {len(_SH_VALUES) - 1}",

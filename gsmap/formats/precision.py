@@ -42,8 +42,9 @@ def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> Gauss
     apart = neighbour_distance(source) if step else np.inf
     if apart <= 2 * step:
         raise InputError(
-            f"{where}: its positions near {told(origin)} are in single precision, which rounds them to {step:g} there, "
-            f"but neighbours are {apart:.2g} apart: export it in double precision, or with {told(origin)} taken off",
+            f"{where}: its positions near {format_origin(origin)} are in single precision, which rounds them to "
+            f"{step:g} there, but neighbours are {apart:.2g} apart: export it in double precision, or with "
+            f"{format_origin(origin)} taken off",
             code="precision_loss",
         )
     return source
@@ -72,14 +73,14 @@ def about_zero(
     apart = np.inf if is_exact else neighbour_distance(gaussians)
     if apart < _FINE * step:
         raise InputError(
-            f"{path} cannot hold positions near {told(gaussians.origin)}: it rounds them to {step:g} there, and "
-            f"neighbours are {apart:.2g} apart: write .ply, .glb, .usdc or tileset.json, or take the offset "
-            f"{told(gaussians.origin)} off (gsmap convert --local)",
+            f"{path} cannot hold positions near {format_origin(gaussians.origin)}: it rounds them to {step:g} there, "
+            f"and neighbours are {apart:.2g} apart: write .ply, .glb, .usdc or tileset.json, or take the offset "
+            f"{format_origin(gaussians.origin)} off (gsmap convert --local)",
             code="precision_loss",
         )
     return gaussians.about(np.zeros(3))
 
 
-def told(origin: np.ndarray) -> str:
-    """An origin in words."""
+def format_origin(origin: np.ndarray) -> str:
+    """Format an origin for messages."""
     return "(" + ", ".join(f"{value:.15g}" for value in origin) + ")"

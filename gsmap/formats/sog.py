@@ -218,7 +218,10 @@ def _encode(g: Gaussians, palette_size: int, turns: int) -> tuple[dict[str, Any]
     }
     if k > 1:
         entries, labels = palette(
-            g.sh[:, 1:].reshape(n, -1), min(palette_size, max(_LEAST_PALETTE, n // _PER_ENTRY)), turns, _told(g)
+            g.sh[:, 1:].reshape(n, -1),
+            min(palette_size, max(_LEAST_PALETTE, n // _PER_ENTRY)),
+            turns,
+            _palette_weights(g),
         )
         book, places = codebook(entries)
         places = places.reshape(-1, 3)
@@ -229,13 +232,13 @@ def _encode(g: Gaussians, palette_size: int, turns: int) -> tuple[dict[str, Any]
     return meta, images
 
 
-def _told(g: Gaussians) -> np.ndarray:
-    """(N,) how much the colour of each Gaussian tells in pictures: opacity times the area it shows, at most four
-    times the median, so that no few take the palette."""
+def _palette_weights(g: Gaussians) -> np.ndarray:
+    """Return (N,) weights of the Gaussians for the palette: opacity times projected area, at most four times the
+    median, so that a few large Gaussians do not dominate it."""
     scales = np.sort(np.clip(g.log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE), axis=1)[:, 1:]
     area = np.exp((scales - np.median(scales, axis=0)).clip(-5, 5).sum(1))
-    told = area / (1 + np.exp(-g.logit_opacities.clip(-20, 20)))
-    return np.clip(told / np.median(told), 0.25, 4).astype(np.float32)
+    weights = area / (1 + np.exp(-g.logit_opacities.clip(-20, 20)))
+    return np.clip(weights / np.median(weights), 0.25, 4).astype(np.float32)
 
 
 def _webp(texels: np.ndarray) -> bytes:

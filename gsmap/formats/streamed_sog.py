@@ -294,18 +294,18 @@ def _leaves(path: Path, meta: Mapping[str, Any]) -> Iterator[dict[int, Run]]:
                 f"{path}: more than {_MAX_NODES} nodes, or nested deeper than {_MAX_DEPTH}", code="nested_too_deeply"
             )
         if "lods" in node:
-            yield {int(level): _run(path, names, told) for level, told in list(node["lods"].items())[:_MAX_LEVELS]}
+            yield {int(level): _run(path, names, entry) for level, entry in list(node["lods"].items())[:_MAX_LEVELS]}
         todo += [(child, depth + 1) for child in reversed(node.get("children") or [])]
 
 
-def _run(path: Path, names: list[str], told: Mapping[str, Any]) -> Run:
-    file, offset, count = int(told["file"]), int(told.get("offset", 0)), int(told.get("count", 0))
+def _run(path: Path, names: list[str], entry: Mapping[str, Any]) -> Run:
+    file, offset, count = int(entry["file"]), int(entry.get("offset", 0)), int(entry.get("count", 0))
     if not 0 <= file < len(names) or offset < 0 or count < 0:
         raise InputError(
             f"{path}: file {file} of {len(names)}, from {offset}, {count} Gaussians: no such run",
             code="rows_outside_file",
         )
-    extras = {name: value for name, value in told.items() if name not in ("file", "offset", "count")}
+    extras = {name: value for name, value in entry.items() if name not in ("file", "offset", "count")}
     return Run(str(names[file]), offset, count, extras)
 
 

@@ -20,7 +20,7 @@ from gsmap.errors import InputError, MissingDependencyError, NotGaussiansError
 from gsmap.formats.axes import PLY, change_axes
 from gsmap.formats.quantise import check_size, require_writable
 from gsmap.formats.scans.limits import Params
-from gsmap.formats.scans.process import asked
+from gsmap.formats.scans.process import read_in_process
 from gsmap.formats.tiles3d import box_of
 from gsmap.geometry.transforms import transform_with_origin
 from gsmap.types import Gaussians, Sim3
@@ -53,13 +53,13 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         )
     mib = size / _MIB
     limits = Params(max_memory_mb=int(_FREE_MIB + _RATIO * mib), max_seconds=_TIME_S + mib / _MIB_A_SECOND)
-    told = asked(path, "usd", limits)
-    if "refused" in told:
-        raise InputError(f"{path}: {told['refused']}", code="unsupported_feature")
-    up = str(told["up"])
+    stage = read_in_process(path, "usd", limits)
+    if "refused" in stage:
+        raise InputError(f"{path}: {stage['refused']}", code="unsupported_feature")
+    up = str(stage["up"])
     if up not in _UP:
         raise InputError(f"{path}: its up axis is {up!r}; gsmap reads Y and Z", code="unsupported_axes")
-    parts = [_splat(path, told, i) for i in range(int(told["count"]))]
+    parts = [_splat(path, stage, i) for i in range(int(stage["count"]))]
     if not parts:
         raise NotGaussiansError(f"{path} holds no ParticleField3DGaussianSplat: a mesh, or splats of an older schema?")
     return change_axes(Gaussians.concatenate(parts), PLY, _UP[up])
@@ -123,16 +123,16 @@ def _packed(values: np.ndarray, number: Any) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=number)
 
 
-def _splat(path: Path, told: dict[str, np.ndarray], i: int) -> Gaussians:
+def _splat(path: Path, stage: dict[str, np.ndarray], i: int) -> Gaussians:
     """Read the Gaussians of one prim, in the frame of the stage."""
 
     def array(name: str) -> np.ndarray | None:
-        return told.get(f"{i}.{name}")
+        return stage.get(f"{i}.{name}")
 
     means = array("positions")
     if means is None or not len(means):
         raise InputError(f"{path}: a ParticleField3DGaussianSplat without positions", code="missing_attribute")
-    n, degree = len(means), int(told[f"{i}.degree"])
+    n, degree = len(means), int(stage[f"{i}.degree"])
     if not 0 <= degree <= 3:
         raise InputError(f"{path}: SH degree {degree}; gsmap reads 0 to 3", code="unsupported_sh_degree")
     k = (degree + 1) ** 2
@@ -153,7 +153,7 @@ def _splat(path: Path, told: dict[str, np.ndarray], i: int) -> Gaussians:
     with np.errstate(invalid="ignore", divide="ignore"):  # a negative scale becomes NaN, which validation names
         log_scales = np.log(np.where(scales == 0, _TINY, scales))
     found = Gaussians(means, quats, log_scales, np.log(opacity / (1 - opacity)), sh)
-    matrix = told[f"{i}.matrix"].astype(np.float64).T  # USD's vectors are rows
+    matrix = stage[f"{i}.matrix"].astype(np.float64).T  # USD's vectors are rows
     return found if np.array_equal(matrix, np.eye(4)) else transform_with_origin(found, _similarity(path, matrix))
 
 

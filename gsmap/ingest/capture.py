@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmap import formats
 from gsmap.errors import ConfigError, NotPinholesError
-from gsmap.formats.precision import about_origin, rounded_to, told
+from gsmap.formats.precision import about_origin, format_origin, rounded_to
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.ingest.capture_search import CaptureFiles, find_captures
@@ -172,7 +172,10 @@ def take_capture(
 
 def _origin_notes(gaussians: GaussianSource, origin: np.ndarray) -> list[str]:
     """Return remarks on a capture with large coordinates."""
-    notes = [f"its coordinates are large: poses and positions in its frame are those of the file less {told(origin)}"]
+    notes = [
+        "its coordinates are large: poses and positions in its frame are those of the file less "
+        f"{format_origin(origin)}"
+    ]
     step = rounded_to(gaussians)
     if step:
         notes.append(f"the file has its positions in single precision, which rounds them to {step:g} there")

@@ -11,7 +11,7 @@ import numpy as np
 from gsmap.errors import InputError, MissingDependencyError
 from gsmap.formats.scans import limits
 from gsmap.formats.scans.points import scan_of
-from gsmap.formats.scans.process import asked
+from gsmap.formats.scans.process import read_in_process
 from gsmap.types.scan import Scan
 
 _HEADER_BYTES, _LEAST_HEADER_BYTES = 375, 227
@@ -31,7 +31,7 @@ def read(path: Path, params: limits.Params) -> Scan:
             f"{path}: .las and .laz are read by laspy, which is not installed: pip install 'gsmap[las]'"
         )
     _require_header(path)
-    found = asked(path, "las", params)
+    found = read_in_process(path, "las", params)
     counts, scales, offsets = found.get("counts", np.zeros((0, 3))), found["scales"], found["offsets"]
     total, seen = found["total"].tolist()
     if not (np.isfinite(scales).all() and np.isfinite(offsets).all() and (scales > 0).all()):

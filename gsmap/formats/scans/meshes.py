@@ -13,7 +13,7 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.formats.scans import limits
 from gsmap.formats.scans.points import scan_of
-from gsmap.formats.scans.process import asked
+from gsmap.formats.scans.process import read_in_process
 from gsmap.types.scan import Scan
 
 _SEED = 0
@@ -28,7 +28,7 @@ def read(path: Path, params: limits.Params) -> Scan:
     kind = "cloud" if path.suffix.lower() == ".pcd" else "mesh"
     if path.suffix.lower() == ".ply":
         _require_vertices(path)
-    found = asked(path, kind, params)
+    found = read_in_process(path, kind, params)
     vertices, colours = _checked(found, "vertices", 3, path), found.get("colours")
     if colours is not None:
         colours = _checked(found, "colours", 3, path) if len(colours) == len(vertices) else None

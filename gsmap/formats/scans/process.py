@@ -19,14 +19,14 @@ from gsmap.formats.scans import child, limits
 _MIB = 1 << 20
 
 
-def asked(path: Path, kind: str, params: limits.Params) -> dict[str, np.ndarray]:
+def read_in_process(path: Path, kind: str, params: limits.Params) -> dict[str, np.ndarray]:
     """Read a file with a library in a separate process, with limits on time and memory.
 
     Args:
         kind: ``cloud`` or ``mesh`` (open3d), ``las`` (laspy), or ``usd`` (usd-core).
 
     Raises:
-        InputError: it does not read it, or not within the limits.
+        InputError: the library cannot read the file, or not within the limits.
     """
     end, out = os.pipe()
     command = [sys.executable, "-P", child.__file__, str(out), str(path.resolve()), kind]
@@ -41,12 +41,12 @@ def asked(path: Path, kind: str, params: limits.Params) -> dict[str, np.ndarray]
         )
         os.close(out)
         try:
-            said = _until_end(pipe, process, params, path)
+            output = _read_output(pipe, process, params, path)
         finally:
             process.kill()
             process.wait()
     try:
-        with np.load(io.BytesIO(said), allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(output), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(
@@ -56,8 +56,8 @@ def asked(path: Path, kind: str, params: limits.Params) -> dict[str, np.ndarray]
         ) from error
 
 
-def _until_end(pipe: Any, process: subprocess.Popen[bytes], params: limits.Params, path: Path) -> bytes:
-    """All that the process writes, before its time is up."""
+def _read_output(pipe: Any, process: subprocess.Popen[bytes], params: limits.Params, path: Path) -> bytes:
+    """Read all output of the process within its limits of time and size."""
     timer = threading.Timer(params.max_seconds, process.kill)
     timer.start()
     parts, size = [], 0
