@@ -274,7 +274,7 @@ def _primitives(
         if seen > _MAX_NODES or index < 0:
             raise InputError(f"{path}: more than {_MAX_NODES} nodes, or nodes in a circle", code="nested_too_deeply")
         node = nodes[index]
-        world = parent @ _node_matrix(path, node)
+        world = parent @ _node_matrix(node)
         todo += [(int(child), world) for child in node.get("children", [])]
         if "mesh" in node:
             for primitive in gltf["meshes"][node["mesh"]]["primitives"]:
@@ -282,7 +282,7 @@ def _primitives(
                     yield primitive, world
 
 
-def _node_matrix(path: str | os.PathLike[str], node: dict[str, Any]) -> np.ndarray:
+def _node_matrix(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     matrix = np.eye(4)

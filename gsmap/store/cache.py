@@ -64,7 +64,7 @@ def keep(sha256: str, chunks: Iterable[bytes], what: str) -> Path:
                 file.write(chunk)
         if digest.hexdigest() != sha256:
             raise CorruptError(f"{what} differs from what gsmap wrote", code="bytes_differ")
-        _make_room(root, staged.stat().st_size)
+        _make_room(root)
         os.replace(staged, root / sha256)
     finally:
         staged.unlink(missing_ok=True)
@@ -77,14 +77,14 @@ def drop(sha256: str) -> None:
         path.unlink(missing_ok=True)
 
 
-def _make_room(root: Path, size_bytes: int) -> None:
-    """Delete the least recently used files until ``size_bytes`` more fit."""
+def _make_room(root: Path) -> None:
+    """Delete the least recently used files until the cache, with the staged file, is within its limit."""
     kept = []
     for entry in os.scandir(root):
         with contextlib.suppress(FileNotFoundError):
             about = entry.stat(follow_symlinks=False)
             kept.append((about.st_mtime, about.st_size, entry.name))
-    over = sum(size for _, size, _ in kept) - max_bytes()  # the incoming file is already staged in this folder
+    over = sum(size for _, size, _ in kept) - max_bytes()
     for _, size, name in sorted(kept):
         if over <= 0:
             break

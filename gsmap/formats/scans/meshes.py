@@ -66,14 +66,14 @@ def _sampled(path: Path, found: dict[str, Any], vertices: np.ndarray, colours: n
     r1, r2 = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
     shares = np.stack([1 - r1, r1 * (1 - r2), r1 * r2], axis=1)
     points = np.einsum("nk,nkj->nj", shares, corners[rows])
-    seen = _textured(found, rows, shares, path)
+    seen = _textured(found, rows, shares)
     if seen is None and colours is not None:
         seen = np.einsum("nk,nkj->nj", shares, colours[triangles[rows]])
     note = f"{count:,} points spread over the {areas.sum():,.0f} square units of its {len(triangles):,} triangles"
     return scan_of(points, None if seen is None else np.clip(seen, 0, 1), path, count, kind="mesh", notes=(note,))
 
 
-def _textured(found: dict[str, Any], rows: np.ndarray, shares: np.ndarray, path: Path) -> np.ndarray | None:
+def _textured(found: dict[str, Any], rows: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
     """(N, 3) colours of the samples from the mesh's pictures; None where it has none, or where they do not fit."""
     pictures = [found[name] for name in sorted(n for n in found if n.startswith("texture"))]
     pictures = [found[f"texture{number}"] for number in range(len(pictures))]
