@@ -12,8 +12,6 @@ import numpy as np
 from gsmap.types import NodeLayer
 
 _LLOYD_STEPS = 10  # of spherical k-means; the recall on synthetic places is the same after 5 and after 20
-
-
 _MAX_DISTANCE_M = 1.5  # objects nearer to each other are joined in the local graph
 NUM_WORDS = 48  # of the codebook, at most
 SHARPNESS = 20.0  # inverse temperature of the softmax by which a feature is shared among the words

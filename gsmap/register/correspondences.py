@@ -98,10 +98,10 @@ def similar_pairs(
     units_m: tuple[float, float],
     ups: tuple[np.ndarray | None, np.ndarray | None],
 ) -> Correspondences:
-    """Match the ends of some match_nodes with all nodes that are as similar to them as their partners.
+    """Match the ends of some correspondences with all nodes that are as similar to them as their partners.
 
     Args:
-        members: the match_nodes.
+        members: the correspondences.
         quantile: of their similarities; the lower limit of the similarity of a pair.
         count: largest number of the most similar pairs.
         units_m, ups: as in `match_nodes`.
@@ -135,7 +135,7 @@ def _between(
     units_m: tuple[float, float],
     ups: tuple[np.ndarray | None, np.ndarray | None],
 ) -> Correspondences:
-    """Return the match_nodes of rows of both layers, in metres."""
+    """Return the correspondences of rows of both layers, in metres."""
     points_t, points_s = target.positions[t] * units_m[0], source.positions[s] * units_m[1]
     level = ups[0] is not None and ups[1] is not None
     return Correspondences(

@@ -27,8 +27,8 @@ _MIN_PATTERN = 0.05
 _PATTERN_CORRELATION = 0.1
 _PATCH_PX = 16  # colours are compared after the mean over a patch of this size is removed ...
 _CELL_M = 0.4  # ... and over a cell of this size for scenes without cameras
-_MIN_SEEN = 100  # cameras of a scene that add_pixels fewer Gaussians of the other scene are ignored
-NUM_CAMERAS = 6  # of each scene, chosen to add_pixels most of the other scene
+_MIN_SEEN = 100  # cameras of a scene that see fewer Gaussians of the other scene are ignored
+NUM_CAMERAS = 6  # of each scene, chosen to see most of the other scene
 MAX_POINTS = 12_000  # of each scene that are tested for coinciding
 
 
@@ -86,7 +86,7 @@ def measure(
     Args:
         target, source: surfaces, in metres; so is the pose.
         views: the target's and the source's own.
-        num_cameras: of each scene, chosen to add_pixels most of the other scene.
+        num_cameras: of each scene, chosen to see most of the other scene.
         max_points: of each scene that are tested for coinciding.
     """
     rows_t, rows_s = target.sample(max_points), source.sample(max_points)
@@ -136,9 +136,8 @@ class CrossViewStats:
     products: list[np.ndarray] = field(default_factory=list)  # (patches, 3) each
     squares: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
     area_m2: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of each Gaussian, where it was seen best
-    patterns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(
-        default_factory=list
-    )  # as in `add_pixels`, one per view
+    # Of each view the rows, areas and mean correlations that `add_pixels` computes.
+    patterns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
 
     @classmethod
     def of(cls, count: int) -> CrossViewStats:

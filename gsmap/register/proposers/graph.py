@@ -43,7 +43,7 @@ _RIVAL_SEARCHES = 3  # cliques among them that are tried until one implies a pos
 
 @dataclass(frozen=True)
 class Params:
-    """Pose proposals by matcher two scene graphs.
+    """Pose proposals by matching two scene graphs.
 
     Args:
         kinds: Kinds of nodes that propose poses, each on its own: ``landmarks``, ``objects`` or both.
@@ -197,7 +197,7 @@ class LayerMatcher:
         return [(s, score) for s, score in scales if score >= min_vote]
 
     def compatibility_graph(self, among: Correspondences, at_scale: float) -> np.ndarray:
-        """Bit rows of the compatibility graph of some correspondences (`consistency.consistency_graph`)."""
+        """Return bit rows of the compatibility graph of some correspondences (`consistency.consistency_graph`)."""
         return consistency.consistency_graph(among, self.params.consistency, scale=at_scale, sigma_m=self.sigma_m)
 
     def pose_of_largest_clique(self, among: Correspondences, at_scale: float, at_least: int = 0) -> Proposal | None:

@@ -24,7 +24,7 @@ _MIN_CELLS = 50  # of each surface
 
 @dataclass(frozen=True)
 class Params:
-    """Global matcher of surfaces by KISS-Matcher.
+    """Global matching of surfaces by KISS-Matcher.
 
     Args:
         voxel_m: Size of the cells at which features are computed, in metres, positive; a larger value is faster and

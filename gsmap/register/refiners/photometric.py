@@ -44,7 +44,7 @@ def refine(
     """
     if target.gaussians is None or source.gaussians is None or not target.cameras:
         return start
-    # Renders are of the scenes in their start_in_units units.
+    # Renders are of the scenes in their own units.
     unit_t, unit_s = target.unit_m, source.unit_m
     start_in_units = Sim3(start.rotation, start.translation / unit_t, start.scale * (unit_s / unit_t))
     aligned = _align(
@@ -71,7 +71,7 @@ def _align(
     unit_m: float,
     with_scale: bool,
 ) -> Sim3:
-    """Align renders under a pose between the scenes' start_in_units units; ``unit_m`` metres per unit of the target."""
+    """Align renders under a pose between the scenes' own units; ``unit_m`` metres per unit of the target."""
     from gsmap.render import render
 
     cameras = _select_cameras(cameras.resized(_IMAGE_SIZE_PX), source, start, _NUM_VIEWS)
