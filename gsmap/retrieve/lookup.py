@@ -1,4 +1,4 @@
-"""Look up candidates of a scene in an inverted index: tf-idf votes of nodes, other_tf_idf geometric verification."""
+"""Look up candidates of a scene in an inverted index: tf-idf votes of nodes, then geometric verification."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ class _CandidateMatches:
         row_of[chosen] = np.arange(len(chosen))
         kept = np.flatnonzero(row_of[place] >= 0)
         kept = kept[np.argsort(row_of[place[kept]], kind="stable")]
-        other_centres = [members.members[k] for k in chosen]
+        others = [members.members[k] for k in chosen]
         return cls(
             row_of[place[kept]],
             node[kept],
@@ -247,9 +247,9 @@ class _CandidateMatches:
             query.query_nodes.positions[node[kept]].astype(np.float64),
             candidate_points[kept].astype(np.float64),
             len(query.query_nodes),
-            np.array([max(o.coarseness, query.member.coarseness) for o in other_centres]),
-            np.array([o.metric and query.member.metric for o in other_centres], bool),
-            np.array([o.upright and query.member.upright for o in other_centres], bool),
+            np.array([max(o.coarseness, query.member.coarseness) for o in others]),
+            np.array([o.metric and query.member.metric for o in others], bool),
+            np.array([o.upright and query.member.upright for o in others], bool),
         )
 
 
