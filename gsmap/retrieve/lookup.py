@@ -270,8 +270,8 @@ def _scores(candidates: _CandidateMatches) -> np.ndarray:
     gaps = np.round(((centres[:, None] - centres) ** 2).sum(2), 6)
     np.fill_diagonal(gaps, np.inf)
     peers_of = np.argsort(gaps, axis=1, kind="stable")[:, : min(PEERS, count // 3)]
-    mean = tf_idf[peers_of].sum(1) / max(PEERS, 1)
-    spread = np.sqrt(np.maximum((tf_idf[peers_of] ** 2).sum(1) / max(PEERS, 1) - mean**2, 0.0))
+    mean = tf_idf[peers_of].sum(1) / PEERS
+    spread = np.sqrt(np.maximum((tf_idf[peers_of] ** 2).sum(1) / PEERS - mean**2, 0.0))
     least = max(_LEAST_SPREAD * float(tf_idf.max()), 1e-9)
     out: np.ndarray = np.maximum(tf_idf - mean, 0.0) / (spread + least)
     return out
@@ -339,7 +339,7 @@ def _fit_alignments(candidates: _CandidateMatches, rows: np.ndarray) -> tuple[np
     u, _, v = np.linalg.svd(both)
     u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
     large, small = means(x**2).sum(1), means(y**2).sum(1)
-    least = max(1.0 - _SCALE_SLACK, 1e-3)
+    least = 1.0 - _SCALE_SLACK
     scale = np.clip(np.sqrt(np.maximum(large, 1e-12) / np.maximum(small, 1e-12)), least, 1.0 / least)
     turns = (u @ v) * np.where(candidates.metric, 1.0, scale)[:, None, None]
     return turns, here - np.einsum("kij,kj->ki", turns, there)
