@@ -40,7 +40,7 @@ _STEPS = 64  # maximum number of steps in which edges are accepted by likelihood
 
 def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
     """Find doubtful edges (E,): at least the fraction ``bar`` of the common surface disagrees, and no person
-    confirmed.
+    confirmed the edge.
     """
     with np.errstate(invalid="ignore"):  # NaN: not compared, hence not doubtful
         found: np.ndarray = (m.disagreement >= bar) & ~m.confirmed

@@ -44,7 +44,7 @@ def diff(
 
 
 def motion(old: Sim3, new: Sim3, centroid: np.ndarray | None = None) -> tuple[float, float, float]:
-    """Compute rotation in degrees, path of the centroid in map units, and scale ratio between two poses."""
+    """Compute rotation in degrees, displacement of the centroid in map units, and scale ratio between two poses."""
     middle = np.zeros(3) if centroid is None else np.asarray(centroid, dtype=np.float64)
     turned = np.degrees(angle_between(old.rotation, new.rotation))
     return float(turned), float(np.linalg.norm(new.apply(middle) - old.apply(middle))), new.scale / old.scale

@@ -35,7 +35,7 @@ from gsmap.optimize.survey_terms import Unknowns
 from gsmap.types import Sim3
 from gsmap.types.world import UNSOLVED, Contradiction, WorldFrame
 
-_EQUAL = 2.0  # groups whose sigmas differ by less than this factor are equally precise; majorities are judged by it too
+_EQUAL = 2.0  # groups whose sigmas differ by less than this factor are equally precise; a majority is larger by it
 _SPECIFIC = ("altitude_zero", "feet", "above_takeoff")  # causes with a characteristic pattern in the heights
 
 

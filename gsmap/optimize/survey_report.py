@@ -24,7 +24,7 @@ class Solution:
 
     Args:
         active: observations that it was solved from.
-        contradictions: groups that were left out, or the observations that cannot be determined apart.
+        contradictions: groups that were left out, or the observations of which it is unknown which are right.
         reasons: by (kind, row) of an observation, the contradiction that left it out.
     """
 

@@ -106,9 +106,8 @@ class _PosePairs:
         sigma = np.array([np.zeros(7) if c is None else np.sqrt(np.maximum(np.diag(c), 0)) for c in covariances])
         tied = np.zeros(len(self.scenes), dtype=bool)
         tied[self.targets] = tied[self.sources] = True
-        free = tied & np.array(
-            [c is None for c in covariances], dtype=bool
-        )  # without covariances only neighbours are compared
+        # Scenes without covariance are compared with their neighbours only.
+        free = tied & np.array([c is None for c in covariances], dtype=bool)
         still = self.known & (free | (np.abs(steps) <= _ROUNDING + sigmas * sigma).all(1))
         inside = still[self.targets] & still[self.sources]
         off = self._off(self.before, inside) > sigmas
