@@ -55,13 +55,16 @@ class Params:
         for name in ("gate_probability", "min_wrong_probability", "max_disagreement"):
             if not 0 < getattr(self, name) < 1:
                 raise ConfigError(f"{name} must lie between 0 and 1, got {getattr(self, name)}", code="out_of_range")
-        for name in ("max_growth", "max_full_scenes", "max_marginal_scenes", "same_visit_h", "max_tilt_deg"):
+        for name in (
+            "max_growth",
+            "max_full_scenes",
+            "max_marginal_scenes",
+            "same_visit_h",
+            "max_tilt_deg",
+            "max_unchanged_sigmas",
+        ):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be at least 0, got {getattr(self, name)}", code="out_of_range")
         for name in ("min_large_component", "min_bridge_edges"):
             if not getattr(self, name) >= 1:
                 raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}", code="out_of_range")
-        if not self.max_unchanged_sigmas >= 0:
-            raise ConfigError(
-                f"max_unchanged_sigmas must be at least 0, got {self.max_unchanged_sigmas}", code="out_of_range"
-            )
