@@ -1,9 +1,8 @@
 """Rounding of scene graphs to their significant digits, so that stored and matched values are equal and small.
 
 All numbers are rounded to multiples of powers of two, which small integers hold without loss
-(`gsmap.store.array_encoding`).
-Landmarks are localized to centimetres, and embeddings of one place differ by tenths between captures: a millimetre and
-1/256 are far below that.
+(`gsmap.store.array_encoding`). Landmarks are localized to centimetres, and embeddings of one place differ by tenths
+between captures: a millimetre and 1/256 are far below that.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ def round_graph(graph: SceneGraph) -> SceneGraph:
     """Return the graph with its numbers rounded."""
     step = float(2.0 ** np.round(np.log2(LENGTH_M / graph.working_m)))
     layers = {name: _layer(layer, step) for name, layer in graph.layers.items()}
-    return replace(graph, layers=layers, segments=None if graph.segments is None else _things(graph.segments, step))
+    return replace(graph, layers=layers, segments=None if graph.segments is None else _segments(graph.segments, step))
 
 
 def _layer(layer: NodeLayer, step: float) -> NodeLayer:
@@ -52,14 +51,14 @@ def _layer(layer: NodeLayer, step: float) -> NodeLayer:
     )
 
 
-def _things(things: Segments, step: float) -> Segments:
+def _segments(segments: Segments, step: float) -> Segments:
     return replace(
-        things,
-        positions=_to(things.positions, step),
-        extents=_to(things.extents, step),
-        colours=_to(things.colours, LAB),
-        samples=_to(things.samples, step),
-        sample_colours=_to(things.sample_colours, LAB),
+        segments,
+        positions=_to(segments.positions, step),
+        extents=_to(segments.extents, step),
+        colours=_to(segments.colours, LAB),
+        samples=_to(segments.samples, step),
+        sample_colours=_to(segments.sample_colours, LAB),
     )
 
 

@@ -28,9 +28,7 @@ _MIN_SIMILARITY = 1.1  # cosine + GIoU above which a region joins a node (Graph-
 _VOXEL_M = 0.03  # a node's points are thinned to one per cell of this size, metres under the layer's unit
 _MANY = 400_000  # points of the surface; of more, an even share is lifted
 # Settings that change the set of nodes, but not the meaning of a node and its embedding.
-_NOT_COMPARED = (
-    *("render_backend", "num_cameras", "longest_side_px", "depth_tolerance", "min_confidence", "min_views"),
-)
+_NOT_COMPARED = ("render_backend", "num_cameras", "longest_side_px", "depth_tolerance", "min_confidence", "min_views")
 
 # Settings without effect on the layer: the backend is in the key by itself, a model beyond its limits makes no layer.
 _NOT_NAMED = ("render_backend", "model_time_s", "model_memory_mb")

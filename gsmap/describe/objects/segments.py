@@ -100,8 +100,8 @@ def _members(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None, uni
     structure = find_structure(points, normals, planarity, areas, neighbours)
     lab = cloud.lab[rows].astype(np.float64)
     surface = _Surface(points, lab, areas, distances, neighbours, structure)
-    things = _numbered(surface.things())
-    out[cloud.index[rows]] = things
+    segments = _numbered(surface.labels())
+    out[cloud.index[rows]] = segments
     # Remaining Gaussians, opaque or not: the segment (or the building) whose surface is nearest.
     others = are_finite(gaussians.means)
     others[cloud.index[rows]] = False
@@ -109,7 +109,7 @@ def _members(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None, uni
     at = gaussians.means.take(rest, axis=0).astype(np.float64) @ level.T * unit_m
     distance, nearest = nearest_of(points, at, _ASSIGN_M)
     near = np.isfinite(distance)
-    out[rest[near]] = things[nearest[near]]
+    out[rest[near]] = segments[nearest[near]]
     return out
 
 
@@ -175,7 +175,7 @@ class _Surface:
         self.linked = near & (rank < _LINKED)
         self.near = near
 
-    def things(self) -> np.ndarray:
+    def labels(self) -> np.ndarray:
         """Label (N,) the segment of each point, -1 for the building."""
         heights, building = self.structure.heights_m, self.structure
         shell = heights < _FLOOR_M
@@ -185,7 +185,7 @@ class _Surface:
         by_wall = ~shell & (wall >= 0)
         distinct = by_wall & ((np.abs(off) > _WALL_M) | self._foreign_colour(wall, off, by_wall))
         hanging, patches = self._hanging(~shell & ~by_wall, distinct, wall)
-        # Points near a wall that hang on it no more are the wall, or the back of an object before it.
+        # Points near a wall that are in no hanging patch are the wall, or the back of an object before it.
         free = ~shell & (~by_wall | (distinct & (patches < 0) & (np.abs(off) > _WALL_M)))
         ok = self.linked & free[self.a] & free[self.b]
         labels = np.where(free, components(self.count, self.a[ok], self.b[ok]), -1)

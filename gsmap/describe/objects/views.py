@@ -10,6 +10,8 @@ from gsmap.render import ChunkIndex, render
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.views import View
 
+_MIN_SEEN = 0.2  # a view of which a smaller share shows anything is empty
+
 
 def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, backend: str = "auto") -> Iterator[View]:
     """Yield a view per camera, each at its own aspect ratio.
@@ -27,12 +29,11 @@ def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, b
         yield View(rgb, image.depth[0], image.alpha[0], image.dominant_id[0], camera)
 
 
-def is_blocked(view: View, nearest: float, min_seen: float = 0.2) -> bool:
+def is_blocked(view: View, nearest: float) -> bool:
     """Return True if the camera is inside an object: most of its view is nearer than ``nearest``, or empty.
 
     Args:
         nearest: scene units.
-        min_seen: a picture of which a smaller share shows anything is empty.
     """
     seen = view.alpha > 0.5
-    return bool(seen.mean() < min_seen or (view.depth[seen] < nearest).mean() > 0.5)
+    return bool(seen.mean() < _MIN_SEEN or (view.depth[seen] < nearest).mean() > 0.5)
