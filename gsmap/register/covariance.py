@@ -45,8 +45,9 @@ _CLIP = 3.0  # standard deviations: larger residuals are changes of the place, n
 class UnobservedErrors:
     """Standard deviations of pose errors that leave no residual (a trainer's bias, a sensor's bent depths).
 
-    A model fitted to synthetic places by ``tools/fit/covariance.py``, stored in ``covariance.json``. *Colour motion* is
-    the motion by which colours alone would move a pose, the *field* the correlated surface errors (`error_field`).
+    A model fitted to synthetic places by ``tools/fit/covariance.py``, stored in ``covariance.json``; a new fit needs a
+    new `gsmap.register.recipe.VERSION`. *Colour motion* is the motion by which colours alone would move a pose, the
+    *field* the correlated surface errors (`error_field`).
 
     Args:
         residual_factor: factor on the standard deviation that the residuals show.
