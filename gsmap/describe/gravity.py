@@ -30,45 +30,47 @@ def estimate_up(points: np.ndarray, cameras: Cameras | None) -> np.ndarray | Non
         points: (N, 3) surface points, any unit.
         cameras: in the points' frame.
     """
-    held = None if cameras is None or cameras.synthesised or not len(cameras) else CameraOrientations.of(cameras)
-    turned = None if held is None else estimate_turn_axis(held)
+    orientations = (
+        None if cameras is None or cameras.synthesised or not len(cameras) else CameraOrientations.of(cameras)
+    )
+    turn = None if orientations is None else estimate_turn_axis(orientations)
     if len(points) < 200:
-        return turned.up if turned and turned.sure else None
+        return turn.up if turn and turn.sure else None
     normals, weights, sample = _planes(points)
     if weights.sum() <= 0:
-        return turned.up if turned and turned.sure else None
+        return turn.up if turn and turn.sure else None
     directions = fibonacci_sphere(8000)
-    if turned is not None:
-        near = directions[directions @ turned.up > np.cos(np.radians(turned.cone_deg))]
+    if turn is not None:
+        near = directions[directions @ turn.up > np.cos(np.radians(turn.cone_deg))]
         up = _refine(near[np.argmax(_uprightness(near, normals, weights))], normals, weights)
-        return up if turned.sure or _side(sample, up) > 0 else None
+        return up if turn.sure or _side(sample, up) > 0 else None
     axes = _plane_axes(normals, weights, directions[directions[:, 2] >= 0])
     room = _up_of_room(sample, axes)
-    if held is None or held.at_all_angles:
+    if orientations is None or orientations.at_all_angles:
         return room
-    confirmed = _confirmed(held, sample, axes, room)
-    accepted = confirmed is None or held.is_upright(confirmed) or _side(sample, confirmed) > 0
+    confirmed = _confirmed(orientations, sample, axes, room)
+    accepted = confirmed is None or orientations.is_upright(confirmed) or _side(sample, confirmed) > 0
     return confirmed if accepted else None
 
 
 def _confirmed(
-    held: CameraOrientations, points: np.ndarray, axes: list[np.ndarray], room: np.ndarray | None
+    orientations: CameraOrientations, points: np.ndarray, axes: list[np.ndarray], room: np.ndarray | None
 ) -> np.ndarray | None:
     """Return the vertical of cameras on one heading: an axis of the scene's planes that the cameras allow and a second
     cue confirms; None where two are confirmed, or none.
     """
     named = [] if room is None else [room]
-    for cue in (held.normal_of_path(points), held.normal_of_rows()):
+    for cue in (orientations.normal_of_path(points), orientations.normal_of_rows()):
         # Replace the rough cue by the exact axis of planes near it. Where the cameras look along that axis (a drone
         # along a facade, or over the ground), the cue is invalid.
         of_planes = [] if cue is None else [a for a in axes if abs(a @ cue) > np.cos(np.radians(_COMMON_DEG))]
         if of_planes:
             axis = max(of_planes, key=lambda a: abs(a @ cue))
-            if not held.looks_along(axis):
-                named.append(axis if held.is_allowed(axis) else -axis)
+            if not orientations.looks_along(axis):
+                named.append(axis if orientations.is_allowed(axis) else -axis)
     if not named or any(n @ named[0] < np.cos(np.radians(_COMMON_DEG)) for n in named):
         return None
-    return named[0] if held.is_allowed(named[0]) else None
+    return named[0] if orientations.is_allowed(named[0]) else None
 
 
 def _planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

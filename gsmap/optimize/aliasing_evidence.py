@@ -67,20 +67,20 @@ def find_doubtful_in_map(
         fits[rows] = consistent_with_component(m, rows, state.drift(m), params.gate_probability)
     contradicted = inside & doubtful & ~fits
     aliasing = aliasing_probability(int((inside & doubtful & fits).sum()), int(contradicted.sum()))
-    believed = state.accepted & (m.disagreement > 0)
-    if aliasing > _MAX_ALIASING_PROBABILITY and believed.any():
-        bar = min(bar, separating_threshold(m.disagreement[believed], m.disagreement[contradicted]))
+    accepted = state.accepted & (m.disagreement > 0)
+    if aliasing > _MAX_ALIASING_PROBABILITY and accepted.any():
+        bar = min(bar, separating_threshold(m.disagreement[accepted], m.disagreement[contradicted]))
     found = find_doubtful(m, bar)
     if not (state.accepted | state.ambiguous | doubtful).all():
         found |= find_first_contradicted(m, ~(state.ambiguous | doubtful), state.terms, gate, params)
     return found
 
 
-def separating_threshold(believed: np.ndarray, contradicted: np.ndarray) -> float:
+def separating_threshold(accepted: np.ndarray, contradicted: np.ndarray) -> float:
     """Compute the threshold that best separates two log-normal sets of disagreements (Bayes, a wrong edge costs `_COST`
     right ones); infinity where they cannot be separated.
     """
-    logs = [np.log(np.maximum(values, 1e-6)) for values in (believed, contradicted)]
+    logs = [np.log(np.maximum(values, 1e-6)) for values in (accepted, contradicted)]
     low, high = (float(np.median(values)) for values in logs)
     if high <= low:
         return float("inf")

@@ -96,14 +96,14 @@ def solve_groups(system: System, frame: WorldFrame | None) -> Solution | SurveyF
 class _GroupSolver:
     def __init__(self, system: System, places: CommonPoints, frame: WorldFrame) -> None:
         self.system, self.places, self.frame = system, places, frame
-        self.verdicts = _ContradictionLog()
+        self.contradictions = _ContradictionLog()
 
     def solve(self) -> Solution | SurveyFailure:
         left = self._measured(np.arange(len(self.places)))
         while True:
             found = self._reference(left)
             if isinstance(found, str):
-                return self._refusal(found)
+                return self._failure(found)
             reference, left = found
             rivals, agreeing = self._compared(reference, left)
             wrong = self._resolved(reference, rivals, agreeing)
@@ -118,7 +118,7 @@ class _GroupSolver:
     def _explain(self, reference: _PartialSolution) -> None:
         """Compare sources that contradict themselves with the reference, which may reveal the reason."""
         own = str(self.places.kinds[reference.rows[0]])
-        for k, (one, rows) in enumerate(zip(self.verdicts.found, self.verdicts.rows, strict=True)):
+        for k, (one, rows) in enumerate(zip(self.contradictions.found, self.contradictions.rows, strict=True)):
             if one.cause == "split" and one.kept == "none" and len(rows) >= 2:
                 some = self.places[rows]
                 terms = self.system.terms.observations(reference.x)
@@ -128,7 +128,7 @@ class _GroupSolver:
                     found = describe_contradiction(some, self._scenes(rows), shift, own, why, "against")
                     others = tuple(dict.fromkeys([*found.other_causes, "split", *one.other_causes]))
                     others = tuple(cause for cause in others if cause != found.cause)
-                    self.verdicts.found[k] = replace(found, other_causes=others, text=f"{one.text}; {found.text}")
+                    self.contradictions.found[k] = replace(found, other_causes=others, text=f"{one.text}; {found.text}")
 
     # --- the reference -----------------------------------------------------------------------------------------------
 
@@ -146,7 +146,7 @@ class _GroupSolver:
             one = Contradiction(
                 "photos", "photos", "altitude_zero", count=len(some), scenes=tuple(sorted(set(scenes))), text=text
             )
-            self.verdicts.add(one, some)
+            self.contradictions.add(one, some)
         return rows[keep]
 
     def _scenes(self, rows: np.ndarray) -> list[str]:
@@ -180,18 +180,18 @@ class _GroupSolver:
             if isinstance(found, _PartialSolution):
                 return found, rows
             if isinstance(found, Contradiction):
-                self.verdicts.add(found, self.places[mine], mine)
+                self.contradictions.add(found, self.places[mine], mine)
                 rows = rows[~np.isin(rows, mine)]
             else:
                 problem = problem or found
         remaining = self._sources(rows)
         if not len(remaining):
-            return self.verdicts.found[-1].text if self.verdicts.found else problem or NOTHING
+            return self.contradictions.found[-1].text if self.contradictions.found else problem or NOTHING
         if len(remaining) == 1 and len(sources) == 1:
             return problem
         found = self._alone(rows, bars=True)
         if isinstance(found, Contradiction):
-            self.verdicts.add(found, self.places[rows])
+            self.contradictions.add(found, self.places[rows])
             return found.text
         return found if isinstance(found, str) else (found, rows)
 
@@ -342,7 +342,7 @@ class _GroupSolver:
         some, shift = self.places[mine], average_shifts(shifts)
         why = likely_causes(some, shift, self.frame, self._ground(rows))
         kind = str(self.places.kinds[rows[0]])
-        self.verdicts.add(describe_contradiction(some, self._scenes(mine), shift, kind, why, "against"), some)
+        self.contradictions.add(describe_contradiction(some, self._scenes(mine), shift, kind, why, "against"), some)
 
     def _elsewhere(self, rows: np.ndarray) -> int:
         """Count the units of some places that agree on a similarity of their own."""
@@ -438,7 +438,7 @@ class _GroupSolver:
         """Decide between the reference and the groups that contradict it.
 
         Returns:
-            None where the reference holds; the places to go on with where the reference is wrong; or a refusal.
+            None where the reference holds; the places to go on with where the reference is wrong; or a failure.
         """
         used = reference.rows[self._is_active(reference.active, reference.rows)]
         own = str(self.places.kinds[used[0]])
@@ -464,7 +464,7 @@ class _GroupSolver:
                 back = replace(rival.shift, shift_m=-rival.shift.shift_m)
                 wrong, its = self.places[reference.rows], self._scenes(reference.rows)
                 one = describe_contradiction(wrong, its, back, str(some.kinds[0]), rival.if_right, "against")
-                self.verdicts.add(one, wrong)
+                self.contradictions.add(one, wrong)
                 keep = self.places.sources != self.places.sources[used[0]]
                 return np.setdiff1d(np.flatnonzero(keep), self._left_out())
             precise = ratio >= _EQUAL and not (marked and own_marked)
@@ -475,20 +475,20 @@ class _GroupSolver:
             both = tuple(dict.fromkeys([*rival.if_wrong, *rival.if_right]))
             one = describe_contradiction(some, scenes, rival.shift, own, both, "none")
             one = replace(one, text=f"{one.text} Cannot tell which are right")
-            self.verdicts.add(one, some)
-            return self._refusal(one.text)
+            self.contradictions.add(one, some)
+            return self._failure(one.text)
         for one, some in named:
-            self.verdicts.add(one, some)
+            self.contradictions.add(one, some)
         return None
 
     def _left_out(self) -> np.ndarray:
         """Return the rows of places that a contradiction has excluded."""
         kinds = np.where(self.places.kinds == "points", "point", "fix")
         pairs = zip(kinds.tolist(), self.places.rows.tolist(), strict=True)
-        return np.flatnonzero([pair in self.verdicts.reasons for pair in pairs])
+        return np.flatnonzero([pair in self.contradictions.reasons for pair in pairs])
 
-    def _refusal(self, problem: str) -> SurveyFailure:
-        found = self.verdicts.found
+    def _failure(self, problem: str) -> SurveyFailure:
+        found = self.contradictions.found
         if not found:
             return SurveyFailure(problem, "unsolved" if problem == UNSOLVED else "undetermined")
         texts = dict.fromkeys([*(one.text for one in found), problem])
@@ -517,7 +517,9 @@ class _GroupSolver:
                     self._name_units(best, np.setdiff1d(rows, kept))
             except (np.linalg.LinAlgError, RuntimeError):
                 pass
-        return Solution(best.x, best.active, best.factor, tuple(self.verdicts.found), dict(self.verdicts.reasons))
+        return Solution(
+            best.x, best.active, best.factor, tuple(self.contradictions.found), dict(self.contradictions.reasons)
+        )
 
     def _name_units(self, tie: _PartialSolution, rows: np.ndarray) -> None:
         """Record captures that were excluded at last."""
@@ -552,12 +554,12 @@ class _GroupSolver:
             f"{int(same.sum())} scale bars say {ratio:.4g} times the length that the {GROUPS[own]} give: "
             f"{format_causes([cause])}"
         )
-        self.verdicts.add(
+        self.contradictions.add(
             Contradiction("bars", own, cause, (), "against", (), (), ratio, int(same.sum()), (), text),
             self.places[np.zeros(0, dtype=np.int64)],
         )
         for k in np.flatnonzero(bad).tolist():
-            self.verdicts.reasons["bar", k] = text
+            self.contradictions.reasons["bar", k] = text
         return ~bad
 
 

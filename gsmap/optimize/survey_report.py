@@ -97,11 +97,11 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
     )
 
 
-def tie_by_bars(system: System, index: int, survey: Survey, refusal: SurveyFailure) -> Georeference:
+def tie_by_bars(system: System, index: int, survey: Survey, failure: SurveyFailure) -> Georeference:
     """Build a tie from scale bars alone, where positions do not determine the rest: metric scale and nothing else."""
-    terms, missing = system.terms, refusal.problem
+    terms, missing = system.terms, failure.problem
     nothing = Georeference(
-        index, frame=survey.frame, problem=missing, problem_code=refusal.code, contradictions=refusal.contradictions
+        index, frame=survey.frame, problem=missing, problem_code=failure.code, contradictions=failure.contradictions
     )
     rows = [Residual("point", p.name, "", "check" if p.check else "unused", reason=missing) for p in terms.points]
     rows += [Residual("fix", f.name, f.scene, "unused", reason=missing) for f in terms.fixes]
