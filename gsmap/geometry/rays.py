@@ -18,8 +18,8 @@ def surface_along(
     """Return the distance of the surface along a ray, and its thickness; None where the ray meets too little.
 
     Every Gaussian absorbs light at its peak along the ray, with its opacity there; the surface is where half of the
-    absorbed light is absorbed. A rendered depth averages the Gaussians' centres instead, which lie beside the ray, and
-    has an error of their size at a slant.
+    total absorption has happened. A rendered depth averages the Gaussians' centres instead, which lie beside the ray,
+    and has an error of their size at a slant.
 
     Args:
         gaussians: in the ray's frame.
@@ -27,7 +27,7 @@ def surface_along(
         min_opacity: of all Gaussians along the ray together.
 
     Returns:
-        Distance, and half of the distance between the points where 16 % and 84 % of the absorbed light are absorbed.
+        Distance, and half of the distance between the points where 16 % and 84 % of the absorption have happened.
     """
     o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
     to_centre = gaussians.means.astype(np.float64) - o

@@ -93,7 +93,10 @@ def joint_of_answer(
     scenes: Sequence[str],
     component: int,
 ) -> np.ndarray | None:
-    """Compute `gsmap.optimize.joint_covariance` by linearizing at the answer; only points without poses are solved."""
+    """Compute `gsmap.optimize.joint_covariance` by linearizing at the answer.
+
+    Scenes and ``S_world_map`` stay; only control points, uncertain cameras and common errors are solved.
+    """
     ids = sorted(scene for scene, pose in answer.poses.items() if pose.component == component)
     inside = set(ids)
     mine = [e for e in edges if {e.target, e.source} <= inside and answer.use(e.target, e.source) != "unused"]
