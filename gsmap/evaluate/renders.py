@@ -114,8 +114,8 @@ def _at_size(camera: Cameras, width: int, height: int) -> Cameras:
     ratio = np.array([width, height]) / old
     if abs(old[0] * ratio[1] - width) > 2:
         raise InputError(
-            f"image of camera {camera.names[0]} is {width} x {height}, its camera says {old[0]} x {old[1]}: "
-            "the shapes differ",
+            f"image of camera {camera.names[0]} is {width} x {height}, its camera has {old[0]} x {old[1]}: "
+            "the aspect ratios differ",
             code="size_mismatch",
         )
     return Cameras(

@@ -66,7 +66,7 @@ class CommonPoints:
         return out
 
     def missing(self, S: Sim3 | None = None) -> str | None:
-        """Explain what the points leave undetermined, and what would determine it; None where nothing is.
+        """Explain what the points leave undetermined, and what would determine it; None if they determine all.
 
         Args:
             S: ``S_world_map`` near the answer; without it only the number of points is checked.
