@@ -88,7 +88,7 @@ def changes_report(
         missing_comparisons,  # with the comparison, which looking at a change does without
     )
 
-    known, (placed, metres) = scenes_by_id(store), _placed(store, settings)
+    known, (placed, metres) = scenes_by_id(store), _placed(store)
     missing = set(missing_comparisons(store, asked, settings))
     pairs = set(asked.pairs)
     chosen = [one for one in store.changes.current() if (one.older, one.newer) in pairs]
@@ -115,10 +115,10 @@ _WRITE = "run gsmap changes with write access to the map"
 
 
 @snapshot_read
-def change_row(store: Store, settings: Settings, number: int) -> ChangeRow:
+def change_row(store: Store, number: int) -> ChangeRow:
     """Return one change, in the current map frame."""
     comparison, change = _find(store, number)
-    return ChangeRow(**_row(comparison, change, scenes_by_id(store), *_placed(store, settings)))
+    return ChangeRow(**_row(comparison, change, scenes_by_id(store), *_placed(store)))
 
 
 def change_arrays(store: Store, number: int) -> Change:
@@ -146,12 +146,12 @@ def change_arrays(store: Store, number: int) -> Change:
 
 
 @snapshot_read
-def change_detail(store: Store, settings: Settings, number: int) -> ChangeDetail:
+def change_detail(store: Store, number: int) -> ChangeDetail:
     """Report one change with its history of reviews."""
     comparison, change = _find(store, number)
     words = [PairEventRow(at=one.created_at, what=one.review, reason=one.note) for one in store.changes.reviews(number)]
     return ChangeDetail(
-        **_row(comparison, change, scenes_by_id(store), *_placed(store, settings)),
+        **_row(comparison, change, scenes_by_id(store), *_placed(store)),
         num_voxels=change.num_voxels,
         compared_at=comparison.created_at,
         notes=comparison.notes,
@@ -182,10 +182,10 @@ def _pair(one: Comparison, known: dict[str, Scene]) -> dict[str, Any]:
     }
 
 
-def _placed(store: Store, settings: Settings) -> tuple[PoseGraph | None, dict[int, MetricScale]]:
+def _placed(store: Store) -> tuple[PoseGraph | None, dict[int, MetricScale]]:
     """Return the newest poses and the metric scale of each component."""
     graph = store.revisions.get()
-    return graph, map_metres(store, settings, graph)
+    return graph, map_metres(store, graph)
 
 
 def _row(

@@ -20,7 +20,6 @@ from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.changes import change_arrays, parse_change_id
 from gsmap.map.metric_scales import metres_of_scenes
-from gsmap.map.settings import Settings
 from gsmap.methods import text_digest
 from gsmap.register.view_cache import ViewCache
 from gsmap.store import Store
@@ -88,9 +87,7 @@ class PictureFolder:
         return len(gone)
 
 
-def draw(
-    store: Store, folder: Path, rows: Sequence[ChangeRow], settings: Settings, progress: StageProgress
-) -> dict[str, str]:
+def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageProgress) -> dict[str, str]:
     """Draw each change before and after; return the files by change id.
 
     Args:
@@ -107,7 +104,7 @@ def draw(
     known.save(folder)  # first: what an interrupted run leaves is known to a purge
     files: dict[str, str] = {}
     for pair in dict.fromkeys((row.older, row.newer) for row in rows):
-        drawer = PairRenderer(store, *pair, settings)
+        drawer = PairRenderer(store, *pair)
         for row in rows:
             if (row.older, row.newer) == pair:
                 progress("pictures", len(files) / len(rows), row.id)
@@ -178,9 +175,9 @@ def pair_views(store: Store, edge: Registration, looks: int) -> PairViews:
     return PairViews(target, source, chosen, 1.0 if graph is None else graph.unit_m)
 
 
-def picture_of_change(store: Store, settings: Settings, row: ChangeRow, side_px: int = 320) -> np.ndarray | None:
+def picture_of_change(store: Store, row: ChangeRow, side_px: int = 320) -> np.ndarray | None:
     """Render a change before and after, (H, W, 3) uint8; None if it has no place. Errors as `picture_of_pair`."""
-    return None if row.box_m is None else PairRenderer(store, row.older, row.newer, settings).picture(row, side_px)
+    return None if row.box_m is None else PairRenderer(store, row.older, row.newer).picture(row, side_px)
 
 
 def save_picture(picture: np.ndarray, path: str | os.PathLike[str]) -> None:
@@ -204,7 +201,6 @@ def draw_places(
     folder: Path,
     scenes: Sequence[str],
     boxes: Sequence[np.ndarray],
-    settings: Settings,
     progress: StageProgress,
 ) -> list[str]:
     """Draw the content of boxes, each from one scene; return the files in the order of the boxes.
@@ -220,7 +216,7 @@ def draw_places(
 
     known, poses = PictureFolder.load(folder, store.id), store.revisions.get()
     assert poses is not None
-    metres = metres_of_scenes(store, settings, poses)
+    metres = metres_of_scenes(store, poses)
     names = [
         f"find-{text_digest(f'{scene} {box.tolist()}')[:16]}.png" for scene, box in zip(scenes, boxes, strict=True)
     ]
@@ -247,11 +243,11 @@ def _save(drawn: np.ndarray, path: Path) -> None:
 class PairRenderer:
     """Renders all changes of a pair of scenes, which are read once."""
 
-    def __init__(self, store: Store, older: str, newer: str, settings: Settings) -> None:
+    def __init__(self, store: Store, older: str, newer: str) -> None:
         graph = store.revisions.get()
         assert graph is not None
         self._store = store
-        self._metres = metres = metres_of_scenes(store, settings, graph)[newer]
+        self._metres = metres = metres_of_scenes(store, graph)[newer]
         self._older = _placed(store, older, in_metres(graph.poses[older].S_map_scene, metres))
         self._newer = _placed(store, newer, in_metres(graph.poses[newer].S_map_scene, metres))
 

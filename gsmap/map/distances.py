@@ -69,7 +69,7 @@ def measure(
     in_world = any(end.place.crs is not None for end in placed)
     if one.component is not None and one.component == two.component and not in_world:
         tie = graph.tie(one.component)
-        metres, sigma_log, known_by = _metre(store, settings, graph, one.component, tie)
+        metres, sigma_log, known_by = _metre(store, graph, one.component, tie)
         span = _apart(one.map, two.map)
         variance = _pose_variance(solved, placed) * metres**2 + (span * metres * sigma_log) ** 2
         distance = span * metres
@@ -147,13 +147,11 @@ def _where(store: Store, one: SpecifiedPoint, graph: PoseGraph, component: int |
     return _LocatedPoint(one, of, at, metric)
 
 
-def _metre(
-    store: Store, settings: Settings, graph: PoseGraph, component: int, tie: Georeference | None
-) -> tuple[float, float, str]:
+def _metre(store: Store, graph: PoseGraph, component: int, tie: Georeference | None) -> tuple[float, float, str]:
     """Return metres per unit of a component, the standard deviation of its logarithm, and how it is known."""
     if tie is not None and tie.metres_per_unit is not None:
         return tie.metres_per_unit, tie.scale_sigma, "world" if tie.S_world_map is not None else "measured"
-    metre = map_metres(store, settings, graph)[component]
+    metre = map_metres(store, graph)[component]
     sigma = metre.sigma if np.isfinite(metre.sigma) else float("inf")
     return metre.metres_per_unit, sigma, metre.known_by
 

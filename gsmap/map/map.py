@@ -322,7 +322,7 @@ class Map(AbstractContextManager["Map"]):
 
         if (number := changes.change_number(what)) is not None:
             self.store.changes.review(number, review, note)
-            return changes.change_row(self.store, self._settings_to_look_by(), number)
+            return changes.change_row(self.store, number)
         a, b = self._pair(what)
         self.store.registrations.review(a.id, b.id, review, note)
         return reports.edge_row(self.store, a, b)
@@ -426,7 +426,7 @@ class Map(AbstractContextManager["Map"]):
             return report
         from gsmap.map.comparison_pictures import draw
 
-        files = draw(self.store, Path(pictures), report.changes, self.settings, self._progress)
+        files = draw(self.store, Path(pictures), report.changes, self._progress)
         return replace(report, changes=tuple(replace(row, picture=files.get(row.id)) for row in report.changes))
 
     def show_change(self, name: str) -> ChangeDetail:
@@ -437,7 +437,7 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map import changes
 
-        return changes.change_detail(self.store, self._settings_to_look_by(), changes.parse_change_id(name))
+        return changes.change_detail(self.store, changes.parse_change_id(name))
 
     def read_change(self, name: str) -> Change:
         """Return a change (``c12``) with its arrays, map frame: voxels, and rows of the Gaussians of both captures.
@@ -613,7 +613,7 @@ class Map(AbstractContextManager["Map"]):
         report, boxes = find_places(self.store, request, self.settings, self._progress)
         if pictures is None:
             return report
-        return with_pictures(self.store, report, boxes, Path(pictures), self.settings, self._progress)
+        return with_pictures(self.store, report, boxes, Path(pictures), self._progress)
 
     # --- scans -------------------------------------------------------------------------------------------------------
 
@@ -760,7 +760,7 @@ class Map(AbstractContextManager["Map"]):
 
     def metres(self, revision: int | None = None) -> dict[int, MetricScale]:
         """Return the metric scale of each component of a revision, by default the newest."""
-        return metres_at(self.store, self._settings_to_look_by(), revision)
+        return metres_at(self.store, revision)
 
     def pose_graph(self, revision: int | None = None) -> PoseGraph | None:
         """Return the poses of a revision, by default the newest; None before the first optimize."""
@@ -878,7 +878,7 @@ class Map(AbstractContextManager["Map"]):
 
     def diff(self, before: int, after: int) -> Table[PoseChangeRow]:
         """List how each scene moved between two revisions (``gsmap diff MAP R1 R2``), measured at its centre."""
-        return Table(reports.pose_change_rows(self.store, before, after, self._settings_to_look_by()))
+        return Table(reports.pose_change_rows(self.store, before, after))
 
     def evaluate(
         self,
@@ -1030,7 +1030,7 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.comparison_pictures import picture_of_change, save_picture
 
         row = self.show_change(name)
-        if (picture := picture_of_change(self.store, self._settings_to_look_by(), row)) is None:
+        if (picture := picture_of_change(self.store, row)) is None:
             raise NotFoundError(
                 f"{name} has no position: its newer capture has no pose; run gsmap update", code="change_unplaced"
             )
@@ -1053,7 +1053,7 @@ class Map(AbstractContextManager["Map"]):
         """Export poses for other programs (``gsmap poses MAP OUT --format F``, `gsmap.map.poses`); return the files."""
         from gsmap.map.poses import write_poses
 
-        return write_poses(self.store, Path(out), format, crs, settings=self._settings_to_look_by())
+        return write_poses(self.store, Path(out), format, crs)
 
     # --- the world ---------------------------------------------------------------------------------------------------
 

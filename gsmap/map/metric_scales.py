@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 from gsmap.errors import NotFoundError
 from gsmap.geometry.metric_scale import PLAUSIBLE_M, SceneUnit, estimate_metric_scale
@@ -13,25 +12,21 @@ from gsmap.types import PoseGraph, ScenePose
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.world import Georeference
 
-if TYPE_CHECKING:
-    from gsmap.map.settings import Settings
 
-
-def metres_at(store: Store, settings: Settings, revision: int | None = None) -> dict[int, MetricScale]:
+def metres_at(store: Store, revision: int | None = None) -> dict[int, MetricScale]:
     """Return the metric scale of every component of a revision, by default the newest."""
     graph = (
         PoseGraph(store.revisions.poses(), world=store.revisions.world())
         if revision is None
         else store.revisions.get(revision)
     )
-    return map_metres(store, settings, graph)
+    return map_metres(store, graph)
 
 
-def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dict[int, MetricScale]:
-    """Return the metric scale of every component, the largest first; no array is read. Scenes removed since the
-    revision still count.
+def map_metres(store: Store, graph: PoseGraph | None) -> dict[int, MetricScale]:
+    """Return the metric scale of every component, the largest first; no array is read.
 
-    What is known of a scene that was removed since still counts, as long as the poses are those it took part in.
+    Scenes removed since count as long as the poses are those that they took part in.
     """
     told, policies = (
         store.scenes.specified_metres(),
@@ -68,9 +63,9 @@ def _surveyed(tie: Georeference | None) -> tuple[float, float] | None:
     return None if tie is None or tie.metres_per_unit is None else (tie.metres_per_unit, tie.scale_sigma)
 
 
-def metres_of_scenes(store: Store, settings: Settings, graph: PoseGraph) -> dict[str, float]:
+def metres_of_scenes(store: Store, graph: PoseGraph) -> dict[str, float]:
     """Return metres per unit of the frame of each scene's component, by scene id."""
-    metres = map_metres(store, settings, graph)
+    metres = map_metres(store, graph)
     return {
         scene: metres[pose.component].metres_per_unit if pose.component in metres else 1.0
         for scene, pose in graph.poses.items()

@@ -159,8 +159,8 @@ class MapPageSource:
         return PairPictures(names[: len(looks)], a, b, difference)
 
     def change_picture(self, change: str) -> np.ndarray:
-        row = change_row(self._store, self._settings, parse_change_id(change))
-        picture = picture_of_change(self._store, self._settings, row, _PICTURE_PX)
+        row = change_row(self._store, parse_change_id(change))
+        picture = picture_of_change(self._store, row, _PICTURE_PX)
         if picture is None:
             raise NotFoundError(
                 f"{change} has no position: its newer capture has no pose; run gsmap update", code="change_unplaced"
@@ -247,7 +247,7 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
     poses = placed.poses if placed else {}
     graphs = store.graphs.list()
     ups = {one.scene: np.array(one.up, np.float64) for one in graphs if one.up is not None}
-    metres = map_metres(store, settings, placed)
+    metres = map_metres(store, placed)
     told = {}
     for number, prior in store.priors.numbered():
         pose = poses.get(prior.scene)

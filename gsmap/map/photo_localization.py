@@ -161,7 +161,7 @@ def _of_pictures(
     notes: list[str] = []
     if options.changes or options.add:
         rows, notes = _with_what_they_tell(localizer, named, [one for one, _ in found], rows, options, progress)
-    metres = metres_at(store, settings)
+    metres = metres_at(store)
     components = {row.component for row in rows if row.component is not None and row.status == "placed"}
     return LocalizeReport(
         results=tuple(rows),

@@ -497,7 +497,6 @@ def with_pictures(
     report: FindReport,
     boxes: Sequence[np.ndarray],
     folder: Path,
-    settings: Settings,
     progress: StageProgress,
 ) -> FindReport:
     """Return the report with an image of every hit in a folder; see `gsmap.map.comparison_pictures`.
@@ -507,6 +506,6 @@ def with_pictures(
     """
     from gsmap.map.comparison_pictures import draw_places
 
-    files = draw_places(store, folder, [hit.scene for hit in report.hits], boxes, settings, progress)
+    files = draw_places(store, folder, [hit.scene for hit in report.hits], boxes, progress)
     hits = tuple(replace(hit, picture=file) for hit, file in zip(report.hits, files, strict=True))
     return replace(report, hits=hits)

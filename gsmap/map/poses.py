@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,18 +25,13 @@ from gsmap.types import Cameras, Edge, Scene, ScenePose, Sim3
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import SCHEMA
 
-if TYPE_CHECKING:
-    from gsmap.map.settings import Settings
-
 FORMATS = ("tum", "g2o", "colmap", "nerfstudio", "json")
 
 _log = logging.getLogger("gsmap.map")
 
 
 @snapshot_read
-def write_poses(
-    store: Store, out: Path, format: str, crs: str | None = None, *, settings: Settings | None = None
-) -> list[Path]:
+def write_poses(store: Store, out: Path, format: str, crs: str | None = None) -> list[Path]:
     """Write the newest poses of all placed scenes; returns the files or folders written.
 
     - ``tum``: a line per scene after a comment with its name, ``T_map_scene`` (a scale is left out: the format has
@@ -52,16 +46,11 @@ def write_poses(
 
     Components share no frame: where there are several, each gets a file of its own, ``NAME_component_K``.
 
-    Args:
-        settings: of the map, by which its metre is known; None for the defaults.
-
     Raises:
         ConfigError: another format.
         NotFoundError: no scene has a pose yet.
         InputError: a pose that the format cannot say, or several components for one pipe.
     """
-    from gsmap.map.settings import Settings
-
     if format not in FORMATS:
         raise ConfigError(f"poses are written as {', '.join(FORMATS)}, got {format!r}", code="invalid_choice")
     graph = store.revisions.get()
@@ -85,7 +74,7 @@ def write_poses(
             f"{out} takes one file, and each of {len(components)} components gets its own: name a file",
             code="missing_option",
         )
-    metres = map_metres(store, settings or Settings(), graph)
+    metres = map_metres(store, graph)
     placed.sort(key=lambda pose: scenes[pose.scene].name)
     written = []
     for component in components:

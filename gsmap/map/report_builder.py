@@ -376,7 +376,7 @@ class _ReportBuilder:
         out = []
         for pair in dict.fromkeys((row.older, row.newer) for row in found):
             try:
-                drawer = PairRenderer(self.store, *pair, self.settings)
+                drawer = PairRenderer(self.store, *pair)
                 for row in found:
                     if (row.older, row.newer) == pair:
                         self.progress("report", 0.9, row.id)
@@ -398,7 +398,7 @@ def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState
     """Read the catalog and the parts of the report that need no arrays."""
     when = None if since is None else parse_moment(since)
     scenes, graph = store.scenes.list(), store.revisions.get()
-    metres = map_metres(store, settings, graph)
+    metres = map_metres(store, graph)
     stored = {(one.registration.target, one.registration.source): one for one in store.registrations.current()}
     edges = reports.edge_rows(store)
     revisions = reports.revision_rows(store)
@@ -419,8 +419,8 @@ def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState
         ),
         revisions=tuple(revisions[-_REVISIONS:]),
         num_revisions=len(revisions),
-        moved=tuple(_moved(store, settings, revisions, _COMPARED_REVISIONS)),
-        moved_since=None if when is None else _moved_since(store, settings, revisions, when),
+        moved=tuple(_moved(store, revisions)),
+        moved_since=None if when is None else _moved_since(store, revisions, when),
         changes=changes,
         objects=None if graph is None else _load_objects(store, settings),
         storage=tuple(StorageEntry(_KINDS.get(one.kind, one.kind), one.count, one.num_bytes) for one in sizes(store)),
@@ -453,21 +453,19 @@ def _news(since: str, when: datetime, scenes: Sequence[Scene], edges: Sequence[E
     )
 
 
-def _moved(store: Store, settings: Settings, revisions: Sequence[RevisionRow], most: int) -> Iterable[PoseDifferences]:
+def _moved(store: Store, revisions: Sequence[RevisionRow]) -> Iterable[PoseDifferences]:
     """Return the pose changes between the newest stored revisions, newest first."""
     kept = [row.number for row in revisions if row.dropped_at is None]
-    for after, before in list(zip(reversed(kept), reversed(kept[:-1]), strict=False))[:most]:
-        yield PoseDifferences(before, after, tuple(reports.pose_change_rows(store, before, after, settings)))
+    for after, before in list(zip(reversed(kept), reversed(kept[:-1]), strict=False))[:_COMPARED_REVISIONS]:
+        yield PoseDifferences(before, after, tuple(reports.pose_change_rows(store, before, after)))
 
 
-def _moved_since(
-    store: Store, settings: Settings, revisions: Sequence[RevisionRow], when: datetime
-) -> PoseDifferences | None:
+def _moved_since(store: Store, revisions: Sequence[RevisionRow], when: datetime) -> PoseDifferences | None:
     kept = [row for row in revisions if row.dropped_at is None]
     before = [row.number for row in kept if not is_after(row.created_at, when)]
     if not before or before[-1] == kept[-1].number:
         return None
-    rows = reports.pose_change_rows(store, before[-1], kept[-1].number, settings)
+    rows = reports.pose_change_rows(store, before[-1], kept[-1].number)
     return PoseDifferences(before[-1], kept[-1].number, tuple(rows))
 
 

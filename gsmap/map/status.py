@@ -87,7 +87,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     add("duplicates", len(twice), f"gsmap list {at} edges", "pairs that are the same capture twice: remove one of each")
     isolated = [pose for pose in poses if pose.status == "isolated"]
     add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes without edges to others")
-    metres = map_metres(store, settings, graph)
+    metres = map_metres(store, graph)
     components = len({pose.component for pose in poses})
     return MapStatus(
         todo=tuple(todo),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from gsmap.map.date_filter import is_after, parse_moment
 from gsmap.map.metric_scales import metres_of_scenes
@@ -16,9 +15,6 @@ from gsmap.store import Store
 from gsmap.store.revisions import Revision
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import IngestRow, PairRef, PoseChangeRow, RevisionRow, UpdateReport
-
-if TYPE_CHECKING:
-    from gsmap.map.settings import Settings
 
 
 @snapshot_read
@@ -69,7 +65,7 @@ def _revision_row(revision: Revision, undecided: Sequence[tuple[str, str]], name
 
 
 @snapshot_read
-def pose_change_rows(store: Store, before: int, after: int, settings: Settings) -> list[PoseChangeRow]:
+def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRow]:
     """List how each scene's pose differs between two revisions, measured at the scene's centre.
 
     Raises:
@@ -80,7 +76,7 @@ def pose_change_rows(store: Store, before: int, after: int, settings: Settings) 
     old, new = store.revisions.get(before), store.revisions.get(after)
     assert old is not None
     assert new is not None
-    known, metres = scenes_by_id(store), metres_of_scenes(store, settings, new)
+    known, metres = scenes_by_id(store), metres_of_scenes(store, new)
     changes = diff(old, new, {scene.id: scene.bounds.mean(0) for scene in known.values()})
     return [
         PoseChangeRow(

@@ -54,7 +54,7 @@ def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene]
         )
     scenes = store.scenes.list() if pair is None else list(pair)
     undated = [scene.name for scene in scenes if scene.captured_at is None]
-    metres = metres_of_scenes(store, settings, graph)
+    metres = metres_of_scenes(store, graph)
     visits = {
         scene.id: Visit(
             scene.id,

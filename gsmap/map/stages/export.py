@@ -148,7 +148,7 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
     _check(request, recipe)
     revision = store.revisions.newest_number() if request.revision is None else request.revision
     graph, placed = _placed(store, revision, request.component)
-    metres = map_metres(store, settings, graph)
+    metres = map_metres(store, graph)
     living = {scene.id: scene for scene in store.scenes.list()}
     scenes = {scene: living.get(scene) or store.scenes.get(scene) for scene in placed}  # older poses name removed ones
     notes: tuple[str, ...] = ()

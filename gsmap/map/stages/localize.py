@@ -95,8 +95,7 @@ class Localizer:
                 f"{store.location} {empty} (gsmap update {store.location}), and localise then", code="no_placed_scene"
             )
         self.metres = {
-            component: metre.metres_per_unit
-            for component, metre in map_metres(store, settings, PoseGraph(poses)).items()
+            component: metre.metres_per_unit for component, metre in map_metres(store, PoseGraph(poses)).items()
         }
         self.keys = feature_keys(store, list(self.scenes.values()), settings)
         self._held: dict[str, SceneFeatures] = {}

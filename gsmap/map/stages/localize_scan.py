@@ -140,7 +140,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     joined = None
     if supports:
         names = {scene.id: scene.name for scene in scenes.values()}
-        metres = metres_of_scenes(store, settings, poses)[supports[0].scene]
+        metres = metres_of_scenes(store, poses)[supports[0].scene]
         one = PoseTolerance(SAME_ROTATION_DEG, SAME_DISTANCE_M / metres, SAME_LOG_SCALE, AGREE_SIGMAS)
         joined = combine_poses(supports, source.centre, one, names)
     seconds = time.process_time() - began

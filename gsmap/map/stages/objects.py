@@ -68,7 +68,7 @@ def objects_of_components(
             code="no_poses",
         )
     scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in placed.poses}
-    metres = {component: one.metres_per_unit for component, one in map_metres(store, settings, placed).items()}
+    metres = {component: one.metres_per_unit for component, one in map_metres(store, placed).items()}
     described = {graph.scene: graph.key for graph in store.graphs.list()}  # the newest of each
     without = [scene.name for scene in scenes.values() if scene.id not in described] if graphs is None else []
     mine: dict[int, list[Scene]] = {}

@@ -138,7 +138,7 @@ def _superseded(
         before: scenes captured earlier are old.
     """
     bar = settings.thin.min_seen_again
-    metres = metres_of_scenes(store, settings, graph)
+    metres = metres_of_scenes(store, graph)
     looks: dict[str, CaptureViews] = {}
     stay: list[Scene] = []
     shares: dict[str, float] = {}
