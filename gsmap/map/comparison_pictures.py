@@ -31,7 +31,7 @@ _log = logging.getLogger("gsmap.map")
 FILE_NAME = "changes.json"
 _VERSION = 1
 _PICTURE = re.compile(r"c\d+\.png|why-[0-9a-f]{8}-[0-9a-f]{8}\.png|find-[0-9a-f]{16}\.png")
-_LOOKS = 2  # cameras of each capture that a picture of a pair is drawn from
+VIEWS_PER_SCENE = 2  # maximum number of cameras of each scene of a pair that both are drawn from
 _MAX_BYTES = 1 << 26
 
 
@@ -148,7 +148,7 @@ def picture_of_pair(store: Store, a: str, b: str, side_px: int = 320) -> np.ndar
         return None
     from gsmap.view.pair_picture import draw_pair
 
-    seen = pair_views(store, stored.registration, _LOOKS)
+    seen = pair_views(store, stored.registration)
     return draw_pair(seen.target, seen.source, seen.cameras, unit_m=seen.unit_m, side_px=side_px)
 
 
@@ -162,15 +162,16 @@ class PairViews:
     unit_m: float
 
 
-def pair_views(store: Store, edge: Registration, looks: int) -> PairViews:
-    """Return both scenes of an edge with a pose, and at most ``looks`` cameras of each."""
+def pair_views(store: Store, edge: Registration) -> PairViews:
+    """Return both scenes of an edge with a pose, and at most `VIEWS_PER_SCENE` cameras of each."""
     assert edge.S_target_source is not None
     target, source = _placed(store, edge.target, Sim3.identity()), _placed(store, edge.source, edge.S_target_source)
     graph = store.graphs.load(edge.target)
     chosen = []
     for one, other in ((target, source), (source, target)):
         if one.cameras is not None and len(one.cameras):
-            rows = ViewCache(one.gaussians, one.cameras, synthesize=False).select_views(other.gaussians.means, looks)
+            cache = ViewCache(one.gaussians, one.cameras, synthesize=False)
+            rows = cache.select_views(other.gaussians.means, VIEWS_PER_SCENE)
             chosen += [one.cameras[[row]] for row in rows]
     return PairViews(target, source, chosen, 1.0 if graph is None else graph.unit_m)
 

@@ -30,7 +30,7 @@ def pair_detail(store: Store, settings: Settings, a: Scene, b: Scene, S_map_targ
     said, pair = explain_pair(store, settings, a, b), pair_report(store, a, b)
     S = pair.S_target_source
     ends = (pair.target, pair.source)
-    shared = [] if S is None else correspondences(store, settings, ends, S, S_map_target)
+    shared = [] if S is None else correspondences(store, ends, S, S_map_target)
     return {
         "S_target_source": None if S is None else S.matrix().tolist(),
         "steps": [
@@ -43,7 +43,7 @@ def pair_detail(store: Store, settings: Settings, a: Scene, b: Scene, S_map_targ
 
 
 def correspondences(
-    store: Store, settings: Settings, pair: tuple[str, str], S_target_source: Sim3, S_map_target: Sim3
+    store: Store, pair: tuple[str, str], S_target_source: Sim3, S_map_target: Sim3
 ) -> list[list[list[float]]]:
     """Return mutually nearest landmarks of both graphs within a quarter of a metre under the edge's pose; map frame by
     the target's pose, the target's point and the source's.

@@ -14,7 +14,7 @@ from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_poses
 from gsmap.map import reports
 from gsmap.map.changes import change_row, changes_report, parse_change_id
-from gsmap.map.comparison_pictures import pair_views, picture_of_change
+from gsmap.map.comparison_pictures import VIEWS_PER_SCENE, pair_views, picture_of_change
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.objects import MapObjects, compute_objects, history_report, objects_report
 from gsmap.map.page_pairs import pair_detail
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 _NODES = 2_000  # of a layer of a scene graph that are sent, by weight
 _CAMERAS = 300  # of a scene that are sent, evenly along its capture
-_PAIR_VIEWS = 2  # cameras of each of two scenes that they are compared from
 _PICTURE_PX = 640  # longer side of the pictures of a pair or a change
 _CAMERA_M = 0.1  # how long a camera is drawn
 
@@ -143,8 +142,9 @@ class MapPageSource:
         ends = [self._entry(scene).scene for scene in (stored.registration.target, stored.registration.source)]
         if sum(scene.num_gaussians for scene in ends) > self._settings.view.picture_gaussians:
             return ()
-        looks = _PAIR_VIEWS
-        return tuple(f"{scene.name}, view {k + 1}" for scene in ends for k in range(min(looks, scene.num_cameras)))
+        return tuple(
+            f"{scene.name}, view {k + 1}" for scene in ends for k in range(min(VIEWS_PER_SCENE, scene.num_cameras))
+        )
 
     def pair_pictures(self, target: str, source: str) -> PairPictures:
         stored, names = self._store.registrations.get(target, source), self.pair_cameras(target, source)
@@ -152,9 +152,8 @@ class MapPageSource:
             raise NotFoundError(
                 "this pair has no pose to draw both scenes in, or is too large to be drawn here", code="no_pose_of_pair"
             )
-        seen = pair_views(self._store, stored.registration, _PAIR_VIEWS)
-        side = _PICTURE_PX
-        looks = [looks_at(seen.target, seen.source, one.resized(side), seen.unit_m) for one in seen.cameras]
+        seen = pair_views(self._store, stored.registration)
+        looks = [looks_at(seen.target, seen.source, one.resized(_PICTURE_PX), seen.unit_m) for one in seen.cameras]
         a, b, difference = zip(*looks, strict=True) if looks else ((), (), ())
         return PairPictures(names[: len(looks)], a, b, difference)
 

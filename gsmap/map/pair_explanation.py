@@ -30,7 +30,7 @@ def explain_pair(store: Store, settings: Settings, a: Scene, b: Scene) -> PairEx
     value = f"tried{rank}" if is_tried else f"never tried{rank}; {untried}"
     retrieval = ExplanationStep(name="retrieval", value=value, bar="among the candidates", passed=is_tried)
     steps = [retrieval, *_steps(pair, settings)]
-    advice = _advice(pair, settings, {step.name: step for step in steps}, untried)
+    advice = _advice(pair, {step.name: step for step in steps}, untried)
     ends = {name: getattr(pair, name) for name in ("target", "target_name", "source", "source_name")}
     return PairExplanation(
         **ends, status=pair.status, reason=pair.reason, reason_code=pair.reason_code, steps=tuple(steps), advice=advice
@@ -139,7 +139,7 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
     ]
 
 
-def _advice(pair: PairReport, settings: Settings, steps: Mapping[str, ExplanationStep], untried: str) -> str:
+def _advice(pair: PairReport, steps: Mapping[str, ExplanationStep], untried: str) -> str:
     """Return advice for the first open step; empty if there is none."""
     a, b, at = pair.target_name, pair.source_name, "MAP"
     failed = {name for name, step in steps.items() if step.passed is False}

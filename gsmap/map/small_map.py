@@ -137,7 +137,7 @@ def export_small(
             break
         factor *= 0.97 * free / max(total - (budget_bytes - free), 1)
     _require_enough(rows, shown, budget_bytes, total)
-    header = _header(store, localizer, files, settings)
+    header = _header(store, localizer, files)
     out.parent.mkdir(parents=True, exist_ok=True)
     with staging.beside(out.absolute()) as staged:
         for name, content in (*((f"{scene}.npz", files[scene]) for scene in scenes), (FILE_NAME, header)):
@@ -277,7 +277,7 @@ def _require_enough(rows: Sequence[SmallSceneRow], shown: Mapping[str, int], bud
             )
 
 
-def _header(store: Store, localizer: Localizer, files: Mapping[str, bytes], settings: Settings) -> bytes:
+def _header(store: Store, localizer: Localizer, files: Mapping[str, bytes]) -> bytes:
     import hashlib
 
     poses = store.revisions.poses()
