@@ -35,7 +35,6 @@ from gsmap.report.words import (
 
 _MARK = re.compile(rb'<meta name="gsmap-map" content="([0-9a-f]{32,64})">')
 _HEAD_BYTES = 4096  # start of a report file that contains the id of its map
-_BARS = 24  # maximum number of bars in a plot
 _CHANGES = 200  # maximum number of rows in the tables of changes and objects
 _MATRIX_SCENES = 300  # maximum number of scenes in the matrix of registered pairs
 _FEW = 12  # rows of a long table that are visible; the remaining rows are folded
@@ -288,8 +287,8 @@ def _edges(report: Report) -> Markup | None:
     if plots.pulled(solved):
         plots_.append(
             _figure(
-                plots.residual_bars(solved, _BARS),
-                f"{_largest(plots.pulled(solved), _BARS)}. Dashed: 95 % and 99.9 % of correct edges lie below. "
+                plots.residual_bars(solved),
+                f"{_largest(plots.pulled(solved))}. Dashed: 95 % and 99.9 % of correct edges lie below. "
                 "An edge in no cycle has no residual, whether right or wrong.",
             )
         )
@@ -303,7 +302,7 @@ def _edges(report: Report) -> Markup | None:
         )
     if any(edge.translation_m is not None for edge in plots.pulled(solved)):
         plots_.append(
-            _figure(plots.offset_bars(solved, _BARS), "Distance between the poses and each edge's measurement, at "
+            _figure(plots.offset_bars(solved), "Distance between the poses and each edge's measurement, at "
                     "the centre of the second scene.")
         )  # fmt: skip
     parts: list[Part] = [_redundancy(report), tag("div", plots_, class_="plots"), _statistics(checked)]
@@ -311,7 +310,8 @@ def _edges(report: Report) -> Markup | None:
     return joined(parts)
 
 
-def _largest(edges: Sequence[EdgeEntry], most: int) -> str:
+def _largest(edges: Sequence[EdgeEntry]) -> str:
+    most = plots.MAX_BARS
     return f"The {most} largest of {len(edges):,}" if len(edges) > most else "All edges in cycles"
 
 
@@ -465,10 +465,10 @@ def _scenes(report: Report) -> Markup | None:
     parts: list[Part] = []
     known = [entry for entry in report.scenes if entry.position_sigma_m]
     if known:
-        most = _BARS
+        most = plots.MAX_BARS
         first = f"The {most} largest of {len(known):,}" if len(known) > most else "The largest first"
         words = f"{first}. At the centre of each scene, in the least certain direction, in the component frame."
-        drawn = [_figure(plots.sigma_bars(known, most), words)]
+        drawn = [_figure(plots.sigma_bars(known), words)]
         if len(known) > most:
             drawn.append(_figure(plots.sigma_distribution(known), "Share of the scenes up to each standard deviation."))
         parts.append(tag("div", drawn, class_="plots"))

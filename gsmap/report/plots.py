@@ -13,13 +13,14 @@ from gsmap.report.svg import Axis, Frame
 from gsmap.report.words import NOT_PULLED, cut, cut_pair, length, number
 from gsmap.types.rows import RevisionRow
 
+MAX_BARS = 24  # maximum number of bars in a plot
 _ROW = 17.0
 _NAMES, _CHARACTERS = 150.0, 19  # width of the column of names, in pixels and characters
 
 
-def residual_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
+def residual_bars(edges: Sequence[EdgeEntry]) -> Markup:
     """Plot the chi-square of each edge, largest first, with quantiles of the expected distribution."""
-    chosen = sorted(pulled(edges), key=lambda e: -(e.chi2 or 0.0))[:most]
+    chosen = sorted(pulled(edges), key=lambda e: -(e.chi2 or 0.0))[:MAX_BARS]
     values = [max(e.chi2 or 0.0, 1e-2) for e in chosen]
     frame = Frame(_ROW * len(chosen) + 62, _NAMES)
     x = svg.log_axis([0.1, 100.0, *values], *frame.x_span)
@@ -76,10 +77,10 @@ def residual_distribution(edges: Sequence[EdgeEntry]) -> Markup:
     return svg.plot(frame, x, y, words, "Residuals against expectation", parts)
 
 
-def offset_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
+def offset_bars(edges: Sequence[EdgeEntry]) -> Markup:
     """Plot the distance between each edge's measurement and the poses, metres, the largest first."""
     chosen = [e for e in pulled(edges) if e.translation_m is not None]
-    chosen = sorted(chosen, key=lambda e: -(e.translation_m or 0.0))[:most]
+    chosen = sorted(chosen, key=lambda e: -(e.translation_m or 0.0))[:MAX_BARS]
     values = [max(e.translation_m or 0.0, 1e-5) for e in chosen]
     names = [_ends(e) for e in chosen]
     tips = [f"{e.row.pair}: {length(e.translation_m)}, {number(e.rotation_deg, 2)}°" for e in chosen]
@@ -87,9 +88,9 @@ def offset_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
     return _metre_bars(names, values, tips, kinds, "distance between edge and poses", "Residuals in metres")
 
 
-def sigma_bars(scenes: Sequence[SceneEntry], most: int) -> Markup:
+def sigma_bars(scenes: Sequence[SceneEntry]) -> Markup:
     """Plot the standard deviation of each scene's position, largest first."""
-    chosen = sorted((s for s in scenes if s.position_sigma_m), key=lambda s: -(s.position_sigma_m or 0.0))[:most]
+    chosen = sorted((s for s in scenes if s.position_sigma_m), key=lambda s: -(s.position_sigma_m or 0.0))[:MAX_BARS]
     values = [s.position_sigma_m or 0.0 for s in chosen]
     names = [s.row.name for s in chosen]
     tips = [f"{s.row.name}: {length(s.position_sigma_m)}, {number(s.rotation_sigma_deg, 2)}°" for s in chosen]

@@ -86,9 +86,7 @@ class Levels:
         tree: Sizes of the levels.
     """
 
-    def __init__(
-        self, page_source: PageSource, cache: TreeCache, workers: int = 2, tree: TreeParams | None = None
-    ) -> None:
+    def __init__(self, page_source: PageSource, cache: TreeCache, workers: int, tree: TreeParams | None = None) -> None:
         self._page_source, self._cache, self._tree = page_source, cache, tree or TreeParams()
         self._maker = Maker(workers)
         self._lock = threading.RLock()
