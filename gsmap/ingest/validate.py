@@ -29,8 +29,9 @@ def validate(
         where: what to call it in messages (its file).
 
     Raises:
-        InputError: no Gaussians; NaN, an infinity that is no value (see `gsmap.stream.clamped`), an absurd scale or a
-            zero quaternion, with its row; cameras of which none sees a Gaussian, or with pictures larger than any.
+        InputError: no Gaussians; NaN, an infinity that is no value (see `gsmap.stream.clamp_infinities`), an absurd
+            scale or a zero quaternion, with its row; cameras of which none sees a Gaussian, or with pictures larger
+            than any.
     """
     notes = validate_gaussians(gaussians, where)
     return notes if cameras is None else (*notes, *validate_cameras(cameras, gaussians, where))

@@ -47,7 +47,7 @@ class Request:
         bars: (A, B, metres) distances between points.
         check: names of control points to hold out; None leaves them unchanged, an empty one holds out none.
         sigma_m: (horizontal, vertical) standard deviations of control points; None for the setting.
-        bar_sigma_m: standard deviation of the distances; None for the setting.
+        bar_sigma_m: standard deviation of the distances; None for a fraction of each (`BAR_SIGMA_FRACTION`).
         photo_size_px: width and height of the photos in which pixels were picked, if the captures have smaller ones.
     """
 

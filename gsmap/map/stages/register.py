@@ -252,7 +252,8 @@ def num_stale(pairs: Iterable[tuple[str, str]], graphs: Mapping[str, RecipeKey],
     """Count the edges made by other settings or versions; measured edges are never stale.
 
     Args:
-        pairs: pairs with the key of their current registration (`gsmap.store.registrations.Registrations.keys`).
+        pairs: pairs with the key of their current registration, see
+            `gsmap.store.registrations.Registrations.current_keys`.
         graphs: graph key of each living scene.
     """
     digest_of = recipe_key(settings.register).digest_of
