@@ -217,7 +217,9 @@ class _Handler(BaseHTTPRequestHandler):
         action = self.page_source.actions.get(named[1])
         if action is None:
             if not self.page_source.actions:
-                raise ReadOnlyError("this page is read-only; start gsmap view without --read-only to review or edit")
+                raise ReadOnlyError(
+                    "this page is read-only: gsmap view was started with --read-only, or the map cannot be written"
+                )
             raise NotFoundError(f"unknown action {named[1]}", code="page_not_found")
         try:
             data = json.loads(body)
