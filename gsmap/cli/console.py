@@ -18,7 +18,7 @@ from gsmap.texts import escaped, shown
 
 if TYPE_CHECKING:
     from gsmap.map import Map
-    from gsmap.store.quarantine import QuarantinedJob
+    from gsmap.store.quarantine import QuarantineRecord
     from gsmap.types.progress import StageProgress
     from gsmap.types.rows import Row
 
@@ -238,7 +238,7 @@ def opened(
         _left.extend(m.store.quarantine.encountered.values())
 
 
-_left: list[QuarantinedJob] = []
+_left: list[QuarantineRecord] = []
 
 
 def left() -> str:

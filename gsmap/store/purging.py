@@ -140,9 +140,9 @@ def list_purges(store: Store) -> list[Purge]:
     return [Purge(row.number, row.scene, dict(row.receipt), row.created_at) for row in rows]
 
 
-def record_tile_files(store: Store, purge: Purge, target: str, num_files: int) -> Purge:
-    """Record the number of tile files to delete in a folder before they are deleted, since a crash may leave none to
-    count."""
+def record_files(store: Store, purge: Purge, target: str, num_files: int) -> Purge:
+    """Record the number of files to delete in a folder (tiles, pages, reports, images) before they are deleted, since a
+    crash may leave none to count."""
     pending = purge.receipt["pending"]
     known = pending.get("tiles", {})  # missing in purges begun by an older gsmap
     noted = {**known, target: max(num_files, known.get(target, 0))}

@@ -15,8 +15,8 @@ CAPTURE = "capture"
 
 
 @dataclass(frozen=True)
-class QuarantinedJob:
-    """A quarantined job or capture.
+class QuarantineRecord:
+    """A job or capture that was quarantined, with the reason.
 
     Args:
         what: the result of the job, ``graph KEY``, ``edge KEY``, ``comparison KEY`` or ``tile KEY``; or ``capture
@@ -42,13 +42,13 @@ class Quarantine:
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
-        self.encountered: dict[str, QuarantinedJob] = {}
+        self.encountered: dict[str, QuarantineRecord] = {}
 
-    def list(self) -> list[QuarantinedJob]:
+    def list(self) -> list[QuarantineRecord]:
         """Return all, oldest first."""
         with self._catalog.read() as connection:
             rows = connection.execute(select(set_aside).order_by(set_aside.c.created_at, set_aside.c.what))
-            return [QuarantinedJob(**row) for row in rows.mappings()]
+            return [QuarantineRecord(**row) for row in rows.mappings()]
 
     def add(self, what: str, about: str, reason: str) -> None:
         """Quarantine a job or a capture, replacing one of the same kind about the same inputs (of an older recipe)."""
@@ -58,7 +58,7 @@ class Quarantine:
             same = (set_aside.c.about == about) & set_aside.c.what.startswith(f"{kind} ")
             connection.execute(delete(set_aside).where(same if kind != "tile" else set_aside.c.what == what))
             connection.execute(insert(set_aside), row)
-        self.encountered[what] = QuarantinedJob(**row)
+        self.encountered[what] = QuarantineRecord(**row)
 
     def forget(self, jobs: Collection[str]) -> None:
         """Release jobs: they are to be tried again, are done, or are no longer needed."""

@@ -96,7 +96,7 @@ def _finish(store: Store, begun: Purge) -> Purge:
     unreachable = []
     levels = TreeCache(cache_folder(), 0)
     if num_files := levels.num_files(begun.scene):
-        begun = purging.record_tile_files(store, begun, str(levels.root), num_files)
+        begun = purging.record_files(store, begun, str(levels.root), num_files)
         levels.forget(begun.scene)
     for target in begun.receipt["pending"]["targets"]:
         try:
@@ -106,14 +106,14 @@ def _finish(store: Store, begun: Purge) -> Purge:
                     begun = _clean(store, out, begun)
             elif is_file(out) and owner_of(out) == store.id:
                 remove_file(out.parent, out.name)  # it shows all scenes; gsmap report makes it anew
-                begun = purging.record_tile_files(store, begun, str(out), 1)
+                begun = purging.record_files(store, begun, str(out), 1)
             elif os.path.lexists(out / SITE):
                 if site_owner(out) == store.id:  # it shows all scenes; gsmap view --export makes it anew
-                    begun = purging.record_tile_files(store, begun, str(out), len(site_files(out)) + 1)
+                    begun = purging.record_files(store, begun, str(out), len(site_files(out)) + 1)
                     remove_site(out)
             elif os.path.lexists(out / PICTURES):
                 if gone := PictureFolder.load(out, store.id).forget(out, begun.scene):
-                    begun = purging.record_tile_files(store, begun, str(out), gone)
+                    begun = purging.record_files(store, begun, str(out), gone)
             else:
                 unreachable.append(f"{out}: it is not there, or no report, and holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
@@ -149,7 +149,7 @@ def _clean(store: Store, out: Path, begun: Purge) -> Purge:
             stale.append(folder)
     num_files = len(paths) + sum(_num_levels(out, folder) for folder in stale)
     if num_files or made_with_it:
-        begun = purging.record_tile_files(store, begun, str(out), num_files)
+        begun = purging.record_files(store, begun, str(out), num_files)
     for leftover in leftovers(out):
         remove_tree(out, *leftover)  # what an interrupted export left may be such a tile
     if made_with_it:
