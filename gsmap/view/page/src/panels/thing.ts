@@ -63,7 +63,7 @@ export class Thing extends Panel {
               room
                 ? html`<dt>Room</dt>
                     <dd>${room.id}, ${room.area_m2.toFixed(1)} m²</dd>
-                    <dt>PageSource to</dt>
+                    <dt>Doors to</dt>
                     <dd>${room.doors.join(", ") || "none seen"}</dd>`
                 : nothing
             }
