@@ -111,7 +111,7 @@ def test_where_a_render_agrees_little_its_pose_is_settled_once_more(judged, monk
 
 
 def test_how_well_a_render_agrees_that_is_laid_over_is_evidence(world, judged):
-    """Of the last time, before it retract_pose: high where the pose is right, low where it is not."""
+    """Of the last time, before it moved: high where the pose is right, low where it is not."""
     picture, found = judged
     assert found.evidence["laid"] == found.refined.agreement > 0.4
     start = retract_pose(found.refined.T_metric_camera, np.array([0.0, np.radians(25), 0, 0, 0, 0]))

@@ -1,4 +1,4 @@
-"""A made map behind page_source of its own, and a page of a few bytes: what the tests of the server look through."""
+"""A made map behind a page source of its own, and a page of a few bytes: what the tests of the server look through."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ other exposures, and by night), and of the place with furniture moved, removed, 
 the true ones sharpened and judged as localisation does; what it would refuse is left out. Photographs are made once,
 in WORK. Said are: boxes in photographs of unchanged places, by light, and of how many changes that a photograph shows
 (half a percent of the picture and more, of what can be compared) a fifth of the pixels are in a region. A box is right
-where a fifth of it changed. PageSource, which captures saw open or shut, are left out.
+where a fifth of it changed. Doors, which captures saw open or shut, are left out.
 """
 
 # Thread counts must be set before numpy comes in.
