@@ -8,7 +8,7 @@
 #
 # PYTHON=/path/to/python3.12     another interpreter (3.11 to 3.13)
 # GSMAP_VENV=/path/to/venv       another place for the environment
-# GSMAP_TORCH_INDEX=URL          take torch from this index (see README, "CPU or CUDA")
+# GSMAP_TORCH_INDEX=URL          take torch from this index (see README, "Install")
 set -eu
 cd "$(dirname "$0")/.."
 venv=${GSMAP_VENV:-.venv}

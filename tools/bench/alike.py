@@ -25,14 +25,11 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
-
-import gsmap.map  # noqa: E402
-from gsmap.map.settings import Settings  # noqa: E402
-from gsmap.map.stages.optimize import pose_inputs  # noqa: E402
-from gsmap.optimize import optimize  # noqa: E402
-from gsmap.types import PoseGraph, Sim3  # noqa: E402
+import gsmap.map
+from gsmap.map.settings import Settings
+from gsmap.map.stages.optimize import pose_inputs
+from gsmap.optimize import optimize
+from gsmap.types import PoseGraph, Sim3
 
 FOLDED_M = 1.0
 

@@ -116,8 +116,8 @@ def begin(captures: list[DemoCapture], params: tto.Params, tile_size_m: float) -
 def finish(begun: Begun, params: tto.Params, fit: Callable[..., tuple[Gaussians, int, bool]]) -> tuple[Gaussians, int]:
     """All tiles together, and how many steps they took."""
     parts, count = list(begun.others), 0
-    for (start, frozen, wanted, _, deadline, progress), bounds in begun.fits:
-        fitted, steps, _ = fit(start, frozen, wanted, params, deadline, progress)
+    for (start, frozen, wanted, _, *options), bounds in begun.fits:
+        fitted, steps, _ = fit(start, frozen, wanted, params, *options)
         mine = inside(start.means, bounds)
         parts.append(replace(fitted[mine], means=clamp_inside(fitted.means[mine], bounds)))
         count += steps

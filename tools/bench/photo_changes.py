@@ -87,17 +87,17 @@ def photographs(seed: int) -> dict[str, np.ndarray]:
     with contextlib.suppress(ConfigError):
         edits = random_edits(place, rng, rooms=range(len(place.rooms)), share=0.5)
         changed = edit_place(place, edits)
-    then = states(place)
+    then, rooms = states(place), range(len(place.rooms))
     out: dict[str, list] = {name: [] for name in ("rgb", "truth", "ids", "kind", "pose", "lens", "doors")}
     leaves = [thing.id for thing in place.objects if thing.kind == "door"]
     for kind, seen in (("day", place), ("night", night), ("changed", changed)):
         now = states(seen)
         for _ in range(PHOTOS):
-            pose, focal = _pose(place, rng), rng.uniform(0.55, 0.95)
+            pose, focal = _pose(place, rooms, rng), rng.uniform(0.55, 0.95)
             for _ in range(TRIES if seen is changed else 0):  # somewhere from where a change is seen
                 if _shows_change(place, changed, pose, then, now):
                     break
-                pose = _pose(place, rng)
+                pose = _pose(place, rooms, rng)
             gain, gamma = rng.uniform(0.6, 1.4) * rng.uniform(0.95, 1.05, 3), rng.uniform(0.85, 1.2)
             frames = synthetic.film(seen, pose[None], size_px=PHOTO_PX, gain=gain, gamma=gamma, focal=focal)
             ids, before = (sight(one, frames.cameras)[0][0] for one in (seen, place))

@@ -45,9 +45,6 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
-
 from gsmap.retrieve import Params, SceneNodes, look_up, new_segment, select_nodes
 from gsmap.store import Store
 from gsmap.types import SceneGraph

@@ -44,11 +44,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from tools.bench.spent import spent, statements
-
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
-
 import gsmap.map
 from gsmap.cli import COLLECT_AFTER
 from gsmap.evaluate.calibration import nees_of_edge, nees_of_pose, relative_covariance
@@ -61,6 +56,7 @@ from gsmap_synthetic import make_captures
 from gsmap_synthetic.make import DemoCapture
 from gsmap_synthetic.place import Place, build_place
 from gsmap_synthetic.plan import WALL_M, Door, Room
+from tools.bench.spent import spent, statements
 
 COLUMNS, RUNG = 16, 8  # columns of rooms made at once, and from one door between the rows to the next
 _ROOM_M = np.array([4.2, 3.8])
@@ -178,7 +174,7 @@ def captures(args: argparse.Namespace, start: int) -> Iterator[tuple[int, Walk, 
 PARTS = [
     ("describing", describe, "describe_scene"),
     ("pairs", register, "register_scenes"),
-    ("looking up", register, "ask"),
+    ("looking up", register, "look_up_scenes"),
     ("solving", optimize.solver, "optimize"),
     ("keeping still", optimize.solver, "keep_unchanged_poses"),
     ("naming poses", optimize, "pose_basis"),

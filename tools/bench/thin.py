@@ -18,19 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
-
-import gsmap.map  # noqa: E402
-import gsmap_synthetic as synthetic  # noqa: E402
-from gsmap import formats  # noqa: E402
-from gsmap.evaluate.images import psnr  # noqa: E402
-from gsmap.geometry.transforms import transform_gaussians  # noqa: E402
-from gsmap.map import Map  # noqa: E402
-from gsmap.render import render  # noqa: E402
-from gsmap.types import Gaussians, Sim3  # noqa: E402
-from gsmap_synthetic.capture import default_routes  # noqa: E402
-from gsmap_synthetic.make import fit_frames, put_in_own_frame  # noqa: E402
+import gsmap.map
+import gsmap_synthetic as synthetic
+from gsmap import formats
+from gsmap.evaluate.images import psnr
+from gsmap.geometry.transforms import transform_gaussians
+from gsmap.map import Map
+from gsmap.render import render
+from gsmap.types import Gaussians, Sim3
+from gsmap_synthetic.capture import default_routes
+from gsmap_synthetic.make import fit_frames, put_in_own_frame
 
 HOLD_OUT = 6
 

@@ -12,16 +12,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
-
-from gsmap.describe import Params, describe  # noqa: E402
-from gsmap.retrieve.codes import AXES, NUM_DIMS  # noqa: E402
-from gsmap_synthetic import make_captures  # noqa: E402
+from gsmap.describe import Params, describe
+from gsmap.retrieve.codes import AXES, NUM_DIMS
+from gsmap_synthetic import make_captures
 
 
 def main() -> None:

@@ -5,12 +5,9 @@
 `tools.make.docs` calls it for the page docs/reference/json.md of the site.
 """
 
-# ruff: noqa: E402
-
 from __future__ import annotations
 
 import argparse
-import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -18,9 +15,6 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))  # the rows of this checkout, whichever one is installed
 
 from gsmap.cli.objects import OBJECTS, ManyRows, Object, OptionalRow
 from gsmap.reason_codes import ERRORS, REASONS
