@@ -1,4 +1,4 @@
-"""Measure which small faults (mutants) in a room its tests detect, by cosmic-ray: pip install 'gsmap[mutation]'.
+"""Measure which small faults (mutants) in a room its tests detect, by cosmic-ray (pip install '.[mutation]').
 
     python -m tools.check.mutation --room store --sample 200 --seed 0
     python -m tools.check.mutation --room optimize --module component_joins
