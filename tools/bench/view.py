@@ -70,7 +70,7 @@ def made_room(seed: int, count: int, sh_degree: int = 1) -> Gaussians:
 
 
 @dataclass
-class MadeDoors:
+class SyntheticPageSource:
     """So many rooms on a grid, no two alike: what repeats would pack as no map does."""
 
     num_scenes: int
@@ -169,7 +169,7 @@ def look(url: str, settle_s: float) -> dict[str, Any]:
 
 
 def large(args: argparse.Namespace) -> None:
-    page_source = MadeDoors(args.scenes, args.gaussians)
+    page_source = SyntheticPageSource(args.scenes, args.gaussians)
     with tempfile.TemporaryDirectory() as cache_folder:
         for name in ("cold", "warm"):
             cpu = time.process_time()

@@ -1,8 +1,8 @@
 """Print how readable the tree is for a stranger: start-up, settings, names, docstrings, tests of wording, prose.
 
-    tools/check/readability.py              all measures, with their bars
-    tools/check/readability.py --list       also the settings, docstrings, names and places that miss a bar
-    tools/check/readability.py --no-startup without timing verbs (a minute of CPU)
+    python -m tools.check.readability               all measures, with their bars
+    python -m tools.check.readability --list        also the settings, docstrings, names and places that miss a bar
+    python -m tools.check.readability --no-startup  without timing verbs (a minute of CPU)
 
 The exit status is 1 if a measure misses its bar. Mutation scores are printed by ``tools/check/mutation.py``; the
 equality of outputs is tested by ``tests/contracts/test_golden.py``.
@@ -52,18 +52,18 @@ class Measure:
     Args:
         name: the quantity and its unit.
         value: as measured.
-        bar: largest value that passes; None where there is no bar.
+        bar: largest value that passes.
         misses: the items that count against it.
     """
 
     name: str
     value: float
-    bar: float | None
+    bar: float
     misses: list[str] = field(default_factory=list)
 
     @property
     def met(self) -> bool:
-        return self.bar is None or self.value <= self.bar
+        return self.value <= self.bar
 
 
 @cache
@@ -151,12 +151,11 @@ def name_measures() -> Iterator[Measure]:
 
 
 def test_measures() -> Iterator[Measure]:
-    quoting = [
+    faults = [
         f"{path.relative_to(ROOT)}"
         for path in tracked("tools/*.toml", "tests/*.toml")
-        if "[[fault]]" in path.read_text()
+        for _ in range(path.read_text(encoding="utf-8").count("[[fault]]"))
     ]
-    faults = sum((ROOT / name).read_text().count("[[fault]]") for name in quoting)
     wording = [
         f"{path.relative_to(ROOT)}:{node.lineno}"
         for path in tracked("tests/*.py")
@@ -166,7 +165,7 @@ def test_measures() -> Iterator[Measure]:
         and "match" in (given := {word.arg for word in node.keywords})
         and "code" not in given  # beside a code it names a file, a line or an option
     ]
-    yield Measure("planted faults that quote source", faults, 0, quoting)
+    yield Measure("planted faults that quote source", len(faults), 0, faults)
     yield Measure("tests that tell errors apart by the wording of a message", len(wording), 50, wording)
 
 
@@ -174,8 +173,7 @@ def test_measures() -> Iterator[Measure]:
 
 
 def prose_measures() -> Iterator[Measure]:
-    pages = tracked("*.md", "docs/*.md", "changes/*.md")
-    total = sum(len(page.read_text(encoding="utf-8").split()) for page in dict.fromkeys(pages))
+    total = sum(len(page.read_text(encoding="utf-8").split()) for page in tracked("*.md"))
     notes = tracked("docs/design/[0-9]*.md")
     yield Measure("words of prose", total, 50_000)
     yield Measure("README, bytes", (ROOT / "README.md").stat().st_size, 9_000)
@@ -184,7 +182,7 @@ def prose_measures() -> Iterator[Measure]:
 
 
 def command_measures() -> Iterator[Measure]:
-    sys.path[:0] = [str(ROOT / "tests" / "contracts"), str(ROOT / "tests"), str(ROOT)]
+    sys.path[:0] = [str(ROOT / "tests" / "contracts"), str(ROOT / "tests")]
     import test_documents as documents
 
     lines = [(page, line, whole) for page in documents.PAGES for line, whole in documents.commands_in(page.read_text())]
@@ -199,12 +197,13 @@ def command_measures() -> Iterator[Measure]:
 # --- start-up --------------------------------------------------------------------------------------------------------
 
 VERBS = ("list {} scenes", "status {}", "show {} hall", "edit {} hall --note wet", "poses {}")
+_RUNS = 7
 
 
-def cpu_s(command: list[str], runs: int) -> float:
+def cpu_s(command: list[str]) -> float:
     """Return the median CPU seconds, user and system, of a command."""
     spent = []
-    for _ in range(runs):
+    for _ in range(_RUNS):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -212,13 +211,13 @@ def cpu_s(command: list[str], runs: int) -> float:
     return statistics.median(spent)
 
 
-def startup_measures(runs: int = 7) -> Iterator[Measure]:
+def startup_measures() -> Iterator[Measure]:
     import numpy as np
 
     import gsmap
 
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    base = cpu_s([sys.executable, "-c", "import sqlalchemy, numpy"], runs)
+    base = cpu_s([sys.executable, "-c", "import sqlalchemy, numpy"])
     with tempfile.TemporaryDirectory() as folder:
         site = Path(folder) / "site.gsmap"
         means = np.random.default_rng(0).uniform(size=(50, 3)).astype(np.float32)
@@ -229,7 +228,7 @@ def startup_measures(runs: int = 7) -> Iterator[Measure]:
             m.optimize()
         for verb in VERBS:
             command = [sys.executable, "-m", "gsmap", *verb.format(site).split()]
-            ratio = cpu_s(command, runs) / base
+            ratio = cpu_s(command) / base
             yield Measure(f"CPU of `gsmap {verb.format('MAP')}` over that of `import sqlalchemy, numpy`", ratio, 2.5)
 
 
@@ -253,8 +252,7 @@ def main() -> None:
     for measures in MEASURES + (() if options.no_startup else (startup_measures,)):
         for one in measures():
             shown = f"{one.value:,.2f}" if one.value != int(one.value) else f"{int(one.value):,}"
-            bar = "" if one.bar is None else f"{one.bar:,}"
-            print(f"{one.name:<90} {shown:>9} {bar:>8}{'' if one.met else '  missed'}", flush=True)
+            print(f"{one.name:<90} {shown:>9} {one.bar:>8,}{'' if one.met else '  missed'}", flush=True)
             if options.list and not one.met:
                 print("\n".join(f"    {miss}" for miss in one.misses))
             failed |= not one.met

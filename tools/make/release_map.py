@@ -2,11 +2,10 @@
 
     python -m tools.make.release_map [tests/store/releases/VERSION.tar.xz]
 
-The installed gsmap writes it, through its doors and its store alone, so that an older checkout can run this file, too.
-In it: four tiny scenes, one of them removed; a graph of each; edges that were accepted, refused, measured by hand,
-confirmed, rejected, and adopted again; a prior and an up direction; facts with their history; a model; settings;
-revisions, one of them dropped; an export; and, where this gsmap knows them, changes with a word on one, one comparison
-of a pair superseded by another, a tag and a branch.
+The installed gsmap writes it, through its Python interface and its store. In it: four tiny scenes, one of them removed;
+a graph of each; edges that were accepted, refused, measured by hand, confirmed, rejected, and adopted again; a prior
+and an up direction; facts with their history; a model; settings; revisions, one of them dropped; an export; changes
+with a word on one, one comparison of a pair superseded by another, a tag and a branch.
 """
 
 from __future__ import annotations
@@ -60,8 +59,7 @@ def write(path: Path) -> None:
             dated = f"2026-01-0{k + 1}T03:04:05Z"
             m.ingest(gaussians, cameras=cameras, name=name, captured_at=dated, scale="known")
         m.edit("hall", note="scanned in the morning", tags=["ground floor", "north"])
-        if hasattr(m, "metres"):  # younger than this script
-            m.edit("attic", metres_per_unit=1.02)
+        m.edit("attic", metres_per_unit=1.02)
         m.edit("stairs", name="stairwell", captured_at="2026-01-02T03:05:00Z")
         m.describe()
         register(m)
@@ -76,18 +74,14 @@ def write(path: Path) -> None:
         m.reject("hall:attic", withdraw=True)
         m.add_edge("hall:shed", Sim3(np.eye(3), np.array([4.0, 0, 0])), np.full(7, 0.05), "tape measure")
         m.optimize()
-        if hasattr(m.store, "changes"):  # younger than this script
-            compare(m)
-        if hasattr(m.store, "photos"):  # younger than this script
-            keep_photo(m)
-        if hasattr(m.store, "objects"):  # younger than this script
-            keep_objects(m)
+        compare(m)
+        keep_photo(m)
+        keep_objects(m)
         m.remove("shed")
         m.optimize()
         m.prune(keep_revisions=3)
-        for verb, name in (("tag", "handed-over"), ("branch", "what-if")):
-            if hasattr(m, verb):  # younger than this script
-                getattr(m, verb)(name)
+        m.tag("handed-over")
+        m.branch("what-if")
 
 
 def room(seed: int, n: int = 250) -> tuple[Gaussians, Cameras]:
