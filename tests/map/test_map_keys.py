@@ -204,18 +204,18 @@ def test_the_settings_file_is_honoured(site: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "code"),
+    ("text", "code", "match"),
     [
-        ("[optimize]\ngate_probability = 'often'\n", "invalid_setting_value"),
-        ("preset = 'napkin'\n", "unknown_preset"),
-        ("[optimize\n", "invalid_settings_file"),
+        ("[optimize]\ngate_probability = 'often'\n", "invalid_setting_value", r"settings\.toml: optimize\.gate_prob"),
+        ("preset = 'napkin'\n", "unknown_preset", r"settings\.toml: .*'napkin'"),
+        ("[optimize\n", "invalid_settings_file", r"settings\.toml"),
     ],
 )
-def test_a_bad_settings_file_is_refused_and_changes_nothing(site: Path, text: str, code: str) -> None:
+def test_a_bad_settings_file_is_refused_and_changes_nothing(site: Path, text: str, code: str, match: str) -> None:
     (site / "settings.toml").write_text(text)
     with gsmap.open(site) as m:
         for verb in (m.update, m.optimize, m.describe, m.status):
-            with raises(ConfigError, code=code) as refused:
+            with raises(ConfigError, code=code, match=match) as refused:
                 verb()
             assert "\n" not in str(refused.value)
         assert [row.number for row in m.revision_rows()] == [1]

@@ -127,7 +127,7 @@ def test_components_have_a_metre_each(made: Made) -> None:
 def test_it_is_told_everywhere_and_may_be_taken_back(made: Made, tmp_path: Path) -> None:
     m = made((UNIT, UNIT))
     assert m.status().metres_per_unit is None
-    assert any("--metres-per-unit" in note for note in m.export(tmp_path / "out", merge="union").notes)
+    assert any("its metric scale is unknown" in note for note in m.export(tmp_path / "out", merge="union").notes)
     m.edit("capture_a", metres_per_unit=UNIT)
     status, shown = m.status(), m.show_scene("capture_b")
     assert status.metres_per_unit == pytest.approx(UNIT)

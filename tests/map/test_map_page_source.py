@@ -21,6 +21,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
 from gsmap.map.stages.export import Request
 from gsmap.map.stages.register import read_pairs
+from gsmap.settings import changed
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, SceneGraph, Sim3
 
@@ -286,21 +287,22 @@ def test_a_map_whose_file_names_a_removed_setting_opens_with_one_warning(
     site: Map, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = site.store.folder / "settings.toml"
-    path.write_text("# mine\n[merge]\nmethod = 'union'\nformer = 0.3\n[gone.away]\nkin_share = 2\n")
+    misspelt = "[optimize]\ngate_probabilty = 0.9\n"
+    path.write_text("# mine\n[merge]\nmethod = 'union'\nformer = 0.3\n[gone.away]\nkin_share = 2\n" + misspelt)
     site.__dict__.pop("settings", None)
-    assert site.settings.merge.method == "union"
+    assert site.settings == changed(Settings(), {"merge.method": "union"})
     with gsmap.map.open(site.store.folder) as m:
         assert m.settings == site.settings
         m.change_settings({"merge.method": "voxel"})
-    for name in ("merge.former", "gone.away.kin_share"):
+    for name in ("merge.former", "gone.away.kin_share", "optimize.gate_probabilty"):
         (warning,) = [one.getMessage() for one in caplog.records if name in one.getMessage()]
-        assert str(path) in warning
-        assert "constant" in warning
-    with raises(ConfigError, code="unknown_setting"):
+        assert warning.startswith(f"{path}: setting {name} is ignored")
+        assert warning.endswith(f"gsmap settings MAP --unset {name}")
+    with raises(ConfigError, code="unknown_setting", match=r"merge\.former"):
         site.with_settings({"merge.former": 0.4})
-    with raises(ConfigError, code="unknown_setting"):
+    with raises(ConfigError, code="unknown_setting", match=r"merge\.former"):
         site.change_settings({"merge.former": 0.4})
-    site.change_settings(unset=["merge.former", "gone.away.kin_share"])
+    site.change_settings(unset=["merge.former", "gone.away.kin_share", "optimize.gate_probabilty"])
     assert path.read_text().startswith("# mine")
     assert "former" not in path.read_text()
 

@@ -424,7 +424,7 @@ def test_the_commands_write_pages(folder, tmp_path):
     assert (tmp_path / "map.html").stat().st_size > 1000
     done = run("export", folder, tmp_path / "map.html", "--format", "html", "--merge", "union")
     assert done.returncode == 2
-    assert "--merge" in done.stderr
+    assert "--merge does not apply to --format html" in done.stderr
 
 
 def test_the_cache_is_bounded_by_a_setting(folder):
