@@ -139,35 +139,38 @@ def test_blender_angle_and_image_size(tmp_path):
 
 
 BAD = {
-    "not json": ("{", "not_json"),
-    "deep": ("[" * 100_000, "not_json"),
-    "empty list": ("[]", "no_cameras"),
-    "number": ("3", "invalid_cameras"),
-    "no frames": ("{}", "invalid_cameras"),
-    "empty frames": ('{"frames": []}', "no_cameras"),
-    "strings": ('["a"]', "invalid_cameras"),
-    "lacks": ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]]}]', "invalid_cameras"),
+    "not json": ("{", "not_json", "line 1 column 2"),
+    "deep": ("[" * 100_000, "not_json", r"c\.json"),
+    "empty list": ("[]", "no_cameras", "the list is empty"),
+    "number": ("3", "invalid_cameras", r"c\.json"),
+    "no frames": ("{}", "invalid_cameras", "'frames'"),
+    "empty frames": ('{"frames": []}', "no_cameras", "list of frames is empty"),
+    "strings": ('["a"]', "invalid_cameras", r"c\.json"),
+    "lacks": ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]]}]', "invalid_cameras", "'position'"),
     "nan": (
         '[{"rotation": [[1,0,0],[0,1,0],[0,0,NaN]], "position": [0,0,0], "width": 1, "height": 1, "fx": 1, "fy": 1}]',
         "invalid_cameras",
+        "camera 0 holds NaN",
     ),
     "mirrored": (
         '[{"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "position": [0,0,0], "width": 1, "height": 1, "fx": 1, "fy": 1}]',
         "invalid_cameras",
+        "camera 0 .*rigid",
     ),
     "no focal": (
         '{"w": 4, "h": 4, "frames": [{"file_path": "a", "transform_matrix": '
         "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}",
         "incomplete_camera",
+        "frame a .*focal",
     ),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_files(tmp_path, case):
-    text, code = BAD[case]
+    text, code, match = BAD[case]
     (tmp_path / "c.json").write_text(text)
-    with raises(InputError, code=code) as caught:
+    with raises(InputError, code=code, match=match) as caught:
         read_cameras(tmp_path / "c.json")
     assert "c.json" in str(caught.value)
     assert "\n" not in str(caught.value)

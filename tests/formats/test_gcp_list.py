@@ -48,27 +48,27 @@ def test_the_first_line_names_the_system(line: str, crs: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "code"),
+    ("text", "code", "match"),
     [
-        ("", "file_empty"),
-        ("EPSG:25832\n", "no_control_points"),
-        ("1 2 3 4 5 a.jpg\n", "gcp_crs_missing"),
-        ("UTM somewhere\n1 2 3 4 5 a.jpg", "gcp_crs_missing"),
-        ("WGS84 UTM 61N\n1 2 3 4 5 a.jpg", "gcp_crs_missing"),
-        ("EPSG:1\n\n1 2 4 5 a.jpg", "invalid_line"),
-        ("EPSG:1\n1 2 3 4 five a.jpg", "invalid_line"),
-        ("EPSG:1\n1 nan 3 4 5 a.jpg", "invalid_line"),
-        ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 4 4 5 b.jpg P", "duplicate"),
-        ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 3 6 7 a.jpg P", "duplicate"),
-        ("EPSG:1\nG1 1 2 3", "invalid_line"),
-        ("EPSG:1\n1 2 3 4 5 a.jpg b.jpg G1", "invalid_line"),
-        ("EPSG:1\n1 2 3 4 5 DJI_0001 (2) G1", "invalid_line"),
-        ("EPSG:1\n1 2 3 4 5 DJI_0001 (2)", "invalid_line"),
-        ("EPSG:1\n1 2 3 4 5 a.jpg\n1.0 2 3e0 6 7 a.jpg", "duplicate"),
+        ("", "file_empty", "is empty"),
+        ("EPSG:25832\n", "no_control_points", "no control point"),
+        ("1 2 3 4 5 a.jpg\n", "gcp_crs_missing", "line 1: .*is a point"),
+        ("UTM somewhere\n1 2 3 4 5 a.jpg", "gcp_crs_missing", "line 1: 'UTM somewhere'"),
+        ("WGS84 UTM 61N\n1 2 3 4 5 a.jpg", "gcp_crs_missing", "line 1: UTM zone 61"),
+        ("EPSG:1\n\n1 2 4 5 a.jpg", "invalid_line", "line 3 has 5 of .*height"),
+        ("EPSG:1\n1 2 3 4 five a.jpg", "invalid_line", "line 2: im_y is 'five'"),
+        ("EPSG:1\n1 nan 3 4 5 a.jpg", "invalid_line", "line 2: geo_y is 'nan'"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 4 4 5 b.jpg P", "duplicate", "line 3: point P has other .*line 2"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 3 6 7 a.jpg P", "duplicate", "line 3: point P in a.jpg .*line 2"),
+        ("EPSG:1\nG1 1 2 3", "invalid_line", "line 2 has 4 fields and begins with 'G1'"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg b.jpg G1", "invalid_line", "line 2: .*'a.jpg b.jpg G1'"),
+        ("EPSG:1\n1 2 3 4 5 DJI_0001 (2) G1", "invalid_line", "line 2: .*'DJI_0001 .2. G1'"),
+        ("EPSG:1\n1 2 3 4 5 DJI_0001 (2)", "invalid_line", "line 2: .*'DJI_0001 .2.'"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg\n1.0 2 3e0 6 7 a.jpg", "duplicate", "line 3: point 1_2_3 in a.jpg .*line 2"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_line(text: str, code: str) -> None:
-    with raises(InputError, code=code):
+def test_what_is_wrong_is_named_with_its_line(text: str, code: str, match: str) -> None:
+    with raises(InputError, code=code, match=match):
         gcp_list.parse(text, "g.txt")
 
 

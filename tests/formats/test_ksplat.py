@@ -101,29 +101,29 @@ def put(data: bytes, kind: str, at: int, *values: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("damage", "code"),
+    ("damage", "code", "match"),
     [
-        (lambda d: b"", "wrong_file_type"),
-        (lambda d: d[:4000], "wrong_file_type"),
-        (lambda d: d[:4200], "file_truncated"),
-        (lambda d: d[:-1], "file_truncated"),
-        (lambda d: put(d, "<B", 0, 1), "unsupported_version"),
-        (lambda d: put(d, "<H", 20, 3), "unsupported_version"),
-        (lambda d: put(d, "<I", 4, 0), "file_truncated"),
-        (lambda d: put(d, "<I", 4, 2**32 - 1), "file_truncated"),
-        (lambda d: put(d, "<I", 16, 7), "count_mismatch"),
-        (lambda d: put(d, "<I", 4096, 2**31), "count_mismatch"),
-        (lambda d: put(d, "<2I", 4096, 2**31, 2**31), "file_truncated"),
-        (lambda d: put(d, "<2I", 4096, 0, 200), "no_gaussians"),
-        (lambda d: put(d, "<I", 4096 + 12, 2**32 - 1), "file_truncated"),
-        (lambda d: put(d, "<I", 4096 + 12, 0), "invalid_buckets"),
-        (lambda d: put(d, "<I", 4096 + 32, 2**31), "invalid_buckets"),
-        (lambda d: put(d, "<H", 4096 + 20, 8), "invalid_buckets"),
-        (lambda d: put(d, "<H", 4096 + 40, 3), "unsupported_sh_degree"),
-        (lambda d: put(d, "<I", 5120, 2**31), "invalid_buckets"),
+        (lambda d: b"", "wrong_file_type", "it has 0 bytes"),
+        (lambda d: d[:4000], "wrong_file_type", "it has 4000 bytes"),
+        (lambda d: d[:4200], "file_truncated", "1 sections .*4200 bytes"),
+        (lambda d: d[:-1], "file_truncated", "byte 13572 of 13571"),
+        (lambda d: put(d, "<B", 0, 1), "unsupported_version", "version 1.1"),
+        (lambda d: put(d, "<H", 20, 3), "unsupported_version", "level 3"),
+        (lambda d: put(d, "<I", 4, 0), "file_truncated", " 0 sections"),
+        (lambda d: put(d, "<I", 4, 2**32 - 1), "file_truncated", "4294967295 sections"),
+        (lambda d: put(d, "<I", 16, 7), "count_mismatch", " 7 Gaussians"),
+        (lambda d: put(d, "<I", 4096, 2**31), "count_mismatch", "2147483648 Gaussians with room for 200"),
+        (lambda d: put(d, "<2I", 4096, 2**31, 2**31), "file_truncated", "byte 90194318388 of 13572"),
+        (lambda d: put(d, "<2I", 4096, 0, 200), "no_gaussians", "no Gaussians"),
+        (lambda d: put(d, "<I", 4096 + 12, 2**32 - 1), "file_truncated", "byte 51539621064 of 13572"),
+        (lambda d: put(d, "<I", 4096 + 12, 0), "invalid_buckets", " 0 buckets of 12 bytes"),
+        (lambda d: put(d, "<I", 4096 + 32, 2**31), "invalid_buckets", "4 buckets of 12 bytes"),
+        (lambda d: put(d, "<H", 4096 + 20, 8), "invalid_buckets", "4 buckets of 8 bytes"),
+        (lambda d: put(d, "<H", 4096 + 40, 3), "unsupported_sh_degree", "SH degree 3"),
+        (lambda d: put(d, "<I", 5120, 2**31), "invalid_buckets", "buckets of 2147483840 Gaussians"),
     ],
 )
-def test_damage_is_named(tmp_path, damage, code):
+def test_damage_is_named(tmp_path, damage, code, match):
     (tmp_path / "a.ksplat").write_bytes(damage(ksplat([near(200, 1)], 1)))
-    with raises(InputError, code=code):
+    with raises(InputError, code=code, match=match):
         formats.read(tmp_path / "a.ksplat")

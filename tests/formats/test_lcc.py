@@ -125,31 +125,31 @@ def patched(name: str, kind: str, at: int, value: int):
 
 
 @pytest.mark.parametrize(
-    ("damage", "code"),
+    ("damage", "code", "match"),
     [
-        (rewritten(lambda m: m.update(totalLevel=0)), "unsupported_version"),
-        (rewritten(lambda m: m.update(totalLevel=10**9)), "unsupported_version"),
-        (rewritten(lambda m: m.update(totalLevel=3)), "file_damaged"),
-        (rewritten(lambda m: m.update(attributes=[])), "unsupported_version"),
-        (rewritten(lambda m: m.update(attributes=5)), "not_json"),
-        (rewritten(lambda m: m["attributes"][0].update(min=["x"])), "not_json"),
-        (lambda f: (f / "scene.lcc").write_text("[]"), "not_json"),
-        (lambda f: (f / "scene.lcc").write_text("{"), "not_json"),
-        (lambda f: (f / "Index.bin").unlink(), "content_missing"),
-        (lambda f: (f / "data.bin").unlink(), "content_missing"),
-        (lambda f: (f / "Shcoef.bin").unlink(), "content_missing"),
-        (lambda f: (f / "data.bin").write_bytes(b""), "rows_outside_file"),
-        (lambda f: (f / "Shcoef.bin").write_bytes(b"1" * 640), "rows_outside_file"),
-        (patched("Index.bin", "<u4", 4, 2**31), "rows_outside_file"),
-        (patched("Index.bin", "<u8", 8, 2**63), "rows_outside_file"),
-        (patched("Index.bin", "<u8", 8, 7), "rows_outside_file"),
-        (patched("Index.bin", "<u4", 4, 0), "rows_outside_file"),
+        (rewritten(lambda m: m.update(totalLevel=0)), "unsupported_version", " 0 levels"),
+        (rewritten(lambda m: m.update(totalLevel=10**9)), "unsupported_version", "1000000000 levels"),
+        (rewritten(lambda m: m.update(totalLevel=3)), "file_damaged", r"Index\.bin: 20 bytes .*3 levels"),
+        (rewritten(lambda m: m.update(attributes=[])), "unsupported_version", r"bounds of \[\]"),
+        (rewritten(lambda m: m.update(attributes=5)), "not_json", r"scene\.lcc is not the JSON"),
+        (rewritten(lambda m: m["attributes"][0].update(min=["x"])), "not_json", r"scene\.lcc is not the JSON"),
+        (lambda f: (f / "scene.lcc").write_text("[]"), "not_json", "KeyError 'totalLevel'"),
+        (lambda f: (f / "scene.lcc").write_text("{"), "not_json", "line 1 column 2"),
+        (lambda f: (f / "Index.bin").unlink(), "content_missing", "'index.bin'"),
+        (lambda f: (f / "data.bin").unlink(), "content_missing", "'data.bin'"),
+        (lambda f: (f / "Shcoef.bin").unlink(), "content_missing", "'shcoef.bin'"),
+        (lambda f: (f / "data.bin").write_bytes(b""), "rows_outside_file", "not in data.bin"),
+        (lambda f: (f / "Shcoef.bin").write_bytes(b"1" * 640), "rows_outside_file", "not in data.bin"),
+        (patched("Index.bin", "<u4", 4, 2**31), "rows_outside_file", "not in data.bin"),
+        (patched("Index.bin", "<u8", 8, 2**63), "rows_outside_file", "not there"),
+        (patched("Index.bin", "<u8", 8, 7), "rows_outside_file", "not there"),
+        (patched("Index.bin", "<u4", 4, 0), "rows_outside_file", "no rows"),
     ],
 )
-def test_damage_is_named(tmp_path, damage, code):
+def test_damage_is_named(tmp_path, damage, code, match):
     lcc(tmp_path / "s", [[some(30, 3)]], with_sh=True)
     damage(tmp_path / "s")
-    with raises(InputError, code=code):
+    with raises(InputError, code=code, match=match):
         formats.read(tmp_path / "s" / "scene.lcc")
 
 

@@ -118,32 +118,40 @@ def test_real_files_hold_what_their_meta_says(shared_data):
 
 
 @pytest.mark.parametrize(
-    ("damage", "code"),
+    ("damage", "code", "match"),
     [
-        (lambda m, f: m.update(version=1), "unsupported_version"),
-        (lambda m, f: m.pop("version"), "unsupported_version"),
-        (lambda m, f: m.update(count=10**12), "count_mismatch"),
-        (lambda m, f: m.update(count=-1), "count_mismatch"),
-        (lambda m, f: m.update(count=9), "count_mismatch"),
-        (lambda m, f: m["means"].update(files=["../../etc/passwd", "means_u.webp"]), "content_missing"),
-        (lambda m, f: m["means"].update(files=[]), "not_json"),
-        (lambda m, f: m.update(means=3), "not_json"),
-        (lambda m, f: m["scales"].update(codebook=[1, 2]), "invalid_codebook"),
-        (lambda m, f: m["scales"].update(codebook=["x"] * 256), "not_json"),
-        (lambda m, f: m["shN"].update(bands=7), "unsupported_sh_degree"),
-        (lambda m, f: m["shN"].update(bands=2), "invalid_palette"),
-        (lambda m, f: m["shN"].update(count=64), "invalid_palette"),
-        (lambda m, f: f.pop("quats.webp"), "content_missing"),
-        (lambda m, f: f.update({"quats.webp": b"not an image"}), "picture_unreadable"),
-        (lambda m, f: f.update({"quats.webp": f["quats.webp"][:40]}), "picture_unreadable"),
-        (lambda m, f: f.update({"quats.webp": texture(np.full((8, 4), 128))}), "not_a_rotation"),
+        (lambda m, f: m.update(version=1), "unsupported_version", "version 1"),
+        (lambda m, f: m.pop("version"), "unsupported_version", "version 1"),
+        (lambda m, f: m.update(count=10**12), "count_mismatch", "count of 1000000000000"),
+        (lambda m, f: m.update(count=-1), "count_mismatch", "count of -1"),
+        (lambda m, f: m.update(count=9), "count_mismatch", "8 texels for 9"),
+        (
+            lambda m, f: m["means"].update(files=["../../etc/passwd", "means_u.webp"]),
+            "content_missing",
+            "'../../etc/passwd'",
+        ),
+        (lambda m, f: m["means"].update(files=[]), "not_json", r"meta\.json .*IndexError"),
+        (lambda m, f: m.update(means=3), "not_json", r"meta\.json .*TypeError"),
+        (lambda m, f: m["scales"].update(codebook=[1, 2]), "invalid_codebook", r"codebook of shape \(2,\)"),
+        (lambda m, f: m["scales"].update(codebook=["x"] * 256), "not_json", r"meta\.json .*ValueError"),
+        (lambda m, f: m["shN"].update(bands=7), "unsupported_sh_degree", "7 bands"),
+        (lambda m, f: m["shN"].update(bands=2), "invalid_palette", "192 wide, expected 512"),
+        (lambda m, f: m["shN"].update(count=64), "invalid_palette", "label of 65 .*64"),
+        (lambda m, f: f.pop("quats.webp"), "content_missing", "'quats.webp'"),
+        (lambda m, f: f.update({"quats.webp": b"not an image"}), "picture_unreadable", r"quats\.webp .*WebP"),
+        (lambda m, f: f.update({"quats.webp": f["quats.webp"][:40]}), "picture_unreadable", r"quats\.webp .*WebP"),
+        (
+            lambda m, f: f.update({"quats.webp": texture(np.full((8, 4), 128))}),
+            "not_a_rotation",
+            "Gaussian 0 .*tag 128",
+        ),
     ],
 )
-def test_damage_is_named(tmp_path, damage, code):
+def test_damage_is_named(tmp_path, damage, code, match):
     meta, files = sog()
     damage(meta, files)
     save(tmp_path / "a.sog", meta, files)
-    with raises(InputError, code=code):
+    with raises(InputError, code=code, match=match):
         formats.read(tmp_path / "a.sog")
 
 
@@ -292,22 +300,22 @@ def test_what_a_sog_cannot_hold_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("file", "code"),
+    ("file", "code", "match"),
     [
-        ("../a.webp", "content_outside_folder"),
-        ("/etc/passwd", "content_outside_folder"),
-        ("none.webp", "content_missing"),
-        ("a\0b", "content_invalid"),
+        ("../a.webp", "content_outside_folder", "'../a.webp'"),
+        ("/etc/passwd", "content_outside_folder", "'/etc/passwd'"),
+        ("none.webp", "content_missing", "'none.webp'"),
+        ("a\0b", "content_invalid", r"'a\\x00b'"),
     ],
 )
-def test_a_folder_names_no_file_elsewhere(tmp_path, file, code):
+def test_a_folder_names_no_file_elsewhere(tmp_path, file, code, match):
     folder = tmp_path / "scene"
     formats.write(folder / "meta.json", random_gaussians(10, 0))
     (tmp_path / "a.webp").write_bytes(webp(np.zeros((4, 4, 4))))
     meta = json.loads((folder / "meta.json").read_text())
     meta["scales"]["files"] = [file]
     (folder / "meta.json").write_text(json.dumps(meta))
-    with raises(InputError, code=code):
+    with raises(InputError, code=code, match=match):
         formats.read(folder / "meta.json")
 
 

@@ -209,28 +209,36 @@ HEADER = struct.Struct("<4sIIBBBB")
 
 
 @pytest.mark.parametrize(
-    ("data", "code"),
+    ("data", "code", "match"),
     [
-        (b"", "wrong_file_type"),
-        (b"PK\x03\x04 no splat", "wrong_file_type"),
-        (gzipped(b"short"), "file_truncated"),
-        (gzipped(HEADER.pack(b"PSGN", 3, 1, 0, 12, 0, 0)), "wrong_file_type"),
-        (gzipped(HEADER.pack(b"NGSP", 9, 1, 0, 12, 0, 0)), "unsupported_version"),
-        (gzipped(HEADER.pack(b"NGSP", 4, 1, 0, 12, 0, 0)), "compression_mismatch"),
-        (gzipped(HEADER.pack(b"NGSP", 3, 0, 0, 12, 0, 0)), "no_gaussians"),
-        (gzipped(HEADER.pack(b"NGSP", 3, 1, 5, 12, 0, 0)), "invalid_fractional_bits"),
-        (gzipped(HEADER.pack(b"NGSP", 3, 1, 3, 31, 0, 0)), "invalid_fractional_bits"),
-        (gzipped(HEADER.pack(b"NGSP", 3, 100, 0, 12, 0, 0), bytes(100)), "file_truncated"),
-        (gzipped(HEADER.pack(b"NGSP", 3, 2**32 - 1, 3, 12, 0, 0)), "decompression_bomb"),
-        (b"NGSP" + struct.pack("<II", 4, 2**32 - 1) + bytes(20), "invalid_streams"),
-        (b"NGSP" + struct.pack("<IIBBBBI", 4, 2**32 - 1, 0, 12, 0, 5, 32) + bytes(12 + 80), "count_mismatch"),
-        (b"NGSP" + struct.pack("<II", 3, 1) + bytes(20), "compression_mismatch"),
-        (b"\x1f\x8b\x08\x00 garbage that does not inflate", "decompression_failed"),
+        (b"", "wrong_file_type", "it is empty"),
+        (b"PK\x03\x04 no splat", "wrong_file_type", "begins with b'PK"),
+        (gzipped(b"short"), "file_truncated", "16 bytes promised, 5 found"),
+        (gzipped(HEADER.pack(b"PSGN", 3, 1, 0, 12, 0, 0)), "wrong_file_type", "no NGSP header"),
+        (gzipped(HEADER.pack(b"NGSP", 9, 1, 0, 12, 0, 0)), "unsupported_version", "version 9"),
+        (gzipped(HEADER.pack(b"NGSP", 4, 1, 0, 12, 0, 0)), "compression_mismatch", "version 4"),
+        (gzipped(HEADER.pack(b"NGSP", 3, 0, 0, 12, 0, 0)), "no_gaussians", "no Gaussians"),
+        (gzipped(HEADER.pack(b"NGSP", 3, 1, 5, 12, 0, 0)), "invalid_fractional_bits", "SH degree 5"),
+        (gzipped(HEADER.pack(b"NGSP", 3, 1, 3, 31, 0, 0)), "invalid_fractional_bits", "31 fractional"),
+        (
+            gzipped(HEADER.pack(b"NGSP", 3, 100, 0, 12, 0, 0), bytes(100)),
+            "file_truncated",
+            "2,000 bytes promised, 100 found",
+        ),
+        (gzipped(HEADER.pack(b"NGSP", 3, 2**32 - 1, 3, 12, 0, 0)), "decompression_bomb", "266,240 MiB"),
+        (b"NGSP" + struct.pack("<II", 4, 2**32 - 1) + bytes(20), "invalid_streams", "0 streams"),
+        (
+            b"NGSP" + struct.pack("<IIBBBBI", 4, 2**32 - 1, 0, 12, 0, 5, 32) + bytes(12 + 80),
+            "count_mismatch",
+            "4294967295 Gaussians",
+        ),
+        (b"NGSP" + struct.pack("<II", 3, 1) + bytes(20), "compression_mismatch", "version 3"),
+        (b"\x1f\x8b\x08\x00 garbage that does not inflate", "decompression_failed", "cannot be decompressed"),
     ],
 )
-def test_damage_is_named(tmp_path, data, code):
+def test_damage_is_named(tmp_path, data, code, match):
     (tmp_path / "a.spz").write_bytes(data)
-    with raises(InputError, code=code):
+    with raises(InputError, code=code, match=match):
         formats.read(tmp_path / "a.spz")
 
 

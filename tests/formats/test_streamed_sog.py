@@ -114,26 +114,34 @@ def test_a_leaf_without_its_finest_level_gives_the_next(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("damage", "code"),
+    ("damage", "code", "match"),
     [
-        (lambda m: m.update(version=2), "unsupported_version"),
-        (lambda m: m.pop("tree"), "unsupported_version"),
-        (lambda m: m.update(tree=3), "wrong_file_type"),
-        (lambda m: m.update(filenames=["../../etc/passwd"] * 99), "content_outside_folder"),
-        (lambda m: m.update(filenames=["none/meta.json"] * 99), "content_missing"),
-        (lambda m: m.update(filenames=[]), "rows_outside_file"),
-        (lambda m: leaves(m["tree"])[0]["lods"]["0"].update(offset=-1), "rows_outside_file"),
-        (lambda m: leaves(m["tree"])[0]["lods"]["0"].update(count=10**9), "rows_outside_file"),
-        (lambda m: leaves(m["tree"])[0]["lods"].update({"0": leaves(m["tree"])[1]["lods"]["0"]}), "rows_outside_file"),
-        (lambda m: leaves(m["tree"])[0].update(lods={"0": 5}), "wrong_file_type"),
-        (lambda m: [leaf.update(lods={}) for leaf in leaves(m["tree"])], "no_gaussians"),
+        (lambda m: m.update(version=2), "unsupported_version", "it has version 2"),
+        (lambda m: m.pop("tree"), "unsupported_version", r"it has version 1 and \[.*'lodLevels', 'version'\]"),
+        (lambda m: m.update(tree=3), "wrong_file_type", "TypeError"),
+        (lambda m: m.update(filenames=["../../etc/passwd"] * 99), "content_outside_folder", "'../../etc/passwd'"),
+        (lambda m: m.update(filenames=["none/meta.json"] * 99), "content_missing", "'none/meta.json'"),
+        (lambda m: m.update(filenames=[]), "rows_outside_file", "file 0 of 0"),
+        (lambda m: leaves(m["tree"])[0]["lods"]["0"].update(offset=-1), "rows_outside_file", "from -1"),
+        (
+            lambda m: leaves(m["tree"])[0]["lods"]["0"].update(count=10**9),
+            "rows_outside_file",
+            "Gaussians 0 to 1000000000",
+        ),
+        (
+            lambda m: leaves(m["tree"])[0]["lods"].update({"0": leaves(m["tree"])[1]["lods"]["0"]}),
+            "rows_outside_file",
+            "another leaf's",
+        ),
+        (lambda m: leaves(m["tree"])[0].update(lods={"0": 5}), "wrong_file_type", "TypeError"),
+        (lambda m: [leaf.update(lods={}) for leaf in leaves(m["tree"])], "no_gaussians", "no Gaussians"),
     ],
 )
-def test_damage_is_named(tmp_path, damage, code):
+def test_damage_is_named(tmp_path, damage, code, match):
     meta = written(tmp_path, count=600, degree=0, max_per_leaf=200)
     damage(meta)
     (tmp_path / "lod-meta.json").write_text(json.dumps(meta))
-    with raises(InputError, code=code):
+    with raises(InputError, code=code, match=match):
         formats.read(tmp_path / "lod-meta.json")
 
 

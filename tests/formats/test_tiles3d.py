@@ -228,20 +228,20 @@ def test_content_outside_the_folder_is_not_followed(tmp_path, uri):
 
 
 @pytest.mark.parametrize(
-    ("root", "code"),
+    ("root", "code", "match"),
     [
-        ({"content": {"uri": "nowhere.glb"}}, "content_missing"),
-        ({"content": {"uri": "points.pnts"}}, "content_invalid"),
-        ({"content": {}}, "wrong_file_type"),
-        ({"content": None}, "wrong_file_type"),
-        ({"children": [{"transform": [1, 2, 3], "content": {"uri": "a.glb"}}]}, "wrong_file_type"),
-        ({"children": [{}]}, "file_damaged"),
-        ({"implicitTiling": {}}, "unsupported_feature"),
+        ({"content": {"uri": "nowhere.glb"}}, "content_missing", "'nowhere.glb'"),
+        ({"content": {"uri": "points.pnts"}}, "content_invalid", "'points.pnts'"),
+        ({"content": {}}, "wrong_file_type", r"no file \(uri\)"),
+        ({"content": None}, "wrong_file_type", "AttributeError"),
+        ({"children": [{"transform": [1, 2, 3], "content": {"uri": "a.glb"}}]}, "wrong_file_type", "ValueError"),
+        ({"children": [{}]}, "file_damaged", "no tiles with content"),
+        ({"implicitTiling": {}}, "unsupported_feature", "implicit"),
     ],
 )
-def test_damage_is_named(tmp_path, root, code):
+def test_damage_is_named(tmp_path, root, code, match):
     change(tmp_path, **root)
-    with raises(InputError, code=code):
+    with raises(InputError, code=code, match=match):
         formats.read(tmp_path / "tileset.json")
 
 

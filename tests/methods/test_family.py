@@ -29,16 +29,16 @@ def test_nothing_is_imported_before_it_is_asked_for(toys):
 
 
 @pytest.mark.parametrize(
-    ("name", "code"),
+    ("name", "code", "match"),
     [
-        ("wod", "unknown_method"),
-        ("bare", "invalid_method"),
-        ("loose", "invalid_method"),
-        ("torn", "method_not_loadable"),
+        ("wod", "unknown_method", "'wod' .did you mean 'wood'.*bare, glass"),
+        ("bare", "invalid_method", "'bare' lacks Params, build"),
+        ("loose", "invalid_method", "'loose': its Params"),
+        ("torn", "method_not_loadable", "'torn' of the package toys"),
     ],
 )
-def test_what_does_not_keep_the_contract_is_named(toys, name, code):
-    with raises(ConfigError, code=code):
+def test_what_does_not_keep_the_contract_is_named(toys, name, code, match):
+    with raises(ConfigError, code=code, match=match):
         toys.get(name)
 
 

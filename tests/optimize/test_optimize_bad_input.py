@@ -37,20 +37,20 @@ def lopsided():
 
 
 @pytest.mark.parametrize(
-    ("edges", "code"),
+    ("edges", "code", "match"),
     [
-        (broken(np.full((7, 7), np.nan)), "not_finite"),
-        (broken(singular()), "invalid_information"),
-        (broken(indefinite()), "invalid_information"),
-        (broken(lopsided()), "invalid_information"),
-        (broken(np.eye(6)), "invalid_information"),
-        ([*GOOD, replace(GOOD[3], target="c", source="zz")], "unknown_scene"),
-        ([*GOOD, replace(GOOD[3], target="c", source="c")], "self_edge"),
-        ([*GOOD, GOOD[3]], "duplicate"),
+        (broken(np.full((7, 7), np.nan)), "not_finite", "NaN"),
+        (broken(singular()), "invalid_information", "positive definite"),
+        (broken(indefinite()), "invalid_information", "positive definite"),
+        (broken(lopsided()), "invalid_information", "not symmetric"),
+        (broken(np.eye(6)), "invalid_information", r"\(7, 7\) .*\(6, 6\)"),
+        ([*GOOD, replace(GOOD[3], target="c", source="zz")], "unknown_scene", "'zz'"),
+        ([*GOOD, replace(GOOD[3], target="c", source="c")], "self_edge", "c:c "),
+        ([*GOOD, GOOD[3]], "duplicate", "c:d is given twice"),
     ],
 )
-def test_an_unusable_edge_is_named(edges, code):
-    with raises(InputError, code=code) as caught:
+def test_an_unusable_edge_is_named(edges, code, match):
+    with raises(InputError, code=code, match=match) as caught:
         optimize(IDS, edges)
     assert "edge c:" in str(caught.value)
 

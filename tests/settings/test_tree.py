@@ -56,29 +56,29 @@ def test_a_method_that_cannot_be_loaded_does_not_hinder_the_settings_of_another(
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "code"),
+    ("name", "value", "code", "match"),
     [
-        ("bars.neer_m", 1.0, "unknown_setting"),
-        ("near_m", 1.0, "unknown_setting"),
-        ("toys.wood.size", 1.0, "unknown_setting"),
-        ("count.more", 1, "unknown_setting"),
-        ("qqq", 1, "unknown_setting"),
-        ("bars", 1, "setting_not_a_leaf"),
-        ("toys.wood", 1, "setting_not_a_leaf"),
-        ("count", 1.5, "invalid_setting_value"),
-        ("count", True, "invalid_setting_value"),
-        ("loud", 1, "invalid_setting_value"),
-        ("bars.near_m", "wide", "invalid_setting_value"),
-        ("bars.near_m", None, "invalid_setting_value"),
-        ("budget_s", "long", "invalid_setting_value"),
-        ("mode", "quick", "invalid_choice"),
-        ("weights", [1.0], "invalid_setting_value"),
-        ("weights", [1.0, "a"], "invalid_setting_value"),
-        ("names", "xy", "invalid_setting_value"),
+        ("bars.neer_m", 1.0, "unknown_setting", "'bars.neer_m': did you mean bars.near_m"),
+        ("near_m", 1.0, "unknown_setting", "'near_m': did you mean bars.near_m"),
+        ("toys.wood.size", 1.0, "unknown_setting", "'toys.wood.size': did you mean toys.wood.size_m"),
+        ("count.more", 1, "unknown_setting", "'count.more'"),
+        ("qqq", 1, "unknown_setting", "'qqq': gsmap settings MAP"),
+        ("bars", 1, "setting_not_a_leaf", "bars holds .*such as bars.near_m"),
+        ("toys.wood", 1, "setting_not_a_leaf", "toys.wood holds .*such as toys.wood.size_m"),
+        ("count", 1.5, "invalid_setting_value", "count takes int, got 1.5"),
+        ("count", True, "invalid_setting_value", "count takes int, got True"),
+        ("loud", 1, "invalid_setting_value", "loud takes bool, got 1"),
+        ("bars.near_m", "wide", "invalid_setting_value", "bars.near_m takes float, got 'wide'"),
+        ("bars.near_m", None, "invalid_setting_value", "bars.near_m takes float, got None"),
+        ("budget_s", "long", "invalid_setting_value", r"budget_s takes float \| None, got 'long'"),
+        ("mode", "quick", "invalid_choice", "mode must be one of slow, fast, got 'quick'"),
+        ("weights", [1.0], "invalid_setting_value", r"weights takes .*got \[1\.0\]"),
+        ("weights", [1.0, "a"], "invalid_setting_value", "weights takes float, got 'a'"),
+        ("names", "xy", "invalid_setting_value", "names takes .*got 'xy'"),
     ],
 )
-def test_what_is_wrong_is_refused_with_its_name(tree, name, value, code):
-    with raises(ConfigError, code=code):
+def test_what_is_wrong_is_refused_with_its_name(tree, name, value, code, match):
+    with raises(ConfigError, code=code, match=match):
         changed(tree, {name: value})
 
 
