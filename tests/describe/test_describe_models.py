@@ -127,7 +127,7 @@ def test_crop_is_square_centred_and_keeps_the_mask():
 
 @pytest.mark.parametrize("preset", ["clp", "mean=1,2;std=1,1,1", "mean=0,0,0;std=0,1,1", "mean=0,0,0", ""])
 def test_unknown_pixel_scaling_is_refused(preset):
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="pixel scaling"):
         parse_preset(preset)
 
 
@@ -148,7 +148,7 @@ def test_what_is_not_a_model_is_refused(tmp_path):
             check_model("clip", part)
     with pytest.raises(NotFoundError):
         check_model("clip", tmp_path / "absent.onnx")
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="'dino'"):
         check_model("dino", picture)
 
 

@@ -245,7 +245,7 @@ def test_no_cameras_no_objects_but_a_note():
 
 @pytest.mark.parametrize("name", ["segmenter", "embedder"])
 def test_back_ends_that_do_not_exist_are_refused(name):
-    with raises(ConfigError, code="unknown_method"):
+    with raises(ConfigError, code="unknown_method", match="'magic'"):
         describe("x", *room(n=500), Params(landmarks=False, object=ObjectParams(**{name: "magic"})))
 
 

@@ -188,7 +188,7 @@ def test_a_job_s_own_error_comes_through() -> None:
 
 def test_an_executor_is_chosen_by_name() -> None:
     assert sorted(v for _, (v, _) in engine.run_jobs(square, [(i,) for i in range(3)])) == [0, 1, 4]
-    with raises(ConfigError, code="unknown_method"):
+    with raises(ConfigError, code="unknown_method", match="did you mean 'local'"):
         list(engine.run_jobs(square, [(1,)], engine.Params(executor="locl")))
 
 

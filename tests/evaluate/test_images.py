@@ -52,7 +52,7 @@ def test_lpips_runs_a_network_of_the_right_signature(tmp_path):
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path):
-    with raises(InputError, code="shape_mismatch"):
+    with raises(InputError, code="shape_mismatch", match=r"\(H, W, 3\)"):
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
     with raises(InputError, code="picture_too_small"):
         ssim(np.zeros((4, 40, 3)), np.zeros((4, 40, 3)))

@@ -146,7 +146,7 @@ def test_a_box_cuts_tiles_and_must_touch_the_map():
         plan_tiles(poses, {"a": BOX}, tile_size_m=4.0, bbox=box[::-1])
     with raises(InputError, code="nothing_to_export"):
         plan_tiles({}, {}, tile_size_m=4.0)
-    with raises(ConfigError, code="out_of_range"):
+    with raises(ConfigError, code="out_of_range", match="tile size .*-1"):
         plan_tiles(poses, {"a": BOX}, tile_size_m=-1)
     with raises(ConfigError, code="too_many_tiles"):
         plan_tiles(poses, {"a": BOX}, tile_size_m=1e-4)

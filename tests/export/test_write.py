@@ -198,7 +198,7 @@ def test_progress_ends_at_one(street):
 
 def test_folders_of_others_are_left_alone(street):
     street.export()
-    with raises(ConfigError, code="foreign_export"):
+    with raises(ConfigError, code="foreign_export", match="another map"):
         street.export(map_id="elsewhere")
     (street.out / "tiles.json").write_text("{")
     with raises(InputError, code="foreign_export"):
@@ -215,7 +215,7 @@ def test_folders_of_others_are_left_alone(street):
 
 
 def test_bad_options_are_refused_before_anything_is_written(street):
-    with raises(ConfigError, code="unsupported_output"):
+    with raises(ConfigError, code="unsupported_output", match="'obj'"):
         street.export(format="obj")
     with raises(ConfigError, code="out_of_range", match="max_shift_m"):
         street.export(params=Params(max_shift_m=-1))

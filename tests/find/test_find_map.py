@@ -95,25 +95,25 @@ def test_hits_are_drawn(site: Map, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_found_is_said(site: Map, tmp_path: Path) -> None:
-    with raises(ConfigError, code="nothing_requested"):
+    with raises(ConfigError, code="nothing_requested", match="give one query"):
         site.find()
-    with raises(ConfigError, code="nothing_requested"):
+    with raises(ConfigError, code="nothing_requested", match="give one query"):
         site.find("red", at=[0, 0, 0])
-    with raises(ConfigError, code="invalid_point"):
+    with raises(ConfigError, code="invalid_point", match="three numbers"):
         site.find(at=[0, np.nan, 0])
-    with raises(ConfigError, code="nothing_requested"):
+    with raises(ConfigError, code="nothing_requested", match="query text is empty"):
         site.find("  ")
-    with raises(ConfigError, code="object_not_found"):
+    with raises(ConfigError, code="object_not_found", match="clip-text"):
         site.find("red sofa")
     with raises(NotFoundError, code="nothing_near"):
         site.find(at=[2, 1.5, 1.5])
-    with raises(NotFoundError, code="object_not_found"):
+    with raises(NotFoundError, code="object_not_found", match="abcd"):
         site.find(like="abcd")
     with raises(NotFoundError, code="object_out_of_range"):
         site.find(like="may:9999")
     with pytest.raises(NotFoundError):
         site.find(like="august:1")
-    with raises(NotFoundError, code="file_not_found"):
+    with raises(NotFoundError, code="file_not_found", match=r"none\.png"):
         site.find(picture=tmp_path / "none.png")
     (tmp_path / "bad.png").write_bytes(b"no picture")
     with raises(InputError, code="picture_unreadable"):

@@ -191,7 +191,7 @@ def test_antialiased_is_kept(tmp_path):
 
 def test_options_and_range_are_checked(tmp_path):
     g = random_gaussians(3)
-    with raises(ConfigError, code="unsupported_output"):
+    with raises(ConfigError, code="unsupported_output", match="version 2"):
         formats.write(tmp_path / "a.spz", g, version=2)
     with raises(ConfigError, code="out_of_range", match="sh_bits"):
         formats.write(tmp_path / "a.spz", g, sh_bits=(0, 4))

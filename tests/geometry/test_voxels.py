@@ -85,11 +85,11 @@ def test_mean_shadow_of_a_sphere_and_of_a_disc():
 
 
 def test_bad_input_is_refused():
-    with raises(ConfigError, code="out_of_range"):
+    with raises(ConfigError, code="out_of_range", match="voxel size"):
         voxel_labels(np.zeros((1, 3)), 0)
     with raises(InputError, code="extent_too_large"):
         voxel_labels(np.array([[0, 0, 0], [1e30, 1e30, 1e30]]), 0.01)
-    with raises(InputError, code="shape_mismatch"):
+    with raises(InputError, code="shape_mismatch", match="2 labels for 0"):
         merge_groups(Gaussians.empty(), np.zeros(2, dtype=int))
     assert len(merge_groups(Gaussians.empty(), np.zeros(0, dtype=int))[0]) == 0
 

@@ -196,7 +196,7 @@ def test_options(tmp_path):
             read_captures(tmp_path, **wrong)
     with raises(ConfigError, code="invalid_date"):
         read_captures(tmp_path / "a.ply", captured_at="yesterday")
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="auto, known, unknown, got 'metres'"):
         read_captures(tmp_path / "a.ply", scale_policy="metres")
     (capture,) = read_captures(tmp_path / "a.ply", captured_at="2026-05-31T14:00:00", scale_policy="known")
     assert capture.captured_at == "2026-05-31T14:00:00+00:00"

@@ -129,7 +129,7 @@ def test_localize_takes_scans_and_depth_pictures(opened: gsmap.map.Map, room: Sc
     assert any("room.ply" in note for note in report.notes) == bool(alone.notes)
     depth, colour = save_depth(tmp_path, room.frames, 1)
     for options in ({}, {"focal": 100}):
-        with raises(ConfigError, code="missing_option"):
+        with raises(ConfigError, code="missing_option", match="intrinsics"):
             opened.localize(colour, depth=depth, **options)
     with raises(ConfigError, code="conflicting_options"):
         opened.localize(colour, colour, depth=depth, intrinsics=room.frames.cameras.intrinsics_px[1])
@@ -196,9 +196,9 @@ def test_what_cannot_be_looked_for(opened: gsmap.map.Map, room: Scanned, tmp_pat
     with raises(NotFoundError, code="file_not_found"):
         opened.localize_scan(tmp_path / "none.ply")
     path = ply(tmp_path / "room.ply", room.points, room.colours)
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="scale .*'large'"):
         opened.localize_scan(path, scale="large")
-    with raises(ConfigError, code="missing_option"):
+    with raises(ConfigError, code="missing_option", match="intrinsics"):
         opened.localize_scan(path, colour=path)
     (tmp_path / "a.ply").write_bytes(b"ply\n")
     with raises(InputError, code="ply_header"):

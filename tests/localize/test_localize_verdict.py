@@ -68,7 +68,7 @@ def test_a_room_that_looks_alike_is_as_improbable_as_it_is_rare() -> None:
 
 @pytest.mark.parametrize("aliased_prior", [-0.1, 0.7])
 def test_the_priors_sum_to_less_than_one(aliased_prior: float) -> None:
-    with raises(ConfigError, code="out_of_range"):
+    with raises(ConfigError, code="out_of_range", match="aliased_prior"):
         verdict.Params(aliased_prior=aliased_prior)
 
 

@@ -175,7 +175,7 @@ def test_the_command_line_takes_masks(folder, world, crowds, capsys) -> None:
         assert not ended.value.code
         assert [row["status"] for row in json.loads(capsys.readouterr().out)["results"]] == [status]
     with gsmap.map.open(site) as m:
-        with raises(ConfigError, code="option_not_applicable"):
+        with raises(ConfigError, code="option_not_applicable", match="frames of a video"):
             m.localize(video=folder / "clip.mp4", masks=folder / "masks")
-        with raises(ConfigError, code="option_not_applicable"):
+        with raises(ConfigError, code="option_not_applicable", match="depth image"):
             m.localize(folder / "photo.png", depth=folder / "photo.png", masks=folder / "masks", intrinsics=lens)

@@ -310,21 +310,21 @@ def test_named_pairs_are_registered_again(watched: Watched, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("text", "error", "code"),
+    ("text", "error", "code", "match"),
     [
-        ("capture_a capture_b\ncapture_a\n", InputError, "invalid_pairs_file"),
-        ("capture_a capture_b capture_a\n", InputError, "invalid_pairs_file"),
-        ("capture_a capture_z\n", NotFoundError, "scene_not_found"),
-        ("capture_a capture_a\n", ConfigError, "same_scene"),
-        (None, NotFoundError, "file_not_found"),
+        ("capture_a capture_b\ncapture_a\n", InputError, "invalid_pairs_file", "line 2"),
+        ("capture_a capture_b capture_a\n", InputError, "invalid_pairs_file", "line 1"),
+        ("capture_a capture_z\n", NotFoundError, "scene_not_found", "line 1.*capture_z"),
+        ("capture_a capture_a\n", ConfigError, "same_scene", "capture_a"),
+        (None, NotFoundError, "file_not_found", r"pairs\.txt"),
     ],
 )
 def test_bad_files_of_pairs_are_refused(
-    watched: Watched, tmp_path: Path, text: str | None, error: type[Exception], code: str
+    watched: Watched, tmp_path: Path, text: str | None, error: type[Exception], code: str, match: str
 ) -> None:
     if text is not None:
         (tmp_path / "pairs.txt").write_text(text)
-    with raises(error, code=code):
+    with raises(error, code=code, match=match):
         watched.map.register(tmp_path / "pairs.txt")
     assert watched.computed() == set()
 

@@ -221,5 +221,5 @@ def test_a_length_that_gsmap_did_not_write_is_refused(made: Made) -> None:
     with m.store.catalog.write() as connection:
         told = scene_facts.c.kind == "metres_per_unit"
         connection.execute(scene_facts.update().where(told).values(value="wide"))
-    with raises(CorruptError, code="catalog_invalid"):
+    with raises(CorruptError, code="catalog_invalid", match="'wide'"):
         m.metres()

@@ -188,7 +188,9 @@ def test_a_flight_that_is_not_in_the_map_does_not_tie_it_elsewhere(site: Site, t
             photo(tmp_path / "bare" / folder / name, None if k == 0 else place)
             photo(tmp_path / "unclear" / f"card{k}" / name, place)
     with flights(tmp_path / "m.gsmap", site, [DRONE], ["flight0"]) as m:
-        with raises(InputError, code="photo_ambiguous"):
+        with raises(
+            InputError, code="photo_ambiguous", match=r"card0/DJI_0001\.JPG and .*card1/DJI_0001\.JPG may both be"
+        ):
             m.georeference(Request(exif=tmp_path / "unclear"))
         with raises(NotFoundError, code="photos_not_matched"):
             m.georeference(Request(exif=tmp_path / "bare"))
@@ -199,7 +201,11 @@ def test_a_flight_that_is_not_in_the_map_does_not_tie_it_elsewhere(site: Site, t
         (row,) = m.pose_rows("EPSG:4979")
         want = from_frame(site.frame, site.truth[0].translation[None], "EPSG:4979")[0]
         assert np.abs((row.world - want) * [7e4, 1.1e5, 1]).max() < 0.1
-        with raises(InputError, code="photo_ambiguous"):
+        with raises(
+            InputError,
+            code="photo_ambiguous",
+            match=r"DJI_\d+\.JPG has the file name of camera DJI_\d+\.JPG, .* [789]\d(\.\d)? m away",
+        ):
             m.georeference(Request(exif=tmp_path / "unclear" / "card1"))
         # Alone, nothing tells them from the flight's own photos: that is said.
         told = m.georeference(Request(exif=tmp_path / "unclear" / "card0")).notes
@@ -212,7 +218,11 @@ def test_photos_of_another_day_are_refused_where_only_file_names_tell(site: Site
         photo(tmp_path / "flight0" / name, place, taken="2026:05:31 14:00:00")
     with flights(tmp_path / "m.gsmap", site, [DRONE], ["flight0"]) as m:
         m.edit("flight0", captured_at="2026-06-02T20:00:00Z")
-        with raises(InputError, code="photo_ambiguous"):
+        with raises(
+            InputError,
+            code="photo_ambiguous",
+            match=r"DJI_0001\.JPG .* of flight0 and was taken 2 days from it, as were all 8",
+        ):
             m.georeference(Request(exif=tmp_path / "card"))
         assert not m.store.world.survey()
         # Of a capture that began on their day, or in a folder of its name, they are its photos.
@@ -228,11 +238,13 @@ def test_photos_of_a_list_are_told_apart_too(site: Site, tmp_path: Path) -> None
     ]
     with flights(tmp_path / "m.gsmap", site, [DRONE, DRONE], ["flight0", "flight1"]) as m:
         gcp_list.write(tmp_path / "bare.txt", site.frame.crs, [replace(one, image=one.image[8:]) for one in lines])
-        with raises(InputError, code="photo_ambiguous"):
+        with raises(
+            InputError, code="photo_ambiguous", match=r"line 2: DJI_\d+\.JPG may be the camera flight0/DJI_\d+\.JPG or "
+        ):
             m.georeference(Request(gcp=tmp_path / "bare.txt"))
         twice = [lines[0], replace(lines[0], image=lines[0].image.replace(".JPG", ""))]
         gcp_list.write(tmp_path / "twice.txt", site.frame.crs, twice)
-        with raises(InputError, code="duplicate"):
+        with raises(InputError, code="duplicate", match="line 3: point .* again, as on .*line 2"):
             m.georeference(Request(gcp=tmp_path / "twice.txt"))
         gcp_list.write(tmp_path / "g.txt", site.frame.crs, lines)
         m.georeference(Request(gcp=tmp_path / "g.txt"))

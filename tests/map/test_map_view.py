@@ -331,7 +331,7 @@ def test_a_page_is_not_written_over_files_of_others(folder, tmp_path):
         (out / "map.json").unlink()
         (out / "map.json").mkdir()
         before = told(out)
-        with raises(ConfigError, code="folder_not_empty"):
+        with raises(ConfigError, code="folder_not_empty", match=r"map\.json"):
             m.write_site(out)
         assert told(out) == before
         (out / "map.json").rmdir()
@@ -372,7 +372,7 @@ def test_one_file_goes_where_it_may(folder, tmp_path):
         with raises(NotFoundError, code="folder_not_found"):
             m.write_page(tmp_path / "nowhere" / "map.html")
         for megabytes in (0, -1, float("nan")):
-            with raises(ConfigError, code="out_of_range"):
+            with raises(ConfigError, code="out_of_range", match="megabytes"):
                 m.write_page(path, megabytes=megabytes)
 
 

@@ -107,7 +107,7 @@ def test_measuring(tied: Path, site: Site) -> None:
         in_map = m.measure("site-008:0,0,0", ",".join(map(repr, found.a.map.tolist())))
         assert 1e-4 < in_map.sigma_m < 0.05
         for text in ("nonsense", "a:1,2"):
-            with raises(ConfigError, code="invalid_point"):
+            with raises(ConfigError, code="invalid_point", match=text):
                 m.measure(text, "0,0,0")
         for text in ("nobody:1,2,3", "site-000:none.jpg@1,2"):
             with pytest.raises(NotFoundError):
@@ -187,19 +187,19 @@ def test_bad_input_changes_nothing(site: Site, tmp_path: Path) -> None:
     outside = "\t".join([*first[:3], "4000", "20", *first[5:]])
     unknown = "\t".join([*first[:5], "nobody.jpg", first[6]])
     with made_map(tmp_path / "m.gsmap", replace(site)) as m:
-        for request, error, code in (
-            (file("EPSG:25832", swapped), InputError, "outside_crs"),
-            (file("EPSG:25832", outside), InputError, "pixel_outside"),
-            (file("EPSG:25832", unknown), NotFoundError, "photos_not_matched"),
-            (file("EPSG:999999", lines[1]), ConfigError, "invalid_crs"),
-            (file("EPSG:25832+7837", lines[1]), ConfigError, "grid_missing"),
-            (Request(crs="EPSG:25832"), InputError, "not_georeferenced"),
-            (Request(), ConfigError, "nothing_requested"),
-            (Request(check=["P9"]), NotFoundError, "observation_not_found"),
-            (Request(bars=[("0,0,0", "site-000:0,0,0", 2.0)]), ConfigError, "moving_frame"),
-            (Request(bars=[("site-000:0,0,0", "site-000:1,0,0", -2.0)]), ConfigError, "invalid_observation"),
+        for request, error, code, match in (
+            (file("EPSG:25832", swapped), InputError, "outside_crs", "control point G0 .* axes swapped"),
+            (file("EPSG:25832", outside), InputError, "pixel_outside", "line 2: .*4000 20"),
+            (file("EPSG:25832", unknown), NotFoundError, "photos_not_matched", "1 photo"),
+            (file("EPSG:999999", lines[1]), ConfigError, "invalid_crs", "EPSG:999999"),
+            (file("EPSG:25832+7837", lines[1]), ConfigError, "grid_missing", "needs the grid"),
+            (Request(crs="EPSG:25832"), InputError, "not_georeferenced", "EPSG:25832"),
+            (Request(), ConfigError, "nothing_requested", "--gcp"),
+            (Request(check=["P9"]), NotFoundError, "observation_not_found", "'P9'"),
+            (Request(bars=[("0,0,0", "site-000:0,0,0", 2.0)]), ConfigError, "moving_frame", "'0,0,0'"),
+            (Request(bars=[("site-000:0,0,0", "site-000:1,0,0", -2.0)]), ConfigError, "invalid_observation", "-2"),
         ):
-            with raises(error, code=code):
+            with raises(error, code=code, match=match):
                 m.georeference(request)
             assert not m.store.world.survey()
             assert m.store.world.survey().frame is None
@@ -346,7 +346,7 @@ def test_tiles_move_on_the_globe_when_the_tie_does(tied: Path, tmp_path: Path) -
         before = root()
         m.georeference(Request(check=["G3"]))
         assert root() != before
-        with raises(InputError, code="outside_crs"):
+        with raises(InputError, code="outside_crs", match="the map lies at 48"):
             m.georeference(Request(crs="EPSG:2583"))  # a digit short of EPSG:25832
         m.georeference(Request(crs="EPSG:4326"))
         root()  # no tile changes, and what is said of them does

@@ -97,7 +97,7 @@ def test_bad_input_is_refused_in_words():
     part = PosedScene(cloud(0))
     with raises(InputError, code="nothing_to_merge"):
         merge([], "union")
-    with raises(ConfigError, code="unknown_method"):
+    with raises(ConfigError, code="unknown_method", match="'concat'.*choose one of"):
         merge([part], "concat")
     with raises(ConfigError, code="invalid_budget"):
         merge([part], "union", budget_s=0)

@@ -398,9 +398,9 @@ def test_cameras_inside_walls_do_no_harm():
 
 
 def test_options_that_do_not_exist_are_refused():
-    with raises(ConfigError, code="unknown_method"):
+    with raises(ConfigError, code="unknown_method", match="refiner 'magic'"):
         Params(refiner="magic")
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="scale policy .*'maybe'"):
         replace(splat_world(0, points=1000).target, scale_policy="maybe")
 
 

@@ -17,7 +17,7 @@ def test_auto_is_gsplat_where_it_can_be_used(monkeypatch, there, chosen):
     monkeypatch.setattr(backends, "gsplat_available", lambda: there)
     assert backend() == backend("auto") == chosen
     assert (backend("native"), backend("gsplat")) == ("native", "gsplat")
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="auto, native or gsplat, got 'cuda'"):
         backend("cuda")
 
 

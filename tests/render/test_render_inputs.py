@@ -117,26 +117,26 @@ def test_empty_scenes_and_no_cameras():
 def test_wrong_arguments_are_input_errors():
     gaussians, cameras = random_scene(1, n=50)
     two = Cameras(np.tile(np.eye(4), (2, 1, 1)), [[90, 95, 48, 36]] * 2, [[100, 70], [50, 70]])
-    with raises(InputError, code="shape_mismatch"):
+    with raises(InputError, code="shape_mismatch", match="share one image size"):
         render(gaussians, two)
-    with raises(InputError, code="wrong_type"):
+    with raises(InputError, code="wrong_type", match="Cameras, got ndarray"):
         render(gaussians, np.eye(4))
-    with raises(InputError, code="invalid_vector"):
+    with raises(InputError, code="invalid_vector", match="background"):
         render(gaussians, cameras, background=(0, 0))
-    with raises(InputError, code="wrong_type"):
+    with raises(InputError, code="wrong_type", match="Gaussians or GaussianTensors, got ndarray"):
         render(np.zeros((3, 3)), cameras)
-    with raises(InputError, code="invalid_pose"):
+    with raises(InputError, code="invalid_pose", match="T_camera_frame needs"):
         render(gaussians, cameras, T_camera_frame=torch.eye(4)[None])
-    with raises(InputError, code="shape_mismatch"):
+    with raises(InputError, code="shape_mismatch", match="index is of 10 Gaussians"):
         render(gaussians, cameras, index=ChunkIndex.build(gaussians[:10]))
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="backend .*'vulkan'"):
         render(gaussians, cameras, backend="vulkan")
     tensors = GaussianTensors.of(gaussians)
-    with raises(InputError, code="not_finite"):
+    with raises(InputError, code="not_finite", match="T_camera_frame holds NaN"):
         render(tensors, cameras, T_camera_frame=torch.full((1, 4, 4), torch.nan))
-    with raises(InputError, code="invalid_pose"):
+    with raises(InputError, code="invalid_pose", match="1, 4, 4"):
         render(tensors, cameras, T_camera_frame=torch.eye(4))
-    with raises(InputError, code="wrong_type"):
+    with raises(InputError, code="wrong_type", match="means must be a float32"):
         GaussianTensors(tensors.means.double(), *tensors.tensors()[1:])
     with raises(InputError, code="shape_mismatch"):
         GaussianTensors(tensors.means, tensors.quats[:, :3], *tensors.tensors()[2:])

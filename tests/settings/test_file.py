@@ -49,5 +49,5 @@ def test_what_goes_back_to_its_default_leaves_no_empty_table(tmp_path):
 def test_a_file_that_is_not_toml_is_named(tmp_path, content):
     path = tmp_path / "settings.toml"
     path.write_bytes(content)
-    with raises(ConfigError, code="invalid_settings_file"):
+    with raises(ConfigError, code="invalid_settings_file", match=r"settings\.toml"):
         load(path)

@@ -67,7 +67,7 @@ def test_a_person_accepts_the_catalog(closed):
     with sqlite3.connect(closed / sqlite.FILE) as connection:  # as the sqlite3 program does
         connection.execute("UPDATE scenes SET name = 'renamed' WHERE name = 'monday'")
     connection.close()
-    with raises(CorruptError, code="catalog_damaged"):
+    with raises(CorruptError, code="catalog_damaged", match="accept-catalog"):
         Store.open(closed)
     (said,) = Store.accept_catalog(closed)
     assert "map.sqlite" in said

@@ -337,7 +337,7 @@ def test_keep_deletes_old_snapshots_and_what_only_they_needed(filled, place, tmp
     assert {p.name for p in objects(place)} - {"note.txt"} == needed
     restore(place, tmp_path / "r")
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
-    with raises(ConfigError, code="out_of_range"):
+    with raises(ConfigError, code="out_of_range", match="snapshots .*0"):
         save(filled, place, keep=0)
 
 

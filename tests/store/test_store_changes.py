@@ -166,7 +166,7 @@ def test_damage_is_found_and_mended(store, ids):
 @pytest.mark.guards("data")
 def test_rows_of_gaussians_that_a_scene_lacks_are_refused(store, ids):
     kept = save_comparison(store, *ids, made_change(CHAIR, after=np.array([500], np.int32)))
-    with raises(CorruptError, code="catalog_invalid"):
+    with raises(CorruptError, code="catalog_invalid", match="result of a comparison"):
         store.changes.load(kept.number)
 
 

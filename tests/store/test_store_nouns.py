@@ -276,7 +276,7 @@ def test_reviews(store, two_scenes):
     assert store.registrations.review("scene0", "scene1", "withdraw").review is None
     assert [r.review for r in store.registrations.reviews(a, b)] == ["confirm", "reject", "withdraw"]
     assert store.registrations.reviews(a, b)[0].note == "looked at it"
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="review .*'maybe'"):
         store.registrations.review(a, b, "maybe")
     none = registration(a, b, status="no_match", S_target_source=None, reason="look alike")
     store.registrations.save(none, key("register", "3"))

@@ -128,7 +128,7 @@ def test_a_strangers_objects_are_refused(store, scenes, value):
         connection.execute(update(schema.object_sets).values(value=value))
     if value.get("objects") == whole["objects"]:
         return
-    with raises(CorruptError, code="catalog_invalid"):
+    with raises(CorruptError, code="catalog_invalid", match="object_sets"):
         store.objects.sets()
 
 

@@ -43,7 +43,7 @@ def test_open_refuses_what_is_no_map(tmp_path):
     (tmp_path / "file").touch()
     with raises(StoreError, code="not_a_map"):
         Store.open(tmp_path / "file")
-    with raises(ConfigError, code="invalid_choice"):
+    with raises(ConfigError, code="invalid_choice", match="mode .*'rw'"):
         Store.open(tmp_path, "rw")
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 

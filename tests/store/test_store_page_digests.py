@@ -340,7 +340,7 @@ def test_a_catalog_in_another_journal_mode_is_refused_until_it_is_accepted(close
         assert connection.execute("PRAGMA journal_mode = DELETE").fetchone() == ("delete",)
     connection.close()
     page_digests.write_digests(file)
-    with raises(CorruptError, code="catalog_damaged"):
+    with raises(CorruptError, code="catalog_damaged", match="journal mode.*--accept-catalog"):
         Store.open(closed)
     Store.accept_catalog(closed)
     with Store.open(closed) as store:

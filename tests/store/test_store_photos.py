@@ -110,7 +110,7 @@ def test_rows_that_gsmap_did_not_write_are_told(store, scene, change):
         table = schema.photo_sightings
         value = json.loads(json.dumps(connection.execute(table.select()).one().value)) | change
         connection.execute(update(table).values(value=value))
-    with raises(CorruptError, code="catalog_invalid"):
+    with raises(CorruptError, code="catalog_invalid", match="photo_sightings"):
         store.photos.list()
 
 

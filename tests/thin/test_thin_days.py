@@ -18,5 +18,5 @@ def test_days_that_no_calendar_has_are_refused(tmp_path: Path, days: float) -> N
         cameras = Cameras(np.eye(4)[None], np.array([[40.0, 40, 16, 12]]), np.array([[32, 24]]), ("a",))
         (row,) = m.ingest(one, cameras=cameras, name="a")
         m.store.revisions.save(PoseGraph({row.scene: ScenePose(row.scene, Sim3.identity(), 0, "placed")}, {}))
-        with raises(ConfigError, code=("date_out_of_range", "out_of_range")):
+        with raises(ConfigError, code=("date_out_of_range", "out_of_range"), match="days"):
             m.thin(keep_days=days)

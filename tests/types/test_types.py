@@ -65,9 +65,9 @@ def test_gaussians_concatenate_pads_sh() -> None:
 
 
 def test_gaussians_refuse_shapes_that_do_not_fit() -> None:
-    with raises(InputError, code="shape_mismatch"):
+    with raises(InputError, code="shape_mismatch", match=r"sh must have shape \(2, K, 3\)"):
         Gaussians(np.zeros((2, 3)), np.ones((2, 4)), np.zeros((2, 3)), np.zeros(2), np.ones((2, 5, 3)))
-    with raises(InputError, code="shape_mismatch"):
+    with raises(InputError, code="shape_mismatch", match=r"quats must have shape \(2, 4\)"):
         Gaussians(np.zeros((2, 3)), np.ones((3, 4)), np.zeros((2, 3)), np.zeros(2), np.ones((2, 1, 3)))
 
 
@@ -95,11 +95,11 @@ def test_cameras_name_the_one_that_is_wrong() -> None:
     c = cameras()
     pose = c.T_frame_camera.copy()
     pose[1, 0, 3] = np.nan
-    with raises(InputError, code="not_finite"):
+    with raises(InputError, code="not_finite", match="camera 1 holds NaN"):
         Cameras(pose, c.intrinsics_px, c.sizes_px)
     pose = c.T_frame_camera.copy()
     pose[2, :3, :3] *= 2
-    with raises(InputError, code="invalid_camera"):
+    with raises(InputError, code="invalid_camera", match="camera 2 has a pose"):
         Cameras(pose, c.intrinsics_px, c.sizes_px)
 
 
