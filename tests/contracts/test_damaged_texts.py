@@ -75,15 +75,15 @@ def test_pose(tmp_path: Path, text: str) -> None:
     [
         "a = " + "9" * 5000,
         "a = " + DEEP,
-        "a = nan",
         f"[merge.mergers.voxel]\nvoxel_m = {HUGE}",
+        "[optimize]\ngate_probability = nan",
         "[describe]\nobjects = 2099-99-99",
     ],
 )
 def test_settings(tmp_path: Path, text: str) -> None:
     (tmp_path / "settings.toml").write_text(text)
     with raises(
-        ConfigError, code=("invalid_settings_file", "invalid_setting_value", "unknown_setting"), match=r"settings\.toml"
+        ConfigError, code=("invalid_settings_file", "invalid_setting_value", "out_of_range"), match=r"settings\.toml"
     ):
         map_settings(tmp_path, None, {})
     name, _, value = text.partition(" = ")

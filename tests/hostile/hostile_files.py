@@ -183,7 +183,7 @@ def a_name_that_steers_the_terminal(w: World) -> None:
     del w
 
 
-@case(r"refused .*\\x1b\[31mx", verbs=(f"list HOME/\x1b[31m{'x' * 300}.gsmap scenes",))
+@case(r"operating system .*\\x1b\[31mx", verbs=(f"list HOME/\x1b[31m{'x' * 300}.gsmap scenes",))
 def a_name_that_the_system_refuses_and_that_steers_the_terminal(w: World) -> None:
     del w
 
