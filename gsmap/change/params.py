@@ -14,14 +14,15 @@ class Params:
     Args:
         longest_side_px: Longest side in pixels, at least 1, of the views that both captures are rendered in; larger
             finds smaller changes and takes more time.
-        max_views: Largest number of views of each capture that are compared, at least 1; larger misses less and takes
-            more time.
-        voxel_m: Edge in metres, positive, of the voxels that a change is reported in; larger makes reports smaller and
-            coarser.
-        min_area_m2: Smallest changed surface in square metres that is reported, at least 0; larger drops small changes.
-        min_moved_fraction: Smallest fraction in [0, 1] of the points of an object in each scene that must fit its
-            points in the other scene for a move to be reported; larger reports fewer moves, and more pairs of
-            disappeared and appeared objects.
+        max_views: Largest number of views of each capture that are compared, at least 1; larger misses fewer changes
+            and takes more time.
+        voxel_m: Edge length in metres, positive, of the voxels in which a change is reported; larger makes reports
+            smaller and coarser.
+        min_area_m2: Smallest area in square metres, at least 0, of a change that is reported; larger drops small
+            changes.
+        min_moved_fraction: Smallest fraction in [0, 1] of an object's points in each scene that must fit the object's
+            points in the other scene for a move to be reported; larger reports fewer moves, and more pairs of a
+            disappeared and an appeared object.
         min_confidence: Smallest probability in [0, 1] of a change that is reported; larger drops doubtful changes.
     """
 

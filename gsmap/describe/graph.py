@@ -34,13 +34,15 @@ class Params:
     """Settings of `describe`.
 
     Args:
-        landmarks: Make the landmark layers, which registration and retrieval match; without them only objects are
+        landmarks: Compute the landmark layers, which retrieval and registration match; if off, only objects are
             matched.
-        objects: Make the object layer, which is rendered and segmented and takes most of the time.
+        objects: Compute the object layer by rendering and segmenting views, which takes most of the time of
+            ``describe``.
         things: Group Gaussians into segments, one per physical object, for changes and objects over time.
-        min_opacity: Opacity in [0, 1] below which a Gaussian is not part of the surface; larger ignores more haze.
-        view_distance_m: Typical distance in metres, positive, from a camera to what it sees, by which the unit of a
-            scene without metric scale is estimated; the default fits rooms, and outdoor captures need a larger one.
+        min_opacity: Smallest opacity in [0, 1] at which a Gaussian belongs to the surface; larger ignores more haze.
+        view_distance_m: Typical distance in metres, positive, from a camera to the surface that it sees, used to
+            estimate the unit of a scene without metric scale; the default fits rooms, and outdoor captures need a
+            larger value.
         landmark: Settings of the landmark layers.
         object: Settings of the object layer.
     """

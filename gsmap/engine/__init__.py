@@ -24,7 +24,8 @@ class Params:
 
     Args:
         executor: Executor that runs jobs: ``local`` (processes of this machine), ``dask`` (a running cluster), or one
-            from another package; ``auto`` takes ``GSMAP_EXECUTOR``, or ``local``.
+            from another package; ``auto`` takes the executor that the environment variable ``GSMAP_EXECUTOR`` names, or
+            ``local``.
         executors: Settings of each executor.
     """
 

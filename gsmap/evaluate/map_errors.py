@@ -40,16 +40,16 @@ class Params:
     """Settings of the evaluation.
 
     Args:
-        max_rre_deg: Largest rotation error of a right edge in degrees, positive; a larger value counts more edges as
-            right.
-        max_rte_m: Largest translation error of a right edge in metres, positive, at the source's centroid; a larger
-            value counts more edges as right.
-        truth_sigma_deg: Standard deviation of the true rotation of each scene in degrees, at least 0; a larger value
-            lowers normalized errors (NEES).
-        truth_sigma_m: Standard deviation of the true position of each scene's centroid in metres, at least 0; a larger
-            value lowers normalized errors (NEES).
-        bands: True overlaps in (0, 1), increasing, that divide pairs into bands; recall and precision are reported for
-            each band.
+        max_rre_deg: Largest rotation error in degrees, positive, of an edge that counts as correct; a larger value
+            counts more edges as correct.
+        max_rte_m: Largest translation error in metres, positive, at the source's centroid, of an edge that counts as
+            correct; a larger value counts more edges as correct.
+        truth_sigma_deg: Standard deviation in degrees, at least 0, of the rotation that the truth states for each
+            scene; a larger value lowers normalized errors (NEES).
+        truth_sigma_m: Standard deviation in metres, at least 0, of the centroid position that the truth states for each
+            scene; a larger value lowers normalized errors (NEES).
+        bands: Limits in (0, 1), increasing, that divide pairs into bands by their true overlap; recall and precision
+            are reported for each band.
     """
 
     max_rre_deg: float = 1.0

@@ -40,8 +40,8 @@ class Params:
     """Settings of levels of detail.
 
     Args:
-        views: Largest number of the scenes' cameras, at least 0, that a level is fitted to and measured by; larger is
-            slower and more reliable, and with 0 levels are merged only and their errors are distances.
+        views: Largest number of scene cameras, at least 0, from which a level is fitted and measured; larger is slower
+            and more reliable. With 0, levels are merged without a fit and their errors are distances.
         steps: Number of optimization steps of one level, at least 0; larger improves levels and takes more time.
     """
 

@@ -22,12 +22,12 @@ class Params:
     """Settings of tiles and their levels of detail.
 
     Args:
-        max_shift_m: Largest distance in metres, at least 0, that a scene may have moved within a tile before the tile
-            is made again; larger reuses more tiles.
-        max_tiles: Largest number of tiles of an export, counting those that a scene reaches into; larger permits larger
-            exports.
-        max_shared_bytes: Largest size in bytes, at least 0, of the renders that tiles share in the folder while they
-            are made; larger needs more disk and renders less often.
+        max_shift_m: Largest distance in metres, at least 0, by which a scene may have moved within a tile that is
+            reused; larger reuses more tiles.
+        max_tiles: Largest number of tiles of an export, at least 0, not counting tiles without a scene; an export with
+            more tiles is refused, so larger permits larger exports.
+        max_shared_bytes: Largest size in bytes, at least 0, of the renders that are stored in the folder during an
+            export for use by several tiles; larger needs more disk and renders less often.
         levels: Settings of the coarser levels of 3D Tiles and streamed SOG.
     """
 

@@ -20,11 +20,11 @@ class Params:
     """Settings of choosing frames of a video clip.
 
     Args:
-        interval_s: Length in seconds, positive, of the intervals of a clip, of each of which the sharpest frame is
-            used; larger is faster.
-        max_frames: Largest number of frames of a clip, at least 1, that are used; larger localizes more frames of
+        interval_s: Length in seconds, positive, of the intervals into which a clip is divided; the sharpest frame of
+            each interval is localized. Larger is faster.
+        max_frames: Largest number of frames of a clip, at least 1, that are localized; larger localizes more frames of
             long clips and takes longer.
-        max_side_px: Longer side in pixels, at least 64, to which larger frames of a clip are reduced; larger keeps
+        max_side_px: Longer side in pixels, at least 64, to which larger frames of a clip are downscaled; larger keeps
             more detail.
     """
 

@@ -18,11 +18,12 @@ class Params:
             that another package adds.
         extractors: Settings of each extractor.
         views: Settings of the scene views whose features are stored.
-        max_views: Number of views, at least 1, that a photo is matched with; larger finds more photos and is slower.
-        max_candidates: Number of candidate poses, at least 1, that are refined per photo; larger finds more photos and
+        max_views: Largest number of views, at least 1, that a photo is matched with; larger localizes more photos and
             is slower.
-        min_change_fraction: Share of the photo, in [0, 1], that a region must cover to be reported as a change; larger
-            reports fewer changes.
+        max_candidates: Largest number of candidate poses, at least 1, that are refined per photo; larger localizes more
+            photos and is slower.
+        min_change_fraction: Smallest fraction of the photo, in [0, 1], that a region must cover to be reported as a
+            change; larger reports fewer changes.
         verdict: Thresholds of accepting a pose.
         clips: Settings of choosing frames of a video clip.
     """

@@ -37,9 +37,10 @@ class Params:
     """Settings for localizing a scan.
 
     Args:
-        cell_m: Size in metres, positive, of the cells over which points are averaged; larger is faster and coarser.
-        max_scenes_by_shape: Largest number of scenes, at least 1, that a scan without colours is compared with;
-            larger finds more scans and takes longer.
+        cell_m: Edge length in metres, positive, of the cells over which points of a scan are averaged; larger is faster
+            and coarser.
+        max_scenes_by_shape: Largest number of scenes, at least 1, that a scan without colours is compared with; larger
+            localizes more scans and takes longer.
         reading: Limits of the process that reads the file.
     """
 

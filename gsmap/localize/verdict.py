@@ -20,15 +20,16 @@ class Params:
     """Thresholds of accepting a pose; a wrong pose is worse than none.
 
     Args:
-        min_probability: Probability, in [0, 1], that a pose must have from all evidence together; larger accepts fewer
-            poses, and fewer wrong ones.
-        aliased_prior: Fraction of the candidate poses, in [0, 0.7), that are expected in a room which only looks like
-            one of the map; larger accepts fewer poses, as hotels and schools need (``docs/how-to/localize.md``).
-        max_rival_probability: Probability, in [0, 1], up to which another place of the map may explain the photo;
-            larger accepts more poses, and more of similar rooms.
-        max_rotation_sigma_deg: Standard deviation in degrees, positive, that the rotation may have; larger accepts less
+        min_probability: Smallest probability in [0, 1], given all evidence, that an accepted pose is correct; larger
+            accepts fewer incorrect and fewer correct poses.
+        aliased_prior: Fraction in [0, 0.7) of the candidate poses that are expected to be incorrect because the photo
+            shows a room outside the map that looks like a room of the map; larger accepts fewer poses, as hotels and
+            schools need (``docs/how-to/localize.md``).
+        max_rival_probability: Largest probability, in [0, 1], that the photo shows another place of the map; larger
+            accepts more poses, including more poses in a similar but incorrect room.
+        max_rotation_sigma_deg: Largest standard deviation of the rotation in degrees, positive; larger accepts less
             accurate poses.
-        max_translation_sigma_m: Standard deviation in metres, positive, that the position may have; larger accepts less
+        max_translation_sigma_m: Largest standard deviation of the position in metres, positive; larger accepts less
             accurate poses.
     """
 

@@ -23,12 +23,12 @@ class Params:
     Args:
         image_size_px: Longer side in pixels, at least 64, of the renders and of the photos that are matched with them;
             larger is more accurate and slower.
-        max_own_views: Number of the scene's own cameras, at least 0, that are rendered; larger finds more photos and
+        max_own_views: Largest number of the scene's own cameras, at least 0, from which views are rendered; larger
+            localizes more photos and takes more space.
+        max_synthetic_views: Largest number of synthetic views, at least 0, that are rendered from free space off the
+            cameras' path; larger localizes more photos from unusual positions and takes more space.
+        max_features: Largest number of features, at least 1, that are stored per view; larger localizes more photos and
             takes more space.
-        max_synthetic_views: Number of synthetic views, at least 0, in free space off the cameras' path; larger finds
-            more photos from unusual positions and takes more space.
-        max_features: Number of features, at least 1, that are stored of each view; larger finds more photos and takes
-            more space.
     """
 
     image_size_px: int = 480

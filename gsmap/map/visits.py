@@ -23,8 +23,9 @@ class Params:
     """Settings of the choice of earlier visits that a scene is compared with.
 
     Args:
-        min_new_fraction: Smallest fraction in (0, 1] of a scene's bounding box that an earlier visit must add to the
-            part that later visits cover, for the scene to be compared with that visit; larger compares fewer pairs.
+        min_new_fraction: Smallest fraction in (0, 1] of a scene's bounding box that an earlier visit must cover, beyond
+            the part covered by visits chosen already, to be compared with the scene; visits are tried from the latest
+            to the earliest. Larger compares fewer pairs.
         max_earlier_visits: Largest number of earlier visits that a scene is compared with, at least 0; larger compares
             more pairs.
     """

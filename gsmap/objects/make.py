@@ -24,13 +24,13 @@ class Params:
     """Settings of objects: the association of segments, visibility tests and rooms.
 
     Args:
-        min_gaussians: Smallest number of Gaussians, at least 0, of a segment that becomes an object; larger drops small
-            objects.
+        min_gaussians: Smallest number of Gaussians, at least 0, that a segment must have to become an object; larger
+            drops small objects.
         min_overlap: Smallest fraction in [0, 1] of the smaller of two segments that must lie in the cells of the larger
-            for both to be one object; larger splits objects more often.
-        max_views: Largest number of views of a scene, at least 1 and evenly spread, in which objects are looked up;
+            segment for both segments to be one object; larger splits objects more often.
+        max_views: Largest number of views of a scene, at least 1 and evenly spread, in which objects are searched for;
             larger leaves fewer objects unobserved and takes more time.
-        longest_side_px: Longest side in pixels, at least 1, of the views in which objects are looked up; larger
+        longest_side_px: Longest side in pixels, at least 1, of the views in which objects are searched for; larger
             resolves smaller objects and takes more time.
         min_room_area_m2: Smallest floor area of a room in square metres, at least 0; larger drops closets.
     """

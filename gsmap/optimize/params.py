@@ -12,30 +12,34 @@ class Params:
     """Settings of `gsmap.optimize.optimize`.
 
     Args:
-        gate_probability: Quantile in (0, 1) of the chi-square distribution up to which an edge or a cycle of edges is
-            consistent; larger accepts edges that are further off.
-        marginals: Compute the marginal covariance of every scene pose; without it the solve is quicker.
-        max_growth: Fraction, at least 0, by which a large map may grow since its last full solve while new scenes are
-            placed one by one; 0 always solves in full, and larger solves in full less often.
-        max_full_scenes: Number of scenes, at least 0, up to which a map is always solved in full, so that its poses do
-            not depend on the order in which the scenes came; larger is slower and more accurate.
-        max_marginal_scenes: Number of scenes, at least 0, up to which a component gets covariances; they take 1 ms a
-            scene at 1,000 scenes and 8 ms at 10,000.
-        min_large_component: Number of scenes, at least 1, from which a component is large: smaller ones may be
-            attached by a single edge, and a larger value attaches more scenes by single edges.
-        min_bridge_edges: Number of agreeing edges, at least 1, over as many scene pairs, that it takes to join two
-            large components without a confirmed edge; larger joins fewer components.
-        min_wrong_probability: Probability in (0, 1) from which one edge, or set of edges, of a contradictory loop is
-            rejected; below it all suspects are left undecided, so larger leaves more edges undecided.
-        max_disagreement: Fraction in (0, 1) of the surface seen by both captures of an edge that may disagree before
-            the edge is doubtful; larger trusts edges between places that look alike. Unchanged places with doors shut
-            between captures reach 0.064, look-alikes with different furniture begin at 0.145.
-        same_visit_h: Hours, at least 0, within which two captures count as one visit, between which nothing changes;
-            larger refuses more edges between captures that disagree.
-        max_tilt_deg: Tilt in degrees, at least 0, up to which a component is not turned upright after the solve;
-            larger turns fewer components.
-        max_unchanged_sigmas: Standard deviations, at least 0, up to which a scene keeps the pose of the previous
-            revision; larger keeps more poses, and 0 keeps a pose only where rounding moved it.
+        gate_probability: Quantile in (0, 1) of the chi-square distribution up to which the residual of an edge or of a
+            cycle of edges is consistent; larger accepts larger residuals.
+        marginals: Compute the marginal covariance of every scene pose; if off, the solve is faster.
+        max_growth: Largest fraction, at least 0, by which a large map may grow after a full solve before it is solved
+            in full again; until then, new scenes are placed one by one. 0 always solves in full, and larger solves in
+            full less often.
+        max_full_scenes: Largest number of scenes, at least 0, of a map that is always solved in full, so that its poses
+            do not depend on the order in which scenes were added; larger is slower and more accurate.
+        max_marginal_scenes: Largest number of scenes, at least 0, of a component whose covariances are computed; a
+            larger value computes covariances of larger components, in 1 ms per scene at 1,000 scenes and 8 ms per scene
+            at 10,000.
+        min_large_component: Smallest number of scenes, at least 1, of a large component; a single edge suffices to
+            attach a smaller component, so a larger value attaches more scenes by single edges.
+        min_bridge_edges: Smallest number of scene pairs, at least 1, whose edges must agree to join two large
+            components, unless one edge is confirmed; larger joins fewer components.
+        min_wrong_probability: Smallest probability in (0, 1) of being wrong at which an edge, or a set of edges, of a
+            contradictory loop is rejected; if no edge reaches it, all suspects stay undecided, so larger leaves more
+            edges undecided.
+        max_disagreement: Fraction in (0, 1) of the surface seen by both captures of an edge; if the captures disagree
+            on more of it, the edge is doubtful. Larger trusts edges between places that look alike: an unchanged place
+            with a door shut between the captures reaches 0.064, and different places that look alike begin at 0.145.
+        same_visit_h: Longest time in hours, at least 0, between two captures of one visit, during which nothing is
+            expected to change; larger refuses more edges between captures that disagree.
+        max_tilt_deg: Largest tilt in degrees, at least 0, that a component may keep after the solve; a component with
+            more tilt is turned upright, so larger turns fewer components.
+        max_unchanged_sigmas: Largest motion of a scene, in standard deviations of its pose, at least 0, at which the
+            scene keeps its pose of the previous revision; larger keeps more poses, and 0 keeps a pose only if no more
+            than rounding moved it.
     """
 
     gate_probability: float = 0.999

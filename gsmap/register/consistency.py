@@ -24,8 +24,9 @@ class Params:
     """Pairwise test of correspondences.
 
     Args:
-        test: Test of two correspondences: ``absolute`` (their distances in both scenes may differ by a fixed error) or
-            ``ratio`` (by a share of the distance, as Graph-GSReg).
+        test: Test whether two correspondences are compatible: their distance in one scene may differ from their
+            distance in the other scene by a fixed error (``absolute``) or by a fraction of the distance (``ratio``, as
+            in Graph-GSReg).
         height_slope: Largest difference in height per metre of distance, at least 0, where gravity is known in both
             scenes; a larger value tolerates tilted scenes and inf switches the test off.
     """

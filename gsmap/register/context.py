@@ -23,8 +23,8 @@ class Params:
     """Context of objects.
 
     Args:
-        hops: Number of edges of the local graph, at least 1, that an object's context reaches; a larger value describes
-            a larger neighbourhood (Graph-GSReg: 3).
+        hops: Largest distance from an object to a node of its context, as a number of edges of the local graph, at
+            least 1; a larger value describes a larger neighbourhood (Graph-GSReg: 3).
     """
 
     hops: int = 1

@@ -19,19 +19,20 @@ class Params:
     Args:
         proposer: Method that proposes poses; ``graph`` finds the maximum clique of compatible correspondences.
         fallback_proposer: Method that proposes poses where a scene graph has few nodes.
-        fallback: Use of the fallback proposer: ``auto`` where a scene graph has few nodes, ``never`` or ``always``.
+        fallback: Condition for using the fallback proposer: ``auto`` (if a scene graph has few nodes), ``never`` or
+            ``always``.
         proposers: Settings of each proposer.
-        max_poses: Number of poses, at least 1, that are refined and verified in each round of proposals, and again as
-            rivals of an accepted pose; a larger value finds more matches and is slower.
+        max_poses: Largest number of poses, at least 1, that are refined and verified in each round of proposals, and
+            again the largest number of rival poses per accepted pose; a larger value finds more matches and is slower.
         coarse_refiner: Method of the first refinement, which brings a proposed pose near enough to be verified;
             ``none`` skips it.
         refiner: Method of the final refinement: ``colored_icp``, ``gicp``, ``icp`` (as Graph-GSReg) or ``none``.
         refiners: Settings of each refiner.
-        polisher: Refiner that runs last and whose pose is kept only where local colours then agree better;
+        polisher: Refiner that runs last, or ``none``; its pose is kept only if local colours agree better after it.
             ``photometric`` aligns renders, which gains nothing where scenes share most views and misleads where they
             share few.
-        num_cameras: Number of cameras of each scene, at least 1, through which a refined pose is verified; a larger
-            value is slower and finds more violations of free space.
+        num_cameras: Largest number of cameras of each scene, at least 1, from which a refined pose is verified; a
+            larger value is slower and finds more violations of free space.
         verdict: Thresholds for accepting a pose.
     """
 

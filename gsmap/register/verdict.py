@@ -31,16 +31,16 @@ class Params:
     """Thresholds for accepting a pose; a wrong edge costs a map more than ten missed right ones.
 
     Args:
-        max_log_nfa: Largest log10 of the number of false alarms (NFA) at which a clique counts as significant,
-            at most 0; a larger value accepts more poses, and different rooms with the same furniture reach -7.
+        max_log_nfa: Largest log10 of the number of false alarms (NFA) at which a clique counts as significant, at most
+            0; a larger value accepts more poses (poses between different rooms with the same furniture reach -7).
         min_coinciding: Smallest number of source surface cells, at least 1, that must coincide with the target's
             surface; a larger value rejects small overlaps.
         max_free_space_violation: Largest fraction in [0, 1] of one scene's surface that may stand in the free space of
             the other; a larger value tolerates more change between captures.
-        min_colour_correlation: Smallest correlation in [-1, 1] of local colours in renders of both scenes; a larger
-            value rejects more repainted places.
-        min_probability: Smallest probability in [0, 1] that a pose is right by all evidence together; a larger value
-            accepts fewer wrong and fewer right poses.
+        min_colour_correlation: Smallest correlation in [-1, 1] between the local colours of both scenes in renders; a
+            larger value rejects more repainted places.
+        min_probability: Smallest probability in [0, 1], given all evidence, that an accepted pose is correct; a larger
+            value accepts fewer incorrect and fewer correct poses.
         max_rotation_sigma_deg: Largest standard deviation of the rotation, in degrees, in its least certain direction
             at the overlap's centroid; a larger value accepts less certain poses.
         max_translation_sigma_m: Largest standard deviation of the translation, in metres, in its least certain

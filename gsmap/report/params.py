@@ -12,13 +12,14 @@ class Params:
     """Settings of the report, a page of a few megabytes that is computed in seconds.
 
     Args:
-        islands: Number of components with a floor plan, at least 0, the largest first; more take longer.
-        pair_pictures: Number of tentative and undecided pairs with a picture, at least 0, the most doubtful first; more
-            take longer and make the page larger.
-        change_pictures: Number of changes with a picture, at least 0, the surest first; more take longer and make the
-            page larger.
-        scenes: Number of rows in the table of scenes, at least 0; more rows make the page larger.
-        edges: Number of rows in the table of edges, at least 0; more rows make the page larger.
+        islands: Largest number of components drawn as a floor plan, at least 0, the largest components first; more
+            plans take longer.
+        pair_pictures: Largest number of tentative and undecided pairs shown with a picture, at least 0, the most
+            doubtful first; more pictures take longer and make the page larger.
+        change_pictures: Largest number of changes shown with a picture, at least 0, the most probable first; more
+            pictures take longer and make the page larger.
+        scenes: Largest number of rows in the table of scenes, at least 0; more rows make the page larger.
+        edges: Largest number of rows in the table of edges, at least 0; more rows make the page larger.
     """
 
     islands: int = 8

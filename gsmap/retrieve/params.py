@@ -12,15 +12,15 @@ class Params:
     """Settings of retrieval.
 
     Args:
-        top_k: Number of the best candidates, at least 0, that each scene is paired with; a larger value finds more
-            edges and is slower.
-        max_edges_per_scene: Number of undisputed edges, at least 1, that is enough for a scene: a pair is skipped if
-            both its scenes have as many and an edge or a common neighbour connects them; a larger value registers
-            more pairs and stabilizes the map.
-        nodes_per_scene: Number of the strongest nodes of each layer, at least 1, that an index keeps of a scene; a
-            larger value finds smaller overlaps, and takes more memory and time.
-        num_neighbours: Number of the nearest scenes in its component, at least 0, that each scene with a pose is paired
-            with; a larger value finds more edges and is slower.
+        top_k: Largest number of candidates, at least 0 and the best first, that each scene is paired with; a larger
+            value finds more edges and is slower.
+        max_edges_per_scene: Number of undisputed edges, at least 1, that suffices for a scene: a pair is skipped if
+            both scenes have this number and an edge or a common neighbour connects them already; a larger value
+            registers more pairs and stabilizes the map.
+        nodes_per_scene: Largest number of nodes per scene and layer, at least 1 and the strongest first, that an index
+            stores; a larger value finds smaller overlaps, and takes more memory and time.
+        num_neighbours: Largest number of scenes, at least 0 and the nearest in the component first, that each scene
+            with a pose is paired with; a larger value finds more edges and is slower.
     """
 
     top_k: int = 12

@@ -21,15 +21,15 @@ class Params:
     """Settings of thinning.
 
     Args:
-        min_seen_again: Smallest fraction in [0, 1] of a scene's surface that newer, whole scenes must have observed
-            before it is thinned; larger thins fewer scenes.
-        min_weight: Largest blending weight in [0, 1] that a Gaussian must reach in some view of its scene to be kept;
+        min_seen_again: Smallest fraction in [0, 1] of a scene's surface that newer scenes, not thinned themselves, must
+            have observed before the scene is thinned; larger thins fewer scenes.
+        min_weight: Blending weight in [0, 1] that a Gaussian must reach in at least one view of its scene to be kept;
             larger removes more Gaussians.
-        min_fidelity_db: Smallest PSNR in dB of the thinned scene against the whole one, in the scene's own views, at
-            which it is thinned; larger thins fewer scenes. At 43 dB a scene that fits its photographs at 27 dB loses
-            0.1 dB of that.
-        max_views: Largest number of views, at least 1, evenly along the camera path, in which the PSNR is measured;
-            larger is more reliable and slower.
+        min_fidelity_db: Smallest PSNR in dB that the thinned scene must reach against the original scene, in the
+            scene's own views; larger thins fewer scenes. At 43 dB, a scene with a PSNR of 27 dB against its photographs
+            loses 0.1 dB.
+        max_views: Largest number of views, at least 1 and evenly spread along the camera path, in which the PSNR is
+            measured; larger is more reliable and slower.
         longest_side_px: Longest side in pixels, at least 1, of the views in which the PSNR is measured; larger counts
             smaller Gaussians as visible and is slower.
     """

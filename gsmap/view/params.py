@@ -12,14 +12,16 @@ class Params:
     """Settings of the page; its levels of detail are kept in the user's cache folder, not in the map.
 
     Args:
-        cache_gib: Size in GiB that cached levels of detail may take, positive; more avoids computing levels again.
-        workers: Number of threads that compute levels of detail, at least 1; more are faster and need more memory.
-        picture_gaussians: Largest number of Gaussians of a pair of scenes for which a picture is drawn, at least 0; a
-            larger number draws larger pairs and needs more memory.
-        site_pairs: Number of pairs with pictures on a static page, at least 0, the most doubtful first; more pairs make
-            the page larger.
-        site_changes: Number of changes with pictures on a static page, at least 0, the surest first; more changes make
-            the page larger.
+        cache_gib: Largest size of all cached levels of detail in GiB, positive; a larger cache avoids computing levels
+            again.
+        workers: Number of threads that compute levels of detail, at least 1; more threads are faster and need more
+            memory.
+        picture_gaussians: Largest number of Gaussians, at least 0, that a pair of scenes may have for its picture to be
+            drawn; a larger number draws larger pairs and needs more memory.
+        site_pairs: Largest number of pairs shown with pictures on a static page, at least 0, the most doubtful first;
+            more pairs make the page larger.
+        site_changes: Largest number of changes shown with pictures on a static page, at least 0, the most probable
+            first; more changes make the page larger.
     """
 
     cache_gib: float = 20.0

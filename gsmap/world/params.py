@@ -21,16 +21,16 @@ class Params:
     """Default uncertainties of georeferencing; ``optimize.survey`` holds the settings of the solver.
 
     Args:
-        area_margin_deg: Distance in degrees, positive, by which points may lie outside the area of use of their CRS;
-            larger values accept more points, and swapped axes among them.
-        gcp_sigma_m: Standard deviation in metres, positive, of control points that are given without one; larger
-            values lower their weight.
-        gnss_sigma_m: Standard deviation in metres, positive, of EXIF positions that are given without one, independent
-            from photo to photo; larger values lower their weight.
+        area_margin_deg: Largest distance in degrees, positive, at which points may lie outside the area of use of their
+            CRS; larger values accept more points, including more points with swapped axes.
+        gcp_sigma_m: Standard deviation in metres, positive, of control points for which none is specified; larger
+            values lower the weight of these points.
+        gnss_sigma_m: Standard deviation in metres, positive, of the independent error of each EXIF position that
+            specifies none; larger values lower the weight of these positions.
         gnss_common_sigma_m: Standard deviation in metres, positive, of the error that all EXIF positions of a scene
-            share; larger values lower their weight.
-        survey_sigma_m: Standard deviation in metres, positive, of surveyed scene positions that are given without one;
-            larger values lower their weight.
+            share; larger values lower the weight of these positions.
+        survey_sigma_m: Standard deviation in metres, positive, of surveyed scene positions for which none is specified;
+            larger values lower the weight of these positions.
     """
 
     area_margin_deg: float = 2.0

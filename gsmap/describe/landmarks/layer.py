@@ -30,10 +30,10 @@ class Params:
     """Settings of the landmark layers.
 
     Args:
-        max_per_octave: Number of landmarks, at least 1, that are kept per octave of size, the strongest first; larger
-            finds more overlap in large scenes, and takes more time and space.
-        use_fitted_metric: Transform embeddings by the metric fitted on synthetic places; layers with and without it do
-            not compare.
+        max_per_octave: Largest number of landmarks, at least 1, that are kept per octave of size, the strongest first;
+            larger finds more overlap in large scenes, and takes more time and space.
+        use_fitted_metric: Transform embeddings by a metric that was fitted on synthetic places; a layer with
+            transformed embeddings cannot be matched with a layer without.
     """
 
     max_per_octave: int = MAX_PER_OCTAVE

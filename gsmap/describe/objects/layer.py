@@ -45,20 +45,21 @@ class Params:
         embedder: Embedder that describes masks: ``builtin``, ``clip`` or one from another package; ``auto`` takes the
             first that needs models and has them all, or ``builtin``.
         embedders: Settings of each embedder.
-        render_backend: Renderer of the views: ``native`` (CPU), ``gsplat`` (CUDA), or ``auto`` for gsplat where there
-            is a GPU for it.
-        num_cameras: Number of views, at least 1, that are rendered of a scene, evenly spread over its cameras; larger
-            finds more objects and takes longer.
+        render_backend: Renderer of the views: ``native`` (CPU), ``gsplat`` (CUDA), or ``auto``, which takes gsplat if
+            it finds a CUDA GPU.
+        num_cameras: Largest number of cameras of a scene, at least 1 and evenly spread, from which views are rendered;
+            larger finds more objects and takes longer.
         longest_side_px: Longer side of a rendered view in pixels, positive; larger resolves smaller objects and takes
             longer.
-        depth_tolerance: Fraction, positive, of the rendered depth within which a Gaussian is visible; larger assigns
-            more hidden Gaussians to a mask, and inf all that project into it (as in Graph-GSReg).
-        min_confidence: Confidence in [0, 1] below which masks are dropped; larger keeps fewer, more certain masks.
+        depth_tolerance: Largest difference between the depth of a visible Gaussian and the rendered depth, as a
+            positive fraction of the rendered depth; larger assigns more hidden Gaussians to a mask, and inf assigns
+            every Gaussian that projects into the mask (as Graph-GSReg does).
+        min_confidence: Smallest confidence in [0, 1] of a mask that is kept; larger keeps fewer, more certain masks.
         min_views: Number of views, at least 1, that must show an object; larger drops more spurious objects.
-        model_time_s: Seconds, positive, that a model may take to load or for one run before it is ended with an error;
-            larger allows slower models.
-        model_memory_mb: Memory in MB, positive, that a model may take beside its libraries before it is ended with an
-            error (on Linux); larger allows larger models.
+        model_time_s: Longest time in seconds, positive, that a model may take to load, or to run once, before it is
+            ended with an error; larger allows slower models.
+        model_memory_mb: Largest memory in MB, positive, that a model may use in addition to its libraries before it is
+            ended with an error (on Linux); larger allows larger models.
     """
 
     segmenter: str = "auto"

@@ -31,7 +31,7 @@ class Params:
     """Settings of the built-in segmenter.
 
     Args:
-        scale: Felzenszwalb's k, positive: larger makes fewer, larger parts.
+        scale: Parameter k of Felzenszwalb's segmentation, positive; larger makes fewer and larger parts.
     """
 
     scale: float = 6.0

@@ -36,9 +36,10 @@ class Params:
     """Settings of SAM's automatic mask generator.
 
     Args:
-        points_per_side: Number of prompts, at least 1, along each side of a view; larger finds more small objects and
-            takes longer.
-        min_iou: Intersection over union in [0, 1] that SAM must predict for a mask; larger keeps fewer masks.
+        points_per_side: Number of point prompts, at least 1, along each side of a view; larger finds more small objects
+            and takes longer.
+        min_iou: Smallest intersection over union in [0, 1], as predicted by SAM, of a mask that is kept; larger keeps
+            fewer masks.
     """
 
     points_per_side: int = 16

@@ -37,8 +37,10 @@ class Params:
     """Settings of the Dask executor.
 
     Args:
-        scheduler: Address of the scheduler, such as ``tcp://host:8786``; empty takes ``GSMAP_SCHEDULER``.
-        timeout_s: Seconds, positive, to wait for the scheduler before a run fails; larger tolerates slower networks.
+        scheduler: Address of the Dask scheduler, such as ``tcp://host:8786``; if empty, the environment variable
+            ``GSMAP_SCHEDULER`` is used.
+        timeout_s: Longest time in seconds, positive, to wait for the scheduler before a run fails; larger tolerates
+            slower networks.
     """
 
     scheduler: str = ""

@@ -24,8 +24,8 @@ class Params:
     """Settings of the local executor.
 
     Args:
-        workers: Number of processes, at least 0, that compute at once; larger is faster and takes more memory, and 0
-            takes ``GSMAP_WORKERS``, or every processor that this process may use.
+        workers: Number of worker processes, at least 0; larger is faster and takes more memory. With 0, the environment
+            variable ``GSMAP_WORKERS`` sets the number, and without it every available processor gets a worker.
     """
 
     workers: int = 0

@@ -15,8 +15,8 @@ class Params:
     """Limits of the process that reads a mesh or a LAS file.
 
     Args:
-        max_seconds: Wall time in seconds, positive, after which the process that reads a scan is ended; larger values
-            admit larger files.
+        max_seconds: Longest wall time in seconds, positive, before the process that reads a scan is ended with an
+            error; larger values admit larger files.
         max_memory_mb: Memory in MiB, positive, that the process that reads a scan may take; larger values admit
             larger files.
     """

@@ -29,9 +29,9 @@ class Params:
     """Settings of the extractor ``onnx``.
 
     Args:
-        max_features: Number of features, at least 1, of an image, those with the highest scores; larger finds more
+        max_features: Largest number of features per image, at least 1, the highest scores first; larger localizes more
             photos and is slower.
-        min_score: Score, in the unit of the network, below which features are dropped; larger keeps fewer.
+        min_score: Smallest score, in the unit of the network, of a feature that is kept; larger keeps fewer features.
     """
 
     max_features: int = 1500

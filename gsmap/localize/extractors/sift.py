@@ -30,10 +30,10 @@ class Params:
     """Settings of the extractor ``sift``.
 
     Args:
-        max_features: Number of features, at least 1, of an image, the largest ones first; larger finds more photos and
-            is slower.
-        upsampled: Extract features from the image at double size as well, which finds twice as many in three times the
-            time.
+        max_features: Largest number of features per image, at least 1, the largest features first; larger localizes
+            more photos and is slower.
+        upsampled: Extract features also from the image enlarged to double size, which finds twice as many features in
+            three times the time.
     """
 
     max_features: int = 1500

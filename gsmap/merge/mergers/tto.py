@@ -52,31 +52,35 @@ class Params:
     """Settings of test-time optimization.
 
     Args:
-        min_weight: Smallest blending weight in [0, 1] that a Gaussian must reach in some view of its scene to be kept,
-            unless it has the largest weight of some pixel; larger removes more Gaussians.
-        kept_fraction: Largest number of Gaussians that a tile starts from, as a fraction in [0, 1] of its scenes'
-            Gaussians; smaller merges more of the most similar pairs, and 1 merges none.
-        voxel_m: Edge in metres, positive, of the voxels in which Gaussians are merged first; larger leaves fewer.
-        owner_cells: Assign each cell of half a metre to the scene that shows most of it, so that two scenes of one
-            surface do not overlay each other.
-        ssim_weight: Weight in [0, 1] of 1 - SSIM in the loss, the rest being Huber's loss; larger favours structure
-            over colour.
-        huber_delta: Difference of colours in [0, 1], at least 0, below which the loss is quadratic; 0 is the L1 loss.
+        min_weight: Blending weight in [0, 1] that a Gaussian must reach in at least one view of its scene to be kept,
+            unless it has the largest weight at some pixel; larger removes more Gaussians.
+        kept_fraction: Largest number of Gaussians in a tile before its optimization, as a fraction in [0, 1] of the
+            Gaussians of its scenes in the tile; smaller merges more pairs of similar Gaussians, and 1 merges none.
+        voxel_m: Edge length in metres, positive, of the voxels in which Gaussians are merged first; larger leaves fewer
+            Gaussians.
+        owner_cells: Assign each cell of half a metre to the scene that shows most of the cell, so that Gaussians of two
+            scenes do not overlay each other on one surface.
+        ssim_weight: Weight in [0, 1] of 1 - SSIM in the loss, whose remaining weight goes to the Huber loss; larger
+            favours structure over colour.
+        huber_delta: Colour difference, at least 0 (colours lie in [0, 1]), below which the loss is quadratic; larger
+            weakens the effect of small differences, and 0 is the L1 loss.
         momentum: First-moment decay rate of Adam in [0, 1); larger smooths the steps more, which delays a fit of few
             steps.
-        max_passes: Largest number of passes over all views, at least 0, where ``steps`` is not given; the fit ends
-            earlier once it no longer improves, and larger improves it at the cost of time.
-        steps: Exact number of optimization steps, at least 0; none leaves it to ``max_passes``.
-        halo_m: Width in metres, at least 0, of the surroundings of a tile that are optimized with it, the outer half
-            fixed; larger hides seams better and takes more time.
+        max_passes: Largest number of passes over all views, at least 0, if ``steps`` is not set; the fit ends earlier
+            once it no longer improves. Larger improves the fit and takes more time.
+        steps: Exact number of optimization steps, at least 0; larger takes more time. If none is set, ``max_passes``
+            limits the steps.
+        halo_m: Width in metres, at least 0, of the surroundings that are rendered with a tile; Gaussians in the inner
+            half are optimized with the tile, those in the outer half stay fixed. Larger hides seams better and takes
+            more time.
         longest_side_px: Longest side in pixels, at least 1, of the reference views; larger keeps finer detail and takes
             more time and memory.
-        max_views: Largest number of reference views of a tile, at least 1, those that together see it best, newer ones
-            first; larger takes more memory (3 MB per view of 960 pixels) and time.
-        photo_weight: Number of uses of a kept photo in every pass, at least 0, relative to a rendered view; larger
-            follows photos more closely, and 0 ignores them.
-        balance_exposure: Bring all scenes to one exposure first, which looks even but no longer reproduces each
-            scene.
+        max_views: Largest number of reference views of a tile, at least 1, chosen to see the tile best together, newer
+            views first; larger takes more memory (3 MB per view of 960 pixels) and time.
+        photo_weight: Number of times, at least 0, that each reference photo is used per use of a rendered view; larger
+            follows photos more closely, and 0 ignores photos.
+        balance_exposure: Adjust all scenes to one exposure first, which looks even but no longer reproduces the colours
+            of each scene.
         prefer: Scene that is shown where scenes of different dates disagree: the ``newest``, the ``best`` observed one,
             or ``both``.
     """

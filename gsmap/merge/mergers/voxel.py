@@ -23,7 +23,8 @@ class Params:
     """Settings of voxelization.
 
     Args:
-        voxel_m: Edge in metres, positive, of the voxels whose Gaussians become one; larger leaves fewer.
+        voxel_m: Edge length in metres, positive, of the voxels; all Gaussians in a voxel are merged to one, so larger
+            leaves fewer Gaussians.
         prefer: Scene that is shown where scenes of different dates disagree: the ``newest``, the ``best`` observed one,
             or ``both``.
     """

@@ -46,13 +46,15 @@ class Params:
     """Pose proposals by matching two scene graphs.
 
     Args:
-        kinds: Kinds of nodes that propose poses, each on its own: ``landmarks``, ``objects`` or both.
+        kinds: Kinds of nodes from which poses are proposed, separately for each kind: ``landmarks``, ``objects`` or
+            both.
         context: Context of objects.
         consistency: Pairwise test of correspondences.
-        max_correspondences: Number of the most similar candidate correspondences, at least 4, that are kept; a larger
-            value finds more matches and is slower.
-        step_limit: Number of steps of a clique search, at least 1, about two nanoseconds each; a search that reaches
-            the limit returns the largest clique found so far.
+        max_correspondences: Largest number of candidate correspondences, at least 4 and the most similar first, that
+            are kept; a larger value finds more matches and is slower.
+        step_limit: Largest number of steps of a clique search, at least 1 (a step takes about two nanoseconds); a
+            search that reaches the limit returns the largest clique found so far, and a larger value completes more
+            searches.
     """
 
     kinds: tuple[str, ...] = ("landmarks", "objects")

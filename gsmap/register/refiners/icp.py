@@ -22,8 +22,8 @@ class Params:
     the pose drifts along walls and floors (measured in a room: 1.3 m at 0.35, 9 cm at 0.12).
 
     Args:
-        radii_m: Largest correspondence distances in metres, positive, one run each, coarse to fine; larger values
-            reach farther and drift more.
+        radii_m: Largest correspondence distance in metres, positive, of each run of ICP, from the coarse run to the
+            fine one; larger values reach farther and drift more.
         means: Align the means of all surface Gaussians, as Graph-GSReg does, instead of their averages over cells.
     """
 
