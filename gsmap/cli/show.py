@@ -95,7 +95,7 @@ def _print_scene(scene: SceneReport, nodes: bool) -> None:
         "Gaussians": f"{scene.num_gaussians}, SH degree {scene.sh_degree}" + ", antialiased" * scene.antialiased,
         "cameras": f"{scene.num_cameras}" + ", synthesised" * scene.cameras_synthesised,
         "size": f"{shown(size)} units",
-        "scale": scene.scale_policy + ("" if scene.unit_m is None else f", about {shown(scene.unit_m)} m a unit"),
+        "scale": scene.scale_policy + ("" if scene.unit_m is None else f", about {shown(scene.unit_m)} m per unit"),
         "map": None if metre is None else metre.text(),
         "note on the metric scale": scene.metre_note or None,
         "up": scene.up,

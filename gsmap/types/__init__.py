@@ -1,4 +1,4 @@
-"""The frozen data types of gsmap. They need numpy only and are passed between stages, processes and machines."""
+"""Frozen data types that stages, processes and machines exchange. They import numpy only."""
 
 from gsmap.types.cameras import Cameras
 from gsmap.types.change import CHANGE_KINDS, Change, ChangeKind, ChangeReport

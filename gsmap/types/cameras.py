@@ -12,7 +12,7 @@ from gsmap.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """C undistorted pinhole cameras (OpenCV axes: x right, y down, z forward; pixel centres at +0.5).
+    """A set of C undistorted pinhole cameras (OpenCV axes: x right, y down, z forward; pixel centres at +0.5).
 
     Args:
         T_frame_camera: (C, 4, 4) float64, camera-to-frame (the camera's centre is the last column).
@@ -74,12 +74,12 @@ class Cameras:
 
     @property
     def centers(self) -> np.ndarray:
-        """(C, 3) camera centres in the frame."""
+        """Camera centres (C, 3) in the frame."""
         return self.T_frame_camera[:, :3, 3]
 
     @property
     def T_camera_frame(self) -> np.ndarray:
-        """(C, 4, 4) frame-to-camera (the view matrices)."""
+        """View matrices (C, 4, 4), which map points from the frame to each camera."""
         rotation = self.T_frame_camera[:, :3, :3].transpose(0, 2, 1)
         out = np.tile(np.eye(4), (len(self), 1, 1))
         out[:, :3, :3] = rotation
@@ -88,14 +88,14 @@ class Cameras:
 
     @property
     def K(self) -> np.ndarray:
-        """(C, 3, 3) calibration matrices."""
+        """Calibration matrices (C, 3, 3)."""
         out = np.tile(np.eye(3), (len(self), 1, 1))
         out[:, 0, 0], out[:, 1, 1] = self.intrinsics_px[:, 0], self.intrinsics_px[:, 1]
         out[:, 0, 2], out[:, 1, 2] = self.intrinsics_px[:, 2], self.intrinsics_px[:, 3]
         return out
 
     def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Cameras:
-        """Return the cameras at an index, slice, boolean mask or integer array; always a `Cameras`."""
+        """Return the cameras at an index, slice, boolean mask or integer array as a `Cameras`, also for one index."""
         rows = np.atleast_1d(np.arange(len(self))[index])
         names = tuple(self.names[i] for i in rows)
         return Cameras(
@@ -103,13 +103,13 @@ class Cameras:
         )
 
     def evenly(self, count: int) -> Cameras:
-        """Return at most ``count`` cameras, evenly spaced along the capture, in its order."""
+        """Return at most ``count`` cameras, evenly spaced along the capture, in the order of the capture."""
         if len(self) <= count:
             return self
         return self[np.linspace(0, len(self) - 1, count).round().astype(int)]
 
     def resized(self, longest_side_px: int) -> Cameras:
-        """Return the same views with images shrunk to at most ``longest_side_px`` pixels on the longer side."""
+        """Return the same cameras with images downscaled to at most ``longest_side_px`` pixels on the longer side."""
         factor = np.minimum(1.0, longest_side_px / self.sizes_px.max(1))
         sizes = np.maximum(1, np.round(self.sizes_px * factor[:, None])).astype(np.int64)
         # Scale by the rounded sizes, so that the principal point stays at the same place of the image.

@@ -11,12 +11,14 @@ import numpy as np
 from gsmap.types.sim3 import Sim3
 
 ChangeKind = Literal["appeared", "disappeared", "moved", "recoloured", "replaced", "lighting"]
-"""``appeared`` and ``disappeared``: a thing where the other capture looked through. ``moved``: both, and one thing.
-``recoloured``: the same surface in another colour. ``replaced``: another thing where one stood. ``lighting``: the same
-surfaces, lit otherwise; of the place, never of a thing."""
+"""``appeared`` and ``disappeared``: an object in one capture where the other capture shows free space. ``moved``: an
+object that disappeared at one place and appeared at another. ``recoloured``: the same surface in another colour.
+``replaced``: an object where the older capture shows another object. ``lighting``: the same surfaces under another
+light; a change of the whole place, never of one object.
+"""
 
 Symmetry = Literal["none", "half", "any"]
-"""The turn about the vertical that nothing tells apart: none, half a turn, any."""
+"""The rotation about the vertical that leaves an object looking the same: none, half a turn, or any."""
 
 SYMMETRIES: tuple[Symmetry, ...] = ("none", "half", "any")
 CHANGE_KINDS: tuple[ChangeKind, ...] = ("appeared", "disappeared", "moved", "recoloured", "replaced", "lighting")
@@ -24,7 +26,7 @@ CHANGE_KINDS: tuple[ChangeKind, ...] = ("appeared", "disappeared", "moved", "rec
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """One change from an older capture to a newer one; all lengths and frames are those of the comparison.
+    """One change from an older capture to a newer one, in the frame and unit of the comparison.
 
     Args:
         kind: the kind of change.

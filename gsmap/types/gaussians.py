@@ -16,7 +16,7 @@ _SH_DEGREE = {1: 0, 4: 1, 9: 2, 16: 3}
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N 3D Gaussians in one frame, stored as a trainer stores them (float32, C-contiguous).
+    """A set of N 3D Gaussians in one frame, with the parametrization of trainers (float32, C-contiguous).
 
     Args:
         means: (N, 3) centres about ``origin``, in the frame's unit.
@@ -87,25 +87,25 @@ class Gaussians:
 
     @property
     def opacities(self) -> np.ndarray:
-        """(N,) float32 in [0, 1]."""
+        """Opacities (N,) float32 in [0, 1]."""
         with np.errstate(over="ignore"):
             out: np.ndarray = 1.0 / (1.0 + np.exp(-self.logit_opacities))
         return out
 
     @property
     def scales(self) -> np.ndarray:
-        """(N, 3) float32 standard deviations, in the frame's unit."""
+        """Standard deviations (N, 3) float32, in the frame's unit."""
         out: np.ndarray = np.exp(self.log_scales)
         return out
 
     @property
     def positions(self) -> np.ndarray:
-        """(N, 3) float64 centres in the frame."""
+        """Centres (N, 3) float64 in the frame."""
         out: np.ndarray = self.means + self.origin
         return out
 
     def about(self, origin: np.ndarray) -> Gaussians:
-        """Return the same Gaussians about another origin (3,), in the frame's coordinates."""
+        """Return the same Gaussians with means relative to another origin (3,), which is given in the frame."""
         if np.array_equal(origin, self.origin):
             return self
         means = (self.means + (self.origin - origin)).astype(np.float32)
@@ -121,14 +121,16 @@ class Gaussians:
             return replace(self, **{name: getattr(self, name)[index] for name in FIELDS})
         if index.dtype == bool:
             if index.shape != (len(self),):
-                raise IndexError(f"a mask of shape {index.shape} for {len(self)} Gaussians")
+                raise IndexError(f"a mask of shape {index.shape} does not fit {len(self)} Gaussians")
             index = np.flatnonzero(index)
         # Five times as fast as by brackets.
         return replace(self, **{name: getattr(self, name).take(index, axis=0) for name in FIELDS})
 
     @classmethod
     def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:
-        """Concatenate parts in order, about the origin of the first; lower SH degrees are padded with zeros."""
+        """Concatenate parts in order, with means relative to the origin of the first part; pad lower SH degrees with
+        zeros.
+        """
         if not parts:
             return cls.empty()
         parts = [part.about(parts[0].origin) for part in parts]

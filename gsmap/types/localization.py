@@ -37,16 +37,19 @@ class Photo:
         intrinsics = np.array(self.intrinsics_px, dtype=np.float64)
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.dtype != np.uint8 or min(self.rgb.shape) < 1:
             raise InputError(
-                f"{self.name}: a photo is (H, W, 3) uint8, got {self.rgb.shape} {self.rgb.dtype}", code="shape_mismatch"
+                f"{self.name}: a photo must be a (H, W, 3) uint8 array, got {self.rgb.shape} {self.rgb.dtype}",
+                code="shape_mismatch",
             )
         if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
             raise InputError(
-                f"{self.name}: intrinsics are fx,fy,cx,cy in pixels, focal lengths above 0", code="invalid_intrinsics"
+                f"{self.name}: intrinsics must be fx,fy,cx,cy in pixels, with positive focal lengths",
+                code="invalid_intrinsics",
             )
         if self.known is not None and (self.known.shape != self.rgb.shape[:2] or self.known.dtype != bool):
             told = f"{self.known.shape} {self.known.dtype}"
             raise InputError(
-                f"{self.name}: a mask is {self.rgb.shape[:2]} bool, as its photo, got {told}", code="shape_mismatch"
+                f"{self.name}: a mask must be bool of the shape {self.rgb.shape[:2]} of its photo, got {told}",
+                code="shape_mismatch",
             )
         object.__setattr__(self, "intrinsics_px", intrinsics)
 
@@ -136,7 +139,7 @@ class LocalizationResult:
 
     @property
     def reason_code(self) -> str:
-        """The code of the reason, a key of `gsmap.reason_codes.REASONS`; empty where the reason is."""
+        """Code of the reason, a key of `gsmap.reason_codes.REASONS`; empty without a reason."""
         return reason_code(self.reason)
 
     @property

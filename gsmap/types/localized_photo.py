@@ -36,14 +36,15 @@ class PhotoObjectObservation:
             raise InputError("an object observation in a photo needs a position (3,)", code="invalid_record")
         if self.state not in ("seen", "absent") or not 0 <= self.share <= 1:
             raise InputError(
-                "an object observation in a photo is seen or absent, with a fraction in [0, 1]", code="invalid_record"
+                "an object observation in a photo must be seen or absent, with a fraction in [0, 1]",
+                code="invalid_record",
             )
         object.__setattr__(self, "position", at)
 
 
 @dataclass(frozen=True, eq=False)
 class LocalizedPhoto:
-    """A localized photo that a map stores as evidence.
+    """A localized photo that a map keeps, with its object observations.
 
     Args:
         digest: SHA-256 of the file (64 hex digits); a photo is stored once.
@@ -79,7 +80,8 @@ class LocalizedPhoto:
         shapes = (pose.shape, known.shape, lens.shape)
         if shapes != ((4, 4), (6, 6), (4,)) or not all(np.isfinite(x).all() for x in (pose, known, lens)):
             raise InputError(
-                f"a photo needs a pose (4, 4), a covariance (6, 6) and intrinsics (4,), got {shapes}",
+                "a photo needs finite arrays: a pose (4, 4), a covariance (6, 6) and intrinsics (4,); got shapes "
+                f"{shapes}",
                 code="shape_mismatch",
             )
         turn = pose[:3, :3]
@@ -88,6 +90,6 @@ class LocalizedPhoto:
         if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6 or not 0 <= self.probability <= 1 or (lens[:2] <= 0).any():
             raise InputError("the pose, intrinsics or probability of a photo is invalid", code="invalid_record")
         if len(self.size_px) != 2 or not all(isinstance(n, int) and 0 < n < 10**6 for n in self.size_px):
-            raise InputError("a photo has a width and a height in pixels", code="invalid_record")
+            raise InputError("the size of a photo must be a positive width and height in pixels", code="invalid_record")
         for name, value in (("T_scene_camera", pose), ("covariance", known), ("intrinsics_px", lens)):
             object.__setattr__(self, name, value)

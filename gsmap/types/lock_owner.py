@@ -1,4 +1,4 @@
-"""The owner of a lock or lease: a process, its task, and a test whether it still runs."""
+"""The process that owns a lock or lease, its task, and a test whether the process still runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ class LockOwner:
 
     @property
     def who(self) -> str:
-        """Description such as ``gsmap update (process 123 on HOST, since 14:02)``; with the date if not today."""
+        """Description such as ``gsmap update (process 123 on HOST, since 14:02)``, with the date if the task began
+        before today.
+        """
         try:
             since = datetime.fromisoformat(self.since).astimezone()
             text = f"{since:%H:%M}" if since.date() == datetime.now().astimezone().date() else f"{since:%Y-%m-%d %H:%M}"
@@ -46,7 +48,7 @@ class LockOwner:
 
     @property
     def is_gone(self) -> bool:
-        """True if the process has ended; known for this machine only, else false."""
+        """True if the process certainly has ended; always false for a process of another machine."""
         number, _, rest = self.process.partition(" ")
         started, _, machine = rest.partition(" ")
         if not self.pid or machine != _machine():
@@ -69,8 +71,7 @@ def this_process(task: str) -> LockOwner:
 
 @cache
 def _machine() -> str:
-    """Return an identifier of the running kernel and pid namespace. Processes can judge each other by pid only if both
-    agree; host names may be shared by containers and machines.
+    """Return an identifier of the running kernel and pid namespace, which two processes must share to compare pids.
 
     Containers of one machine may share its name, and a machine its name with another; neither shares both of these.
     """

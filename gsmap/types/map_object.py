@@ -8,13 +8,14 @@ from typing import Literal
 import numpy as np
 
 ObservationState = Literal["seen", "absent", "unseen"]
-"""``seen``: it is there. ``absent``: the capture looked at or through its place, and it is not. ``unseen``: the capture
-did not look there, which says nothing."""
+"""``seen``: the capture shows the object. ``absent``: the capture shows the object's place without the object.
+``unseen``: the capture does not show the place, so nothing is known.
+"""
 
 OBSERVATION_STATES: tuple[ObservationState, ...] = ("seen", "absent", "unseen")
 
 OBJECT_FACTS = ("name", "label", "note", "same_as")
-"""What people say of an object."""
+"""Kinds of annotations that a person can give an object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class ObjectObservation:
 
 @dataclass(frozen=True)
 class ObjectAnnotations:
-    """The current annotations of an object; empty where there are none.
+    """The current annotations of an object; an annotation that nobody gave is empty.
 
     Args:
         name: unique name.
@@ -79,15 +80,15 @@ class MapObject:
 
     @property
     def seen(self) -> int:
-        """Number of observations that show it."""
+        """Number of observations that show the object."""
         return sum(sighting.state == "seen" for sighting in self.sightings)
 
     @property
     def looks(self) -> int:
-        """Number of observations that show it or show that it is absent."""
+        """Number of observations that show the object or its absence."""
         return sum(sighting.state != "unseen" for sighting in self.sightings)
 
     @property
     def there(self) -> bool:
-        """True if the newest observation of its place shows it."""
+        """True if the newest observation of the object's place shows the object."""
         return next((s.state == "seen" for s in reversed(self.sightings) if s.state != "unseen"), False)

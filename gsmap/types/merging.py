@@ -14,7 +14,7 @@ from gsmap.types.gaussians import Gaussians
 
 @dataclass(frozen=True, eq=False)
 class ReferencePhoto:
-    """A localized photo used as a reference view, in the map frame (`PosedScene`) or its scene's frame.
+    """A localized photo used as a reference view, posed in the map frame (in a `PosedScene`) or in its scene's frame.
 
     Args:
         camera: its camera; the stored image may be smaller.
@@ -32,7 +32,7 @@ class ReferencePhoto:
 
 @dataclass(frozen=True, eq=False)
 class PosedScene:
-    """A capture, or the part of it near a tile, in the map frame.
+    """A capture in the map frame, or only the part of the capture near a tile.
 
     Args:
         gaussians: Gaussians, map frame.
@@ -55,9 +55,10 @@ class PosedScene:
     photos: tuple[ReferencePhoto, ...] = ()
 
     def whole_centroid(self) -> np.ndarray | None:
-        """Return the (3,) float64 unweighted mean of the means of the whole capture, map frame; None if it is empty.
+        """Return the unweighted mean (3,) float64 of all Gaussian means of the capture, map frame; None without
+        Gaussians.
 
-        Read when it is asked for: mergers that do not ask do not pay for it.
+        The mean is read on this call, so that mergers without a use for it do not pay for it.
         """
         if self.centroid is not None:
             return self.centroid()
@@ -66,7 +67,7 @@ class PosedScene:
 
 @dataclass(frozen=True, eq=False)
 class MergeResult:
-    """The merged Gaussians and their origin.
+    """Merged Gaussians, with the scene that each Gaussian comes from.
 
     Args:
         gaussians: Gaussians in the map frame whose mean lies in the requested bounds.

@@ -17,7 +17,7 @@ KNOWN_BY: tuple[KnownBy, ...] = get_args(KnownBy)
 
 
 def as_known_by(text: str) -> KnownBy:
-    """Check a word read from a file against `KNOWN_BY`.
+    """Check that a text read from a file is one of `KNOWN_BY`, and return it.
 
     Raises:
         InputError: another word.
@@ -25,7 +25,9 @@ def as_known_by(text: str) -> KnownBy:
     for known in KNOWN_BY:
         if text == known:
             return known
-    raise InputError(f"a metre is known by one of {', '.join(KNOWN_BY)}, got {text!r}", code="invalid_metre")
+    raise InputError(
+        f"the source of a metric scale must be one of {', '.join(KNOWN_BY)}, got {text!r}", code="invalid_metre"
+    )
 
 
 @dataclass(frozen=True)
@@ -59,13 +61,14 @@ class MetricScale:
 
     @property
     def is_rough(self) -> bool:
-        """True if the scale is known to a factor only, or unknown."""
+        """True if the scale is unknown, or known only to within a factor."""
         return self.sigma > _ROUGH_SIGMA
 
     def text(self) -> str:
-        """Return a text such as ``0.3 m a unit, told, to 1 %``."""
+        """Return a text such as ``0.3 m per unit, told, to within 1 %``."""
         if not self.is_known:
-            return "not known, 1 m a unit is taken"
+            return "unknown, 1 m per unit is used"
         if self.is_rough:
-            return f"{self.metres_per_unit:.2g} m a unit, {self.known_by}, to a factor of {np.exp(self.sigma):.2g}"
-        return f"{self.metres_per_unit:.4g} m a unit, {self.known_by}, to {100 * self.sigma:.2g} %"
+            bar = f"a factor of {np.exp(self.sigma):.2g}"
+            return f"{self.metres_per_unit:.2g} m per unit, {self.known_by}, to within {bar}"
+        return f"{self.metres_per_unit:.4g} m per unit, {self.known_by}, to within {100 * self.sigma:.2g} %"

@@ -8,7 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Tensor:
-    """An input or output of a model: its name, shape (None where it is free) and ONNX type such as ``float``."""
+    """An input or output of a model: its name, shape (None for a free dimension) and ONNX type such as ``float``."""
 
     name: str
     shape: tuple[int | None, ...]
@@ -16,7 +16,9 @@ class Tensor:
 
     @property
     def is_image(self) -> bool:
-        """True for an image tensor: (N, 3, H, W) or (N, H, W, 3), or (H, W, 3) as some SAM encoders take."""
+        """True for an image tensor of shape (N, 3, H, W) or (N, H, W, 3), or (H, W, 3), which some SAM encoders
+        take.
+        """
         s = self.shape
         channels_first = len(s) == 4 and s[1] in (3, None)
         return channels_first or (len(s) in (3, 4) and s[-1] == 3)
@@ -60,10 +62,10 @@ class ModelSpec:
     limits: ModelLimits = field(default_factory=ModelLimits)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values for a catalog."""
+        """Return the model as plain JSON values, as the catalog stores it."""
         return {name: value for name, value in asdict(self).items() if name != "limits"}
 
     @property
     def digest(self) -> str:
-        """Contribution to a recipe: file and normalization."""
+        """Text that represents the model in a recipe: the digest of its file and its normalization."""
         return f"{self.kind}:{self.sha256}:{self.mean}:{self.std}"

@@ -16,12 +16,12 @@ _SHORT = 12  # digits of a digest that tell a map's things apart
 
 
 def cell_text(name: str, value: Any) -> str:
-    """Format a field for a table, on a terminal or in a notebook; digests are shortened."""
+    """Format a field for a table on a terminal or in a notebook, with digests shortened."""
     return short(value) if name in _DIGESTS else shown(value)
 
 
 def short(value: Any) -> str:
-    """Format a value as `shown`; digests are shortened."""
+    """Format a value like `shown`, with digests shortened."""
     return value[:_SHORT] if isinstance(value, str) and _DIGEST.fullmatch(value) else shown(value)
 
 
@@ -39,7 +39,7 @@ def html_table(columns: Mapping[str, str], rows: Sequence[Any]) -> str:
 
 
 def html_facts(title: str, facts: Iterable[tuple[str, Any]]) -> str:
-    """Format facts under a title, one per line; None and empty values are left out."""
+    """Format facts as an HTML table with a title, one fact per line; leave out facts that are None or empty."""
     lines = (
         f"<tr>{_cell(shown(name), name)}{_cell(short(value), '')}</tr>"
         for name, value in facts

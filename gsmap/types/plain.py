@@ -11,9 +11,9 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """Convert any value to dicts, lists, text and numbers.
+    """Convert any value to dicts, lists, texts and numbers.
 
-    Floats keep their bits; NaN and infinity stay what they are. What is unknown becomes its text.
+    Floats keep their bits; NaN and infinity are kept. A value of another type becomes its text.
     """
     if value is None or (isinstance(value, (bool, int, float, str)) and not isinstance(value, np.generic)):
         return value
@@ -36,5 +36,5 @@ def canonical(value: Any) -> str:
 
 
 def of_plain(value: Any) -> str:
-    """Return the canonical JSON text of a value that is plain already."""
+    """Return the canonical JSON text of a value that consists of plain types already."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))

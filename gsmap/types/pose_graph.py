@@ -1,4 +1,4 @@
-"""The global pose graph: edges in, one pose per scene out."""
+"""Types of the global pose graph, which takes edges and gives one pose per scene."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Outside knowledge of one scene's pose (GPS, survey, anchor, a known scale, gravity).
+    """A pose prior of one scene, from GPS, a survey, an anchor, a known scale or gravity.
 
     The three parts are independent, so that any of them may be unknown: rotation ``Log(R_hat^T R)``, translation
     ``R_hat^T (t - t_hat) / s_hat`` and ``log(s / s_hat)``. With an identity rotation in ``S_map_scene`` the
@@ -104,7 +104,7 @@ class EdgeOutcome:
 
     @property
     def reason_code(self) -> str:
-        """The code of the reason, a key of `gsmap.reason_codes.REASONS`; empty where the reason is."""
+        """Code of the reason, a key of `gsmap.reason_codes.REASONS`; empty without a reason."""
         return reason_code(self.reason)
 
     def __post_init__(self) -> None:
@@ -136,7 +136,7 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """The solution of one optimization.
+    """The solution of one run of the pose graph optimization.
 
     Args:
         poses: by scene id.
@@ -155,11 +155,11 @@ class PoseGraph:
     world: tuple[Georeference, ...] = ()
 
     def tie(self, component: int) -> Georeference | None:
-        """Return the georeference of a component; None without observations."""
+        """Return the georeference of a component; None if the component has no observations of the world."""
         return next((tie for tie in self.world if tie.component == component), None)
 
     def use(self, target: str, source: str) -> str:
-        """Return the use of an edge; ``unused`` if it was not given."""
+        """Return the use of an edge in the solution; ``unused`` if the optimization did not get the edge."""
         outcome = self.outcomes.get((target, source))
         return "unused" if outcome is None else outcome.use
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[float, str], None]
-"""Called with the fraction done in [0, 1] and what is being worked on."""
+"""A callback that gets the finished fraction in [0, 1] and a text that names the current work."""
 
 StageProgress = Callable[[str, float, str], None]
-"""Called with the stage's name, the fraction done in [0, 1], and what is being worked on."""
+"""A callback that gets the name of the stage, the finished fraction in [0, 1], and a text that names the current
+work.
+"""
 
 
 def silent(fraction: float, text: str) -> None:
-    """Ignore progress."""
+    """Discard reports of progress."""

@@ -16,23 +16,24 @@ STATUSES = ("accepted", "rejected", "no_match")
 
 
 class Support(Protocol):
-    """The correspondences of a proposal, and the candidates to count the inliers of any pose of the pair."""
+    """The correspondences of a proposal, and all candidate correspondences, by which any pose of the pair is scored."""
 
     @property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corresponding points of the target (K, 3) and source (K, 3), each in its scene's own unit."""
+        """Corresponding points of the target (K, 3) and the source (K, 3), each in the unit of its scene."""
 
     def count(self, S_target_source: Sim3) -> tuple[int, float]:
-        """Return the number of inliers of a pose (scenes' own units) and its log10 number of false alarms."""
+        """Return the number of inliers of a pose (in the scenes' own units) and the log10 of its number of false
+        alarms.
+        """
 
     def rival(self, S_target_source: Sim3, log_nfa: float, others: Sequence[Sim3] = ()) -> Proposal | None:
-        """Return a rival pose with about as many inliers that is similar to none of ``others``; None if there is
-        none."""
+        """Return a rival pose with about as many inliers that differs from all of ``others``; None without one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A proposed pose of a pair of scenes, to be refined and verified.
+    """A proposed pose of a pair of scenes, before refinement and verification.
 
     Args:
         proposer: method and node layer, such as ``graph:landmarks``.
@@ -62,7 +63,7 @@ class Proposal:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The registration of ``source`` in ``target``.
+    """The registration of a source scene in the frame of a target scene.
 
     Args:
         target, source: scene ids.
@@ -132,7 +133,7 @@ class Registration:
 
     @property
     def reason_code(self) -> str:
-        """The code of the reason, a key of `gsmap.reason_codes.REASONS`; empty where the reason is."""
+        """Code of the reason, a key of `gsmap.reason_codes.REASONS`; empty without a reason."""
         return reason_code(self.reason)
 
     @property

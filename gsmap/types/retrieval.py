@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class IndexedScene:
-    """A scene of an index.
+    """A scene in an inverted index.
 
     Args:
         scene: scene id.

@@ -35,19 +35,19 @@ class Room:
 
     @property
     def box(self) -> np.ndarray:
-        """(2, 3) bounding box."""
+        """Bounding box (2, 3) of the room."""
         high = self.low + np.array(self.cells.shape) * self.cell_m
         return np.array([[*self.low, self.floor_m], [*high, self.ceiling_m]])
 
     @property
     def middle(self) -> np.ndarray:
-        """(3,) centre of its floor."""
+        """Centre (3,) of the room's floor."""
         at = np.argwhere(self.cells).mean(0) + 0.5
         return np.array([*(self.low + at * self.cell_m), self.floor_m])
 
     @property
     def outline(self) -> np.ndarray:
-        """(K, 2, 3) end points of the unordered line segments around its floor."""
+        """End points (K, 2, 3) of the line segments around the room's floor, unordered."""
         cells = np.pad(self.cells, 1).astype(np.int8)
         pieces = []
         for axis in (0, 1):
@@ -63,7 +63,7 @@ class Room:
         return np.concatenate([at, np.full((*at.shape[:2], 1), self.floor_m)], axis=2)
 
     def holds(self, point: np.ndarray) -> bool:
-        """Return true if a point (3,) lies in the room, its floor or its ceiling."""
+        """Return true if a point (3,) lies in the room, in its floor or in its ceiling."""
         if not self.floor_m - _SLACK_M <= point[2] <= self.ceiling_m + _SLACK_M:
             return False
         cell = np.floor((point[:2] - self.low) / self.cell_m).astype(int)

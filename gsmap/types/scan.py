@@ -15,7 +15,7 @@ _ROUND = 100.0
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Points of a surface, in the frame of their file about an origin.
+    """Points of a surface, relative to an origin in the frame of their file.
 
     Args:
         points: (N, 3) float64 about ``origin``, in the file's unit; at least one, all finite.
@@ -41,22 +41,25 @@ class Scan:
         object.__setattr__(self, "origin", np.array(self.origin, dtype=np.float64))
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.origin.shape != (3,):
             raise InputError(
-                f"a scan has points (N, 3) about an origin (3,), got {self.points.shape}", code="shape_mismatch"
+                "a scan needs points of shape (N, 3) and an origin of shape (3,), got points of shape "
+                f"{self.points.shape}",
+                code="shape_mismatch",
             )
         if not len(self.points) or not np.isfinite(self.points).all() or not np.isfinite(self.origin).all():
-            raise InputError("a scan has at least one point, and all of them are finite", code="empty_scan")
+            raise InputError("a scan needs at least one point, and finite points only", code="empty_scan")
         if self.colours is not None:
             object.__setattr__(self, "colours", np.ascontiguousarray(self.colours, dtype=np.float32))
             if self.colours.shape != self.points.shape:
                 raise InputError(
-                    f"a scan of {len(self.points)} points has colours {self.colours.shape}", code="shape_mismatch"
+                    f"a scan of {len(self.points)} points got colours of shape {self.colours.shape}",
+                    code="shape_mismatch",
                 )
 
     def __len__(self) -> int:
         return len(self.points)
 
     def about_its_middle(self) -> Scan:
-        """Return the scan about an origin near its points, rounded to hundreds, if they lie far from zero."""
+        """Return the scan with its origin moved near its points, in whole hundreds, if they lie far from zero."""
         middle = np.median(self.points, axis=0)
         if self.camera is not None or np.abs(middle).max() < _SHIFT:
             return self

@@ -14,7 +14,7 @@ SCALE_POLICIES = ("auto", "known", "unknown")
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One ingested capture without its arrays.
+    """The facts of one ingested capture, without its arrays.
 
     Args:
         id: content digest (hex) of Gaussians and cameras; the same content has the same id in every map.

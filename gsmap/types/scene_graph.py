@@ -11,7 +11,7 @@ from gsmap.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class NodeLayer:
-    """M nodes of one kind whose embeddings are comparable with the same layer of another scene.
+    """A set of M nodes of one kind, whose embeddings can be compared with those of the same layer in another scene.
 
     Args:
         positions: (M, 3) float64, scene frame and unit.
@@ -70,7 +70,7 @@ class NodeLayer:
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """The segments of a scene: connected groups of Gaussians that are one physical object each.
+    """The segments of a scene: connected groups of Gaussians, each of which is one physical object.
 
     Args:
         members: (N,) int32 segment of each Gaussian, in the scene's order; -1 for the building and for floaters.
@@ -127,7 +127,7 @@ class Segments:
 
 @dataclass(frozen=True, eq=False)
 class SceneGraph:
-    """The nodes of one scene, by layer; edges are implied (fully connected, length = distance of positions).
+    """The nodes of one scene, by layer. Edges are not stored: every two nodes are connected by their distance.
 
     Args:
         scene_id: the scene it describes.

@@ -1,4 +1,4 @@
-"""Index segments: immutable inverted lists that are merged as they grow (log-structured).
+"""Segments of an inverted index: immutable inverted lists, which are merged as the index grows (log-structured).
 
 A row is bytes of which the last four say whose it is: the place of its scene among the segment's members.
 """
@@ -15,13 +15,13 @@ from gsmap.errors import CorruptError
 from gsmap.types.retrieval import IndexArrays, IndexedScene
 
 LEVEL = 16
-"""A segment holds from a power of this many scenes to the next; there is at most one of each size."""
+"""Ratio of segment sizes: an index has at most one segment between two neighbouring powers of this number of scenes."""
 
 PLACE_BYTES = 4
 
 
 class Segment(Protocol):
-    """A part of an index on disk.
+    """A part of an inverted index, such as one on disk.
 
     Args:
         members: its scenes; None for scenes that no longer count.
@@ -34,11 +34,11 @@ class Segment(Protocol):
     def num_nodes(self) -> int: ...
 
     def lists(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the (W,) int64 ascending list keys and the (W + 1,) int64 start of each list."""
+        """Return the ascending keys of the lists (W,) int64, and the first row of each list (W + 1,) int64."""
         ...
 
     def rows(self, start: int, stop: int) -> np.ndarray:
-        """Return rows (stop - start, B) uint8."""
+        """Return the rows from ``start`` to ``stop`` as a (stop - start, B) uint8 array."""
         ...
 
 
@@ -61,7 +61,7 @@ class InMemory:
 
 
 def in_lists(members: Sequence[IndexedScene | None], keys: np.ndarray, rows: np.ndarray) -> InMemory:
-    """Build a segment from rows (M, B) uint8 and the list key (M,) of each."""
+    """Build a segment from rows (M, B) uint8 and the list key (M,) of each row."""
     order = np.argsort(keys, kind="stable")
     names, counts = np.unique(keys, return_counts=True)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -69,25 +69,25 @@ def in_lists(members: Sequence[IndexedScene | None], keys: np.ndarray, rows: np.
 
 
 def places_of(rows: np.ndarray, num_members: int) -> np.ndarray:
-    """Return (M,) int32 the index of each row's scene among the members.
+    """Return the index (M,) int32 among the members of each row's scene.
 
     Raises:
         CorruptError: a row of a scene that is not there.
     """
     places = np.ascontiguousarray(rows[:, -PLACE_BYTES:]).view("<i4")[:, 0]
     if len(places) and not (places.min() >= 0 and places.max() < num_members):
-        raise CorruptError("an index has rows of unknown scenes", code="index_damaged")
+        raise CorruptError("the index has rows of unknown scenes", code="index_damaged")
     return places
 
 
 def write_places(rows: np.ndarray, places: np.ndarray | int) -> None:
-    """Write the scene index of rows (M, B) uint8."""
+    """Set the scene index in rows (M, B) uint8, in place."""
     held = np.broadcast_to(np.asarray(places, "<i4"), len(rows))
     rows[:, -PLACE_BYTES:] = np.ascontiguousarray(held)[:, None].view(np.uint8)
 
 
 def merged(segments: Iterable[Segment]) -> InMemory:
-    """Merge segments into one, without scenes that no longer count."""
+    """Merge segments into one; drop scenes that were removed from the index."""
     members: list[IndexedScene | None] = []
     keys, parts = [], []
     for segment in segments:
@@ -107,7 +107,7 @@ def merged(segments: Iterable[Segment]) -> InMemory:
 
 
 def to_merge(sizes: Sequence[int], added: int) -> list[int]:
-    """Choose the segments to merge with a new one, so that there is one of each size.
+    """Choose the segments to merge with a new one, so that at most one segment of each size class remains.
 
     Args:
         sizes: number of scenes of each segment.
@@ -126,7 +126,7 @@ def to_merge(sizes: Sequence[int], added: int) -> list[int]:
 
 
 def lists_of(segment: Segment) -> tuple[np.ndarray, np.ndarray]:
-    """Return `Segment.lists` after checking that they lie within the rows.
+    """Return the lists of a segment (see `Segment.lists`) after checking that they lie within its rows.
 
     Raises:
         CorruptError: no segment has such.
@@ -142,7 +142,7 @@ def lists_of(segment: Segment) -> tuple[np.ndarray, np.ndarray]:
         and (np.diff(keys) > 0).all()
     )
     if not sound:
-        raise CorruptError("the lists of an index are invalid", code="index_damaged")
+        raise CorruptError("the index has invalid lists", code="index_damaged")
     return keys, starts
 
 

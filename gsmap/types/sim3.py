@@ -11,7 +11,7 @@ from gsmap.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Sim3:
-    """A similarity ``x_a = scale * R @ x_b + t``; named ``S_a_b`` where it maps frame b to frame a.
+    """A similarity ``x_a = scale * R @ x_b + t``; a variable ``S_a_b`` maps points from frame b to frame a.
 
     Args:
         rotation: (3, 3) float64, orthonormal with determinant +1.
@@ -56,7 +56,7 @@ class Sim3:
 
     @classmethod
     def many(cls, rotations: np.ndarray, translations: np.ndarray, scales: np.ndarray) -> list[Sim3]:
-        """Build from (N, 3, 3), (N, 3) and (N,), checked together; raises `InputError` as for one."""
+        """Build N similarities from (N, 3, 3), (N, 3) and (N,); raise `InputError` if one of them is invalid."""
         rotations, translations = np.array(rotations, dtype=np.float64), np.array(translations, dtype=np.float64)
         scales = np.asarray(scales, dtype=np.float64)
         finite = np.isfinite(rotations).all() and np.isfinite(translations).all() and np.isfinite(scales).all()
@@ -78,7 +78,7 @@ class Sim3:
 
     @classmethod
     def from_matrix(cls, matrix: np.ndarray) -> Sim3:
-        """Build from a (4, 4) matrix ``[sR t; 0 1]``. A rotation within 1e-3 of SO(3) is projected to it."""
+        """Build from a (4, 4) matrix ``[sR t; 0 1]``; a rotation within 1e-3 of SO(3) is projected to SO(3)."""
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise InputError(
@@ -97,18 +97,18 @@ class Sim3:
         return cls(u @ vt, matrix[:3, 3], scale)
 
     def matrix(self) -> np.ndarray:
-        """Return (4, 4) float64 ``[sR t; 0 1]``."""
+        """Return the (4, 4) float64 matrix ``[sR t; 0 1]``."""
         out = np.eye(4)
         out[:3, :3] = self.scale * self.rotation
         out[:3, 3] = self.translation
         return out
 
     def inverse(self) -> Sim3:
-        """Return ``S_b_a`` of an ``S_a_b``."""
+        """Return the inverse similarity: ``S_b_a`` for an ``S_a_b``."""
         return Sim3(self.rotation.T, -(self.rotation.T @ self.translation) / self.scale, 1.0 / self.scale)
 
     def __matmul__(self, other: Sim3) -> Sim3:
-        """``S_a_c = S_a_b @ S_b_c``."""
+        """Compose two similarities: ``S_a_c = S_a_b @ S_b_c``."""
         rotation = self.rotation @ other.rotation
         # Long chains drift off SO(3); one polar projection keeps every product orthonormal to 1e-15.
         u, _, vt = np.linalg.svd(rotation)
@@ -131,7 +131,7 @@ def check_sim3(value: object, name: str) -> None:
     """Raise `InputError` naming an argument that is not a `Sim3`."""
     if not isinstance(value, Sim3):
         raise InputError(
-            f"{name} must be a gsmap.types.Sim3, got {type(value).__name__}; of a (4, 4) matrix M pass "
+            f"{name} must be a gsmap.types.Sim3, got {type(value).__name__}; for a (4, 4) matrix M, pass "
             "Sim3.from_matrix(M)",
             code="invalid_pose",
         )

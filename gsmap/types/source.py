@@ -11,7 +11,7 @@ from gsmap.types.gaussians import Gaussians
 
 
 class GaussianSource(Protocol):
-    """N Gaussians in one frame, read in chunks, repeatably.
+    """A set of N Gaussians in one frame that can be read in chunks, any number of times.
 
     `Gaussians` are one themselves. Who reads a source needs memory for a chunk (`gsmap.types.gaussians.CHUNK_ROWS`),
     not for the scene; who needs all of it at once says ``load``. All chunks are about one origin, and so are the means
@@ -37,7 +37,7 @@ class GaussianSource(Protocol):
         ...
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
-        """Yield one field of `Gaussians` in chunks, which may cost less than `chunks`."""
+        """Yield one field of `Gaussians` in chunks, which may be faster than `chunks`."""
         ...
 
     def load(self) -> Gaussians:
@@ -46,13 +46,13 @@ class GaussianSource(Protocol):
 
 
 def origin_of_source(source: GaussianSource) -> np.ndarray:
-    """Return the (3,) float64 origin of a source's means."""
+    """Return the origin (3,) float64 that a source's means are relative to."""
     first = next(iter(source.chunks()), None)
     return np.zeros(3) if first is None else first.origin
 
 
 def gathered(source: GaussianSource, name: str, rows: np.ndarray) -> np.ndarray:
-    """Return rows (M,), in ascending order, of one field of a source."""
+    """Return one field of a source at the given rows (M,), which must ascend."""
     out, start = [], 0
     for column in source.columns(name):
         first, last = np.searchsorted(rows, (start, start + len(column)))

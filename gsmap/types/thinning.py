@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Thinning:
-    """A thinned capture: rounded Gaussians that are visible in its own images, without a graph.
+    """Facts about a thinned capture, which keeps only rounded Gaussians visible in its own views, and no graph.
 
     Args:
         thinned_at: ISO 8601 time with zone.

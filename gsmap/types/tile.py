@@ -12,7 +12,7 @@ from gsmap.types.sim3 import Sim3
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """A box of the map with its inputs and its file.
+    """A written tile: its box, the inputs of its Gaussians, and its file.
 
     Args:
         key: digest of everything that decides its content but the poses.

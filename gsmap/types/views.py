@@ -1,4 +1,4 @@
-"""Observations of a scene: its surface, rendered views, and masks."""
+"""A scene as segmenters and embedders observe it: its surface, rendered views, and masks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PointCloud:
         return len(self.points)
 
     def evenly(self, count: int) -> PointCloud:
-        """Return about ``count`` points at most, each standing for more surface."""
+        """Return every n-th point, at most ``count``, with the area of each point multiplied by n."""
         step = -(-len(self) // count)
         rows = slice(None, None, step)
         return (
@@ -44,7 +44,7 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class SceneContext:
-    """The data of a scene for segmenters and embedders, before the first view.
+    """The data of a scene that segmenters and embedders get before the first view.
 
     Args:
         cloud: the surface, with its colours; scene frame and unit.
@@ -63,7 +63,7 @@ class SceneContext:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One render.
+    """A rendered view.
 
     Args:
         rgb: (H, W, 3) uint8.
@@ -82,7 +82,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """A part of a view.
+    """A mask of one part of a view, such as an object.
 
     Args:
         pixels: (H, W) bool.

@@ -17,12 +17,12 @@ from gsmap.errors import InputError
 from gsmap.types.sim3 import Sim3
 
 LOCAL = "local"
-"""In place of a CRS: east, north, up in metres of the world frame."""
+"""The name used instead of a CRS for coordinates east, north, up in metres of the world frame."""
 
 
 @dataclass(frozen=True)
 class WorldFrame:
-    """The Euclidean frame that the map is solved in: metres along east, north and up at an origin.
+    """The Euclidean frame in which the map is solved: metres along east, north and up from an origin.
 
     Args:
         crs: the CRS of the map's input and output, ``EPSG:N`` or WKT.
@@ -47,7 +47,7 @@ OBSERVATION_KINDS = ("frame", "point", "image", "fix", "bar")
 
 @dataclass(frozen=True, eq=False)
 class ControlPoint:
-    """A ground control point: a mark whose world coordinates were surveyed.
+    """A ground control point: a marked point with surveyed world coordinates.
 
     Args:
         name: unique in the map.
@@ -70,7 +70,7 @@ class ControlPoint:
 
 @dataclass(frozen=True, eq=False)
 class ImagePoint:
-    """The pixel of a control point in a photo, with the photo's camera.
+    """The pixel at which a photo shows a control point, with the photo's camera.
 
     Args:
         point: name of the control point.
@@ -111,7 +111,7 @@ class ImagePoint:
 
 @dataclass(frozen=True, eq=False)
 class PositionFix:
-    """A measured world position of a point of a scene: a camera's GNSS fix, or a survey of the scene's origin.
+    """A measured world position of one point of a scene: a camera's GNSS fix, or the surveyed origin of the scene.
 
     Args:
         name: unique within its scene: of the photo, or ``survey``.
@@ -147,7 +147,7 @@ class PositionFix:
 
 @dataclass(frozen=True, eq=False)
 class ScaleBar:
-    """A distance that was measured between two picked points.
+    """A measured distance between two points, each of which was picked in a scene.
 
     Args:
         name: unique in the map.
@@ -173,7 +173,7 @@ class ScaleBar:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """All observations of the world. For a solve, positions are in the world frame (``crs`` is ``local``).
+    """All observations of the world; a solver takes them with positions in the world frame (``crs`` is ``local``).
 
     Args:
         frame: the world frame; None until a CRS is specified.
@@ -197,7 +197,7 @@ class Survey:
 # --- what was solved --------------------------------------------------------------------------------------------------
 
 UNSOLVED = "the observations have no solution: they contradict each other, or the registrations, beyond measure"
-"""The problem of a component whose least squares diverge or are singular; its poses are then those of its edges."""
+"""The problem of a component whose least squares diverge or are singular; its edges alone then give its poses."""
 
 RESIDUAL_KINDS = ("point", "image", "fix", "bar")
 RESIDUAL_USES = ("used", "outlier", "check", "unused")
@@ -234,7 +234,9 @@ class Residual:
 
     def __post_init__(self) -> None:
         if self.kind not in RESIDUAL_KINDS or self.use not in RESIDUAL_USES:
-            raise InputError(f"no such residual: {self.kind!r}, {self.use!r}", code="invalid_observation")
+            raise InputError(
+                f"unknown kind or use of a residual: {self.kind!r}, {self.use!r}", code="invalid_observation"
+            )
 
 
 GROUP_KINDS = ("points", "photos", "scenes", "bars")
@@ -249,7 +251,7 @@ CAUSES = (
     "scale",
     "split",
 )
-"""Likely reasons of a contradiction: altitudes are 0; heights or lengths are in feet; heights are above take-off;
+"""Likely causes of a contradiction: altitudes are 0; heights or lengths are in feet; heights are above take-off;
 ellipsoidal against orthometric heights; a vertical or horizontal shift without a known reason; positions whose shape is
 not that of the map (of another flight or place); lengths in another unit; a group that contradicts itself."""
 KEPT = ("group", "against", "none")
@@ -258,7 +260,7 @@ PROBLEMS = ("", "undetermined", "contradiction", "unsolved")
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A group of observations that differs from another group by more than their common errors explain.
+    """A group of observations that contradicts another group by more than the common errors of both groups explain.
 
     Args:
         group: ``points`` (control points), ``photos`` (of captures), ``scenes`` (surveyed scenes) or ``bars``.
@@ -290,7 +292,8 @@ class Contradiction:
         causes = {self.cause, *self.other_causes}
         if not ({self.group, self.against} <= set(GROUP_KINDS) and causes <= set(CAUSES) and self.kept in KEPT):
             raise InputError(
-                f"no such contradiction: {self.group!r}, {self.against!r}, {causes}, {self.kept!r}",
+                f"unknown group, cause or kept side of a contradiction: {self.group!r}, {self.against!r}, {causes}, "
+                f"{self.kept!r}",
                 code="invalid_observation",
             )
 
@@ -330,10 +333,12 @@ class Georeference:
 
     def __post_init__(self) -> None:
         if self.problem_code not in PROBLEMS:
-            raise InputError(f"no such problem: {self.problem_code!r}", code="invalid_observation")
+            raise InputError(
+                f"unknown problem code of a georeference: {self.problem_code!r}", code="invalid_observation"
+            )
 
     def left_out(self) -> set[tuple[str, str, str]]:
-        """Return (kind, name, scene) of the observations that were not used."""
+        """Return (kind, name, scene) of each observation that the solution does not use."""
         return {(r.kind, r.name, r.scene) for r in self.residuals if r.use != "used"}
 
 

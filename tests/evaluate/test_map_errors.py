@@ -90,7 +90,7 @@ def test_a_map_without_poses_says_so() -> None:
     report = evaluate_map(scenes, [edge("a", "b", at(-5), used=False)], None, overlaps(scenes, ab=0.6))
     assert report.verdict == "0 of 2 placed, no ATE: the map has no poses yet: run gsmap optimize"
     assert report.bands[3].recall == 1.0
-    assert report.edges_verdict == "none that the truth could judge"
+    assert report.edges_verdict == "no edge in use could be compared with the truth"
 
 
 def test_a_scene_whose_neighbours_are_gone_is_not_placed() -> None:

@@ -101,8 +101,8 @@ def test_where_nothing_tells_one_is_taken_and_said_to_be():
 
 
 def test_people_can_read_it():
-    assert MetricScale(0.25, 0.01, "told").text() == "0.25 m a unit, told, to 1 %"
-    assert MetricScale(0.25, float(np.log(2)), "guessed").text() == "0.25 m a unit, guessed, to a factor of 2"
+    assert MetricScale(0.25, 0.01, "told").text() == "0.25 m per unit, told, to within 1 %"
+    assert MetricScale(0.25, float(np.log(2)), "guessed").text() == "0.25 m per unit, guessed, to within a factor of 2"
     for wrong in (0.0, -1.0, float("nan")):
         with raises(InputError, code="invalid_metre"):
             MetricScale(wrong, 0.01, "told")

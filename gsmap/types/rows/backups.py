@@ -49,7 +49,7 @@ class SnapshotRow(Row):
 
     @property
     def num_scenes(self) -> int | None:
-        """Number of living scenes."""
+        """Number of scenes in the snapshot that are not removed."""
         return self.counts.get("scenes")
 
 

@@ -14,21 +14,21 @@ from gsmap.types.plain import plain
 from gsmap.types.sim3 import Sim3
 
 SCHEMA = 2
-"""The number under ``schema`` in everything that ``--json`` prints; raised when a key goes or changes its meaning."""
+"""The number under ``schema`` in all JSON output; it is raised whenever a key is removed or changes its meaning."""
 
 
 class Row:
-    """Base of all rows and reports: a frozen dataclass that compares equal if its JSON does."""
+    """Base class of all rows and reports: frozen dataclasses; two are equal if their JSON is equal."""
 
     columns: ClassVar[Mapping[str, str]] = {}
-    """The heading of each field (or property) that a table shows, in order."""
+    """Heading of each field or property that a table shows, in the order of the columns."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return every field as JSON: poses as 4x4 matrices, arrays as lists, NaN and infinity as null."""
+        """Return all fields as JSON values: poses as 4x4 matrices, arrays as lists, NaN and infinity as null."""
         return {field.name: _json(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
     def cells(self) -> list[Any]:
-        """Return the values of a table line, in the order of ``columns``."""
+        """Return the values of this row's line in a table, in the order of ``columns``."""
         return [getattr(self, name) for name in self.columns]
 
     def _repr_html_(self) -> str:
@@ -52,7 +52,7 @@ class Table(list[R]):
 
 
 def coordinates(world: np.ndarray | None) -> str | None:
-    """Format world coordinates to a tenth of a millimetre, whatever their size."""
+    """Format world coordinates with a precision of a tenth of a millimetre, however large they are."""
     if world is None:
         return None
     degrees = abs(world[0]) <= 360 and abs(world[1]) <= 90

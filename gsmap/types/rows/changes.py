@@ -37,7 +37,7 @@ class VisitPairRef(Row):
 
     @property
     def pair(self) -> str:
-        """``OLDER:NEWER`` by name, as the command line takes it."""
+        """The pair as ``OLDER:NEWER`` by scene names, the form that the command line takes."""
         return f"{self.older_name}:{self.newer_name}"
 
 
@@ -91,12 +91,12 @@ class ChangeRow(VisitPairRef):
 
     @property
     def at_m(self) -> str:
-        """Centre of its box, metres."""
+        """Centre of the change's box, metres."""
         return "-" if self.box_m is None else _three(self.box_m.mean(0))
 
     @property
     def size_m(self) -> str:
-        """Size of its box, metres."""
+        """Size of the change's box, metres."""
         return "-" if self.box_m is None else _three(self.box_m[1] - self.box_m[0])
 
 

@@ -12,7 +12,7 @@ from gsmap.types.rows.pairs import PairRef
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseErrorRow(PairRef):
-    """The error of one relative pose.
+    """The error of one estimated relative pose.
 
     Args:
         rre_deg: relative rotation error.
@@ -71,7 +71,7 @@ class EdgeErrorRow(PoseErrorRow):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BandRow(Row):
-    """The pairs of captures in a band of true overlap.
+    """The pairs of captures whose true overlap lies in one band.
 
     Args:
         overlap_from: lower end of the band, inclusive.
@@ -79,9 +79,9 @@ class BandRow(Row):
         num_pairs: number of pairs of scenes with a truth; most pairs of the lowest band may share nothing and count as
             missed.
         num_accepted: number of accepted edges.
-        num_right: number of right edges.
-        recall: right edges divided by pairs; null without pairs.
-        precision: right edges divided by accepted edges; null without accepted edges.
+        num_right: number of correct edges.
+        recall: correct edges divided by pairs; null without pairs.
+        precision: correct edges divided by accepted edges; null without accepted edges.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -103,13 +103,13 @@ class BandRow(Row):
 
     @property
     def band(self) -> str:
-        """The band as text."""
+        """The band of overlap as text."""
         return f"{100 * self.overlap_from:.3g} to {100 * self.overlap_to:.3g} %"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComponentErrorRow(Row):
-    """The error of the newest poses of one component.
+    """The error of one component's newest poses.
 
     Args:
         component: component index.
@@ -131,7 +131,7 @@ class ComponentErrorRow(Row):
         "alignment": "alignment",
         "ate_m": "ATE, m",
         "ate_reason": "why none",
-        "metres_per_unit": "m a unit",
+        "metres_per_unit": "m per unit",
         "true_metres_per_unit": "truly",
     }
 
@@ -245,8 +245,8 @@ class EvaluationReport(Row):
         edges_in_use: number of ``edges`` that the newest poses use.
         edges_without_truth: number of accepted edges without a truth.
         false_edges: used edges that are wrong.
-        max_rre_deg: maximum ``rre_deg`` of a right edge.
-        max_rte_m: maximum ``centroid_m`` of a right edge.
+        max_rre_deg: maximum ``rre_deg`` of a correct edge.
+        max_rte_m: maximum ``centroid_m`` of a correct edge.
         bands: recall and precision of ``edges`` by true overlap.
         components: errors of the newest poses by component.
         nees: consistency of the covariances of edges and poses.
@@ -323,7 +323,7 @@ class EvaluationReport(Row):
 
     @property
     def verdict(self) -> str:
-        """Number of placed scenes, and the ATE or why there is none, as text."""
+        """Number of placed scenes, and the ATE or the reason why no ATE could be computed, as text."""
         placed = f"{self.num_placed} of {self.num_scenes} placed"
         if self.num_tentative:
             placed += f", {self.num_tentative} tentative"
@@ -331,14 +331,14 @@ class EvaluationReport(Row):
 
     @property
     def edges_verdict(self) -> str:
-        """Number and names of wrong edges in use, as text."""
+        """Number and names of incorrect edges in use, as text."""
         bars = f"beyond {self.max_rre_deg:g} deg or {self.max_rte_m:g} m"
         if not self.edges_in_use:
-            return "none that the truth could judge"
+            return "no edge in use could be compared with the truth"
         names = ": " + ", ".join(edge.pair for edge in self.false_edges) if self.false_edges else ""
         return f"{len(self.false_edges)} of {self.edges_in_use} false, {bars}{names}"
 
     @property
     def notes_text(self) -> str:
-        """The notes in one line."""
+        """All notes in one line."""
         return "; ".join(self.notes)

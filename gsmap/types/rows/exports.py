@@ -89,7 +89,7 @@ class SmallSceneRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SmallMapReport(Row):
-    """A small map for localization only.
+    """A written small map, which serves localization only.
 
     Args:
         out: folder of the small map.

@@ -13,7 +13,7 @@ from gsmap.types.rows.base import Row
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FindHit(Row):
-    """A place that matches the query.
+    """A place in the map that matches the query.
 
     Args:
         rank: rank, from 1.

@@ -11,7 +11,7 @@ from gsmap.types.rows.base import Row
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LeaseRow(Row):
-    """The work of a running process.
+    """The task of a running process.
 
     Args:
         what: ``map`` (shared with other processes), ``poses``, ``graph KEY`` or ``edge KEY`` (one job), or ``export

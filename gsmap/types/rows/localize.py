@@ -109,7 +109,7 @@ class LocalizeRow(Row):
 
     @property
     def position(self) -> str:
-        """Camera centre or scan origin, map unit."""
+        """Camera centre or scan origin, in map units."""
         at = self.T_map_camera[:3, 3] if self.T_map_camera is not None else None
         if self.S_map_scan is not None:
             at = self.S_map_scan.translation
@@ -117,7 +117,7 @@ class LocalizeRow(Row):
 
     @property
     def sigma(self) -> str:
-        """Largest standard deviations: degrees, and map units."""
+        """Largest standard deviations of the rotation (degrees) and of the position (map units), as text."""
         if self.covariance is None:
             return "-"
         turn, shift = (np.sqrt(np.linalg.eigvalsh(self.covariance[p, p])[-1]) for p in (slice(3), slice(3, 6)))
@@ -126,7 +126,7 @@ class LocalizeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhotoRow(Row):
-    """A photo stored in the map, with its pose by the newest revision.
+    """A photo stored in the map, with its pose in the newest revision.
 
     Args:
         id: ``p`` and a number.
@@ -155,8 +155,8 @@ class PhotoRow(Row):
         "component": "component",
         "position": "at (map units)",
         "scene_name": "scene",
-        "num_seen": "shows",
-        "num_absent": "shows to be gone",
+        "num_seen": "objects seen",
+        "num_absent": "objects absent",
     }
 
     id: str
@@ -177,7 +177,7 @@ class PhotoRow(Row):
 
     @property
     def position(self) -> str:
-        """Camera centre, map unit."""
+        """Camera centre, in map units."""
         if self.T_map_camera is None:
             return "-"
         return " ".join(f"{value:.3f}" for value in self.T_map_camera[:3, 3])

@@ -1,4 +1,4 @@
-"""A map as a whole: open tasks, settings, models, maintenance."""
+"""Rows about a whole map: open tasks, settings, models, maintenance."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _FOR_A_PERSON: tuple[TodoKind, ...] = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TodoRow(Row):
-    """An open task: something is stale or needs a decision.
+    """An open task: a stale or missing result, or an open decision.
 
     Args:
         what: ``undescribed`` scenes; ``stale_graphs`` of other settings or versions; ``unregistered`` scenes;
@@ -72,7 +72,7 @@ class TodoRow(Row):
 
     @property
     def wants_person(self) -> bool:
-        """True if a person has to decide; else the command does the work."""
+        """True if a person has to decide; false if running the command suffices."""
         return self.what in _FOR_A_PERSON
 
 
@@ -92,7 +92,7 @@ class MetricScaleRow(Row):
 
     columns: ClassVar[Mapping[str, str]] = {
         "component": "component",
-        "metres_per_unit": "m a unit",
+        "metres_per_unit": "m per unit",
         "metre_known_by": "known by",
         "metre_sigma": "sigma",
         "metre_note": "note",
@@ -299,7 +299,7 @@ class ConvertReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewReport(Row):
-    """A page that is served or was written.
+    """An interactive page that is served or was written.
 
     Args:
         url: local address with the token that opens the page; null if it was written.

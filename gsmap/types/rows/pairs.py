@@ -32,7 +32,7 @@ class PairRef(Row):
 
     @property
     def pair(self) -> str:
-        """``TARGET:SOURCE`` by name, as the command line takes it."""
+        """The pair as ``TARGET:SOURCE`` by scene names, the form that the command line takes."""
         return f"{self.target_name}:{self.source_name}"
 
 
@@ -130,7 +130,7 @@ class PairReport(EdgeRow):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExplanationStep(Row):
-    """One step of a pair from retrieval to the pose graph.
+    """One step in the processing of a pair, from retrieval to the pose graph.
 
     Args:
         name: name of the step.
@@ -149,7 +149,7 @@ class ExplanationStep(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PairExplanation(PairRef):
-    """The explanation why a pair is, or is not, an edge.
+    """An explanation why a pair is, or is not, an edge.
 
     Args:
         status: as in `EdgeRow`.

@@ -1,4 +1,4 @@
-"""Revisions of the poses, and results of an update."""
+"""Revisions of the scene poses, and results of an update."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class PoseChangeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UpdateReport(Row):
-    """The results of an update; ``gsmap list MAP scenes`` and ``edges`` list the whole map.
+    """The results of an update: what this run added or changed, not the whole map.
 
     Args:
         ingested: the given captures.

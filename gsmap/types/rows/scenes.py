@@ -65,7 +65,7 @@ class SceneRow(Row):
         "num_nodes": "nodes",
         "captured_at": "captured",
         "tags": "tags",
-        "metres_per_unit": "m a unit",
+        "metres_per_unit": "m per unit",
         "in_world": "world",
     }
 
@@ -90,7 +90,7 @@ class SceneRow(Row):
 
     @property
     def in_world(self) -> str | None:
-        """World coordinates of its origin as text."""
+        """World coordinates of the scene's origin as text."""
         return coordinates(self.world)
 
 
@@ -411,5 +411,5 @@ class PoseRow(Row):
 
     @property
     def in_world(self) -> str | None:
-        """World coordinates of its origin as text."""
+        """World coordinates of the scene's origin as text."""
         return coordinates(self.world)

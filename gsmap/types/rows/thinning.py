@@ -49,7 +49,7 @@ class ThinRow(SceneRef):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ThinReport(Row):
-    """The result of a thinning, or its preview.
+    """The result of thinning captures, or a preview of it.
 
     Args:
         dry_run: true if nothing was changed.

@@ -1,4 +1,4 @@
-"""Georeference of components, residuals of observations, and measurements."""
+"""Rows about the world frame: georeferences of components, residuals of observations, and measurements."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ class ResidualRow(Row):
 
     @property
     def error_mm(self) -> str:
-        """The error in millimetres, as text."""
+        """The error along each axis in millimetres, as text."""
         return " ".join(f"{1000 * value:.1f}" for value in self.error_m)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContradictionRow(Row):
-    """A group of observations that differs from another group by more than their common errors explain.
+    """A group of observations that contradicts another group by more than the common errors of both groups explain.
 
     Args:
         group: ``points`` (control points), ``photos`` (of captures), ``scenes`` (surveyed scenes) or ``bars``.
@@ -113,7 +113,7 @@ class ContradictionRow(Row):
 
     @property
     def offset(self) -> str:
-        """The offset in metres, as text."""
+        """The offset along east, north and up in metres, as text."""
         return " ".join(f"{value:.2f}" for value in self.offset_m)
 
 
@@ -144,7 +144,7 @@ class GeoreferenceRow(Row):
     columns: ClassVar[Mapping[str, str]] = {
         "component": "component",
         "num_scenes": "scenes",
-        "metres_per_unit": "m a unit",
+        "metres_per_unit": "m per unit",
         "rms_m": "RMS, m",
         "rms_check_m": "RMS of checks, m",
         "num_outliers": "outliers",
@@ -205,7 +205,7 @@ class WorldReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PointRow(Row):
-    """A point in every frame of the map.
+    """A point with its coordinates in every frame of the map.
 
     Args:
         said: the point as given.
