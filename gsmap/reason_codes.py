@@ -343,33 +343,40 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "colours_disagree": ("Colours disagree where surfaces coincide.", r"colours disagree"),
     "correspondences_lost": (
         "Refinement moves the pose away from its correspondences.",
-        r"surfaces pull the pose away",
+        r"surfaces pull the pose away|refinement moved the pose away",
     ),
     "free_space_violation": (
         "A scene has surface where the other scene saw free space.",
         r"free-space violation|\S+% of the (surface|points) seen contradict",
     ),
-    "inconsistent_correspondences": ("The correspondences fit no single pose.", r"correspondences do not fit one pose"),
+    "inconsistent_correspondences": (
+        "The correspondences fit no single pose.",
+        r"correspondences do not fit one pose|no single pose fits",
+    ),
     "mirrored_correspondences": ("The correspondences fit a mirrored pose only.", r"correspondences are mirrored"),
     "no_pose_proposed": (
         "No proposer found a pose.",
-        r"no pose (proposed|under which|that more nodes support)|no match that chance|too few nodes agree",
+        r"chance explains every proposed pose|no pose (found|proposed|under which|that more nodes support)|"
+        r"no match that chance|too few nodes agree",
     ),
     "not_significant": ("The correspondences may have arisen by chance.", r"not significant"),
     "package_missing": (
         "A package that the comparison needs is not installed.",
-        r"comparing shapes needs an|shapes are compared by a package",
+        r"(comparing shapes|registration by shape) needs an|shapes are compared by a package",
     ),
     "rejected_by_person": ("A person rejected the edge.", r"rejected by a person"),
     "too_little_overlap": ("Too little surface coincides.", r"too little surface coincides"),
     "unit_unknown": (
         "The metric scale of a scene is unknown.",
-        r"comparing shapes needs scenes|shapes are compared in metres",
+        r"(comparing shapes|registration by shape) needs scenes|shapes are compared in metres",
     ),
     # Of pairs, photos and scans.
     "ambiguous": ("Another pose or place fits about as well.", r"ambiguous: |it fits two places"),
     "not_probable": ("All evidence together is not strong enough.", r"not probable enough"),
-    "pose_uncertain": ("The pose is known too imprecisely.", r"(the overlap|what it shows) fixes (the|its) pose only"),
+    "pose_uncertain": (
+        "The pose is too uncertain.",
+        r"(the overlap|what it shows) (determines|fixes) (the|its) pose only",
+    ),
     # Photos and scans that are refused.
     "no_match": ("Nothing in the map resembles it.", r"nothing in the map looks like it|no scene of the map has any"),
     "no_views": ("The map has no views to compare a photo with.", r"the map shows nothing to compare it with"),

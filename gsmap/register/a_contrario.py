@@ -10,14 +10,15 @@ from gsmap.types import NodeLayer, Sim3
 _FAR_M = 1e4  # farther than any radius
 
 
-# A node's context covers its neighbours', so near correspondences err together: cells of this size are the independent
-# trials, not nodes.
+# A node's context covers its neighbours', so the errors of near correspondences are correlated: the independent trials
+# are cells of this size, not nodes.
 _CELL_M = 0.5
-_HEIGHT_BAND_M = 0.5  # where gravity is known, random partners lie within this of the candidate's height
+_HEIGHT_BAND_M = 0.5  # largest height difference of a random partner where gravity is known
 
 
 def find_inliers(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarray:
-    """Return the (M,) mask of inliers: correspondences within the radius under a pose, one to one, nearest first."""
+    """Return an (M,) mask that is True for inliers: correspondences whose ends the pose brings within the radius. Each
+    node is used once; the nearest correspondences come first."""
     distance = np.linalg.norm(pose.apply(matches.source) - matches.target, axis=1)
     keep = np.zeros(len(matches), dtype=bool)
     used_t, used_s = set(), set()
@@ -35,12 +36,12 @@ def find_inliers(matches: Correspondences, pose: Sim3, radius_m: float) -> np.nd
 class BackgroundModel:
     """Background model (null hypothesis) of candidate correspondences.
 
-    Each candidate's partner is any source node of its type (and of about its height, where gravity is known),
-    independently between cells. Rooms with the same furniture repeat whole arrangements and violate that independence,
-    so the threshold of the verdict is lower than the theory's (`gsmap.register.verdict`).
+    Under it the partner of each candidate is a random source node of the same type (and of about the same height, where
+    gravity is known), and cells are independent. Rooms with the same furniture repeat whole arrangements and violate
+    that independence, so the verdict uses a lower threshold than the theory (`gsmap.register.verdict`).
 
     Args:
-        target, source: the two layers.
+        target, source: the layer of each scene.
         source_points_m: (N, 3) positions of the source's nodes, in metres.
         matches: the candidates.
         source_heights: (N,) heights of the source's nodes in metres, or None.
@@ -76,9 +77,10 @@ class BackgroundModel:
     def log10_nfa(self, pose: Sim3, radius_m: float = 0.15) -> float:
         """Return log10 of the number of false alarms: the expected number of poses this good by chance.
 
-        With n cells that could hold an inlier, mean probability p each, and k that do, and a pose by every triple of
-        candidates: ``log10 C(M, 3) + log10 P[Bin(n - 3, p) >= k - 3]`` (Desolneux, Moisan and Morel 2000; the triple
-        itself agrees by construction). Below -2 chance is no explanation; inf for fewer than 4 cells.
+        ``log10 C(M, 3) + log10 P[Bin(n - 3, p) >= k - 3]`` (Desolneux, Moisan and Morel 2000), where n cells could hold
+        an inlier, k cells hold one, and p is the mean probability that a cell holds one by chance. Each of the C(M, 3)
+        triples of candidates gives a pose, with which the triple itself agrees by construction. Below -2 chance does
+        not explain the pose; inf for fewer than 4 cells.
         """
         m, cell = len(self.matches), self._cell
         if m < 4:

@@ -1,9 +1,9 @@
-"""Register a pair of which one scene has no colours, by surfaces and free space alone.
+"""Register a pair of scenes by surfaces and free space alone, because one scene has no colours.
 
-A logistic model of its own replaces that of `gsmap.register.probability`, which rests mostly on colour: the number of
-matched features, the overlap, the share of differing surface and the area seen by both add log-odds along monotone
-curves. ``tools/fit/shape.py`` fits them on synthetic flats, where rooms are boxes with furniture along the walls and a
-pose turned by half a turn looks fair; they are stored beside this file.
+The logistic model of `gsmap.register.probability` relies mostly on colour. Here a separate model replaces it: the
+number of matched features, the overlap, the share of differing surface and the area seen in both scenes add log-odds
+along monotone curves. ``tools/fit/shape.py`` fits them on synthetic flats, where rooms are boxes with furniture along
+the walls and a pose that is rotated by 180 degrees looks plausible. The curves are stored beside this file.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ _NAMES = ("inliers", "overlap", "disagreement", "seen")
 
 # Cells at which features of the surfaces are matched: fine ones keep details, coarse ones survive noise.
 VOXELS_M = (0.1, 0.15, 0.25)
-PRIOR = 0.2  # share of proposed poses that are right before any evidence
-_RIVAL_PROBABILITY = 0.3  # another pose that is as probable as this makes the result ambiguous
+PRIOR = 0.2  # share of proposed poses that are correct, before any evidence
+_RIVAL_PROBABILITY = 0.3  # if a second pose is at least this probable, the result is ambiguous
 
 
 def register_by_shape(target: SceneView, source: SceneView, params: Params | None = None) -> Registration:
@@ -48,15 +48,15 @@ def register_by_shape(target: SceneView, source: SceneView, params: Params | Non
     """
     params, watch = params or Params(), Stopwatch()
     if not all(view.scale_policy == "known" or "landmarks" in view.graph.layers for view in (target, source)):
-        why = reason("unit_unknown", "comparing shapes needs scenes in metres, and the unit of one is not known")
+        why = reason("unit_unknown", "registration by shape needs scenes in metres, but the unit of one is unknown")
         return Registration(target.id, source.id, "no_match", why)
     try:
         evaluated = evaluate_by_shape(target, source, params, watch)
     except MissingDependencyError as error:
-        why = reason("package_missing", f"comparing shapes needs an optional package: {error}")
+        why = reason("package_missing", f"registration by shape needs an optional package: {error}")
         return Registration(target.id, source.id, "no_match", why)
     if not evaluated:
-        why = reason("no_pose_proposed", "no pose under which features of both surfaces agree")
+        why = reason("no_pose_proposed", "no pose found under which features of both surfaces agree")
         return Registration(target.id, source.id, "no_match", why, seconds=watch.seconds)
     scored = sorted(((probability(j.proposal, j.evidence, PRIOR), j) for j in evaluated), key=lambda s: -s[0])
     best, why = scored[0][1], _reason(scored, source, params.verdict)
@@ -89,7 +89,7 @@ def register_by_shape(target: SceneView, source: SceneView, params: Params | Non
 def evaluate_by_shape(
     target: SceneView, source: SceneView, params: Params, watch: Stopwatch | None = None
 ) -> list[EvaluatedPose]:
-    """Propose, refine and evaluate poses, each once; the model is fitted to these as well."""
+    """Propose, refine and evaluate poses, each once. The shape model was fitted to such poses."""
     watch, grey = watch or Stopwatch(), (_grey(target), _grey(source))
     unit_m = working_unit_m(*grey, with_scale=False)
     scenes = [MetricScene(view, unit_m) for view in grey]
@@ -131,10 +131,12 @@ def _reason(scored: Sequence[tuple[float, EvaluatedPose]], source: SceneView, pa
             "not_probable",
             f"not probable enough by shape alone: {probable:.1%}, needs {params.min_probability:.0%}: overlap "
             f"{seen.overlap:.0%}, {best.proposal.num_inliers} features agree, {seen.disagreement:.0%} of the "
-            "surface seen in both differs",
+            "surface seen in both scenes differs",
         )
     if len(scored) > 1 and scored[1][0] >= _RIVAL_PROBABILITY:
-        return reason("ambiguous", f"ambiguous: its shape fits in two ways, the other with {scored[1][0]:.1%}")
+        return reason(
+            "ambiguous", f"ambiguous: the shapes fit in two ways, the second one is {scored[1][0]:.1%} probable"
+        )
     if best.covariance is None:
         return reason("too_little_overlap", "too little surface coincides to estimate the uncertainty")
     degrees = float(np.degrees(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1])))
@@ -142,12 +144,14 @@ def _reason(scored: Sequence[tuple[float, EvaluatedPose]], source: SceneView, pa
     lever = np.hstack([-np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.eye(3)])
     metres = float(np.sqrt(np.linalg.eigvalsh(lever @ best.covariance[:6, :6] @ lever.T)[-1]))
     if degrees > params.max_rotation_sigma_deg or metres > params.max_translation_sigma_m:
-        return reason("pose_uncertain", f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * metres:.0f} cm")
+        return reason(
+            "pose_uncertain", f"the overlap determines the pose only to {degrees:.1f} deg, {100 * metres:.0f} cm"
+        )
     return ""
 
 
 def shape_features(proposal: Proposal, evidence: PoseEvidence) -> np.ndarray:
-    """Return the (4,) evidence against a pose, each at least 0."""
+    """Return the (4,) pieces of evidence against a pose, each at least 0."""
     bad = 1.0 if np.isnan(evidence.disagreement) else evidence.disagreement
     return np.array(
         [
@@ -160,7 +164,7 @@ def shape_features(proposal: Proposal, evidence: PoseEvidence) -> np.ndarray:
 
 
 def probability(proposal: Proposal, evidence: PoseEvidence, prior: float) -> float:
-    """Return the probability in (0, 1) that a pose is right, by its shape alone."""
+    """Return the probability in (0, 1) that a pose is correct, by its shape alone."""
     model = _shipped()
     odds = model.base + np.log(prior / (1 - prior))
     for name, value in zip(_NAMES, shape_features(proposal, evidence), strict=True):

@@ -15,8 +15,9 @@ class Clique:
 
     Args:
         members: indices of the correspondences, ascending.
-        exact: proved largest; False when the search stopped at its limit with the best found so far.
-        steps: work done (words of bits touched).
+        exact: the clique is proved to be the largest; False when the search stopped at its limit and returned the best
+            clique found so far.
+        steps: work done (number of 64-bit words read).
     """
 
     members: np.ndarray
@@ -28,12 +29,12 @@ class Clique:
 
 
 def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000, *, more_than: int = 0) -> Clique:
-    """Find the maximum clique of a graph of symmetric bit rows (`consistency_graph`).
+    """Find the maximum clique of a graph whose adjacency matrix is given as symmetric bit rows (`consistency_graph`).
 
     Exact branch and bound over a degeneracy order, bounded by greedy colouring with recolouring (San Segundo et al.
     2011; Tomita et al. 2010), starting from greedily grown cliques. The limit counts steps of work (about two
-    nanoseconds each), not seconds, so the result is the same on every machine. It is empty where no clique has more
-    than ``more_than`` members.
+    nanoseconds each), not seconds, so the result is the same on every machine. The clique is empty if no clique has
+    more than ``more_than`` members.
 
     Raises:
         InputError: rows that are not (M, ceil(M / 64)) uint64.
@@ -43,7 +44,8 @@ def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000, *, more_than:
     rows = np.ascontiguousarray(rows)
     if rows.dtype != np.uint64 or rows.ndim != 2 or rows.shape[1] != -(-len(rows) // 64):
         raise InputError(
-            f"a graph needs (M, ceil(M / 64)) uint64 bit rows, got {rows.shape} {rows.dtype}", code="shape_mismatch"
+            f"a compatibility graph has (M, ceil(M / 64)) uint64 bit rows, got {rows.shape} {rows.dtype}",
+            code="shape_mismatch",
         )
     members, exact, steps = _native.maximum_clique(rows, int(more_than), int(step_limit))
     return Clique(members.astype(np.int64), bool(exact), int(steps))

@@ -1,4 +1,5 @@
-"""Compute the compatibility graph of correspondences: edges join pairs that one similarity could explain."""
+"""Compute the compatibility graph of correspondences: an edge joins two correspondences that one similarity could
+explain."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ Test = Literal["absolute", "ratio"]
 
 
 SIGMA_M = 0.03  # standard deviation of a landmark's position
-_RELATIVE = 0.01  # of the smaller distance, allowed by the absolute test on top of six standard deviations
+_RELATIVE = 0.01  # share of the smaller distance that the absolute test allows on top of six standard deviations
 _RATIO = 0.1  # tolerance of the relative test
 MIN_DISTANCE_M = 0.25  # nodes closer than this hardly constrain the pose
 
@@ -52,18 +53,20 @@ def consistency_graph(
 ) -> np.ndarray:
     """Compute the compatibility graph of correspondences.
 
-    Two correspondences are compatible when the distances of their ends differ by less than ``6 sigma + relative *
-    distance`` after scaling the source, they share no node (one-to-one), and, where gravity is known in both, the
-    differences in height agree as well. The paper's test (`Params.test`) divides by the distance instead; it drops
-    right pairs that are close together and passes wrong pairs that are far apart.
+    Two correspondences are compatible when the distance of their target nodes and that of their scaled source nodes
+    differ by less than ``6 sigma + relative * distance`` and they share no node (one-to-one). Where gravity is known in
+    both scenes, their height differences must agree as well. The test ``ratio`` of the Graph-GSReg paper
+    (`Params.test`) divides by the distance instead; it drops correct correspondences that are close together and passes
+    wrong ones that are far apart.
 
     Args:
-        scale: of the source.
+        scale: factor by which the source's distances are multiplied.
         sigma_m: standard deviation of a node's position.
-        min_distance_m: nearer nodes are not compatible, as they hardly constrain the pose.
+        min_distance_m: correspondences whose nodes are nearer to each other are not compatible, as they hardly
+            constrain the pose.
 
     Returns:
-        (M, ceil(M / 64)) uint64 bit rows, symmetric, bit j of row i set where i and j are compatible.
+        (M, ceil(M / 64)) uint64 bit rows, symmetric: bit j of row i is set if i and j are compatible.
     """
     from gsmap import _native
 

@@ -1,6 +1,6 @@
-"""Add the context of objects to their embeddings: a histogram of the features in the neighbourhood (Graph-GSReg).
+"""Append a context to the embeddings of objects: a histogram of the features of neighbouring objects (Graph-GSReg).
 
-The paper's local graph reaches three hops far; on synthetic places one distinguishes objects best.
+The paper uses neighbours within three hops of its local graph; on synthetic places one hop distinguishes objects best.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 
 from gsmap.types import NodeLayer
 
-_LLOYD_STEPS = 10  # of spherical k-means; the recall on synthetic places is the same after 5 and after 20
+_LLOYD_STEPS = 10  # of spherical k-means; 5 and 20 steps give the same recall on synthetic places
 _MAX_DISTANCE_M = 1.5  # objects nearer to each other are joined in the local graph
 NUM_WORDS = 48  # of the codebook, at most
-SHARPNESS = 20.0  # inverse temperature of the softmax by which a feature is shared among the words
-WEIGHT = 0.5  # length of the context against that of the feature in the embedding
+SHARPNESS = 20.0  # inverse temperature of the softmax that assigns a feature to visual words
+WEIGHT = 0.5  # length of the context in the embedding, where the feature has length 1
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ def add_context(
     weight: float = WEIGHT,
     max_distance_m: float = _MAX_DISTANCE_M,
 ) -> tuple[NodeLayer, NodeLayer]:
-    """Return two layers of one descriptor with embeddings ``[feature, weight * context]`` of unit length.
+    """Return the two layers of one descriptor with new embeddings ``[feature, weight * context]`` of unit length.
 
     The codebook is computed from the two layers themselves (`word_shares`): an image encoder's features all lie in one
-    narrow cone, which a general codebook does not resolve. No context is stored, so the result does not depend on the
-    other scenes of a map nor on their order.
+    narrow cone, which a general codebook does not resolve. No context is stored, so the result does not depend on
+    further scenes of the map or on their order.
     """
     hops = (params or Params()).hops
     if weight == 0 or not len(a) or not len(b):
@@ -63,11 +63,12 @@ def _with_embeddings(
 
 
 def neighbourhood(positions: np.ndarray, max_distance: float, hops: int) -> np.ndarray:
-    """Return (M, M) bool: nodes within ``hops`` edges of each other in the paper's local graph, without themselves.
+    """Return an (M, M) mask that is True for pairs of different nodes within ``hops`` edges of each other in the local
+    graph.
 
     Edges join nodes nearer than ``max_distance``.
     """
-    from scipy.spatial import cKDTree  # naming a recipe does without
+    from scipy.spatial import cKDTree  # imported here, as the recipe key does not need it
 
     count = len(positions)
     step = np.eye(count, dtype=bool)
@@ -80,15 +81,15 @@ def neighbourhood(positions: np.ndarray, max_distance: float, hops: int) -> np.n
 
 
 def word_shares(features: np.ndarray, num_words: int, sharpness: float) -> np.ndarray:
-    """Assign M features softly to K <= ``num_words`` visual words; rows (M, K) sum to 1.
+    """Assign M features softly to K <= ``num_words`` visual words and return the (M, K) weights, whose rows sum to 1.
 
     Features are centred on their mean and normalized. Words are the centres of spherical k-means (Dhillon and Modha
     2001) with farthest-point seeds, without randomness. Centres are sums of features, so the Gram matrix of the
-    features suffices, however long they are. The weights are the softmax of a feature's cosines.
+    features suffices, whatever their dimension. The weights of a feature are the softmax of its cosines to the words.
 
     Args:
         features: (M, F).
-        num_words: K at most; M where there are fewer features.
+        num_words: largest K; K is M if there are fewer features.
         sharpness: inverse temperature of the softmax.
     """
     centred = features.astype(np.float64) - features.mean(0, dtype=np.float64)
@@ -113,13 +114,14 @@ def word_shares(features: np.ndarray, num_words: int, sharpness: float) -> np.nd
 
 
 def context_histograms(shares: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Return (M, K) unit vectors: the square roots of the word histograms of each node's neighbours.
+    """Return the (M, K) context of each node: the square roots of the visual word histogram of its neighbours, of unit
+    length.
 
     Cosines of square roots are Bhattacharyya coefficients. A node without neighbours has the zero vector.
 
     Args:
         shares: (M, K) of `word_shares`.
-        reach: (M, M) bool neighbours of each node.
+        reach: (M, M) mask, True for pairs of neighbours (`neighbourhood`).
     """
     total = reach.astype(np.float64) @ shares
     out: np.ndarray = np.sqrt(total / np.maximum(total.sum(1, keepdims=True), 1e-12))

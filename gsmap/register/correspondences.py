@@ -14,10 +14,11 @@ MAX_CORRESPONDENCES = 1200
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """M candidate pairs of nodes, most similar first, in metres.
+    """M candidate pairs of nodes, most similar first, with positions in metres.
 
     Args:
-        target, source: (M, 3) float64 positions of the two ends, each in its own scene's frame, in metres.
+        target, source: (M, 3) float64 positions of the two nodes of each pair, each in the frame of its scene, in
+            metres.
         target_ids, source_ids: (M,) int32 rows of the two layers.
         similarity: (M,) float32 cosine of the embeddings.
         target_heights, source_heights: (M,) float64 heights along gravity, or None where it is unknown in either scene.
@@ -56,12 +57,13 @@ def match_nodes(
     units_m: tuple[float, float] = (1.0, 1.0),
     ups: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> Correspondences:
-    """Match nodes of one type with similar embeddings: each node's ``top_k``, from both sides.
+    """Match each node with the ``top_k`` most similar nodes of its type in the other scene; return the union of both
+    directions.
 
     Args:
-        target, source: one layer of each scene, by the same descriptor.
-        top_k: a pair is kept when either node is among the other's so many most similar nodes of its type.
-        min_similarity: cosine of the embeddings.
+        target, source: one layer of each scene, both with the same descriptor.
+        top_k: a pair is kept if one node is among the ``top_k`` nodes of its type that are most similar to the other.
+        min_similarity: smallest cosine of the embeddings of a pair.
         max_correspondences: number of the most similar pairs that are kept.
         units_m: metres per unit of the target's and of the source's frame.
         ups: unit vectors against gravity, or None.
@@ -98,12 +100,12 @@ def similar_pairs(
     units_m: tuple[float, float],
     ups: tuple[np.ndarray | None, np.ndarray | None],
 ) -> Correspondences:
-    """Match the ends of some correspondences with all nodes that are as similar to them as their partners.
+    """Match the nodes of some correspondences with all nodes that are about as similar to them as their partners.
 
     Args:
         members: the correspondences.
-        quantile: of their similarities; the lower limit of the similarity of a pair.
-        count: largest number of the most similar pairs.
+        quantile: the similarity of a pair must reach this quantile of the similarities of ``members``.
+        count: largest number of pairs; the most similar are kept.
         units_m, ups: as in `match_nodes`.
     """
     bar = float(np.quantile(members.similarity, quantile)) - 1e-6
@@ -120,7 +122,7 @@ def similar_pairs(
 def _similar_pairs(
     target: NodeLayer, source: NodeLayer, t: np.ndarray, s: np.ndarray, bar: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of rows of both layers that are of one type and at least so similar."""
+    """Return the rows of pairs of nodes that have the same type and a similarity of at least ``bar``."""
     similar = target.embeddings[t] @ source.embeddings[s].T >= bar
     rows, columns = np.nonzero(similar & (target.types[t][:, None] == source.types[s]))
     return t[rows], s[columns]
@@ -135,7 +137,7 @@ def _between(
     units_m: tuple[float, float],
     ups: tuple[np.ndarray | None, np.ndarray | None],
 ) -> Correspondences:
-    """Return the correspondences of rows of both layers, in metres."""
+    """Return the correspondences between rows ``t`` of the target and rows ``s`` of the source, in metres."""
     points_t, points_s = target.positions[t] * units_m[0], source.positions[s] * units_m[1]
     level = ups[0] is not None and ups[1] is not None
     return Correspondences(
@@ -150,11 +152,11 @@ def _between(
 
 
 def _mutual_top_k(similarity: np.ndarray, top_k: int, min_similarity: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and columns of the entries among the ``top_k`` of their row or column."""
+    """Return rows and columns of the entries that are among the ``top_k`` largest of their row or of their column."""
     height, width = similarity.shape
     if top_k == 1:
         column, row = similarity.argmax(1), similarity.argmax(0)
-        once = np.flatnonzero(column[row] != np.arange(width))  # mutual matches are there already, from their row
+        once = np.flatnonzero(column[row] != np.arange(width))  # mutual matches were already added from their row
         rows, columns = np.concatenate([np.arange(height), row[once]]), np.concatenate([column, once])
     else:
         k, m = min(top_k, width), min(top_k, height)

@@ -20,48 +20,48 @@ from gsmap.register.surface import PLANE_NEIGHBOURS, Surface
 from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Sim3
 
-BLOCK_M = 0.3  # residuals within a cell of this size, on surfaces that face one way, are one measurement
-# Pairs farther apart than this are ignored, and from a third of it on they weigh less, as in refining.
+BLOCK_M = 0.3  # residuals within a cell of this size, on surfaces of one orientation, count as one measurement
+# Pairs farther apart than this are ignored; beyond a third of it their weight falls, as in refinement.
 RADIUS_M = 0.08
-_MAX_BLOCKS = 200  # larger cells are taken where there would be more
-# The pose is moved by this much each way (rotation and scale: over the overlap's radius) to see how much of a motion
-# the residuals of this many cells pull back.
+_MAX_BLOCKS = 200  # cells are enlarged until there are at most this many
+# The pose is displaced by this distance in both directions of each motion (rotation and scale: at the overlap's
+# radius); the residuals of this many cells then give the curvature.
 _PROBE_M = 0.01
 _PROBE_POINTS = 6000
-_COLOUR_PARAMS = colored_icp.Params(colour_weight=3.0)  # ten times that of refining
-_COLOUR_PASS = colored_icp.Schedule((0.06,), (10_000,), last_tolerance=0.01)  # one radius; a tenth of a pair's cost
+_COLOUR_PARAMS = colored_icp.Params(colour_weight=3.0)  # ten times that of refinement
+_COLOUR_PASS = colored_icp.Schedule((0.06,), (10_000,), last_tolerance=0.01)  # one radius, for a tenth of a pair's cost
 _MIN_CELLS = 20  # cells that coincide
 _MIN_BLOCK_COUNT = 3.0
 _MIN_LOG_SCALE_SIGMA = 1e-6  # keeps the matrix regular
-_MIN_CONSTRAINED = 0.1  # share of the curvature of a motion, as surfaces constrain it beyond the probe
-# Pairs follow errors of the surfaces as they follow motions, which cancels, but residuals then understate the errors.
-# Half of it cancels in synthetic places whose errors are known.
+_MIN_CONSTRAINED = 0.1  # smallest share of a motion's Gauss-Newton curvature, as surfaces constrain it beyond the probe
+# Correspondences follow surface errors as they follow motions. Both effects cancel, except that residuals then
+# understate the errors. In synthetic places with known errors half of the effect cancels.
 _CANCELLED_SHARE = 0.5
-_WIDTH = 0.3  # of the radius: pairs at this distance from the planes have a quarter of the weight, as in refining
+_WIDTH = 0.3  # of the radius: pairs at this distance from the planes have a quarter of the full weight
 _CLIP = 3.0  # standard deviations: larger residuals are changes of the place, not errors
 
 
 @dataclass(frozen=True)
 class UnobservedErrors:
-    """Standard deviations of pose errors that leave no residual (a trainer's bias, a sensor's bent depths).
+    """Standard deviations of pose errors that leave no residual (bias of a trainer, distorted depths of a sensor).
 
     A model fitted to synthetic places by ``tools/fit/covariance.py``, stored in ``covariance.json``; a new fit needs a
-    new `gsmap.register.recipe.VERSION`. *Colour motion* is the motion by which colours alone would move a pose, the
-    *field* the correlated surface errors (`error_field`).
+    new `gsmap.register.recipe.VERSION`. The *colour motion* is the motion by which colours alone would move a pose. The
+    *field* is the displacement field of spatially correlated surface errors (`error_field`).
 
     Args:
-        residual_factor: factor on the standard deviation that the residuals show.
+        residual_factor: factor on the standard deviation estimated from the residuals.
         colour_share: error of rotations and translations per unit of colour motion.
         colour_scale_share: error of the log scale per unit of colour motion.
         shift_m: error of translations where the field has the size ``field_m``.
         scale_error_m: error of the log scale times the overlap's radius where the field has the size ``field_m``.
         field_m: reference size of the field.
-        field_power: power of the field with which both errors grow.
-        shift_per_scale: error of translations per error of the scale over the overlap's radius: a sensor that scales
-            its depths also bends them.
-        rotation_per_shift: error of rotations over the overlap's radius per error of translations.
-        max_scale_sigma: upper limit of the error of the log scale: no sensor is off by much more.
-        min_shift_m: lower limit of the error of translations, and of rotations over the overlap's radius.
+        field_power: exponent with which both errors grow with the size of the field.
+        shift_per_scale: error of translations per scale error times the overlap's radius: a sensor with scaled depths
+            also distorts them.
+        rotation_per_shift: error of rotations times the overlap's radius, per error of translations.
+        max_scale_sigma: upper limit of the error of the log scale; hardly any sensor exceeds it.
+        min_shift_m: lower limit of the error of translations, and of rotations times the overlap's radius.
     """
 
     residual_factor: float
@@ -79,7 +79,7 @@ class UnobservedErrors:
 
 @cache
 def load_model(*, coloured: bool) -> UnobservedErrors:
-    """Load the fitted model for surfaces with colours or for surfaces without."""
+    """Load the fitted model: one for surfaces with colours, one for surfaces without."""
     stored = json.loads((files("gsmap.register") / "covariance.json").read_text())
     return UnobservedErrors(**stored["coloured" if coloured else "grey"])
 
@@ -99,7 +99,8 @@ class PoseUncertainty:
 
     @classmethod
     def about(cls, covariance: np.ndarray, centroid: np.ndarray, scale: float) -> PoseUncertainty:
-        """Move the covariance (7, 7) of a pose from the overlap's centroid (3,) to the source's origin."""
+        """Return the uncertainty from a covariance (7, 7) about the overlap's centroid (3,), moved to the source's
+        origin."""
         sigmas = (
             float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
             float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * scale,
@@ -115,16 +116,16 @@ class Conditioning:
     """Sensitivity of a refined pose to surface errors and to its scale.
 
     Args:
-        scaled: (7, 7) covariance about the overlap's centroid of the pose with a refined scale, by the residuals.
-        rigid: (6, 6) the same of the pose with the true scale.
-        scale_coupling: (7,) derivative of the refined pose by the logarithm of its scale.
-        centroid: (3,) of the overlap, in the source's frame, metres.
+        scaled: (7, 7) covariance of the pose with a refined scale, about the overlap's centroid, from the residuals.
+        rigid: (6, 6) the same covariance, of the pose with the true scale.
+        scale_coupling: (7,) derivative of the refined pose with respect to the logarithm of its scale.
+        centroid: (3,) centroid of the overlap in the source's frame, in metres.
         field_m: standard deviation of the surface errors that are correlated beyond a block.
-        radius_m: of the overlap.
-        colour_motion: (7,) motion about the centroid by which colours would move the pose; None where there are none.
+        radius_m: radius of the overlap.
+        colour_motion: (7,) motion about the centroid by which colours would move the pose; None without colours.
         unobserved: the model of errors that leave no residual.
         free_covariance: (7, 7) and (6, 6) covariances that are added to ``scaled`` and ``rigid`` along degenerate
-            directions, which colours and correspondences constrain, or nothing.
+            directions, which only colours and correspondences constrain, if anything.
     """
 
     scaled: np.ndarray
@@ -143,7 +144,7 @@ class Conditioning:
         return float(np.sqrt(self.covariance_with_scale(1.0)[6, 6]))
 
     def covariance_with_scale(self, scale: float) -> np.ndarray:
-        """Return the (7, 7) covariance about the overlap's centroid of the pose with a refined scale."""
+        """Return the (7, 7) covariance of the pose with a refined scale, about the overlap's centroid."""
         swell = unobserved_log_scale(self.field_m, self.radius_m, self.colour_motion, self.unobserved)
         unobserved = np.r_[self._unobserved(swell, scale, self.colour_motion), swell]
         return self.unobserved.residual_factor**2 * self.scaled + self.free_covariance[0] + np.diag(unobserved**2)
@@ -151,12 +152,13 @@ class Conditioning:
     def covariance_of_rigid(
         self, scale: float, swell: float, log_scale_sigma: float, colour_motion: np.ndarray | None
     ) -> np.ndarray:
-        """Return the (7, 7) covariance about the overlap's centroid of a pose whose scale is given.
+        """Return the (7, 7) covariance of a pose with a given scale, about the overlap's centroid.
 
         Args:
-            swell: logarithm of the measured scale over the given one, which indicates unobserved errors.
+            swell: logarithm of the measured scale divided by the given scale; a large value indicates unobserved
+                errors.
             log_scale_sigma: standard deviation of the given scale's logarithm.
-            colour_motion: by which colours would move this pose; None where there are none.
+            colour_motion: motion by which colours would move this pose; None without colours.
         """
         out = np.zeros((7, 7))
         unobserved = self._unobserved(abs(swell), scale, colour_motion)
@@ -167,8 +169,8 @@ class Conditioning:
     def uncertainty(
         self, pose: Sim3, decision: ScaleDecision | None = None, colour_motion: np.ndarray | None = None
     ) -> PoseUncertainty:
-        """Return the uncertainty of a pose (metres): of the scaled one, or of a rigid one by the scale decision that
-        colours would move by ``colour_motion``."""
+        """Return the uncertainty of a pose in metres. If the scale decision is rigid, it is that of the rigid pose,
+        which colours would move by ``colour_motion``; otherwise it is that of the pose with the refined scale."""
         if decision is None or not decision.rigid:
             covariance = self.covariance_with_scale(pose.scale)
         else:
@@ -178,13 +180,14 @@ class Conditioning:
         return PoseUncertainty.about(covariance, self.centroid, pose.scale)
 
     def rescaled(self, pose: Sim3, scale: float) -> Sim3:
-        """Change the scale of a pose, and move it as refinement under that scale would."""
+        """Change the scale of a pose, and move the pose as refinement under the new scale would."""
         step = np.log(scale / pose.scale) * self.scale_coupling
         centre = Sim3(np.eye(3), self.centroid)
         return retract(pose @ centre, step) @ centre.inverse()
 
     def _unobserved(self, swell: float, scale: float, colour_motion: np.ndarray | None) -> np.ndarray:
-        """Return the (6,) standard deviations of rotation and translation (source's unit) by unobserved errors."""
+        """Return the (6,) standard deviations of rotation and translation (in the source's unit) due to unobserved
+        errors."""
         turn, shift = unobserved_motion(self.field_m, self.radius_m, swell, self.unobserved)
         out = np.r_[np.full(3, turn), np.full(3, shift / scale)]
         if colour_motion is None:
@@ -200,15 +203,16 @@ def condition(
     correspondences: Correspondences | None = None,
     unobserved: UnobservedErrors | None = None,
 ) -> Conditioning | None:
-    """Compute the sensitivity of a refined pose (metres) to surface errors; None where too little overlaps.
+    """Compute the sensitivity of a refined pose (metres) to surface errors; None where the overlap is too small.
 
-    An ICP Hessian is overconfident 10 to 900 times on splats, for neighbouring points share their error. So the
-    point-to-plane residuals are averaged over blocks, `error_field` estimates their spatial correlation, and the
-    covariance is ``A K A^T`` for errors of covariance K, where A is the derivative of the pose by each block's error
-    (implicit function theorem). A fitted model adds the errors that leave no residual (`UnobservedErrors`).
+    An ICP Hessian is overconfident 10 to 900 times on splats, because the errors of neighbouring points are correlated.
+    So the point-to-plane residuals are averaged over blocks, `error_field` estimates their spatial correlation, and the
+    covariance is ``A K A^T`` for errors of covariance K, where A is the derivative of the pose with respect to each
+    block's error (implicit function theorem). A fitted model adds the errors that leave no residual
+    (`UnobservedErrors`).
 
-    Along degenerate directions (`degeneracy`) colours and the ``correspondences`` constrain the pose, as in refining;
-    where these do not either, its error is as large as the overlap.
+    Along degenerate directions (`degeneracy`) colours and the ``correspondences`` constrain the pose, as in refinement;
+    where nothing constrains it, its error is as large as the overlap.
     """
     blocks = _Blocks.of(target, source, pose)
     if blocks is None:
@@ -246,7 +250,7 @@ def condition(
 def uncertainty_of_correspondences(
     correspondences: Correspondences, pose: Sim3, block_m: float = BLOCK_M
 ) -> PoseUncertainty:
-    """Return the uncertainty of a pose (metres) that was fitted to correspondences alone."""
+    """Return the uncertainty of a pose (metres) that was fitted to correspondences, from the residuals of these."""
     target, source = correspondences
     centroid = source.mean(0)
     information = pose.scale**2 * point_information(source - centroid)
@@ -259,7 +263,7 @@ def _resolution_m(target: Surface, source: Surface) -> float:
 
 
 def _repeats(points: np.ndarray, block_m: float) -> float:
-    """Return the mean number of points per block: points within a block share their error."""
+    """Return the mean number of points per block; the points of one block share one error."""
     return len(points) / len(np.unique(np.floor(points / block_m), axis=0))
 
 
@@ -270,8 +274,9 @@ def _other_information(
     blocks: _Blocks,
     correspondences: Correspondences | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (7, 7) information of colours, of correspondences and of a prior as wide as the overlap, about its
-    centroid in the weights of `_Blocks`, and the (7, 7) covariance of their gradients."""
+    """Return the information of everything but planes, and the covariance of its gradients: both (7, 7), about the
+    overlap's centroid, in the weights of `_Blocks`. It comes from colours, correspondences and a prior as wide as the
+    overlap."""
     variance = max(blocks.noise_m, 1e-6) ** 2
     anywhere = blocks.points / blocks.points[3, 3] * variance / blocks.radius_m**2
     constrained, errors = anywhere.copy(), variance * anywhere
@@ -304,8 +309,8 @@ def find_colour_motion(
     """Return the (7,) motion about the overlap's centroid by which colours would move a refined pose; None without
     colours.
 
-    A sensor that bends its depths, or whose colours and depths are misaligned, moves textures and planes differently.
-    So the poses by colours and by planes differ by about the error of both, which the planes' residuals do not show.
+    Distorted depths, or misaligned colours and depths, displace textures and planes differently. So the pose from
+    colours and the pose from planes differ by about the error of either, which the residuals of planes do not reveal.
     """
     if not all(np.ptp(surface.lightness) > 0 for surface in (target, source)):
         return None
@@ -319,7 +324,7 @@ def find_colour_motion(
 def unobserved_log_scale(
     field_m: float, radius_m: float, colour_motion: np.ndarray | None, unobserved: UnobservedErrors
 ) -> float:
-    """Return the standard deviation of the log scale by errors that leave no residual."""
+    """Return the standard deviation of the log scale due to errors that leave no residual."""
     moved_by_colour = 0.0 if colour_motion is None else unobserved.colour_scale_share * colour_motion[6] * radius_m
     swell = np.hypot(
         unobserved.scale_error_m * (field_m / unobserved.field_m) ** unobserved.field_power, moved_by_colour
@@ -330,13 +335,14 @@ def unobserved_log_scale(
 def unobserved_motion(
     field_m: float, radius_m: float, swell: float, unobserved: UnobservedErrors
 ) -> tuple[float, float]:
-    """Return standard deviations (rad, metres) about the overlap's centroid by errors that leave no residual.
+    """Return the standard deviations (rad, metres) of a pose about the overlap's centroid due to errors that leave no
+    residual.
 
-    Such errors are observed where the scale is known: a sensor whose depths are a percent off scales its surfaces by as
-    much, and rotates and shifts them in proportion.
+    A known scale makes such errors observable: if a sensor's depths are a percent too large, its surfaces are a percent
+    too large as well, and rotated and shifted in proportion.
 
     Args:
-        swell: logarithm of the scale by such errors: measured, or its standard deviation.
+        swell: logarithm of the scale due to such errors: the measured value, or its standard deviation.
     """
     own = unobserved.shift_m * (field_m / unobserved.field_m) ** unobserved.field_power
     shift = float(np.sqrt(own**2 + (unobserved.shift_per_scale * swell * radius_m) ** 2 + unobserved.min_shift_m**2))
@@ -344,12 +350,13 @@ def unobserved_motion(
 
 
 def _measured_hessian(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks) -> np.ndarray:
-    """Return the (7, 7) Hessian of the squared residuals about the overlap's centroid, with new pairs at each probe.
+    """Return the (7, 7) Hessian of the squared residuals about the overlap's centroid, where each probe finds new
+    pairs.
 
-    The Gauss-Newton Hessian keeps the pairs fixed. They follow a motion along a wall, though, and the noise of its
-    normals then seems to constrain it: at a street's far end that Hessian claimed millimetres for a pose that was a
-    decimetre off. So the pose is probed in both directions of each motion, and the gradients give the curvature along
-    each common eigenvector.
+    The Gauss-Newton Hessian keeps the pairs fixed. In truth pairs follow a motion along a wall; with fixed pairs the
+    noise of the wall's normals seems to constrain that motion. At the far end of a street that Hessian gave millimetres
+    for a pose that was a decimetre off. So the pose is displaced in both directions of each motion, and the gradients
+    give the curvature along each common eigenvector.
     """
     chosen = source.sample(_PROBE_POINTS)
     points, centre = source.coarse[0][chosen], Sim3(np.eye(3), blocks.centroid)
@@ -372,12 +379,14 @@ def _measured_hessian(target: Surface, source: Surface, pose: Sim3, blocks: _Blo
 
 
 def _oriented_normals(source: Surface, pose: Sim3) -> np.ndarray | None:
-    """Return the (M, 3) oriented normals of the source's cells in the target's frame, zeros where unknown."""
+    """Return the (M, 3) oriented normals of the source's cells in the target's frame; zeros where the orientation is
+    unknown."""
     return None if source.oriented_normals is None else source.oriented_normals @ pose.rotation.T
 
 
 def _pull(target: Surface, points: np.ndarray, oriented: np.ndarray | None, centred: Sim3, centre: Sim3) -> np.ndarray:
-    """Return the (7,) gradient of the weighted squared point-to-plane distances by a motion about a centre."""
+    """Return the (7,) gradient of the weighted squared point-to-plane distances with respect to a motion about a
+    centre."""
     pose = centred @ centre.inverse()
     moved = pose.apply(points)
     distance, row = target.nearest(moved, RADIUS_M, oriented)
@@ -390,19 +399,19 @@ def _pull(target: Surface, points: np.ndarray, oriented: np.ndarray | None, cent
 
 
 def _weights(residual: np.ndarray) -> np.ndarray:
-    """Return Geman-McClure weights."""
+    """Return the Geman-McClure weights of residuals."""
     weights: np.ndarray = 1.0 / (1.0 + (residual / (_WIDTH * RADIUS_M)) ** 2) ** 2
     return weights
 
 
 def in_scene_units(covariance: np.ndarray, source_unit_m: float) -> np.ndarray:
-    """Convert translations of a covariance from metres to the source's own unit."""
+    """Convert the translations of a covariance from metres to the source's own unit."""
     scale = np.r_[np.ones(3), np.full(3, 1.0 / source_unit_m), 1.0]
     return covariance * scale[:, None] * scale
 
 
 def point_to_plane_jacobian(pose: Sim3, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return the (N, 7) derivative of ``n . (S Exp(xi) p)`` at xi = 0.
+    """Return the (N, 7) derivative of ``n . (S Exp(xi) p)`` with respect to xi at xi = 0.
 
     Args:
         points: (N, 3) in the source's frame.
@@ -414,15 +423,15 @@ def point_to_plane_jacobian(pose: Sim3, points: np.ndarray, normals: np.ndarray)
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Weighted means over B blocks of the pairs under a pose.
+    """Weighted means of the pairs under a pose, over B blocks.
 
     Derivatives are about ``centroid``: rotation and translation then hardly mix, and the matrices are well scaled.
 
     Args:
         hessian: (7, 7) Gauss-Newton Hessian of the point-to-plane distances of all pairs.
-        points: (7, 7) the same of point-to-point distances.
+        points: (7, 7) the same Hessian, of point-to-point distances.
         noise_m: robust standard deviation of the point-to-plane distances.
-        radius_m: of the overlap.
+        radius_m: radius of the overlap.
     """
 
     jacobian: np.ndarray
@@ -446,7 +455,7 @@ class _Blocks:
         if len(hit) < _MIN_CELLS:
             return None
         points, moved, normals = points[hit], moved[hit], target.normals[row[hit]]
-        # Signs of normals mean nothing: those of a block are turned to face one way.
+        # The signs of normals are arbitrary: within a block they are flipped to agree.
         axis = np.abs(normals).argmax(1)
         normals = normals * np.sign(normals[np.arange(len(normals)), axis])[:, None]
         residual = (normals * (moved - target.coarse[0][row[hit]])).sum(1)
@@ -492,7 +501,8 @@ def _labels(points: np.ndarray, axis: np.ndarray, size_m: float) -> np.ndarray:
 
 
 def _shift(centroid: np.ndarray) -> np.ndarray:
-    """Return the (7, 7) map of a tangent at the source's origin to the same motion about ``centroid``.
+    """Return the (7, 7) matrix that turns a tangent at the source's origin into the tangent of the same motion about
+    ``centroid``.
 
     ``Exp(xi) p = p + w x p + v + l p``; about c: ``v_c = v + w x c + l c``.
     """

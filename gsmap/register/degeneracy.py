@@ -1,9 +1,10 @@
-"""Detect degenerate directions: motions of a pose that surfaces leave free and only noise of normals constrains.
+"""Detect degenerate directions: motions of a pose that surfaces leave free, so that only noise of normals constrains
+them.
 
 A plane leaves motions along it free. Measured normals are off by some degrees, though, so the normal equations of
-point-to-plane distances are never quite singular. Along a street's front or a corridor, the gradient of a few pairs at
-the overlap's ends is then divided by next to nothing. So the information on every motion is compared with that
-which the noise alone would produce (Zhang, Kaess and Singh 2016 compare it with a fixed threshold).
+point-to-plane distances are never quite singular. Along a façade or a corridor, the gradient of a few pairs at the ends
+of the overlap is then divided by a tiny curvature. So the information on every motion is compared with the information
+that noise alone would produce (Zhang, Kaess and Singh 2016 use a fixed threshold).
 """
 
 from __future__ import annotations
@@ -13,17 +14,17 @@ import numpy as np
 from gsmap.geometry.rotations import skew
 
 MIN_SIGNAL = 8.0
-"""Smallest information on a constrained motion, in multiples of that which the noise of normals produces: bare
-fronts and corridors reach 5; noisy rooms 16 and more, and a front with a box every ten metres 50."""
+"""Smallest information on a constrained motion, in multiples of the information that the noise of normals produces.
+Bare façades and corridors reach 5, noisy rooms at least 16, and a façade with a box every ten metres 50."""
 
 
 def point_information(levers: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Return the (7, 7) information of point-to-point pairs on [rotation, translation, log scale] about a centre, for
-    points of unit variance (1 square metre).
+    """Return the (7, 7) information of point-to-point pairs on [rotation, translation, log scale] about a centre, if
+    each point has a variance of 1 square metre.
 
     Args:
         levers: (N, 3) points less the centre.
-        weights: (N,) of the pairs; all 1 by default.
+        weights: (N,) weights of the pairs; all 1 by default.
     """
     weights = np.ones(len(levers)) if weights is None else weights
     squares, total = (levers * weights[:, None]).T @ levers, weights @ levers
@@ -39,25 +40,27 @@ def point_information(levers: np.ndarray, weights: np.ndarray | None = None) -> 
 def constrained_motions(
     system: np.ndarray, points: np.ndarray, noise_m: float, resolution_m: float, neighbours: int
 ) -> np.ndarray | None:
-    """Return the (D, D) projection ``P`` of point-to-plane equations on the motions that surfaces constrain; None
-    where they constrain all.
+    """Return the (D, D) projection ``P`` of point-to-plane equations on the motions that surfaces constrain; None if
+    they constrain all motions.
 
     ``P system P^T`` and ``P gradient`` neither constrain nor move a pose along a degenerate direction. The normal of a
     plane through n cells of side a, whose heights have the error ``noise_m / sqrt(2)``, has the error
-    ``noise_m sqrt(2 pi) / (n a)`` about each axis (least squares over a disc), whose square constrains the sliding.
+    ``noise_m sqrt(2 pi) / (n a)`` about each axis (least squares over a disc), whose square seems to constrain motions
+    along the plane.
 
     Args:
         system: (D, D) normal matrix of the plane distances over the first D motions (6: the scale is fixed).
         points: (7, 7) `point_information` of the same pairs, under the same weights.
-        noise_m: standard deviation of the plane distances, errors of both surfaces together.
+        noise_m: standard deviation of the plane distances, including the errors of both surfaces.
         resolution_m: side of a cell.
-        neighbours: cells that a plane is fitted to.
+        neighbours: number of cells to which each plane is fitted.
     """
     from scipy.linalg import eigh
 
     dim = len(system)
-    points = points[:dim, :dim] + 1e-9 * np.diag(np.diag(points)[:dim])  # points on a line turn about it
-    # Distances beyond half a cell are those of a pose that is still off, not of noise.
+    # The second term keeps the matrix regular where points lie on a line, about which they may turn.
+    points = points[:dim, :dim] + 1e-9 * np.diag(np.diag(points)[:dim])
+    # Distances beyond half a cell come from a pose that is still wrong, not from noise.
     noise = 2 * np.pi * (min(noise_m, resolution_m / 2) / (neighbours * resolution_m)) ** 2
     information, motions = eigh(system, points)
     free = motions[:, information < MIN_SIGNAL * noise]

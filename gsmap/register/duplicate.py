@@ -1,4 +1,4 @@
-"""Detect two scenes of one capture that was converted, thinned out or trained again."""
+"""Detect duplicates: two scenes that come from one capture, which was converted, thinned or trained again."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 SAME_CAPTURE = "the same capture"
-_MIN_OVERLAP = 0.5  # of the surface, of duplicates
-_MIN_SHARE = 0.9  # of the smaller scene's Gaussians, or of the fewer cameras
+_MIN_OVERLAP = 0.5  # smallest overlap of duplicates
+_MIN_SHARE = 0.9  # smallest share of the smaller scene's Gaussians, or cameras, that coincide
 _POINTS = 3000
-# Independent Gaussians of one surface lie half their spacing from the nearest of the other (2D Poisson: mean nearest
-# distance to another set equals that within the set); those of one training lie where they were.
+# Gaussians of independent trainings lie about half their spacing from the nearest Gaussian of the other scene (2D
+# Poisson: the mean nearest distance to another set equals that within a set); Gaussians of one training coincide.
 _SPACING_SHARE = 0.1
 _MIN_CAMERAS = 5
-_CAMERA_SHARE = 0.005  # of the distance between camera and scene: no second visit takes every picture to a centimetre
+_CAMERA_SHARE = 0.005  # of the distance from camera to scene: no second visit repeats every position to a centimetre
 _CAMERA_DEG = 1.0
 
 
@@ -32,16 +32,16 @@ def find_duplicate(target: SceneView, source: SceneView, found: Registration) ->
         return ""
     share = _coinciding_gaussians(target, source, S)
     if share >= _MIN_SHARE:
-        return f"{SAME_CAPTURE} twice: {share:.0%} of the Gaussians of the smaller scene are Gaussians of the other"
+        return f"{SAME_CAPTURE} twice: {share:.0%} of the Gaussians of the smaller scene are in the other scene"
     shared, of = _coinciding_cameras(target, source, S)
     if of >= _MIN_CAMERAS and shared >= _MIN_SHARE * of:
-        return f"{SAME_CAPTURE} trained twice: {shared} of {of} cameras are cameras of the other"
+        return f"{SAME_CAPTURE} trained twice: {shared} of {of} cameras of one scene are in the other scene"
     return ""
 
 
 def _coinciding_gaussians(target: SceneView, source: SceneView, S_target_source: Sim3) -> float:
-    """Return the share of the smaller scene's Gaussians that coincide with one of the other scene."""
-    from scipy.spatial import cKDTree  # naming a recipe does without
+    """Return the share of the smaller scene's Gaussians that coincide with a Gaussian of the other scene."""
+    from scipy.spatial import cKDTree  # imported here, as the recipe key does not need it
 
     means, moved = target.gaussians.means.astype(float), S_target_source.apply(source.gaussians.means)
     large, small = (means, moved) if len(means) >= len(moved) else (moved, means)
@@ -53,8 +53,8 @@ def _coinciding_gaussians(target: SceneView, source: SceneView, S_target_source:
 
 
 def _align_closely(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances to and rows of the nearest points of a set after the nearer half of the points is aligned with
-    it: the refined pose is good to a millimetre, which may be the spacing."""
+    """Align points with the nearest points of a set, and return the distances to these and their rows. Only the nearer
+    half is aligned, because the refined pose may be off by a millimetre, which may be as much as the spacing."""
     for _ in range(4):
         distance, row = tree.query(points)
         near = np.argsort(distance)[: max(3, len(points) // 2)]
@@ -64,7 +64,8 @@ def _align_closely(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _coinciding_cameras(target: SceneView, source: SceneView, S_target_source: Sim3) -> tuple[int, int]:
-    """Return how many cameras of the scene with fewer have the pose of a camera of the other, and their number."""
+    """Count the cameras of the scene with fewer cameras that share a pose with a camera of the other scene; return this
+    count and the number of cameras of that scene."""
     from scipy.spatial import cKDTree
 
     ours, theirs = target.cameras, source.cameras

@@ -1,4 +1,5 @@
-"""Measure evidence for a pose from renders of both scenes: free space, coinciding surfaces and local colours."""
+"""Measure evidence for or against a pose from renders of both scenes: free space, coinciding surfaces and local
+colours."""
 
 from __future__ import annotations
 
@@ -16,12 +17,12 @@ _RADIUS_M = 0.08  # surfaces closer than this coincide
 # Depths disagree where they differ by more than the sum of both tolerances, in metres and as a share of the depth.
 _DEPTH_TOLERANCE_M = 0.10
 _DEPTH_TOLERANCE = 0.02
-# Free space in front of a surface that a synthesized view sees: farther from it no camera of the capture need have
-# looked.
+# Depth of the free space in front of a surface in a synthesized view. Farther from the surface space may be unobserved,
+# as no camera of the capture need have looked there.
 _SYNTHESIZED_REACH_M = 1.0
 _MIN_ALPHA = 0.5  # a fainter pixel shows no surface
-# Patterns are compared within patches of this size where both show one (standard deviation of RGB in [0, 1]); they
-# differ where their correlation is below _PATTERN_CORRELATION and far below that of the pair as a whole.
+# Patterns are compared within patches of _PATTERN_PX, where both scenes show one: RGB in [0, 1] has a standard deviation
+# of _MIN_PATTERN. They differ where their correlation is below _PATTERN_CORRELATION and far below that of the whole pair.
 _PATTERN_PX = 8
 _MIN_PATTERN = 0.05
 _PATTERN_CORRELATION = 0.1
@@ -29,7 +30,7 @@ _PATCH_PX = 16  # colours are compared after the mean over a patch of this size 
 _CELL_M = 0.4  # ... and over a cell of this size for scenes without cameras
 _MIN_SEEN = 100  # cameras of a scene that see fewer Gaussians of the other scene are ignored
 NUM_CAMERAS = 6  # of each scene, chosen to see most of the other scene
-MAX_POINTS = 12_000  # of each scene that are tested for coinciding
+MAX_POINTS = 12_000  # of each scene that are tested for coincidence
 
 
 @dataclass(frozen=True)
@@ -37,20 +38,21 @@ class PoseEvidence:
     """Evidence for or against a pose.
 
     Args:
-        overlap: share of surface cells that coincide, the smaller of both directions.
+        overlap: share of one scene's surface cells that coincide with the other scene; the smaller of both directions.
         num_coinciding: source cells that coincide with the target.
-        free_space_violation: share of one scene's surface Gaussians observed by the other's cameras that stand in free
-            space and on no observed surface; the larger of both directions. NaN where no cameras observed any.
-            Gaussians behind a surface are occluded and not counted.
-        num_seen: number of Gaussians so observed, the smaller of both directions; 0 where one is missing.
-        num_judged: number of Gaussians so observed in the direction of ``free_space_violation``.
-        colour_correlation: correlation of the colours of both scenes' renders where their depths agree, differences
-            within a patch only, so neither exposure nor the brightness of whole surfaces counts; mean over lightness
-            and two chromas, the smaller of the available directions. Without cameras, that of coinciding cells.
+        free_space_violation: of one scene's surface Gaussians that the other scene's cameras observe, the share that
+            lies in free space and not on an observed surface; the larger of both directions. NaN if the cameras observe
+            none. Gaussians behind a surface are occluded and not counted.
+        num_seen: number of observed Gaussians, the smaller of both directions; 0 if one direction is missing.
+        num_judged: number of observed Gaussians in the direction of ``free_space_violation``.
+        colour_correlation: correlation of the colours of both scenes' renders where their depths agree. The mean of
+            each patch is subtracted, so neither exposure nor the brightness of whole surfaces counts. Mean over
+            lightness and two chromas, the smaller of the available directions; without cameras, the correlation over
+            coinciding cells.
         colour_t: significance of the correlation, in standard deviations over patches.
-        disagreement: share of the surface area observed in both scenes that differs: it stands in free space or has
-            another pattern. Both directions together; NaN where no cameras observed any. One place captured twice
-            within the hour has next to none, whatever the overlap; changed and aliased places have some.
+        disagreement: share of the surface area observed in both scenes that differs: it lies in free space or has a
+            different pattern. Both directions together; NaN if no camera observes any. It is close to 0 for two
+            captures of a place within an hour, whatever the overlap, and larger for changed and aliased places.
         seen_m2: the surface area observed in both scenes, in square metres.
     """
 
@@ -66,7 +68,7 @@ class PoseEvidence:
 
 
 Views = tuple[ViewCache, float] | None
-"""A scene's cached renders and metres per unit of that scene; None for a scene without cameras."""
+"""Cached renders of a scene and metres per unit of the scene; None for a scene without cameras."""
 
 
 def measure(
@@ -78,16 +80,16 @@ def measure(
     num_cameras: int = NUM_CAMERAS,
     max_points: int = MAX_POINTS,
 ) -> PoseEvidence:
-    """Compare two scenes under ``S_target_source``.
+    """Measure the evidence for the pose ``S_target_source`` of two scenes.
 
-    A few cameras of each scene render both: their own scene whole, and the other scene's surface alone, for seen from
-    elsewhere than its own cameras its haze and floaters occlude everything.
+    A few cameras of each scene render both scenes: the cameras' own scene entirely, the other scene's surface alone.
+    Haze and floaters of the other scene, which its own cameras do not show, would occlude everything from elsewhere.
 
     Args:
         target, source: surfaces, in metres; so is the pose.
-        views: the target's and the source's own.
-        num_cameras: of each scene, chosen to see most of the other scene.
-        max_points: of each scene that are tested for coinciding.
+        views: views of the target and of the source.
+        num_cameras: number of cameras of each scene, chosen to see most of the other scene.
+        max_points: largest number of points of each scene that are tested for coincidence.
     """
     rows_t, rows_s = target.sample(max_points), source.sample(max_points)
     forward, back = pose.apply(source.coarse[0][rows_s]), pose.inverse().apply(target.coarse[0][rows_t])
@@ -129,14 +131,15 @@ def measure(
 
 @dataclass
 class CrossViewStats:
-    """Comparison of a scene with renders by another's cameras: flags of its Gaussians, sums of colours over patches."""
+    """Comparison of a scene with renders by the cameras of another scene: flags of the scene's Gaussians, and sums of
+    colours over patches."""
 
     in_front: np.ndarray
     agrees: np.ndarray
     products: list[np.ndarray] = field(default_factory=list)  # (patches, 3) each
     squares: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
     area_m2: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of each Gaussian, where it was seen best
-    # Of each view the rows, areas and mean correlations that `add_pixels` computes.
+    # Rows, areas and mean correlations of the Gaussians in each view, as `add_pixels` computes them.
     patterns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
 
     @classmethod
@@ -152,13 +155,15 @@ class CrossViewStats:
         return float((self.in_front & ~self.agrees).sum()) / self.num_seen
 
     def areas_m2(self) -> np.ndarray:
-        """Return (3,) areas: surface in free space, surface with another pattern, all observed surface."""
+        """Return the (3,) areas of surface in free space, of surface with a different pattern, and of all observed
+        surface."""
         through = self.area_m2[self.in_front & ~self.agrees].sum()
         observed = self.area_m2[self.in_front | self.agrees].sum()
         if not self.patterns:
             return np.array([through, 0.0, observed])
         gaussian, area_m2, correlation = (np.concatenate(rows) for rows in zip(*self.patterns, strict=True))
-        # A noisy capture's patterns correlate badly everywhere; only those below that noise differ.
+        # Patterns of a noisy capture correlate badly everywhere; a pattern differs only if its correlation is well
+        # below that.
         middle, upper = np.quantile(correlation, [0.5, 0.75])
         differs = correlation < min(_PATTERN_CORRELATION, middle - 3 * (upper - middle))
         other = np.zeros(len(self.area_m2))
@@ -171,7 +176,7 @@ class CrossViewStats:
         Args:
             gaussian: (N,) Gaussian that dominates each pixel.
             area_m2: (N,) surface area of each pixel.
-            correlation: (N,) of the pattern around each pixel in both scenes; NaN where there is none.
+            correlation: (N,) correlation between the patterns of both scenes around each pixel; NaN without a pattern.
         """
         rows, which = np.unique(gaussian, return_inverse=True)
         area = np.bincount(which, area_m2)
@@ -186,7 +191,8 @@ class CrossViewStats:
             )
 
     def add_colours(self, a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> None:
-        """Add lightness and chromas (N, 3) of the same pixels in both scenes, in patches of index ``patch`` (N,)."""
+        """Add lightness and chromas (N, 3) of the same pixels in both scenes; ``patch`` (N,) is the index of each
+        pixel's patch."""
         if not len(a):
             return
         a, b = _subtract_means(a, patch), _subtract_means(b, patch)
@@ -205,10 +211,10 @@ class CrossViewStats:
 def _cross_view(
     views: ViewCache, unit_m: float, other: Surface, pose: Sim3, points: np.ndarray, num_cameras: int
 ) -> CrossViewStats:
-    """Compare a scene with the other, moved into it by ``pose`` (metres), through its cameras.
+    """Compare a scene with another scene, moved into its frame by ``pose`` (metres), through its cameras.
 
     Args:
-        points: (N, 3) of the other scene, moved; the cameras are selected by these.
+        points: (N, 3) moved points of the other scene, by which cameras are selected.
     """
     if other.splats is None or not len(other):
         return CrossViewStats.of(0)
@@ -232,10 +238,10 @@ def _compare(
     focal_px: float,
     reach_m: float,
 ) -> None:
-    """Compare both renders of one view; ``unit_m`` and ``scale`` bring the two depths to the same metres.
+    """Compare both renders of one view; the factors ``unit_m`` and ``scale`` convert the two depth images to metres.
 
     Args:
-        reach_m: space farther than this in front of the surface is not known to be free.
+        reach_m: space farther than this in front of the surface may be unobserved.
     """
     depth, other_depth = own.depth[0] * unit_m, other.depth[0] * scale
     solid = own.alpha[0] > _MIN_ALPHA
@@ -261,7 +267,7 @@ def _compare(
 
 
 def _pattern_correlation(a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """Return the (N,) correlation of colours within each pixel's patch; NaN where not both show a pattern."""
+    """Return the (N,) correlation of colours within each pixel's patch; NaN unless both scenes show a pattern."""
     if not len(a):
         return np.zeros(0)
     count = np.bincount(patch)
@@ -280,7 +286,7 @@ def _opponent_colours(colours: np.ndarray) -> np.ndarray:
 
 
 def _subtract_means(values: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """Subtract the means over patches from values (N, 3)."""
+    """Subtract the mean of each patch from values (N, 3)."""
     means = _sums(values, patch) / np.maximum(np.bincount(patch), 1)[:, None]
     return values - means[patch]
 
@@ -290,7 +296,8 @@ def _sums(values: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 def _depth_range(depth: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest depth over 3 x 3 pixels, so that a shift by a pixel at an edge is tolerated."""
+    """Return the lowest and highest depth in the 3 x 3 neighbourhood of each pixel, which tolerates a shift by a pixel
+    at an edge."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     low = minimum_filter(np.where(solid, depth, np.inf), 3, mode="nearest")

@@ -1,8 +1,8 @@
 """Scale a scene, or a pair of scenes, to the working metres in which poses are refined and verified.
 
-*Working metres* make both scenes look like rooms, for which all lengths of refinement, evidence and covariance are
-meant. For scenes that are viewed from as near as rooms they equal metres; for a courtyard that is viewed from 7 m one
-working metre is four metres, whether or not the scenes' unit is known.
+All lengths of refinement, evidence and covariance are meant for rooms. *Working metres* make both scenes look like
+rooms. They equal metres for scenes that are viewed from as near as rooms are; for a courtyard that is viewed from 7 m
+one working metre is four metres, whether or not the scenes' unit is known.
 """
 
 from __future__ import annotations
@@ -37,18 +37,19 @@ class MetricScene:
         return self.view.surface(self.unit_m)
 
     def views(self) -> Views:
-        """Return the scene's views and working metres per unit; None without cameras."""
+        """Return the scene's views and the working metres per unit of the scene; None without cameras."""
         cache = self.view.views
         return None if cache is None else (cache, self.unit_m)
 
 
 @dataclass(frozen=True, eq=False)
 class MetricPair:
-    """Both scenes in the target's working metres, the source by the proposed scale: the pose left is nearly rigid.
+    """Both scenes in the target's working metres, the source scaled by the proposal: the remaining pose is nearly
+    rigid.
 
     Args:
-        scale: of the proposed pose.
-        correspondences: of the proposal, in working metres; None where chance explains them.
+        scale: scale of the proposed pose.
+        correspondences: correspondences of the proposal, in working metres; None where chance explains them.
     """
 
     target: MetricScene
@@ -92,19 +93,21 @@ class MetricPair:
 
 
 def working_unit_m(target: SceneView, source: SceneView, *, with_scale: bool) -> float:
-    """Return working metres per target unit; for scenes of one unit the geometric mean of both scenes' values."""
+    """Return working metres per target unit; if both scenes have the same unit, the geometric mean of both scenes'
+    values."""
     if _is_metre(target, with_scale) or (target.scale_policy == source.scale_policy == "known"):
         return float(np.sqrt(target.graph.working_m * source.graph.working_m))
     return target.graph.working_m if target.scale_policy == "known" else target.graph.unit_m
 
 
 def own_working_m(view: SceneView) -> float:
-    """Return working metres per unit of a single scene; those of the estimated unit where the scale is not known."""
+    """Return the working metres per unit of a single scene; where the unit is unknown, by the estimated unit."""
     return view.graph.working_m if view.scale_policy == "known" else view.graph.unit_m
 
 
 def target_unit_m(target: SceneView, *, with_scale: bool) -> float:
-    """Return metres per target unit: 1 where the unit may be the metre, else the estimated value."""
+    """Return metres per target unit: 1 where the unit is known to be or may be the metre, otherwise the estimated
+    value."""
     return 1.0 if _is_metre(target, with_scale) or target.scale_policy == "known" else target.graph.unit_m
 
 

@@ -20,8 +20,8 @@ from gsmap.types import Registration, Sim3
 from gsmap.types.progress import Progress, silent
 from gsmap.types.registration import Proposal
 
-# Share of the inliers of a proposed pose that must be inliers of the refined one; with fewer the proposed pose is
-# evaluated in its place.
+# Share of the proposed pose's inliers that must be inliers of the refined pose, too; with fewer the proposed pose is
+# evaluated instead.
 _MIN_EXPLAINED = 0.5
 
 
@@ -31,8 +31,8 @@ def register_pair(
     """Estimate the pose of ``source`` in ``target``, or the reason why there is none.
 
     The scene graphs propose poses (`gsmap.register.proposers.graph`: correspondences, compatibility graph, maximum
-    clique, pose); each pose is refined on the surfaces and verified by renders of both scenes. Where no graph has many
-    nodes, the surfaces propose poses as well. The first accepted pose wins, unless a rival pose is acceptable, too.
+    clique, pose); each pose is refined on the surfaces and verified by renders of both scenes. Where a graph has few
+    nodes, surfaces propose poses as well. The first accepted pose is selected, unless a rival pose is acceptable, too.
 
     Returns:
         `Registration`: ``accepted`` with pose and information; ``rejected`` with the best pose and the evidence against
@@ -49,7 +49,7 @@ def register_pair(
             if not _is_worth_evaluating(proposal, evaluated, target, source):
                 continue
             done = min(len(evaluated) / params.max_poses, 1.0)
-            report(0.2 + 0.7 * done, f"verifying a pose by {proposal.proposer}")
+            report(0.2 + 0.7 * done, f"verifying a pose proposed by {proposal.proposer}")
             tried.append(proposal)
             evaluated.append(_evaluate(proposal, target, source, params, watch))  # refine -> evidence -> decide
             if not evaluated[-1].flaw and verdict.is_significant(evaluated[-1].proposal, params.verdict):
@@ -64,7 +64,7 @@ def register_pair(
 
 
 def check_pose(target: SceneView, source: SceneView, proposal: Proposal, params: Params | None = None) -> Registration:
-    """Refine and verify a given pose, without proposing others.
+    """Refine and verify a given pose, without proposing any.
 
     Returns:
         `Registration`: ``accepted`` with the refined pose, or ``rejected`` or ``no_match`` as by `register_pair`.
@@ -77,14 +77,14 @@ def check_pose(target: SceneView, source: SceneView, proposal: Proposal, params:
 def evaluate_pose(
     target: SceneView, source: SceneView, proposal: Proposal, params: Params | None = None
 ) -> EvaluatedPose:
-    """Refine a pose and measure all its evidence without a prescreen; the verdict's model is fitted to this."""
+    """Refine a pose and measure all its evidence without a prescreen; the verdict's model is fitted to such results."""
     return _evaluate(proposal, target, source, params or Params(), Stopwatch(), prescreen=False)
 
 
 def _is_worth_evaluating(
     proposal: Proposal, evaluated: list[EvaluatedPose], target: SceneView, source: SceneView
 ) -> bool:
-    """Return whether chance does not explain a proposal and no pose like it was evaluated before."""
+    """Return whether chance does not explain a proposal and no similar pose was evaluated before."""
     if proposal.log_nfa > verdict.PRESCREEN_LOG_NFA:
         return False
     S, centre, unit_m = proposal.S_target_source, source.centre, own_working_m(target)
@@ -99,7 +99,7 @@ def _rivals(
     params: Params,
     watch: Stopwatch,
 ) -> list[EvaluatedPose]:
-    """Evaluate rivals of the accepted pose until one is acceptable; none where the accepted pose is significant."""
+    """Evaluate rivals of the accepted pose until one is acceptable; return none if the accepted pose is significant."""
     best = next((j for j in evaluated if not j.flaw), None)
     if best is None or best.proposal.support is None or verdict.is_significant(best.proposal, params.verdict):
         return []
@@ -139,7 +139,8 @@ def _evaluate(
         seen = measure(
             *surfaces, pose, views, num_cameras=verdict.PRESCREEN_CAMERAS, max_points=verdict.PRESCREEN_POINTS
         )
-        # A clique that is significant by itself is verified in full, whatever three cameras show under a rough pose.
+        # A clique that is significant by itself is always verified in full, even if three cameras contradict the rough
+        # pose.
         sure = verdict.is_significant(proposal, params.verdict)
         flaw = "" if sure or not prescreen else verdict.fails_prescreen(seen)
     uncertainty, decision = None, None
@@ -175,7 +176,8 @@ def _evaluate(
         refined = proposal
     if not flaw and refined is proposal and not verdict.has_low_nfa(proposal, params.verdict):
         flaw = reason(
-            "correspondences_lost", "surfaces pull the pose away from its correspondences, which chance explains"
+            "correspondences_lost",
+            "refinement moved the pose away from its correspondences, and chance explains the proposed pose",
         )
     proposal = refined
     flaw = flaw or verdict.decide(proposal, seen, None if uncertainty is None else uncertainty.sigmas, params.verdict)

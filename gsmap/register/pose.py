@@ -1,4 +1,4 @@
-"""Fit a similarity to a set of correspondences, or state the reason why they fit none."""
+"""Fit a similarity to a set of correspondences, or state why none fits."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from gsmap.geometry.umeyama import umeyama
 from gsmap.reason_codes import reason
 from gsmap.types import Sim3
 
-_MAX_ROTATION_SIGMA_DEG = 3.0  # about any axis; correspondences that fix it less well lie along a line
-# Root mean square residual in standard deviations of a node's position. An inlier's residual has sqrt(2) of them per
-# axis, 2.45 over three. Twice that may still be a right match of poorly repeated nodes, for the surfaces to verify.
+_MAX_ROTATION_SIGMA_DEG = 3.0  # about any axis; with a larger value the correspondences lie along a line
+# Largest root mean square residual, in standard deviations of a node's position. An inlier's residual is sqrt(2) of
+# them per axis, or 2.45 over three axes. Twice as much may still be a correct match of poorly repeatable nodes, which
+# the surfaces then verify.
 _MAX_RMS_SIGMAS = 6.0
 
 
@@ -40,11 +41,11 @@ def fit_pose(
     with_scale: bool = False,
     sigma_m: float = 0.03,
 ) -> PoseFit:
-    """Fit a least-squares pose to (N, 3) corresponding points; mirrored and near-collinear sets are flawed.
+    """Fit a least-squares pose to (N, 3) corresponding points; flag mirrored and near-collinear sets as flawed.
 
     Distances do not distinguish a set from its mirror image, so a clique may be mirrored: then an improper rotation
-    fits, and the best proper one does not. Points along a line leave the rotation about it free: for positions with the
-    standard deviation ``sigma_m`` that of the rotation is the largest of ``F^-1/2``,
+    fits, and no proper rotation does. Points along a line leave the rotation about it free: for positions with the
+    standard deviation ``sigma_m`` the standard deviation of the rotation is the largest eigenvalue of ``F^-1/2``, where
     ``F = sum(|x|^2 I - x x^T) / (2 sigma^2)``.
     """
     if len(target) < 3:
@@ -63,7 +64,7 @@ def fit_pose(
     if not flaw and rotation_sigma > np.radians(_MAX_ROTATION_SIGMA_DEG):
         flaw = reason("collinear_correspondences", "correspondences lie along a line")
     if not flaw and rms > _MAX_RMS_SIGMAS * sigma_m:
-        flaw = reason("inconsistent_correspondences", "correspondences do not fit one pose")
+        flaw = reason("inconsistent_correspondences", "no single pose fits the correspondences")
     return PoseFit(pose, rms, rotation_sigma, flaw)
 
 

@@ -21,9 +21,9 @@ from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Registration, Sim3
 from gsmap.types.registration import Proposal
 
-# Poses that differ by less than all of these would be refined to the same pose.
+# Two poses count as the same if all their differences are below these limits: refinement would merge them.
 SAME_ROTATION_DEG = 3.0
-SAME_DISTANCE_M = 0.3  # of the centre of the source's content
+SAME_DISTANCE_M = 0.3  # moved by the centre of the source's content
 SAME_LOG_SCALE = 0.02
 
 
@@ -32,11 +32,11 @@ class EvaluatedPose:
     """A proposal after refinement, with its evidence.
 
     Args:
-        proposal: with the refined pose.
-        evidence: under that pose.
-        covariance: (7, 7) of the pose, translations in the source's unit; None where it was not computed.
-        flaw: why the pose is not accepted; empty where it is.
-        decision: of the scale; None where it was not measured, or where a source's unit is unknown.
+        proposal: the proposal, with the refined pose.
+        evidence: the evidence under the refined pose.
+        covariance: (7, 7) covariance of the pose, translations in the source's unit; None if not computed.
+        flaw: reason why the pose is not accepted; empty if it is.
+        decision: decision on the scale; None if it was not measured, or if the unit of a scene is unknown.
     """
 
     proposal: Proposal
@@ -55,19 +55,19 @@ def select_pose(
     seconds: dict[str, float],
     notes: Sequence[str] = (),
 ) -> Registration:
-    """Return the accepted pose, or the best pose with the evidence against it, or the reason why there is none."""
+    """Return the accepted pose, or the best pose with the evidence against it, or the reason why no pose was found."""
     common: dict[str, Any] = {"target": target.id, "source": source.id, "seconds": seconds}
     if not evaluated:
         fewest = num_nodes(target, source)
         why = reason(
             "no_pose_proposed",
-            f"no pose proposed that chance does not explain (the smaller scene graph has {fewest} nodes)",
+            f"chance explains every proposed pose (the smaller scene graph has {fewest} nodes)",
         )
         return Registration(status="no_match", reason=why, notes=tuple(notes), **common)
     accepted = [j for j in evaluated if not j.flaw]
     best = accepted[0] if accepted else min(evaluated, key=_sort_key)
     status, why = ("accepted", "") if accepted else ("rejected", best.flaw)
-    # A pose that is too uncertain to be an edge is a rival all the same.
+    # A pose that is too uncertain to become an edge still counts as a rival.
     others = [j for j in evaluated if not verdict.contradiction(j.proposal, j.evidence, params.verdict)]
     others = [j for j in others if not _same(best, j, target, source)]
     rivals = [j for j in others if verdict.is_acceptable(j.proposal, j.evidence, params.verdict)]
@@ -77,7 +77,7 @@ def select_pose(
     if accepted and rivals:
         apart = _describe_distance(best, rivals[0], target, source)
         status = "no_match"
-        why = reason("ambiguous", f"ambiguous: {apart}, and the first is right with a probability of {probable:.0%}")
+        why = reason("ambiguous", f"ambiguous: {apart}, and the first is correct with a probability of {probable:.0%}")
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
         status, why = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
     information = None
@@ -106,7 +106,7 @@ def is_same_pose(a: Sim3, b: Sim3, centre: np.ndarray, unit_m: float) -> bool:
     """Return whether two poses would be refined to the same pose.
 
     Args:
-        centre: (3,) of the source's content, in the source's frame.
+        centre: (3,) centre of the source's content, in the source's frame.
         unit_m: working metres per unit of the target.
     """
     return bool(
@@ -130,19 +130,19 @@ def _describe_distance(a: EvaluatedPose, b: EvaluatedPose, target: SceneView, so
 
 
 def _odds_of(evaluated: EvaluatedPose) -> float:
-    """Return the odds that a pose is right, by its own evidence."""
+    """Return the odds that a pose is correct, by its own evidence."""
     p = probability(evaluated.proposal, evaluated.evidence, verdict.PRIOR)
     return p / (1.0 - p)
 
 
 def _probability_among(best: EvaluatedPose, others: Sequence[EvaluatedPose]) -> float:
-    """Return the probability that a pose is right, given that at most one of all poses is."""
+    """Return the probability that a pose is correct, if at most one of all evaluated poses is."""
     odds = _odds_of(best)
     return odds / (1.0 + odds + sum(_odds_of(j) for j in others))
 
 
 def _evidence_figures(evaluated: EvaluatedPose, probable: float) -> dict[str, float]:
-    """Return the evidence as it is stored; see `gsmap.types.Registration`."""
+    """Return the evidence as stored with the registration; see `gsmap.types.Registration`."""
     p, e = evaluated.proposal, evaluated.evidence
     log_scale = log_scale_sigma = float("nan")
     if evaluated.decision is not None:

@@ -1,4 +1,4 @@
-"""Compute the probability that a pose is right from all its evidence.
+"""Compute the probability that a pose is correct from all its evidence.
 
 An additive logistic model: every piece of evidence adds log-odds along a monotone, piecewise linear curve. The curves
 are fitted by ``tools/fit/verdict.py`` on synthetic places with the defects of real captures, and stored beside this
@@ -24,7 +24,7 @@ _FILE = "probability.json"
 
 
 class Model(Odds):
-    """Fitted curves of the evidence that `evidence_of` returns."""
+    """Fitted curves of the pieces of evidence that `evidence_of` returns."""
 
     @classmethod
     def load(cls) -> Model:
@@ -38,7 +38,7 @@ def _shipped() -> Model:
 
 
 def evidence_of(proposal: Proposal, evidence: PoseEvidence) -> dict[str, float]:
-    """Return the evidence of a pose as the inputs of the curves, NaN where it is missing.
+    """Return the pieces of evidence for a pose as inputs of the curves; NaN where a piece is missing.
 
     Logarithms make equal steps about equally meaningful.
     """
@@ -57,21 +57,22 @@ def evidence_of(proposal: Proposal, evidence: PoseEvidence) -> dict[str, float]:
 
 
 def worth(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None) -> dict[str, float]:
-    """Return the log-odds that each piece of evidence adds, by its name."""
+    """Return the log-odds that each piece of evidence adds, by the name of the piece."""
     return (model or Model.load()).worth(evidence_of(proposal, evidence))
 
 
 def shortfalls(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None) -> list[str]:
-    """Return the names of the available evidence, the farthest below its best log-odds first."""
+    """Return the names of the available pieces of evidence, sorted by the log-odds that each lacks to its best value,
+    most first."""
     return (model or Model.load()).shortfalls(evidence_of(proposal, evidence))
 
 
 def probability(proposal: Proposal, evidence: PoseEvidence, prior: float = 0.5, model: Model | None = None) -> float:
-    """Return the probability in (0, 1) that a pose is right.
+    """Return the probability in (0, 1) that a pose is correct.
 
     Args:
-        proposal: with the refined pose.
-        evidence: under that pose.
-        prior: share of evaluated poses that are right before any evidence.
+        proposal: the proposal, with the refined pose.
+        evidence: the evidence under the refined pose.
+        prior: share of evaluated poses that are correct, before any evidence.
     """
     return (model or Model.load()).probability(evidence_of(proposal, evidence), prior)

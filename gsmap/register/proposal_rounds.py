@@ -16,15 +16,15 @@ from gsmap.register.scene_view import SceneView
 from gsmap.register.timing import Stopwatch
 from gsmap.types.registration import Proposal
 
-POOR_NODES = 500  # a scene graph none of whose layers has this many nodes is poor
-# A voted log scale is taken for 0, for refinement, below this plus the spread over the root of the number of
-# correspondences.
+POOR_NODES = 500  # a scene graph is poor if none of its layers has this many nodes
+# For refinement a voted log scale counts as 0 if it is below this plus the spread divided by the square root of the
+# number of correspondences.
 _UNIT_LOG_SCALE = 0.005
 _UNIT_LOG_SCALE_SPREAD = 0.05
 
 
 class ProposalRounds:
-    """Rounds of pose proposals for one pair, each computed when it is iterated to.
+    """Rounds of pose proposals for one pair; each round is computed when the iteration reaches it.
 
     Attributes:
         notes: messages for the user, such as missing packages.
@@ -39,7 +39,8 @@ class ProposalRounds:
         """Yield the proposals of each round.
 
         Rigid poses, unless a scene's unit is unknown; poses with a voted scale, unless both scenes are in metres; poses
-        that do not use gravity, as an up vector may be wrong; and those of the fallback where a graph has few nodes.
+        that do not use gravity, as an up vector may be wrong; and poses by the fallback proposer where a graph has few
+        nodes.
         """
         params = self.params
         if "unknown" not in self.policies:
@@ -57,8 +58,9 @@ class ProposalRounds:
         return wanted and "unknown" not in self.policies
 
     def _without_gravity(self) -> list[Proposal]:
-        """Propose poses from gravity-free landmarks: significant cliques only, for most pairs that come so far share
-        no surface. Empty where a scene's gravity is unknown, for then it was not used before."""
+        """Propose poses from gravity-free landmarks. Only significant cliques are kept, because most pairs that reach
+        this round share no surface. Empty if a scene's gravity is unknown, because then earlier rounds did not use it.
+        """
         target, source = without_gravity(self.target), without_gravity(self.source)
         if target is None or source is None:
             return []
@@ -85,7 +87,8 @@ class ProposalRounds:
 
 
 def without_gravity(view: SceneView) -> SceneView | None:
-    """Return a scene with its gravity-free landmarks alone; None where its gravity is unknown or it has none."""
+    """Return a copy of a scene with its gravity-free landmarks alone; None if its gravity is unknown or it has no such
+    landmarks."""
     free = {
         name.replace("landmarks_gravity_free", "landmarks"): layer
         for name, layer in view.graph.layers.items()
@@ -97,12 +100,12 @@ def without_gravity(view: SceneView) -> SceneView | None:
 
 
 def snap_scale(proposal: Proposal) -> Proposal:
-    """Mark a proposal as one between scenes in metres where its scale is 1 within the error of its correspondences."""
+    """Mark a proposal as one between scenes in metres if its scale is 1 within the error of its correspondences."""
     spread = _UNIT_LOG_SCALE + _UNIT_LOG_SCALE_SPREAD / np.sqrt(max(proposal.num_inliers, 1))
     near = abs(np.log(proposal.S_target_source.scale)) <= spread
     return replace(proposal, with_scale=False) if near else proposal
 
 
 def num_nodes(*views: SceneView) -> int:
-    """Return the number of nodes of the largest layer, of the graph for which that is smallest."""
+    """Return the number of nodes of each scene graph's largest layer; of several graphs, the smallest number."""
     return min(max((len(layer) for layer in view.graph.layers.values()), default=0) for view in views)

@@ -14,13 +14,14 @@ from gsmap.types.plain import plain
 
 VERSION = 13
 
-_RENDER_BACKEND = "native"  # the one that all renders of this room are pinned to
+_RENDER_BACKEND = "native"  # all renders of this room use it
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
-    """Return the recipe of a pair: the settings and versions of the methods that these settings run, and no others.
+    """Return the recipe of a pair: the settings and the versions of the methods that these settings run, and no further
+    ones.
 
-    The inputs, which the caller adds with `RecipeKey.of`, are the keys of the target's and of the source's scene graph.
+    The caller adds the inputs with `RecipeKey.of`: the keys of the target's and of the source's scene graph.
     """
     params = params or Params()
     proposers = {params.proposer} | ({params.fallback_proposer} if params.fallback != "never" else set())
@@ -37,7 +38,7 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
     if params.fallback == "never":
         del settings["fallback_proposer"]
     versions = {"register": VERSION, "probability": probability.VERSION}
-    refiners |= {"colored_icp"}  # covariances use it, too
+    refiners |= {"colored_icp"}  # estimating covariances uses it, too
     for kind, names in (("proposer", proposers), ("refiner", refiners)):
         for name in sorted(names):
             versions |= family(kind).version(name)

@@ -1,4 +1,4 @@
-"""Run the refiners that the settings name."""
+"""Run the refiners named in the settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsmap.register.params import Params
 from gsmap.types import Sim3
 
 SCALE_REFINER = "colored_icp"
-"""The refiner that replaces one that cannot refine the scale, for pairs of unknown scale."""
+"""For pairs of unknown scale, this refiner replaces a refiner that cannot refine the scale."""
 
 
 def refine_coarse(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) -> Sim3:
@@ -24,7 +24,7 @@ def refine_fine(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: boo
 
 
 def polish(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) -> Sim3:
-    """Run the polisher; the same object is returned where it changes nothing."""
+    """Run the polisher on a pose; return the same object if the polisher changes nothing."""
     return _refine(pair, pose, params.polisher, params, with_scale, "fine")
 
 

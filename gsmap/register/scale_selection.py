@@ -1,4 +1,4 @@
-"""Refine a pose to its final accuracy and select its scale: exactly 1 or the measured one."""
+"""Refine a pose to its final accuracy and select its scale: exactly 1 or the measured scale."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ def refine_and_select_scale(
 ) -> tuple[Sim3, PoseUncertainty | None, ScaleDecision | None]:
     """Refine a pose, estimate its uncertainty and decide on its scale.
 
-    The scale is always measured, by refining it with the pose. Where both sources may be in metres the measurement
-    decides between the scaled pose and a rigid pose that is refined from it.
+    The scale is always measured, by refining it with the pose. Where both scenes may be in metres the measurement
+    decides between the scaled pose and a rigid pose refined from it.
 
     Args:
-        with_scale: the scale of ``pose`` was refined before; otherwise it may be some percent off.
+        with_scale: the scale of ``pose`` was already refined; otherwise it may be some percent off.
 
     Returns:
-        The pose (metres), its uncertainty (None where too little overlaps) and the decision (None where a source's unit
-        is unknown or there is no uncertainty; the pose is the scaled one then).
+        The pose (metres), its uncertainty (None where the overlap is too small) and the decision on its scale. The
+        decision is None if a scene's unit is unknown or there is no uncertainty; then the pose has the measured scale.
     """
     surfaces = pair.target.surface(), pair.source.surface()
     start = pose if with_scale else refinement.refine_coarse(pair, pose, params, with_scale=True)
@@ -37,7 +37,7 @@ def refine_and_select_scale(
         return scaled, None, None
     if "unknown" in pair.policies:
         return scaled, conditioned.uncertainty(scaled), None
-    # The units of ``pair`` may contain a voted scale, so the scale between the scenes is the product.
+    # The units of ``pair`` may contain a voted scale, so the scale between the scenes is the product of both.
     log_scale = float(np.log(scaled.scale * pair.scale))
     decision = decide_scale(log_scale, conditioned.log_scale_sigma, specified=pair.policies == {"known"})
     if not decision.rigid:

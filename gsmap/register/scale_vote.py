@@ -6,8 +6,8 @@ import numpy as np
 
 from gsmap.register.correspondences import Correspondences
 
-# Largest scale between two layers once both are in (estimated) metres; graphs have a layer for every factor of 1.45, so
-# that some two are always nearer than this.
+# Largest scale between two layers once both are in (estimated) metres. Graphs have a layer for every factor of 1.45, so
+# some pair of layers always differs by less.
 _MAX_FACTOR = 1.35
 _BIN_WIDTH = 0.01  # of the histogram over the logarithm of the ratio
 _MIN_DISTANCE_M = 1.0  # closer pairs hardly constrain the scale
@@ -17,10 +17,12 @@ _NUM_PEAKS = 3
 
 
 def vote_scales(matches: Correspondences) -> list[tuple[float, float]]:
-    """Return the scales (source to target) with most votes of pairs of candidates, and their significance; best first.
+    """Return the scales (source to target) with most votes, each with its significance, best first; every pair of
+    candidates votes.
 
-    Two right correspondences at a distance d give the ratio ``|dq| / |dp|`` within ``sigma / d``; wrong ones are spread
-    over all ratios. The smooth background is subtracted before peaks are ranked by their significance.
+    Two correct correspondences at a distance d give the true ratio ``|dq| / |dp|`` with a relative error of about
+    ``sigma / d``; wrong ones give ratios spread over all values. The smooth background is subtracted before peaks are
+    ranked by their significance.
     """
     from scipy.ndimage import gaussian_filter1d
 
@@ -29,7 +31,7 @@ def vote_scales(matches: Correspondences) -> list[tuple[float, float]]:
     matches = matches[np.arange(min(len(matches), _MAX_CORRESPONDENCES))]
     limit, margin = np.log(_MAX_FACTOR), 0.3
     bins = int(np.ceil(2 * (limit + margin) / _BIN_WIDTH))
-    # Where gravity is known both distances of a right pair also have the same slope, whatever the scale.
+    # Where gravity is known, both distances of a correct pair also have the same slope, whatever the scale.
     counts = _native.ratio_histogram(
         target=matches.target,
         source=matches.source,

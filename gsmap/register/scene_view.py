@@ -20,7 +20,7 @@ class SceneView:
 
     Args:
         id: the scene's id.
-        gaussians, cameras: in the scene's frame; without cameras free space is not verified.
+        gaussians, cameras: Gaussians and cameras in the scene's frame; without cameras free space is not verified.
         graph: the scene graph.
         scale_policy: ``known`` (metres), ``unknown`` (any unit), or ``auto`` (metres if the match confirms it).
     """
@@ -45,7 +45,8 @@ class SceneView:
         return np.median(self.gaussians.means, axis=0) if len(self.gaussians) else np.zeros(3)
 
     def surface(self, unit_m: float = 1.0) -> Surface:
-        """Return the scene's surface in metres; the last two are cached, for a scene is registered with many others."""
+        """Return the scene's surface in metres. The last two surfaces are cached, because a scene is registered with
+        many others."""
         if unit_m not in self._surfaces:
             while len(self._surfaces) > 1:
                 self._surfaces.pop(next(iter(self._surfaces)))
@@ -54,7 +55,7 @@ class SceneView:
 
     @cached_property
     def views(self) -> ViewCache | None:
-        """Renders of the scene through its own cameras, each computed once; None without cameras."""
+        """Renders of the scene through its own cameras, each computed once and cached; None without cameras."""
         if not self.cameras or not len(self.gaussians):
             return None
         return ViewCache(self.gaussians, self.cameras)

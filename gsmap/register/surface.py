@@ -1,4 +1,4 @@
-"""Extract the surface points of a scene that registration aligns and compares."""
+"""Extract the surface points of a scene, which registration aligns and compares."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gsmap.register import visible_side
 from gsmap.register.view_cache import ViewCache
 from gsmap.types import Cameras, Gaussians
 
-PLANE_NEIGHBOURS = 20  # cells, itself included, that a plane is fitted to, as in small_gicp
+PLANE_NEIGHBOURS = 20  # cells to which each cell's plane is fitted, the cell itself included, as in small_gicp
 _GRADIENT_NEIGHBOURS = 10
 
 
-# A surface Gaussian is at least this opaque; of a fainter capture MIN_OPAQUE_SHARE of the Gaussians count as opaque,
-# down to FAINTEST_OPACITY.
+# A surface Gaussian has at least this opacity. In a fainter capture the threshold falls until MIN_OPAQUE_SHARE of the
+# Gaussians count as opaque, but not below FAINTEST_OPACITY.
 MIN_OPACITY = 0.5
 MIN_OPAQUE_SHARE = 0.4
 FAINTEST_OPACITY = 0.1
@@ -28,7 +28,7 @@ FAINTEST_OPACITY = 0.1
 # and sky are larger.
 MAX_SCALE_M = 0.08
 MAX_SCALE_QUANTILE = 0.7
-MIN_FLOATER_COLOUR = 0.3  # colour difference (RGB in [0, 1]) from the surface around it that makes a point a floater
+MIN_FLOATER_COLOUR = 0.3  # a point whose colour (RGB in [0, 1]) differs by this from the surface around it is a floater
 RESOLUTION_M = 0.05  # points are averaged over cells of this size before they are aligned
 
 
@@ -38,12 +38,12 @@ class Surface:
 
     Args:
         points: (N, 3) float64 in the scene's frame, scaled to metres.
-        colours: (N, 3) float32 view-independent colour.
+        colours: (N, 3) float32 view-independent colours, RGB in [0, 1].
         resolution_m: cell size of the aligned cloud.
-        splats: the N Gaussians themselves, in metres, with their mean colour alone; None where only points are known.
-        unit_m: metres per unit of the scene, of the surface.
+        splats: the N Gaussians in metres, with their mean colour alone; None where only points are known.
+        unit_m: metres per unit of the scene.
         gaussians, cameras: the whole scene in its own unit; None where only points are known.
-        views: the scene through its cameras, which orient its normals; None without.
+        views: renders of the scene through its cameras, which orient its normals; None without cameras.
     """
 
     points: np.ndarray
@@ -66,7 +66,7 @@ class Surface:
         cameras: Cameras | None = None,
         views: ViewCache | None = None,
     ) -> Surface:
-        """Extract the surface of a scene whose unit is ``unit_m`` metres."""
+        """Extract the surface of a scene; ``unit_m`` is metres per unit of the scene."""
         largest = gaussians.log_scales.max(1, initial=-np.inf) + np.log(unit_m)
         opacities = gaussians.opacities
         bar = MIN_OPACITY
@@ -91,23 +91,24 @@ class Surface:
         return cls(points, colours, RESOLUTION_M, splats, unit_m, gaussians, cameras, views)
 
     def scaled(self, factor: float) -> Surface:
-        """Return the surface in a unit ``factor`` times smaller."""
+        """Multiply all coordinates by ``factor``: convert the surface to a unit that is ``factor`` times smaller."""
         return self if factor == 1.0 else Surface(self.points * factor, self.colours, self.resolution_m)
 
     @cached_property
     def coarse(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cell means (M, 3) of points and of colours at the aligned cloud's resolution, in a fixed order."""
+        """Return the cell means (M, 3) of points and of colours at the resolution of the aligned cloud, in a fixed
+        order."""
         points, colours, _ = cell_means(self.points, self.colours, self.resolution_m)
         return points, colours.astype(np.float32)
 
     def sample(self, count: int) -> np.ndarray:
-        """Rows of at most ``count`` cell means, evenly strided (cells come in spatial order)."""
+        """Return the rows of at most ``count`` cell means, evenly strided (cells come in spatial order)."""
         total = len(self.coarse[0])
         return np.arange(total) if total <= count else np.linspace(0, total - 1, count).astype(np.int64)
 
     @cached_property
     def cloud(self) -> tuple[Any, Any]:
-        """Point cloud of small_gicp: the cell means with covariances and normals, and their search tree."""
+        """The small_gicp point cloud of the cell means with covariances and normals, and its search tree."""
         import small_gicp
 
         cloud = small_gicp.PointCloud(self.coarse[0])
@@ -143,7 +144,7 @@ class Surface:
 
     @cached_property
     def oriented_normals(self) -> np.ndarray | None:
-        """(M, 3) normals towards the side that the scene's own cameras saw, zeros where unknown; None without any."""
+        """(M, 3) normals towards the side that the scene's cameras saw: zeros if unknown, None if all are."""
         if self.views is None or not self.views.num_own or not len(self.coarse[0]):
             return None
         found = visible_side.orient_normals(self.coarse[0], self.normals, self.tree, self.views, self.unit_m)
@@ -152,7 +153,7 @@ class Surface:
     def nearest(
         self, points: np.ndarray, radius_m: float, normals: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance to and row of the nearest cell mean of each point; inf and 0 beyond the radius.
+        """Return the distance to and the row of the cell mean nearest to each point; inf and 0 beyond the radius.
 
         Args:
             normals: (P, 3) oriented normals of the points, in this surface's frame; cells that face the opposite side

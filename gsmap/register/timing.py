@@ -1,4 +1,4 @@
-"""Measure wall seconds by step."""
+"""Measure the wall time of each step, in seconds."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Wall seconds of each step by its name, summed."""
+    """Wall seconds of each step by its name; repeated steps are summed."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"match": 0.0, "refine": 0.0, "verdict": 0.0}
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Add the wall seconds of a block to a step."""
+        """Add the wall seconds of the enclosed block to a step."""
         start = time.perf_counter()
         try:
             yield

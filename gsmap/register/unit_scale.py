@@ -6,17 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-DRIFT_SIGMA = 0.02  # of the log scale between two sources in metres that drift: phones and SLAM by one to three percent
+DRIFT_SIGMA = 0.02  # of the log scale between two scenes in metres: phones and SLAM drift by one to three percent
 RIGID_ODDS = 3.0  # prior odds that the scale is exactly 1
-_MAX_DISAGREEMENT_SIGMAS = 5.0  # from 1; a larger disagreement of two scenes specified in metres is noted
-# Surfaces whose scale is off by more than this many standard deviations of the residuals, and by this log scale, bend.
+_MAX_DISAGREEMENT_SIGMAS = 5.0  # from a scale of 1; beyond it two scenes specified in metres get a message
+# A capture counts as bent if its log scale is off by more than this many standard deviations of the residuals and by
+# more than this value.
 _MIN_BEND_SIGMAS = 3.0
 _MIN_BEND = 0.002
 
 
 @dataclass(frozen=True)
 class ScaleDecision:
-    """The scale of a pose: exactly 1 or the measured one.
+    """The decision on the scale of a pose: exactly 1 or the measured scale.
 
     Args:
         rigid: the scale is 1.
@@ -37,12 +38,12 @@ def decide_scale(log_scale: float, sigma: float, *, specified: bool = False) -> 
     """Decide between a scale of 1 and a measured one by a Bayesian test of two hypotheses.
 
     The measurement is ``N(log scale, sigma^2)``, and the log scale is 0 or ``N(0, DRIFT_SIGMA^2)``. The likelihood
-    ratio with prior odds `RIGID_ODDS` decides, so a precise measurement must be nearer to 1, but may be more sigmas
-    off, than an imprecise one. The standard deviation of a scale of 1 is the root mean square of the posterior of a
-    drift.
+    ratio with prior odds `RIGID_ODDS` decides, so for a scale of 1 a precise measurement must be nearer to 1 than an
+    imprecise one, but may be more standard deviations off. A scale of 1 gets the root mean square of the drift's
+    posterior as its standard deviation.
 
     Args:
-        log_scale, sigma: the measurement and its standard deviation.
+        log_scale, sigma: the measured log scale and its standard deviation.
         specified: both scenes are specified to be in metres; the scale is 1 whatever is measured.
     """
     off = abs(log_scale) / sigma
@@ -65,7 +66,7 @@ def bending_note(decision: ScaleDecision, residual_sigma: float, extent_m: float
 
     Args:
         residual_sigma: standard deviation of the log scale by the residuals alone.
-        extent_m: of the overlap.
+        extent_m: size of the overlap.
 
     Returns:
         The message; empty where residuals explain the difference or the scale is not 1.
@@ -74,6 +75,7 @@ def bending_note(decision: ScaleDecision, residual_sigma: float, extent_m: float
     if decision.note or not decision.rigid or off < max(_MIN_BEND_SIGMAS * residual_sigma, _MIN_BEND):
         return ""
     return (
-        f"one capture is bent, or its metric scale drifts: the source measures {np.expm1(-decision.log_scale):+.1%} "
+        "one capture is bent, or its metric scale drifts: the source's lengths differ by "
+        f"{np.expm1(-decision.log_scale):+.1%} "
         f"over {extent_m:.1f} m, {off / residual_sigma:.0f} times the error that the residuals explain"
     )

@@ -11,13 +11,13 @@ from gsmap.register.evidence import PoseEvidence
 from gsmap.register.probability import probability, shortfalls
 from gsmap.types.registration import Proposal
 
-MAX_RUNNER_UP = 0.7  # size of a disagreeing clique, as a share of the best, up to which the best is significant
-# A free-space violation measured on few Gaussians contradicts a pose only where so many would violate free space with
-# less than this probability if the share were the allowed one (binomial test).
+MAX_RUNNER_UP = 0.7  # with a larger rival clique (as a share of the best clique's size) a pose is not significant
+# A free-space violation measured on few Gaussians contradicts a pose only if a binomial test rejects the allowed share:
+# so many violations would have less than this probability.
 _FREE_SPACE_LEVEL = 0.01
-PRIOR = 0.2  # share of evaluated poses that are right before any evidence
-# Prescreen of roughly refined poses.
-PRESCREEN_LOG_NFA = 6.0  # a clique with a larger log10 NFA is not refined at all
+PRIOR = 0.2  # share of evaluated poses that are correct, before any evidence
+# Thresholds of the prescreen of roughly refined poses.
+PRESCREEN_LOG_NFA = 6.0  # a pose with a larger log10 NFA is not refined at all
 PRESCREEN_CAMERAS = 3
 PRESCREEN_POINTS = 4000
 _PRESCREEN_MIN_COINCIDING = 50
@@ -28,7 +28,7 @@ _PRESCREEN_FREE_SPACE_VIOLATION = 0.3
 
 @dataclass(frozen=True)
 class Params:
-    """Thresholds for accepting a pose; a wrong edge costs a map more than ten missed right ones.
+    """Thresholds for accepting a pose; one wrong edge costs a map more than ten missed correct edges.
 
     Args:
         max_log_nfa: Largest log10 of the number of false alarms (NFA) at which a clique counts as significant, at most
@@ -66,18 +66,18 @@ def is_significant(proposal: Proposal, params: Params | None = None) -> bool:
 
 
 def has_low_nfa(proposal: Proposal, params: Params) -> bool:
-    """Return whether the number of false alarms is below the threshold; never where it was not computed."""
+    """Return whether the number of false alarms is below the threshold; False if it was not computed."""
     return bool(proposal.log_nfa < params.max_log_nfa)
 
 
 def not_significant(proposal: Proposal, params: Params, besides: str = "") -> str:
-    """Return the reason why the correspondences alone are not significant; ``besides`` is appended."""
+    """Return the reason why the correspondences alone are not significant, followed by ``besides``."""
     if np.isnan(proposal.log_nfa):
-        why = f"{proposal.proposer} counts no false alarms, log10 NFA needs < {params.max_log_nfa:.1f}"
+        why = f"proposer {proposal.proposer} does not compute the NFA; log10 NFA must be < {params.max_log_nfa:.1f}"
     elif not has_low_nfa(proposal, params):
-        why = f"log10 NFA {proposal.log_nfa:.1f}, needs < {params.max_log_nfa:.1f}"
+        why = f"log10 NFA is {proposal.log_nfa:.1f}, must be < {params.max_log_nfa:.1f}"
     else:
-        why = f"a rival clique has {proposal.runner_up:.0%} of its size, allowed {MAX_RUNNER_UP:.0%}"
+        why = f"a rival clique has {proposal.runner_up:.0%} of the best clique's size, allowed {MAX_RUNNER_UP:.0%}"
     if besides.startswith(_NOT_SIGNIFICANT):
         return besides
     return reason("not_significant", f"{_NOT_SIGNIFICANT}: {why}" + (f" ({besides})" if besides else ""))
@@ -104,8 +104,8 @@ def decide(
     """Return the reason why a pose is not accepted; empty if it is.
 
     Args:
-        proposal: with the refined pose.
-        evidence: under that pose.
+        proposal: the proposal, with the refined pose.
+        evidence: the evidence under the refined pose.
         sigmas: standard deviations (rad, metres, log scale) of the least certain directions; None without overlap.
     """
     params = params or Params()
@@ -120,13 +120,14 @@ def decide(
     ):
         return reason(
             "pose_uncertain",
-            f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * sigmas[1]:.0f} cm, {sigmas[2]:.1%} in scale",
+            f"the overlap determines the pose only to {degrees:.1f} deg, {100 * sigmas[1]:.0f} cm, "
+            f"{sigmas[2]:.1%} in scale",
         )
     return improbable(proposal, evidence, params)
 
 
 def contradiction(proposal: Proposal, evidence: PoseEvidence, params: Params) -> str:
-    """Return the evidence that contradicts a pose whatever supports it; empty if there is none."""
+    """Return the evidence that alone rules out a pose, whatever supports the pose; empty if there is none."""
     if proposal.flaw:
         return proposal.flaw
     if evidence.num_coinciding < params.min_coinciding:
@@ -139,7 +140,7 @@ def contradiction(proposal: Proposal, evidence: PoseEvidence, params: Params) ->
 
 
 def violates_free_space(share: float, num_judged: float, allowed: float) -> bool:
-    """Return whether free space is violated by more than is allowed and than a small sample explains.
+    """Return whether more free space is violated than is allowed and than a small sample explains.
 
     Args:
         share: fraction of the Gaussians that violate free space; NaN where no camera observed them.
@@ -153,12 +154,12 @@ def violates_free_space(share: float, num_judged: float, allowed: float) -> bool
 
 
 def is_acceptable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> bool:
-    """Return whether nothing contradicts a pose and it is probable, whatever its uncertainty."""
+    """Return whether nothing contradicts a pose and the pose is probable, even if its uncertainty is large."""
     return not contradiction(proposal, evidence, params) and not improbable(proposal, evidence, params)
 
 
 def improbable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> str:
-    """Return the reason why a pose is not probable enough by all evidence; empty if it is."""
+    """Return the reason why a pose is not probable enough, by all evidence together; empty if it is."""
     probable = probability(proposal, evidence, PRIOR)
     # A significant clique is enough where the cameras of one scene observed too little to verify it.
     if probable >= params.min_probability or (not evidence.num_seen and is_significant(proposal, params)):
@@ -171,11 +172,11 @@ def _weakest(proposal: Proposal, evidence: PoseEvidence) -> str:
     """Describe the two pieces of evidence that lower the probability most."""
     words = {
         "log_nfa": f"chance explains the correspondences (log10 NFA {proposal.log_nfa:.1f})",
-        "runner_up": f"a rival clique has {proposal.runner_up:.0%} of its size",
+        "runner_up": f"a rival clique has {proposal.runner_up:.0%} of the best clique's size",
         "free_space_violation": f"free-space violation {evidence.free_space_violation:.0%}",
         "disagreement": f"{evidence.disagreement:.0%} of the surface seen in both scenes differs",
         "overlap": f"overlap {evidence.overlap:.0%}",
-        "num_coinciding": f"{evidence.num_coinciding} cells coincide",
+        "num_coinciding": f"only {evidence.num_coinciding} surface cells coincide",
         "colour_correlation": f"colours disagree where surfaces coincide ({evidence.colour_correlation:.2f})",
         "colour_t": f"colours agree by {evidence.colour_t:.1f} standard deviations",
     }

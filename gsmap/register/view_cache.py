@@ -22,18 +22,18 @@ _SELECTION_POINTS = 8_000  # opaque centres that stand for a scene when cameras 
 # Share of the depth by which a point may lie behind a coarse pixel's depth and still count as visible: half a coarse
 # pixel of a slanted wall.
 _SELECTION_MARGIN = 0.1
-_MIN_OWN_SHARE = 0.8  # of a scene; where its cameras see less, views are synthesized in its free space
-_MIN_OWN_HALF = 0.5  # of the visible points; where its own cameras see less, synthesized views are selected, too
+_MIN_OWN_SHARE = 0.8  # of a scene: if its cameras see less, views are synthesized in its free space
+_MIN_OWN_HALF = 0.5  # of the visible points: if the scene's own cameras see less, synthesized views are selected, too
 
 
 class ViewCache:
-    """Cached renders of a scene by its own cameras and, where these see little of it, by synthesized ones.
+    """Cached renders of a scene by its own cameras and, where these see little of the scene, by synthesized cameras.
 
-    Few cameras may see the overlap with another scene, or see it from behind a wall; the Gaussians show it all the
-    same. The renders do not depend on any pose, so they serve all pairs of the scene; the latest are cached.
+    A scene's own cameras may miss the overlap with another scene, or see it from behind a wall, although the Gaussians
+    show it. Renders do not depend on the pose of a pair, so they serve all pairs of the scene; the latest are cached.
 
     Args:
-        gaussians, cameras: in the scene's frame and unit.
+        gaussians, cameras: Gaussians and cameras in the scene's frame and unit.
         image_size_px: longer side of the renders.
         synthesize: add synthesized cameras where the scene's own see too little.
     """
@@ -42,14 +42,14 @@ class ViewCache:
         self, gaussians: Gaussians, cameras: Cameras, *, image_size_px: int = IMAGE_SIZE_PX, synthesize: bool = True
     ) -> None:
         g = gaussians
-        # The mean colour alone: other coefficients were fitted to the view directions of the own cameras.
+        # The mean colour alone: higher coefficients were fitted to the view directions of the scene's own cameras.
         self.gaussians = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, g.sh[:, :1])
         self.cameras = (self._with_synthesized(cameras) if synthesize else cameras).resized(image_size_px)
-        self.num_own = 0 if cameras.synthesised else len(cameras)  # synthesized cameras follow
+        self.num_own = 0 if cameras.synthesised else len(cameras)  # synthesized cameras come after these
         self._renders: OrderedDict[int, Rendering] = OrderedDict()
 
     def _with_synthesized(self, cameras: Cameras) -> Cameras:
-        """Return the cameras and, where they see too little of the scene, synthesized ones."""
+        """Return the scene's cameras, followed by synthesized cameras if they see too little of the scene."""
         if cameras.synthesised or self._share_seen(cameras) >= _MIN_OWN_SHARE:
             return cameras
         synthesized = synthesise_cameras(self.gaussians)
@@ -60,7 +60,7 @@ class ViewCache:
         )
 
     def _share_seen(self, cameras: Cameras) -> float:
-        """Return the share of the sampled opaque centres that any camera sees."""
+        """Return the share of the sampled opaque centres that at least one camera sees."""
         coarse = cameras.resized(_SELECTION_PX)
         seen = np.zeros(len(self._sample), bool)
         for at, pixel, z, nearest in self._projected(coarse):
@@ -70,7 +70,7 @@ class ViewCache:
     def render(self, row: int) -> Rendering:
         """Return colour, alpha and depth (1, H, W) of one camera's view."""
         if row not in self._renders:
-            # On the CPU everywhere: verdicts are equal to the bit on every machine, and images this small gain nothing
+            # Always on the CPU, so that verdicts are equal to the bit on every machine; images this small gain nothing
             # on a GPU (docs/how-to/gpu.md).
             self._renders[row] = render(self.gaussians, self.cameras[[row]], dominant_id=False, backend="native")
             while len(self._renders) > _MAX_CACHED:
@@ -79,12 +79,13 @@ class ViewCache:
         return self._renders[row]
 
     def select_views(self, points: np.ndarray, count: int) -> list[int]:
-        """Select the cameras that see most of some points (N, 3), or surfaces behind them; see `select_views`.
+        """Select the cameras that see most of some points (N, 3) or of surfaces behind them; see the function
+        `select_views`.
 
-        The scene's own cameras, if they see enough: the space that they looked through is free, that of a synthesized
-        view may be unobserved.
+        The scene's own cameras are preferred if they see enough: space that they looked through is free, whereas space
+        in front of a synthesized camera may be unobserved.
         """
-        # Points before the empty background of a synthesized view prove nothing.
+        # Points in front of the empty background of a synthesized view prove nothing.
         synthesized = [np.where(np.isfinite(depth), depth, -np.inf) for depth in self._nearest[self.num_own :]]
         inside = _visible(self._coarse, points, self._nearest[: self.num_own] + synthesized)
         own = inside[: self.num_own]
@@ -93,7 +94,7 @@ class ViewCache:
         return _greedy(inside, count)
 
     def select_views_of_sides(self, points: np.ndarray, normals: np.ndarray, count: int) -> list[int]:
-        """Select own cameras that together see most sides of a surface of points (N, 3) with normals (N, 3)."""
+        """Select own cameras that together see most sides of a surface given by points and normals (N, 3)."""
         rows = np.linspace(0, len(points) - 1, min(len(points), 1000)).astype(int)
         points, normals = points[rows], normals[rows]
         seen = _visible(self._coarse[: self.num_own], points, self._nearest[: self.num_own])
@@ -107,7 +108,7 @@ class ViewCache:
 
     @cached_property
     def _nearest(self) -> list[np.ndarray]:
-        """Nearest depth of each coarse pixel of each camera, by a sample of opaque centres."""
+        """Depth of the nearest sampled opaque centre in each coarse pixel of each camera."""
         return [nearest for *_, nearest in self._projected(self._coarse)]
 
     @cached_property
@@ -118,7 +119,8 @@ class ViewCache:
         return self.gaussians.means[solid[rows]]
 
     def _projected(self, coarse: Cameras) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield rows of the sample in each camera's image, their pixels and depths, and the nearest depth per pixel."""
+        """For each camera yield the rows of the sample that lie in its image, their pixels and depths, and the nearest
+        depth per pixel."""
         for view, intrinsics, size in zip(coarse.T_camera_frame, coarse.intrinsics_px, coarse.sizes_px, strict=True):
             pixel, z, at = _project(self._sample, view, intrinsics, size)
             nearest = np.full(int(size.prod()), np.inf, np.float32)
@@ -132,7 +134,7 @@ def select_views(
     """Select greedily the cameras that together see most points.
 
     Args:
-        cameras: in the points' frame.
+        cameras: the cameras, in the frame of the points.
         points: (N, 3); an even sample of them is tested.
         count: largest number of cameras.
         nearest: flat depth image of each camera; points behind it are occluded.
@@ -141,7 +143,7 @@ def select_views(
 
 
 def _visible(cameras: Cameras, points: np.ndarray, nearest: list[np.ndarray] | None) -> np.ndarray:
-    """Return (C, S) bool: camera c sees point s of an even sample of the points."""
+    """Return a (C, S) mask that is True if camera c sees point s of an even sample of the points."""
     sample = points[np.linspace(0, len(points) - 1, min(len(points), 1000)).astype(int)].astype(np.float32)
     column, row, z = project_all(sample, cameras.T_camera_frame, cameras.intrinsics_px)
     width, height = cameras.sizes_px.T[..., None]
@@ -155,7 +157,7 @@ def _visible(cameras: Cameras, points: np.ndarray, nearest: list[np.ndarray] | N
 
 
 def _greedy(inside: np.ndarray, count: int) -> list[int]:
-    """Select rows that together cover most columns, greedily."""
+    """Select greedily the rows that together cover most columns."""
     left = np.ones(inside.shape[1], dtype=bool)
     chosen: list[int] = []
     for _ in range(min(count, len(inside))):
@@ -171,7 +173,7 @@ def _greedy(inside: np.ndarray, count: int) -> list[int]:
 def _project(
     points: np.ndarray, view: np.ndarray, intrinsics_px: np.ndarray, size_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return flat pixel indices, depths and rows of the points (float32) inside an image."""
+    """Return flat pixel indices, depths and rows of those points (float32) that project into an image."""
     pixels, depth = project(points, view, intrinsics_px)
     rows = np.flatnonzero(in_image(pixels, depth, size_px))
     column, row = np.floor(pixels[rows]).astype(np.int64).T

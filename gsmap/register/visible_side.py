@@ -1,8 +1,8 @@
 """Orient the normals of a surface towards the side that the capture's own cameras saw.
 
-A wall is two surfaces some centimetres apart. A capture of one room shows its front, one of the next room its back;
-nearest neighbours would pair the two, and the refined pose would be off by the wall's thickness with inconspicuous
-residuals. So cells whose oriented normals are opposite are not paired.
+A wall is two surfaces some centimetres apart. A capture of one room shows the wall's front, a capture of the next room
+its back. Nearest neighbours would pair both surfaces, and the refined pose would be off by the wall's thickness with
+inconspicuous residuals. So cells whose oriented normals are opposite are not paired.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from gsmap.register.view_cache import ViewCache
 
 NUM_CAMERAS = 16  # of the capture's own cameras, chosen to see most sides
 _REACH_M = 0.08  # cells farther than this from a camera's depth are not seen by it (Tukey's biweight)
-_MIN_CLEAR = 0.5  # a side is known where at least this share of the weight is not contradicted
-_FILL_ROUNDS = 2  # times that cells without a side take that of their coplanar neighbours
+_MIN_CLEAR = 0.5  # the side is known if at least this share of the total weight agrees
+_FILL_ROUNDS = 2  # rounds in which cells without a side take the side of their coplanar neighbours
 _MIN_ALPHA = 0.5  # a fainter pixel shows no surface
 _NUM_NEIGHBOURS = 10
 _MIN_COPLANAR_COSINE = 0.8  # of the normals of coplanar neighbours
@@ -29,13 +29,13 @@ def orient_normals(points: np.ndarray, normals: np.ndarray, tree: Any, views: Vi
 
     Args:
         points: (M, 3) cell means, metres in the scene's axes.
-        normals: (M, 3) unit normals there, of either sign.
+        normals: (M, 3) unit normals at the cell means, of arbitrary sign.
         tree: the `PointTree` of the points.
-        views: the scene through its cameras, in its own unit of ``unit_m`` metres.
+        views: renders of the scene through its cameras, in its own unit of ``unit_m`` metres.
 
     Returns:
-        (M, 3) unit vectors, zeros where the side is unknown: seen by no camera, or from both sides, as objects thinner
-        than a cell may be.
+        (M, 3) unit vectors; zeros where the side is unknown, because no camera saw the cell, or cameras saw it from
+        both sides (objects thinner than a cell).
     """
     front, back = _weights_of_sides(points, normals, views, unit_m)
     side = _sides(front, back)
@@ -70,13 +70,13 @@ def _weights_of_sides(
 
 
 def _sides(front: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return the (M,) side: 1, -1, or 0 where the weights of both sides are too similar."""
+    """Return the (M,) side of each cell: 1, -1, or 0 where the weights of both sides are too similar."""
     decided: np.ndarray = np.sign(front - back) * (np.abs(front - back) > _MIN_CLEAR * (front + back))
     return decided
 
 
 def _fill_unknown(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: Any) -> np.ndarray:
-    """Return the (M,) sides, unknown ones taken from coplanar neighbours."""
+    """Return the (M,) sides; cells of unknown side take the side of their coplanar neighbours."""
     unknown = np.flatnonzero(side == 0)
     if not len(unknown) or len(unknown) == len(side):
         return side

@@ -78,12 +78,12 @@ def test_a_shape_that_fits_twice_is_ambiguous(
     covariance = np.eye(7) * 1e-8
     twice = [SimpleNamespace(proposal=proposal(), evidence=SEEN, covariance=covariance) for _ in range(2)]
     monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: twice)
-    assert "fits in two ways" in register_by_shape(target, source).reason
+    assert "fit in two ways" in register_by_shape(target, source).reason
     monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: twice[:1])
     assert register_by_shape(target, source).status == "accepted"
     wide = [SimpleNamespace(proposal=proposal(), evidence=SEEN, covariance=np.eye(7))]
     monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: wide)
-    assert "fixes the pose only to" in register_by_shape(target, source).reason
+    assert "determines the pose only to" in register_by_shape(target, source).reason
     monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: [])
     assert register_by_shape(target, source).status == "no_match"
 

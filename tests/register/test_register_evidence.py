@@ -271,7 +271,7 @@ def test_the_direction_that_is_violated_says_of_how_many_gaussians():
 
 @pytest.mark.guards("answers")
 def test_verdict_refuses_what_is_known_too_loosely():
-    assert "fixes the pose only" in verdict.decide(_SURE, _GOOD, (0.05, 0.011, 1e-6))
+    assert "determines the pose only" in verdict.decide(_SURE, _GOOD, (0.05, 0.011, 1e-6))
     assert "too little surface" in verdict.decide(_SURE, _GOOD, None)
     assert verdict.decide(replace(_SURE, flaw="mirrored"), _GOOD, _SIGMAS) == "mirrored"
 

@@ -337,7 +337,7 @@ def test_a_rival_that_is_known_too_loosely_to_be_an_edge_is_a_rival():
         return found.status, found.evidence["probability"]
 
     alone = select_pose(world.target, world.source, [best], Params(), seconds={}).evidence["probability"]
-    loose = replace(best, proposal=moved, flaw="the overlap fixes the pose only to 8 cm")
+    loose = replace(best, proposal=moved, flaw="the overlap determines the pose only to 8 cm")
     assert status(loose) == ("no_match", pytest.approx(0.5, abs=0.01))
     near = replace(loose, proposal=_nearly(best.proposal))
     assert status(near) == ("accepted", pytest.approx(alone))

@@ -173,10 +173,12 @@ def test_not_significant_is_said_in_the_fields_words():
     found = register_pair(world.target, world.source, Params(fallback="never", verdict=bars))
     assert found.status == "no_match"
     assert found.reason.startswith(
-        f"not significant: log10 NFA {found.evidence['log_nfa']:.1f}, needs < -1000.0 (not probable enough: "
+        f"not significant: log10 NFA is {found.evidence['log_nfa']:.1f}, must be < -1000.0 (not probable enough: "
         f"{found.evidence['probability']:.1%}, needs 90%: "
     )
     unsure = Proposal("graph:objects", Sim3.identity(), with_scale=False, num_inliers=9, log_nfa=-9.0, runner_up=0.9)
-    assert "a rival clique has 90% of its size, allowed 70%" in verdict.not_significant(unsure, verdict.Params())
+    assert "a rival clique has 90% of the best clique's size, allowed 70%" in verdict.not_significant(
+        unsure, verdict.Params()
+    )
     uncounted = replace(unsure, proposer="kiss_matcher", log_nfa=float("nan"))
-    assert "kiss_matcher counts no false alarms" in verdict.not_significant(uncounted, verdict.Params())
+    assert "proposer kiss_matcher does not compute the NFA" in verdict.not_significant(uncounted, verdict.Params())

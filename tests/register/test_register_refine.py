@@ -582,7 +582,7 @@ def test_sources_that_were_told_to_be_metric_stay_so_and_disagreement_is_said():
 def test_surfaces_that_measure_another_size_than_their_residuals_explain_are_said_to_bend():
     rigid = unit_scale.ScaleDecision(True, -0.008, 0.005, 0.008)
     said = unit_scale.bending_note(rigid, 0.0005, 6.0)
-    assert "the source measures +0.8% over 6.0 m, 16 times" in said
+    assert "the source's lengths differ by +0.8% over 6.0 m, 16 times" in said
     assert unit_scale.bending_note(rigid, 0.003, 6.0) == ""  # residuals explain it
     assert unit_scale.bending_note(replace(rigid, log_scale=-0.0015), 0.0001, 6.0) == ""  # nobody needs to know
     assert unit_scale.bending_note(replace(rigid, rigid=False), 0.0005, 6.0) == ""  # the scale differs, and is measured

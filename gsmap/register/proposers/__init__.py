@@ -1,1 +1,1 @@
-"""Proposers: methods that find poses of a pair without a start; the contract is `gsmap.methods.proposer`."""
+"""Proposers: methods that find poses of a pair without an initial pose; the contract is `gsmap.methods.proposer`."""

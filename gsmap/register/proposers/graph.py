@@ -1,4 +1,4 @@
-"""Propose poses by matching scene graphs (Graph-GSReg): the maximum clique of compatible correspondences."""
+"""Propose poses by matching scene graphs (Graph-GSReg): find the maximum clique of compatible correspondences."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ PACKAGES = ()
 
 
 _TOP_K = {"objects": 5}  # most similar nodes that each node is paired with; 1 for other kinds
-_SIGMA_M = {"objects": 0.05}  # of positions; other kinds as landmarks, whose centres are better defined
-_NUM_SCALES = 6  # scales tried of those voted for, over all pairs of layers
+_SIGMA_M = {"objects": 0.05}  # of positions; other kinds have the value of landmarks, whose centres are better defined
+_NUM_SCALES = 6  # number of voted scales that are tried, over all pairs of layers
 _MIN_VOTE_SHARE = 0.5  # of the best scale's score
-# With fewer candidates the votes of a scale have next to no noise; with more, where gravity is known, a scale below
-# _MIN_VOTE counts as noise (measured: landmarks of places apart mostly stay below 3.3, overlapping ones start at 7.2;
-# weight-free objects of places apart stay below 1.3).
+# With fewer candidates the votes for a scale have next to no noise. With more candidates and known gravity, a scale
+# below _MIN_VOTE counts as noise. Measured: landmarks of different places mostly stay below 3.3, landmarks of
+# overlapping scenes start at 7.2; weight-free objects of different places stay below 1.3.
 _NOISY_CANDIDATES = 500
 _MIN_VOTE, _MIN_VOTE_OBJECTS = 3.5, 1.5
-_MIN_INLIERS = 5  # fewer compatible correspondences propose nothing
-# Correspondences within so many standard deviations of their distance, or within the radius, agree with a pose.
+_MIN_INLIERS = 5  # with fewer compatible correspondences no pose is proposed
+# Correspondences agree with a pose if their distance under it is below this many standard deviations, or below the
+# radius.
 _INLIER_SIGMAS = 4.0
 _MIN_INLIER_RADIUS_M = 0.15
-RIVAL_SHARE = 0.6  # a clique that disagrees with the best one is a rival from this share of its size on
+RIVAL_SHARE = 0.6  # a clique that disagrees with the best clique is a rival if it has at least this share of its size
 _RIVAL_DISTANCE_M = 1.0  # correspondences that the best pose leaves farther apart disagree with it
-# Nodes may be confused by a rival where they are as similar as all but this share of the best pose's correspondences.
+# A rival may confuse nodes that are at least as similar as all but this share of the best pose's correspondences.
 _TWIN_QUANTILE = 0.1
 _MAX_TWINS = 2400  # the most similar pairs of such nodes
-_RIVAL_SEARCHES = 3  # cliques among them that are tried until one implies a pose
+_RIVAL_SEARCHES = 3  # number of cliques among these pairs that are tried until one gives a pose
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Params:
 
 
 def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:
-    """Propose the best pose by each kind of node and its rival, if there is one; fewest false alarms first."""
+    """Propose the best pose by each kind of node, and its rival if there is one; the fewest false alarms first."""
     params = params or Params()
     found: list[Proposal] = []
     for kind in params.kinds:
@@ -76,10 +77,10 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
 def propose_by_kind(
     target: SceneGraph, source: SceneGraph, kind: str, params: Params | None = None, *, with_scale: bool = False
 ) -> list[Proposal]:
-    """Propose the best pose by one kind of node and its rival, if there is one; best first.
+    """Propose the best pose by one kind of node, and its rival if there is one; best first.
 
-    Correspondences, compatibility graph, maximum clique, closed-form pose. With an unknown scale every pair of the
-    kind's layers (each for another estimate of the metre) votes, and the scales with most votes are tried.
+    Correspondences, compatibility graph, maximum clique, closed-form pose. If the scale is unknown, every pair of the
+    kind's layers (a layer per estimate of the metre) votes for scales, and the scales with most votes are tried.
     """
     params = params or Params()
     pairs = comparable_layers(target, source, kind, with_scale=with_scale)
@@ -112,7 +113,7 @@ def propose_by_kind(
 def comparable_layers(
     target: SceneGraph, source: SceneGraph, kind: str, *, with_scale: bool
 ) -> list[tuple[NodeLayer, NodeLayer]]:
-    """Return pairs of layers of one kind that may be compared: metric ones, or those for estimates of the metre."""
+    """Return the pairs of layers of one kind that may be compared: metric layers, or those for estimates of the metre."""
 
     def of(graph: SceneGraph, other: SceneGraph) -> list[NodeLayer]:
         gravity_free = kind == "landmarks" and graph.up is not None and other.up is None
@@ -125,7 +126,7 @@ def comparable_layers(
     pairs = [(a, b) for a, b in compared if a.descriptor_id == b.descriptor_id and len(a) and len(b)]
     if not with_scale:
         return pairs if kind == "objects" else _of_working_size(pairs, target, source)
-    # Estimates come in fixed steps, so several pairs have one relative scale: keep the one with most nodes.
+    # Estimates come in fixed steps, so several pairs have the same relative scale; keep the pair with most nodes.
     chosen: dict[float, tuple[NodeLayer, NodeLayer]] = {}
     for a, b in sorted(pairs, key=lambda pair: -min(len(pair[0]), len(pair[1]))):
         chosen.setdefault(round(float(np.log(a.unit_m / b.unit_m)), 3), (a, b))
@@ -135,7 +136,8 @@ def comparable_layers(
 def _of_working_size(
     pairs: list[tuple[NodeLayer, NodeLayer]], target: SceneGraph, source: SceneGraph
 ) -> list[tuple[NodeLayer, NodeLayer]]:
-    """Return the pairs of layers of one size; of several, those within an octave of both scenes' working metres."""
+    """Return the pairs of layers of one size; if there are several sizes, those within an octave of both scenes'
+    working metres."""
     pairs = [(a, b) for a, b in pairs if a.unit_m == b.unit_m]
     middle = 0.5 * np.log2(target.working_m * source.working_m)
     near = [pair for pair in pairs if abs(np.log2(pair[0].unit_m) - middle) < 1.0]
@@ -143,17 +145,17 @@ def _of_working_size(
 
 
 def _voted_scales(matchers: list[LayerMatcher]) -> list[tuple[LayerMatcher, float]]:
-    """Return the scales with most votes over all pairs of layers, each with its pair; best first."""
+    """Return the scales with most votes over all pairs of layers, each with the matcher of its pair; best first."""
     votes = [(score, i, s) for i, matcher in enumerate(matchers) for s, score in matcher.vote()]
     votes = sorted(votes, reverse=True)[:_NUM_SCALES]
     return [(matchers[i], s) for score, i, s in votes if score > _MIN_VOTE_SHARE * votes[0][0]]
 
 
 class LayerMatcher:
-    """Two layers, their candidate correspondences, and the search of cliques among these.
+    """Two layers, their candidate correspondences, and the search for cliques among these.
 
     Args:
-        a, b: the layer of the target and that of the source.
+        a, b: the target's layer and the source's layer.
     """
 
     def __init__(
@@ -191,7 +193,7 @@ class LayerMatcher:
         return a_contrario.BackgroundModel(self.a, self.b, points, self.matches, source_heights=heights)
 
     def vote(self) -> list[tuple[float, float]]:
-        """Return scales to try and their significance, best first."""
+        """Return the scales to try, each with its significance, best first."""
         scales = scale_vote.vote_scales(self.matches)
         if len(self.matches) < _NOISY_CANDIDATES or self.matches.target_heights is None:
             return scales
@@ -203,7 +205,8 @@ class LayerMatcher:
         return consistency.consistency_graph(among, self.params.consistency, scale=at_scale, sigma_m=self.sigma_m)
 
     def pose_of_largest_clique(self, among: Correspondences, at_scale: float, at_least: int = 0) -> Proposal | None:
-        """Fit a pose to the largest clique among correspondences; None if it has fewer than ``at_least`` members."""
+        """Fit a pose to the largest clique among correspondences; return None if the clique has fewer than ``at_least``
+        members."""
         params = self.params
         at_least = max(at_least, _MIN_INLIERS)
         if len(among) < at_least:
@@ -230,7 +233,8 @@ class LayerMatcher:
         )
 
     def with_similar_pairs(self, members: Correspondences) -> LayerMatcher:
-        """Return a matcher whose candidates are all pairs that share an end with members and are as similar."""
+        """Return a matcher whose candidates are all pairs that share a node with ``members`` and are about as similar
+        as these."""
         out = copy(self)
         out.__dict__.pop("background", None)
         out.matches = correspondences.similar_pairs(
@@ -276,9 +280,9 @@ class CliqueSupport:
     Implements `gsmap.types.registration.Support`.
 
     Args:
-        scale: of the source, at which the clique was found.
-        equal: log10 NFA and number of inliers of the pose whose rival this is; its candidates are not independent, so
-            the NFA of the rival is derived from that of the pose.
+        scale: factor on the source at which the clique was found.
+        equal: if this is a rival: log10 NFA and number of inliers of the pose that it rivals. The candidates of a rival
+            are not independent, so its NFA is derived from that of the pose.
     """
 
     matcher: LayerMatcher
@@ -302,14 +306,15 @@ class CliqueSupport:
         return inliers, log_nfa * min(inliers / others, 1.0) if log_nfa < 0 else log_nfa
 
     def rival(self, S_target_source: Sim3, log_nfa: float, others: Sequence[Sim3] = ()) -> Proposal | None:
-        """Return the largest rival of a pose among its own nodes; ``runner_up`` is the inverse of its relative size.
+        """Return the largest rival of a pose among its own nodes; the rival's ``runner_up`` is the inverse of its
+        relative size.
 
-        A repetitive scene (a front, a corridor, a stair) has many similar nodes. Candidates are the most similar pairs
-        only, so a rival pose that is off by one period has no correspondences among the remaining candidates. So the
-        nodes of the pose's inliers are matched again, with all nodes that are as similar as their partners.
+        A repetitive scene (a façade, a corridor, a stair) has many similar nodes. Candidates are only the most similar
+        pairs, so a rival pose that is off by one period has no correspondences among them. Therefore the nodes of the
+        pose's inliers are matched again, with all nodes that are as similar as their partners.
 
         Args:
-            log_nfa: of the pose.
+            log_nfa: log10 NFA of the pose.
             others: poses that were found before.
 
         Returns:
@@ -334,6 +339,6 @@ class CliqueSupport:
                     if share >= RIVAL_SHARE
                     else None
                 )
-            # Fronts are flat, and a mirrored clique of their nodes may be larger than a proper one.
+            # Façades are flat, so a mirrored clique of their nodes may be larger than a proper clique.
             left = left[~np.isin(left.target_ids, members.target_ids)]
         return None

@@ -18,7 +18,7 @@ SCALES = False
 PACKAGES = ("kiss_matcher",)  # it has no wheel for Python 3.13
 
 
-_MIN_INLIERS = 5  # fewer matched features propose nothing
+_MIN_INLIERS = 5  # with fewer matched features no pose is proposed
 _MIN_CELLS = 50  # of each surface
 
 
@@ -37,7 +37,7 @@ class Params:
 def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:
     """Propose at most one rigid pose by features of the surfaces' points.
 
-    Its own confidence is not used: most of its wrong poses have a high one.
+    The confidence of KISS-Matcher is not used: most of its wrong poses have a high confidence.
 
     Raises:
         MissingDependencyError: the package is not installed.
@@ -46,13 +46,13 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
     try:
         import kiss_matcher
     except ImportError as error:
-        raise MissingDependencyError("kiss_matcher is not installed") from error
+        raise MissingDependencyError("the package kiss_matcher is not installed") from error
 
     points_t, points_s = target.surface().coarse[0], source.surface().coarse[0]
     if min(len(points_t), len(points_s)) < _MIN_CELLS:
         return []
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(params.voxel_m))
-    # Centred, for the matcher computes in float32.
+    # Centred, because the matcher computes in float32.
     centre_t, centre_s = points_t.mean(0), points_s.mean(0)
     with _one_core():
         solution = matcher.estimate((points_s - centre_s).astype(np.float32), (points_t - centre_t).astype(np.float32))
@@ -71,8 +71,8 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
 def _one_core() -> Iterator[None]:
     """Pin the calling thread, and the threads that the library starts from it, to one core.
 
-    The library sums in the order in which its threads finish: on several cores its pose varies by centimetres between
-    runs. Systems that cannot pin a thread (macOS) are not reproducible.
+    KISS-Matcher sums in the order in which its threads finish, so on several cores its pose varies by centimetres
+    between runs. Systems that cannot pin a thread (macOS) are not reproducible.
     """
     if not hasattr(os, "sched_setaffinity"):
         yield

@@ -5,7 +5,7 @@ from __future__ import annotations
 from gsmap.methods.refiner import Surface
 from gsmap.types import Sim3
 
-_MIN_PAIRS = 10  # and points; fewer do not constrain a pose
+_MIN_PAIRS = 10  # of pairs and of points; fewer do not constrain a pose
 
 
 def align(
@@ -18,12 +18,12 @@ def align(
     max_iterations: int,
     every_point: bool = False,
 ) -> Sim3:
-    """Refine a rigid pose by one run at each correspondence distance; return the start where too little overlaps.
+    """Refine a rigid pose by one run at each correspondence distance; return the start where the overlap is too small.
 
     Args:
         kind: registration type of small_gicp.
-        start: its scale is kept.
-        every_point: align the points instead of their means over cells; for kinds that need no normals.
+        start: initial pose, whose scale is kept.
+        every_point: align all points instead of their means over cells; only for kinds that need no normals.
     """
     import small_gicp
 

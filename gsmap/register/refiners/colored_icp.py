@@ -18,14 +18,14 @@ VERSION = 5
 SCALES = True
 USES_CORRESPONDENCES = True
 
-_WIDTH = 0.3  # of the radius: distances to planes of this count a quarter
-_MAX_RADIUS_SHARE = 0.9  # of the last radius: a pass at a larger share changes nothing
-_MIN_PAIRS = 10  # and cells; fewer do not constrain a pose
-_GREY = 1e-3  # largest range of lightness of a surface without colours: less than a step of 8 bits
-_MIN_NOISE = 0.03  # of the radius: smaller distances to the planes do not raise their weight further
-_MIN_SIGMAS = 4.0  # of the distances between the planes: a smaller radius would cut off noise and fix the pose
+_WIDTH = 0.3  # of the radius: distances to planes of this size have a quarter of the full weight
+_MAX_RADIUS_SHARE = 0.9  # of the last radius: a pass at a larger radius than this changes nothing
+_MIN_PAIRS = 10  # of pairs and of cells; fewer do not constrain a pose
+_GREY = 1e-3  # largest range of lightness of a surface without colours, below one 8-bit step
+_MIN_NOISE = 0.03  # of the radius: if distances to the planes are smaller, their weight does not grow further
+_MIN_SIGMAS = 4.0  # of the distances to the planes: a smaller radius would cut off noise and freeze the pose
 _MAX_ITERATIONS = 20  # Gauss-Newton steps at each radius
-_COLOUR_RADIUS_M = 0.1  # at larger radii lightness extrapolated in a tangent plane means nothing
+_COLOUR_RADIUS_M = 0.1  # at larger radii lightness extrapolated in a tangent plane is meaningless
 _OVERSTEP = 1.5  # factor on steps: pairs follow the pose only in part, so steps fall short, most along the scale
 _MAX_SCALE_CHANGE = 1.3  # from the start's scale; beyond it the start is returned
 
@@ -39,8 +39,8 @@ class Params:
             least 0; a larger value aligns textures more strongly and 0 ignores colour.
     """
 
-    # 1 were errors of colours as independent of each other as those of points, but a texture is blurred or lit
-    # otherwise as a whole.
+    # A weight of 1 would mean that errors of colours are as independent of each other as errors of points, but a
+    # texture is blurred or lit differently as a whole.
     colour_weight: float = 0.3
 
     def __post_init__(self) -> None:
@@ -54,10 +54,9 @@ class Schedule:
 
     Args:
         radii_m: correspondence distances.
-        max_points: cells of both surfaces together at each radius.
-        tolerance: a radius ends when a step moves the pairs by less than this share of it ...
-        last_tolerance: ... and the last radius by less than this: pairs change from pose to pose, and steps shrink
-            slowly.
+        max_points: largest number of cells at each radius, both surfaces together.
+        tolerance: the iterations at a radius end when a step moves the pairs by less than this share of the radius.
+        last_tolerance: the same for the last radius, where steps shrink slowly, as pairs change from pose to pose.
     """
 
     radii_m: tuple[float, ...]
@@ -87,14 +86,14 @@ def refine(
     """Align the source's cells with the target's planes and colours (both in metres) by a similarity or rigid pose.
 
     Iteratively reweighted Gauss-Newton (Geman-McClure over the radius) on point-to-plane distances and, as in Park et
-    al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane; each in units of its
-    own spread. The source's exposure (gain and offset) is fitted as well. The target's cells are aligned with the
-    source's planes, too, half of the points each way: that averages the errors of both surfaces' planes, and one way
-    alone prefers a source that is too small, whose points all lie nearer to some surface. Cells that were seen from
-    opposite sides are not paired.
+    al. 2017, on the difference between the source's lightness and the target's, extrapolated in its tangent plane. Each
+    residual is in units of its own spread. The source's exposure (gain and offset) is fitted as well. Half of the
+    points are cells of the target that are aligned with the source's planes. That averages the errors of both surfaces'
+    planes; one direction alone prefers a source that is too small, whose points all lie nearer to some surface. Cells
+    seen from opposite sides are not paired.
 
-    Planes do not move the pose along degenerate directions (`gsmap.register.degeneracy`): along a street's front, pairs
-    at the ends of the overlap would pull it by metres. There colours and the correspondences constrain the pose.
+    Planes do not move the pose along degenerate directions (`gsmap.register.degeneracy`): along a façade, pairs at the
+    ends of the overlap would pull it by metres. In these directions colours and the correspondences constrain the pose.
     """
     params = params or Params()
     pose = start
@@ -144,8 +143,8 @@ def refine(
 def colour_information(
     target: Surface, source: Surface, pose: Sim3, centre: np.ndarray, schedule: Schedule
 ) -> np.ndarray | None:
-    """Return the (7, 7) information about ``centre`` that colours add per pair at the last radius, in units of the
-    variance of the point-to-plane distances; None where too little overlaps."""
+    """Return the (7, 7) information about ``centre`` that colours add per pair at the last radius; None where the
+    overlap is too small. Its unit is the variance of the point-to-plane distances."""
     pairs = _Pairs(target, source, schedule.max_points[-1], pose, schedule.radii_m[-1], Params())
     both, planes = (pairs.equations(pose, centre, coloured=c) for c in (True, False))
     return None if both.count < _MIN_PAIRS else (both.system - planes.system) / (2 * both.pairs)
@@ -156,12 +155,12 @@ class _Equations:
     """Normal equations of pairs.
 
     Args:
-        system, gradient: (7, 7) and (7,).
-        count: number of pairs, the smaller of both ways.
+        system, gradient: (7, 7) matrix and (7,) right-hand side.
+        count: number of pairs, the smaller of both directions.
         noise_m: robust standard deviation of the point-to-plane distances.
         middle: (3,) mean of the points less the centre.
         extent_m: root mean square distance of the points from the centre.
-        pairs: number of pairs of source cells.
+        pairs: number of pairs that move source cells.
     """
 
     system: np.ndarray
@@ -174,7 +173,7 @@ class _Equations:
 
 
 class _Pairs:
-    """Pairs of two surfaces' cells within one radius, in both directions."""
+    """Pairs of cells of two surfaces within one radius, in both directions."""
 
     def __init__(
         self, target: Surface, source: Surface, count: int, start: Sim3, radius_m: float, params: Params
@@ -187,10 +186,11 @@ class _Pairs:
         self._resolution_m = max(target.resolution_m, source.resolution_m)
 
     def equations(self, pose: Sim3, centre: np.ndarray, *, coloured: bool = True) -> _Equations:
-        """Return the normal equations of both directions, weighted equally whatever their numbers of pairs.
+        """Return the normal equations of both directions together; both have the same weight, whatever their numbers of
+        pairs.
 
         Args:
-            coloured: with colours, at radii at which they count.
+            coloured: use colours as well, at radii small enough for them.
         """
         coloured = coloured and self.coloured
         forward = self._forward.equations(pose, centre, self._radius_m, self._params, coloured=coloured)
@@ -209,8 +209,8 @@ class _Pairs:
         )
 
     def constrained(self, planes: _Equations, centre: np.ndarray, dim: int) -> tuple[np.ndarray | None, np.ndarray]:
-        """Return the (D, D) projection of the planes' equations on the motions that they constrain, None where they
-        constrain all, and the (D, D) information of point-to-point pairs."""
+        """Return the (D, D) projection of the planes' equations on the motions that they constrain (None if these are
+        all) and the (D, D) information of point-to-point pairs."""
         levers = self._forward.paired_points() - centre
         points = point_information(levers) * (2 * planes.pairs / max(len(levers), 1))
         system = planes.system[:dim, :dim]
@@ -220,7 +220,8 @@ class _Pairs:
     def without_degenerate_pull(
         self, found: _Equations, pose: Sim3, centre: np.ndarray, dim: int, constraints: PointConstraints | None
     ) -> _Equations:
-        """Return equations in which planes have no effect on degenerate directions, and correspondences have."""
+        """Return equations in which planes have no effect along degenerate directions and correspondences constrain
+        these."""
         planes = self.equations(pose, centre, coloured=False)
         constrained, points = self.constrained(planes, centre, dim)
         if constrained is None:
@@ -238,7 +239,8 @@ class _Pairs:
 
 
 class PointConstraints:
-    """Corresponding points of both surfaces as constraints; their variance is that of the fit of one similarity."""
+    """Corresponding points of both surfaces as constraints; their variance is estimated by fitting one similarity to
+    them."""
 
     def __init__(self, correspondences: Correspondences) -> None:
         self._target, self._source = correspondences
@@ -255,7 +257,7 @@ class PointConstraints:
 
 
 class _OneWayPairs:
-    """Pairs of one surface's cells with the nearest cells of another within one radius, with cached partners."""
+    """Pairs of one surface's cells with the nearest cells of another surface within a radius, with cached partners."""
 
     def __init__(self, onto: Surface, moving: Surface, count: int, start: Sim3, *, backward: bool = False) -> None:
         self._onto, self._moving, self._backward = onto, moving, backward

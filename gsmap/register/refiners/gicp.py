@@ -17,14 +17,14 @@ _MAX_ITERATIONS = 20  # of each run
 
 @dataclass(frozen=True)
 class Params:
-    """Generalised ICP has no settings."""
+    """Settings of generalised ICP: none."""
 
 
 def refine(
     target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
 ) -> Sim3:
-    """Align two surfaces (metres) by GICP (small_gicp) from a start within about 8 degrees.
+    """Align two surfaces (metres) by GICP (small_gicp) from an initial pose within about 8 degrees.
 
-    The scale of the start is kept. Returns the start where too little overlaps.
+    The scale of the start is kept. Returns the start where the overlap is too small.
     """
     return align("GICP", target, source, start, radii_m=_RADII_M, max_iterations=_MAX_ITERATIONS)

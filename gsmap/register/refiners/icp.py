@@ -1,4 +1,4 @@
-"""Refine a rigid pose by point-to-point ICP, as Graph-GSReg."""
+"""Refine a rigid pose by point-to-point ICP, as Graph-GSReg does."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ _MAX_ITERATIONS = 50  # of each run
 class Params:
     """Point-to-point ICP (Besl and McKay 1992).
 
-    Where scenes overlap in part, points beyond the overlap are pulled to its edge: the larger the distance, the more
-    the pose drifts along walls and floors (measured in a room: 1.3 m at 0.35, 9 cm at 0.12).
+    Where scenes overlap in part, points beyond the overlap are pulled to its edge. The larger the correspondence
+    distance, the more the pose drifts along walls and floors (in a room: 1.3 m at a distance of 0.35 m, 9 cm at 0.12
+    m).
 
     Args:
         radii_m: Largest correspondence distance in metres, positive, of each run of ICP, from the coarse run to the
@@ -36,7 +37,7 @@ def refine(
 ) -> Sim3:
     """Align two surfaces (metres) by ICP on their cells' centres, or on all means (small_gicp).
 
-    The scale of the start is kept. Returns the start where too little overlaps.
+    The scale of the start is kept. Returns the start where the overlap is too small.
     """
     params = params or Params()
     return align(

@@ -1,4 +1,4 @@
-"""No refinement: return the start."""
+"""Return the initial pose without refinement."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SCALES = True
 
 @dataclass(frozen=True)
 class Params:
-    """The method has no settings."""
+    """Settings of the method: none."""
 
 
 def refine(

@@ -1,4 +1,4 @@
-"""Refine a pose by photometric alignment of renders of both scenes, for the last millimetres."""
+"""Refine the last millimetres of a pose by photometric alignment of renders of both scenes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ SCALES = True
 _NUM_VIEWS = 6  # cameras of the target that see most of the source
 _IMAGE_SIZE_PX = 128  # longer side of the renders
 MAX_ITERATIONS = 3  # Gauss-Newton steps
-# Probes of the derivative by rotation, translation and log scale: each moves a pixel at room distance about equally.
+# Steps of the numerical derivative by rotation, translation and log scale; each moves a pixel at room distance by about
+# the same amount.
 _STEP_RAD = 0.003
 _STEP_M = 0.006
 _STEP_LOG = 0.003
@@ -29,7 +30,7 @@ _MIN_PIXELS = 500  # with fewer pixels left the start is returned
 
 @dataclass(frozen=True)
 class Params:
-    """Alignment of renders has no settings."""
+    """Settings of the alignment of renders: none."""
 
 
 def refine(
@@ -37,14 +38,14 @@ def refine(
 ) -> Sim3:
     """Align renders of the source with renders of the target, both by the target's cameras (pose in metres).
 
-    Gauss-Newton on robust colour differences; the derivative is computed by rendering the source from probed poses (a
-    view moves, not the Gaussians). The source's exposure per channel (gain, offset) is fitted, too. A step that does
-    not lower the cost is not taken. Needs a start within a few pixels of the solution, both scenes' Gaussians and the
-    target's cameras; without them the start is returned.
+    Gauss-Newton on robust colour differences; the derivative is computed by rendering the source from displaced poses
+    (the view moves, not the Gaussians). The source's exposure (gain and offset of each channel) is fitted, too. A step
+    that does not lower the cost is not taken. The start must be within a few pixels of the solution. Without both
+    scenes' Gaussians and the target's cameras the start is returned.
     """
     if target.gaussians is None or source.gaussians is None or not target.cameras:
         return start
-    # Renders are of the scenes in their own units.
+    # Renders show the scenes in their own units.
     unit_t, unit_s = target.unit_m, source.unit_m
     start_in_units = Sim3(start.rotation, start.translation / unit_t, start.scale * (unit_s / unit_t))
     aligned = _align(
@@ -83,7 +84,7 @@ def _align(
     centre = np.median(source.means, axis=0).astype(np.float64)
 
     def residual(pose: Sim3, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the colours (P, 3) of the pixels in the mask, and the mask (computed where None)."""
+        """Return the colour residuals (P, 3) of the pixels in the mask, and the mask, which is computed if None."""
         moved = render(source, transform_cameras(cameras, pose.inverse()), backend="native")
         if mask is None:
             depth = moved.depth * pose.scale
@@ -143,7 +144,7 @@ def _gains(colours: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def _match_exposure(colours: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Apply the gain and offset per channel that match the medians of the colours to those of the target."""
+    """Match the exposure of colours to the reference: apply the gain and offset per channel that match the medians."""
     gains = _gains(colours, reference)
     return (colours - np.median(colours, axis=0)) * gains + np.median(reference, axis=0)
 
