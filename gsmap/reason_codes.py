@@ -393,7 +393,7 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "contradicting_groups": ("Two groups of edges contradict each other.", r"edges that agree among themselves"),
     "contradicts_component": (
         "The edge contradicts other evidence of two components.",
-        r"contradicts what else",
+        r"contradicts (what else|other edges between)",
     ),
     "contradicts_edge": (
         "The edge contradicts one of similar evidence.",
@@ -410,7 +410,7 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     # World observations.
     "contradicts_observations": (
         "The observation contradicts the others.",
-        r"it contradicts the other observations|the other bars contradict it",
+        r"it contradicts the other observations|the other (scale )?bars contradict it",
     ),
     "no_ray": ("No two photos show the control point.", r"no two photos show it"),
     # Captures that are not thinned.

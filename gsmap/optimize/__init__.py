@@ -1,7 +1,7 @@
-"""Robust pose-graph optimization: one pose per scene from pairwise edges, in as many components as they connect.
+"""Robust pose-graph optimization: compute one pose per scene from pairwise edges, component by component.
 
-`optimize` solves a map, and `grow` adds scenes to one whose other measurements are unchanged. `diff` and `moved`
-compare two answers, `gravity_align` turns one upright, and `keep_unchanged_poses` keeps poses that did not change.
+`optimize` solves a map, and `grow` adds scenes to a solved map whose other measurements are unchanged. `diff` and
+`moved` compare two answers, `gravity_align` turns an answer upright, and `keep_unchanged_poses` keeps unchanged poses.
 Solvers (gtsam, networkx) load on first use.
 """
 
@@ -50,23 +50,23 @@ def optimize(
 ) -> PoseGraph:
     """Estimate the poses of all scenes from pairwise edges, some of which are wrong. Pure and deterministic.
 
-    Recipe: triangles test the cycle consistency of every edge; poses are initialized along the best supported edges;
-    chordal relaxation and graduated non-convexity refine them; edges that contradict the result are excluded, and
-    edges that agree with it accepted; components join where the evidence suffices, and are split where only places that
-    look alike connect them; a Levenberg-Marquardt solve per component, with one gauge prior each, gives poses and
+    Recipe: triangles test the cycle consistency of every edge. Poses are initialized along the best supported edges;
+    chordal relaxation and graduated non-convexity refine them. Edges that contradict the result are excluded, edges
+    that agree with it are accepted. Components join where the evidence suffices, and are split where only places that
+    look alike connect them. A Levenberg-Marquardt solve per component, with one gauge prior each, gives poses and
     marginal covariances.
 
     Args:
-        scene_ids: all scenes of the map, oldest first. The oldest scene of a component holds its frame, and of
-            components of one size that of the oldest scene comes first; nothing else depends on their order.
-        edges: the measurements to consider, in any order; leave out what a person rejected.
+        scene_ids: all scenes of the map, oldest first. The oldest scene of a component defines the component's frame,
+            and components of equal size are sorted by their oldest scene; nothing else depends on the order of scenes.
+        edges: the measurements to consider, in any order; leave out edges that a person rejected.
         priors: pose priors. The anchor scene of a component fixes the freedom that its priors leave open.
         previous: the previous answer. The frame of its largest component is kept, so that maps do not jump. In large
             maps a few new scenes are placed in it (``provenance.method == "incremental"``); see `Params`.
         params: see `Params`.
-        progress: called with a fraction and a short text.
-        survey: observations of the world, positions in the world frame. They deform the components that they
-            georeference, and never move one as a whole: its pose in the world is in ``world`` of the answer.
+        progress: called with the completed fraction and a short text.
+        survey: observations of the world, with positions in the world frame. They deform the components that they
+            georeference, but never move a component as a whole: its pose in the world is in ``world`` of the answer.
 
     Raises:
         InputError: an edge or prior is unusable, or confirmed edges contradict each other; the message names it.
@@ -88,10 +88,10 @@ def optimize(
 def surroundings(
     scene_ids: Sequence[str], pairs: Sequence[tuple[str, str]], previous: PoseGraph, params: Params
 ) -> tuple[set[str], set[str]]:
-    """Return the scenes within reach of the new scenes in the previous answer, and the outermost ring of them.
+    """Return the scenes of the previous answer within reach of the new scenes, and the outermost ring of these scenes.
 
     Args:
-        pairs: (target, source) of all edges that `optimize` would be given.
+        pairs: (target, source) of all edges that would be passed to `optimize`.
     """
     from gsmap.optimize.incremental import surroundings
 
@@ -99,7 +99,7 @@ def surroundings(
 
 
 def grow(scene_ids: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, params: Params) -> PoseGraph | None:
-    """Place the new scenes in the previous answer; None where only a full solve will do.
+    """Place the new scenes in the previous answer; return None where only a full solve is correct.
 
     The caller guarantees that edges between old scenes, priors and observations have not changed.
 
@@ -121,14 +121,15 @@ def joint_covariance(
 ) -> np.ndarray | None:
     """Compute the joint covariance (7 + 7 S, 7 + 7 S) of ``S_world_map`` and the poses of S scenes of a component.
 
-    Each over [rotation, translation, log scale] on its source side; zero for the world where the component is not
-    georeferenced. Marginals do not give the uncertainty between two scenes: neighbouring scenes have common errors.
+    Each block of 7 is over [rotation, translation, log scale] on the pose's source side; the block of the world is zero
+    if the component is not georeferenced. Marginal covariances do not give the uncertainty between two scenes, because
+    the errors of neighbouring scenes are correlated.
 
     Args:
         answer: an answer of `optimize`, with its edges, priors and observations.
 
     Returns:
-        None where the scenes are alone, or the system cannot be solved.
+        None if no edge reaches the scenes, or the system cannot be solved.
     """
     from gsmap.optimize.survey import joint_of_answer
 

@@ -1,18 +1,18 @@
-"""Doubtful edges: captures that disagree on a surface both saw, of one place that changed or of two similar places.
+"""Judge doubtful edges, whose captures disagree on a surface that both saw: the place changed, or these are two similar
+places.
 
-A pair by itself does not decide which; the map does: a doubtful edge that the other edges support is of one place that
-changed, and one that they contradict is not. A doubtful edge that alone connects two parts of the map is accepted as
-long as most doubtful edges of this map turned out right, and its scenes are tentative; otherwise the parts stay
+The pair alone does not decide between both; the map does. If the remaining edges support a doubtful edge, the place
+changed; if they contradict it, there are two places. A doubtful edge that alone connects two parts of the map is
+accepted, with tentative scenes, if most doubtful edges of this map turned out to be correct; otherwise the parts stay
 separate.
 
-Assumption: in one place captured twice without change nearly all of the common surface agrees, so undoubted edges are
-right as often as any. It fails where rooms are repeated entirely, their furniture included; see
-`gsmap.optimize.perceptual_aliasing` for those.
+Assumption: if a place is captured twice without change, nearly all of the common surface agrees. It fails for rooms
+that are repeated entirely, including their furniture; `gsmap.optimize.perceptual_aliasing` handles them.
 
-The threshold depends on the map: noisy captures disagree more, and bare rooms less. So where edges contradict each
-other the likeliest are accepted first, and the first contradicted ones set the threshold of doubt. The likelihood is
-that of all evidence of registration (`gsmap.optimize.edge_likelihood`), for a repeated facade disagrees less than two
-captures that see one place from afar. Edges of unknown likelihood are ranked by disagreement.
+The threshold of doubt depends on the map: noisy captures disagree more, and bare rooms less. So where edges contradict
+each other, edges are accepted in order of likelihood, and the first contradicted edges set the threshold. The
+likelihood uses all evidence of registration (`gsmap.optimize.edge_likelihood`), because a repeated facade disagrees
+less than two captures that see one place from afar. Edges of unknown likelihood are ranked by disagreement.
 """
 
 from __future__ import annotations
@@ -31,17 +31,16 @@ from gsmap.optimize.state import State, refine
 from gsmap.optimize.structure import component_labels
 from gsmap.reason_codes import reason
 
-_MAX_ALIASING_PROBABILITY = 0.5  # doubtful edges join nothing where more of the map's decided ones were of two places
-_COST = 10.0  # a wrong edge that is accepted costs as much as so many right ones that are doubtful
+_MAX_ALIASING_PROBABILITY = 0.5  # doubtful edges join no components if the aliasing probability of this map is higher
+_COST = 10.0  # accepting a wrong edge costs as much as doubting this many correct edges
 _LEAST_SPREAD = 0.15  # lower bound of the spread of log disagreements, for small samples
-_SCENE_STEPS, _FEWEST_STEPS = 2000, 8  # large maps accept more edges per step, for each step costs a solve
+_SCENE_STEPS, _FEWEST_STEPS = 2000, 8  # large maps accept more edges per step, because each step costs a solve
 _STEPS = 64  # maximum number of steps in which edges are accepted by likelihood
 
 
 def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
-    """Find doubtful edges (E,): at least the fraction ``bar`` of the common surface disagrees, and no person
-    confirmed the edge.
-    """
+    """Return an (E,) mask that is True for doubtful edges: at least the fraction ``bar`` of the common surface
+    disagrees, and no person confirmed the edge."""
     with np.errstate(invalid="ignore"):  # NaN: not compared, hence not doubtful
         found: np.ndarray = (m.disagreement >= bar) & ~m.confirmed
     return found
@@ -50,14 +49,14 @@ def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
 def find_doubtful_in_map(
     m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params
 ) -> np.ndarray:
-    """Find doubtful edges (E,) by ``max_disagreement`` and by the contradictions of this map.
+    """Return an (E,) mask of doubtful edges, judged by ``max_disagreement`` and by the contradictions of this map.
 
-    Where the map contradicts more doubtful edges than it supports, it has places that look alike, and the threshold is
-    the one that best separates the disagreement of its accepted edges from that of the contradicted ones. Where
-    undoubted edges contradict each other, those from `find_first_contradicted` are doubtful as well.
+    Where the map contradicts more doubtful edges than it supports, it has places that look alike; then the threshold
+    best separates the disagreements of accepted edges from those of contradicted edges. Where undoubted edges
+    contradict each other, the edges from `find_first_contradicted` are doubtful as well.
 
     Args:
-        state: state of the map from undoubted edges.
+        state: state of the map computed from undoubted edges alone.
     """
     bar = params.max_disagreement
     inside = _within(m, state.accepted)
@@ -77,8 +76,8 @@ def find_doubtful_in_map(
 
 
 def separating_threshold(accepted: np.ndarray, contradicted: np.ndarray) -> float:
-    """Compute the threshold that best separates two log-normal sets of disagreements (Bayes, a wrong edge costs `_COST`
-    right ones); infinity where they cannot be separated.
+    """Compute the threshold that best separates two log-normal sets of disagreements; infinity if they cannot be
+    separated. The decision is Bayesian: accepting a wrong edge costs `_COST` times as much as doubting a correct edge.
     """
     logs = [np.log(np.maximum(values, 1e-6)) for values in (accepted, contradicted)]
     low, high = (float(np.median(values)) for values in logs)
@@ -92,13 +91,14 @@ def separating_threshold(accepted: np.ndarray, contradicted: np.ndarray) -> floa
 def find_first_contradicted(
     m: Measurements, eligible: np.ndarray, terms: PriorTerms, gate: float, params: Params
 ) -> np.ndarray:
-    """Find the edges (E,) from the rank on at which most edges are contradicted; none where there is no such rank.
+    """Return an (E,) mask of the edges from the rank onwards at which most edges are contradicted; all False if there
+    is no such rank.
 
-    Edges are accepted in order of likelihood, each connecting its scenes; the scenes of late edges are connected
-    already.
+    Edges are accepted in order of likelihood. Early edges connect scenes; late edges, whose scenes are already
+    connected, agree with the map or are contradicted.
 
     Args:
-        eligible: (E,) bool, edges that may be accepted; the others decide nothing.
+        eligible: (E,) mask of the edges that may be accepted; the remaining edges have no influence.
     """
     rank, known = _ranked(m)
     tying = replace(params, min_large_component=m.num_scenes + 1)
@@ -127,9 +127,8 @@ def find_first_contradicted(
 
 
 def _ranked(m: Measurements) -> tuple[np.ndarray, np.ndarray]:
-    """Rank edges by likelihood: (E,) rank, the likeliest 0, and (E,) bool, True where the likelihood is known.
-    Confirmed edges and those of unknown likelihood come first.
-    """
+    """Rank edges by likelihood: return the (E,) rank, 0 for the likeliest, and an (E,) mask that is True where the
+    likelihood is known. Confirmed edges and edges of unknown likelihood come first."""
     known = np.isfinite(m.log_odds_wrong)
     value = m.log_odds_wrong
     if not known.any():
@@ -139,9 +138,8 @@ def _ranked(m: Measurements) -> tuple[np.ndarray, np.ndarray]:
 
 
 def accept_doubtful_edges(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> None:
-    """Accept the doubtful edges that the map supports, and others that connect components if most doubtful edges of
-    this map were right.
-    """
+    """Accept the doubtful edges that the map supports. If most doubtful edges of this map were correct, also accept
+    doubtful edges that connect components."""
     state.doubtful = doubtful
     if close_loops(m, state, params):
         refine(m, state, gate)
@@ -154,19 +152,22 @@ def accept_doubtful_edges(m: Measurements, state: State, doubtful: np.ndarray, g
         before = replace(state, accepted=state.accepted.copy(), failures=state.failures.copy())
         accept_edges(m, state, params)
         refine(m, state, gate)
-        # Edges between places that look alike contradict each other sooner or later: then none of them is accepted.
+        # Edges between places that look alike contradict each other sooner or later; then none of these edges is
+        # accepted.
         contradicted = int((doubtful & _within(m, state.accepted) & ~state.accepted).sum())
         if aliasing_probability(supported, contradicted) > _MAX_ALIASING_PROBABILITY:
             state.accepted, state.failures, state.poses = before.accepted, before.failures, before.poses
     apart = joining & ~_within(m, state.accepted)
     state.undecided |= apart
     for row in np.flatnonzero(apart).tolist():
-        others = "captured in one visit" if one_visit[row] else "so are others of this map, or they contradict it"
+        others = (
+            "captured in one visit" if one_visit[row] else "other places of this map do, or other edges contradict it"
+        )
         state.pending[row] = reason("aliased_places", f"places that look alike? ({others})")
 
 
 def _within(m: Measurements, accepted: np.ndarray) -> np.ndarray:
-    """Return (E,) bool: both scenes of the edge are in one component."""
+    """Return an (E,) mask that is True if both scenes of the edge are in one component."""
     labels = component_labels(m, np.flatnonzero(accepted))
     found: np.ndarray = labels[m.targets] == labels[m.sources]
     return found
@@ -176,6 +177,7 @@ def aliasing_probability(supported: int, contradicted: int) -> float:
     """Estimate the probability that a further doubtful edge joins two different places, by the rule of succession.
 
     Args:
-        supported, contradicted: numbers of doubtful edges of this map that the other edges support and contradict.
+        supported, contradicted: number of doubtful edges of this map that the remaining edges support, and that they
+            contradict.
     """
     return (contradicted + 1) / (supported + contradicted + 2)

@@ -1,4 +1,4 @@
-"""Batch solve: poses of all scenes from all edges, in as many components as the edges connect."""
+"""Batch solve: compute the poses of all scenes from all edges, in as many components as the edges connect."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from gsmap.types import Edge, PoseGraph, Prior, Provenance
 from gsmap.types.progress import Progress
 from gsmap.types.world import Survey
 
-_GNC_START_GATES = 16.0  # width at which the robust kernel of graduated non-convexity starts
+_GNC_START_GATES = 16.0  # initial width of the robust kernel of graduated non-convexity, in gates
 _MAX_ROUNDS = 30  # of accepting edges and refining
 
 
@@ -48,9 +48,9 @@ def solve_batch(
     progress: Progress,
     survey: Survey,
 ) -> PoseGraph:
-    """Solve a map as `gsmap.optimize.optimize`; edges and priors come sorted by id."""
+    """Solve a map as `gsmap.optimize.optimize` does; edges and priors must be sorted by id."""
     check_priors(scene_ids, priors)
-    # Rows are numbered by id, so that the start of the solve and its ties do not depend on the order of input.
+    # Rows are sorted by id, so that neither the initial poses nor the breaking of ties depends on the order of input.
     m = measurements(sorted(scene_ids), edges, rigid=all_rigid(edges, priors, previous))
     gate = float(chi2_quantile(params.gate_probability, m.dim))
 
@@ -63,7 +63,8 @@ def solve_batch(
             doubtful = stricter
             state, cycles = _grown_from(m, ~doubtful, terms, gate, params, progress)
     if doubtful.any():
-        # Undoubted edges make the map; doubtful edges, which may be of other places, are compared with it afterwards.
+        # The map is built from undoubted edges; doubtful edges, which may join different places, are compared with it
+        # later.
         accept_doubtful_edges(m, state, doubtful, gate, params)
     _reconsider(m, state, gate)
     _check_confirmed(m, state, gate)
@@ -84,7 +85,7 @@ def solve_batch(
 def _grown_from(
     m: Measurements, undoubted: np.ndarray, terms: PriorTerms, gate: float, params: Params, progress: Progress
 ) -> tuple[State, CycleSupport]:
-    """Grow components from some of the edges; the remaining edges stay open."""
+    """Grow components from the edges in ``undoubted``; the remaining edges are neither accepted nor rejected."""
     if undoubted.all():
         return _grown(m, terms, gate, params, progress)
     rows = np.flatnonzero(undoubted)
@@ -95,9 +96,8 @@ def _grown_from(
 def _grown(
     m: Measurements, terms: PriorTerms, gate: float, params: Params, progress: Progress
 ) -> tuple[State, CycleSupport]:
-    """Grow components from all edges of ``m``, and split them where places look alike; also return the cycle
-    support.
-    """
+    """Grow components from all edges of ``m``, and split them where places look alike; also return the cycle support of
+    the edges."""
     progress(0.05, "testing cycles")
     cycles = count_cycle_support(m, params.gate_probability)
     state = initial_state(m, cycles, terms, params)
@@ -120,7 +120,7 @@ def _grown(
 
 
 def _ages(m: Measurements, scene_ids: Sequence[str]) -> np.ndarray:
-    """Return the rank (N,) of each scene in the caller's order, oldest first."""
+    """Return the (N,) age rank of each scene, 0 for the oldest, from the caller's order."""
     rank = {scene: k for k, scene in enumerate(scene_ids)}
     return np.array([rank[scene] for scene in m.scene_ids], dtype=np.int64)
 
@@ -144,7 +144,8 @@ def _provenance(
 
 
 def _part_aliased(m: Measurements, cycles: CycleSupport, state: State, gate: float, params: Params) -> bool:
-    """Split components where a group of edges contradicts them and is not clearly outweighed."""
+    """Split components where a group of edges contradicts the map and is not clearly outweighed; return whether any was
+    split."""
     settled = state.undecided | state.rejected
     found = resolve_aliased_loops(m, state.accepted, settled, state.poses, cycles, params)
     if len(state.terms):
@@ -162,21 +163,21 @@ def _part_aliased(m: Measurements, cycles: CycleSupport, state: State, gate: flo
 
 
 def _reconsider(m: Measurements, state: State, gate: float) -> None:
-    """Accept edges again that failed before and fit now."""
+    """Accept edges that failed before but fit now."""
     labels = component_labels(m, np.flatnonzero(state.accepted))
     inside = labels[m.targets] == labels[m.sources]
     state.accepted |= inside & ~state.undecided & ~state.rejected & (chi_squares(m, state.poses) < gate)
 
 
 def _check_confirmed(m: Measurements, state: State, gate: float) -> None:
-    """Raise `InputError` where confirmed edges, which are never excluded, contradict each other."""
+    """Raise `InputError` if confirmed edges, which are never excluded, contradict each other."""
     rows = np.flatnonzero(m.confirmed)
     if len(rows) < 2:
         return
     off = chi_squares(m[rows], state.poses) > CONTRADICTION_GATES * gate
     if not off.any():
         return
-    # They may only contradict unconfirmed edges: solve them alone.
+    # Confirmed edges may contradict only unconfirmed edges: solve the confirmed edges alone.
     alone = m[rows]
     labels = component_labels(alone, np.arange(len(rows)))
     fixed = np.zeros(m.num_scenes, dtype=bool)
@@ -187,6 +188,6 @@ def _check_confirmed(m: Measurements, state: State, gate: float) -> None:
     if worst.max() > CONTRADICTION_GATES * gate:
         target, source = alone.keys[int(np.argmax(worst))]
         raise InputError(
-            f"confirmed edge {target}:{source} contradicts the other confirmed edges: reject it, or one of them",
+            f"confirmed edge {target}:{source} contradicts the other confirmed edges: reject this edge or one of those",
             code="confirmed_edges_contradict",
         )

@@ -6,18 +6,20 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
-_MAX_FILL_BLOCKS = 500_000  # above it conjugate gradients are cheaper; only maps that fill a volume have so many
+_MAX_FILL_BLOCKS = 500_000  # above it conjugate gradients are cheaper; only maps that fill a volume exceed it
 
 
 class BlockSystem:
-    """``min_x sum_e |A_e x_target + B_e x_source + r_e|^2_W`` over the scenes that are not fixed (those stay 0).
+    """``min_x sum_e |A_e x_target + B_e x_source + r_e|^2_W`` over the scenes that are not fixed; ``x`` is 0 for fixed
+    scenes.
 
-    The ordering is found once for the pattern, on the graph of scenes rather than of scalars, and serves every solve.
+    The elimination ordering is computed once from the sparsity pattern, on the graph of scenes rather than of scalars,
+    and is used by every solve.
 
     Args:
         targets, sources: (E,) scenes of each edge.
-        fixed: (N,) bool; also true for scenes that no edge reaches.
-        dim: unknowns per scene.
+        fixed: (N,) mask of fixed scenes; also True for scenes that no edge reaches.
+        dim: number of unknowns per scene.
     """
 
     def __init__(self, targets: np.ndarray, sources: np.ndarray, fixed: np.ndarray, dim: int) -> None:
@@ -109,7 +111,7 @@ class BlockSystem:
 
 
 def _sum_by(groups: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Sum of ``values`` (V, ...) by group; empty groups are zero."""
+    """Sum ``values`` (V, ...) by group; empty groups are zero."""
     out = np.zeros((count, *values.shape[1:]))
     if len(groups):
         order = np.argsort(groups, kind="stable")

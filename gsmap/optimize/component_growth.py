@@ -1,4 +1,4 @@
-"""Growth of components: by loop closures, joins and single edges; and cuts of weak bridges."""
+"""Grow components by loop closures, joins and single edges, and cut weak bridges."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from gsmap.optimize.structure import bridges, component_labels
 
 
 def accept_agreeing_edges(m: Measurements, state: State, params: Params) -> bool:
-    """Accept edges and join components while edges agree; poses are moved, not yet refined."""
+    """Accept edges and join components as long as edges agree; poses are moved but not yet refined. Return whether any
+    changed."""
     any_taken = False
     while close_loops(m, state, params) or join_components(m, state, params, single=False):
         any_taken = True
@@ -28,16 +29,16 @@ def accept_edges(m: Measurements, state: State, params: Params) -> None:
 
 
 def attach_by_single_edges(m: Measurements, state: State, params: Params) -> None:
-    """Attach small components by single edges until there are none left."""
+    """Attach small components by single edges until none can be attached."""
     while join_components(m, state, params, single=True):
         pass
 
 
 def close_loops_through_single_edges(m: Measurements, state: State, params: Params) -> bool:
-    """Accept the cycles that close once single edges attach small components.
+    """Accept the cycles that close once small components are attached by single edges.
 
-    Single edges that no cycle confirms are excluded again, for a scene with one edge is no evidence for others; they
-    are accepted again at the end.
+    Single edges that no cycle confirms are excluded again, because a scene with one edge is no evidence for other
+    edges; they are accepted again at the end.
     """
     accepted, poses = state.accepted.copy(), state.poses
     while join_components(m, state, params, single=True):
@@ -50,7 +51,7 @@ def close_loops_through_single_edges(m: Measurements, state: State, params: Para
 
 
 def close_loops(m: Measurements, state: State, params: Params) -> bool:
-    """Accept the edges inside a component that agree with its prediction."""
+    """Accept the edges inside a component that agree with the component's prediction."""
     rows = state.open()
     if not len(rows):
         return False
@@ -61,7 +62,7 @@ def close_loops(m: Measurements, state: State, params: Params) -> bool:
 
 
 def join_components(m: Measurements, state: State, params: Params, *, single: bool) -> bool:
-    """Join components where edges agree, or, with ``single``, where one edge attaches a small component."""
+    """Join components where several edges agree or, with ``single``, where one edge attaches a small component."""
     rows = state.open()
     if not len(rows):
         return False
@@ -89,10 +90,10 @@ def join_components(m: Measurements, state: State, params: Params, *, single: bo
 
 
 def cut_weak_bridges(m: Measurements, state: State, params: Params) -> None:
-    """Exclude single edges that have come to connect two large components.
+    """Exclude single edges that by now connect two large components.
 
     A scene attached by one edge may become part of a large component; then that edge alone would join two large
-    components, which it may not.
+    components, which is not allowed.
     """
     single = bridges(m, state.accepted) & ~m.confirmed
     blocks = component_labels(m, np.flatnonzero(state.accepted & ~single))

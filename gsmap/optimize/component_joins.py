@@ -1,4 +1,4 @@
-"""Joins of components: the evidence that they need, and the motion that they cause."""
+"""Decide on joins of components by their evidence, and move the joined components."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.reason_codes import reason
 
-_MIN_RIVAL_EDGES = 2  # contradicting edges that agree among themselves count as a place that looks alike from so many
-_RIVAL_FACTOR = 3  # such a rival must be outnumbered so many times before large components join
+_MIN_RIVAL_EDGES = 2  # so many contradicting edges that agree with each other count as a place that looks alike
+_RIVAL_FACTOR = 3  # large components join only if agreeing edges outnumber such a rival by this factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +27,12 @@ class Join:
 
     Args:
         target, source: components by label.
-        edges: rows of the edges that agree, the one that most others agree with first.
-        rival: number of edges in the largest group that contradicts them.
+        edges: rows of the edges that agree; first the edge with which most of them agree.
+        rival: number of edges in the largest group that contradicts the agreeing edges.
         offered: rows of all edges between the two components.
-        log_odds_wrong: of the least likely of the agreeing edges (`Measurements.log_odds_wrong`); 0 where unknown.
-        log_odds: natural log-odds that the likeliest contradicting edge is wrong, against the least likely agreeing
-            one; 0 where unknown or without contradiction.
+        log_odds_wrong: `Measurements.log_odds_wrong` of the least likely agreeing edge; 0 if unknown.
+        log_odds: natural log-odds that the likeliest contradicting edge is wrong rather than the least likely agreeing
+            edge; 0 if unknown or without contradiction.
     """
 
     target: int
@@ -45,7 +45,7 @@ class Join:
 
 
 def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probability: float) -> list[Join]:
-    """Find, for every pair of components with edges between them, the largest group of edges that agree."""
+    """For every pair of components with edges between them, find the largest group of edges that agree."""
     labels = drift.labels
     rows = rows[labels[edges.targets[rows]] != labels[edges.sources[rows]]]
     if not len(rows):
@@ -59,11 +59,11 @@ def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probabi
     first, second = agreeing_pairs(edges, rows, drift, np.repeat(ends, ends - starts), probability)
     neighbours = sp.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(rows), len(rows))).tocsr()
     neighbours = neighbours + neighbours.T
-    # A pair of scenes tied twice is one piece of evidence when it comes to counting pairs; see `join_decision`.
+    # Two edges between the same pair of scenes count as one piece of evidence; see `join_decision`.
     weight = -np.log(np.trace(edges.covariance[rows], axis1=1, axis2=2))
     group = np.repeat(np.arange(len(starts)), ends - starts)
     wrong = edges.log_odds_wrong[rows]
-    # The edge that most others agree with, of equals the likeliest, but a confirmed one before any other.
+    # Confirmed edges first, then the edge with which most edges agree, then the likeliest.
     best = np.lexsort((weight, -np.nan_to_num(wrong), np.diff(neighbours.indptr), edges.confirmed[rows], group))[
         ends - 1
     ]
@@ -85,13 +85,14 @@ def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probabi
 
 
 def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Params) -> str:
-    """Decide on a join: ``agreed``, ``single`` or, where the evidence does not suffice, the reason in words.
+    """Decide on a join: return ``agreed``, ``single`` or, where the evidence does not suffice, the reason in words.
 
-    Modelling assumption: independent mistakes do not agree with each other, so agreeing edges are either right or come
-    from a place that looks like another. It fails where one mistake is made several times over: scenes cut from one
-    capture, or furniture of which there are many.
+    Assumption: independent mistakes do not agree with each other, so agreeing edges are either correct or come from
+    places that look alike. It fails where one mistake is repeated: scenes cut from one capture, or many copies of one
+    piece of furniture.
 
-    As many edges as contradict them suffice where ``params.min_wrong_probability`` separates them by their evidence.
+    If as many edges contradict the join as agree with it, it is still accepted where the evidence separates both groups
+    by ``params.min_wrong_probability``.
     """
     rows = join.edges
     if edges.confirmed[join.offered].any():
@@ -101,7 +102,10 @@ def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Pa
     sure = params.min_wrong_probability
     outweighed = len(rows) <= join.rival - int(join.log_odds >= np.log(sure / (1 - sure)))
     if outweighed or (large and aliased):
-        return reason("outvoted", f"{len(rows)} edges agree and {join.rival} others contradict them: undecided")
+        return reason(
+            "outvoted",
+            f"{len(rows)} edges agree and {join.rival} others contradict them, so none of them is used",
+        )
     low = np.minimum(edges.targets[rows], edges.sources[rows])
     high = np.maximum(edges.targets[rows], edges.sources[rows])
     pairs = len(np.unique(low * edges.num_scenes + high))
@@ -111,8 +115,8 @@ def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Pa
         return reason(
             "too_few_edges",
             f"would join two components of {params.min_large_component} or more scenes: needs "
-            f"{params.min_bridge_edges} agreeing edges over {params.min_bridge_edges} scene pairs, or one that is "
-            f"confirmed, has {pairs}",
+            f"{params.min_bridge_edges} agreeing edges over {params.min_bridge_edges} scene pairs, or a confirmed "
+            f"edge, but has {pairs}",
         )
     return "agreed" if pairs >= 2 else "single"
 
@@ -120,7 +124,7 @@ def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Pa
 def merge_components(
     edges: Measurements, chosen: list[Join], labels: np.ndarray, poses: Similarities
 ) -> tuple[np.ndarray, Similarities]:
-    """Move whole components so that the first edge of each chosen join is satisfied. Joins must form no cycle.
+    """Move whole components so that the first edge of each chosen join is satisfied. The joins must not form a cycle.
 
     Returns:
         Rows of the accepted edges, and the moved poses.
@@ -159,7 +163,7 @@ def merge_components(
 def spanning_joins(offers: list[Join], count: int) -> list[Join]:
     """Select the joins with most edges that form no cycle between ``count`` components."""
     order = sorted(offers, key=lambda join: (-len(join.edges), join.target, join.source))
-    # Distinct weights: the minimum spanning forest is the one that taking them in order would give.
+    # With distinct weights the minimum spanning forest equals that of a greedy choice in order.
     rank = np.arange(1.0, len(order) + 1)
     ends = np.array([join.target for join in order]), np.array([join.source for join in order])
     tree = minimum_spanning_tree(sp.coo_matrix((rank, ends), shape=(count, count)).tocsr())
@@ -167,9 +171,8 @@ def spanning_joins(offers: list[Join], count: int) -> list[Join]:
 
 
 def attaching_joins(offers: list[Join], sizes: np.ndarray, min_large: int) -> list[Join]:
-    """Select joins by single edges, each of which attaches one small component, the likeliest first (a minimum spanning
-    forest, as Prim's); equals from the largest component outwards.
-    """
+    """Select joins by single edges, each of which attaches one small component; the likeliest come first, and equally
+    likely ones from the largest component outwards (a minimum spanning forest, as by Prim's algorithm)."""
     ties: dict[int, list[tuple[int, Join]]] = {}
     for join in offers:
         ties.setdefault(join.target, []).append((join.source, join))
@@ -189,7 +192,7 @@ def attaching_joins(offers: list[Join], sizes: np.ndarray, min_large: int) -> li
             continue
         taken.add(start)
         reach(start, rank)
-        # Large components grow together: a small one between two of them joins by the likelier edge.
+        # All large components grow at once: a small component between two of them joins by the likelier edge.
         if rank + 1 < len(starts) and sizes[starts[rank + 1]] >= min_large:
             continue
         while front:

@@ -1,4 +1,5 @@
-"""Pairwise consistency of edges (as in PCM, Mangelson et al. 2018), and consistency with their component."""
+"""Test the pairwise consistency of edges (as in PCM, Mangelson et al. 2018), and their consistency with their
+component."""
 
 from __future__ import annotations
 
@@ -18,10 +19,10 @@ from gsmap.optimize.structure import ranges
 def consistent_with_component(
     edges: Measurements, rows: np.ndarray, drift: DriftModel, probability: float, gates: float = 1.0
 ) -> np.ndarray:
-    """Test edges inside a component: (len(rows),) bool, True where the component's own prediction agrees.
+    """Return a mask over the edges at ``rows`` that is True where an edge agrees with the prediction of its component.
 
     Args:
-        gates: an edge agrees up to this many times the chi-square of ``probability``.
+        gates: an edge agrees if its chi-square is below ``gates`` times the quantile of ``probability``.
     """
     limit = gates * chi2_quantile(probability, edges.dim)
     out = drift.labels[edges.targets[rows]] == drift.labels[edges.sources[rows]]
@@ -37,7 +38,7 @@ def consistent_with_component(
 
 @dataclass(frozen=True, eq=False)
 class DirectedEdges:
-    """Edges as measurements of the pose of the part at their ``far`` end in the part at their ``near`` end.
+    """Edges as measurements of the pose of their ``far`` scene in the frame of their ``near`` scene.
 
     Args:
         near, far: (K,) scenes.
@@ -52,7 +53,7 @@ class DirectedEdges:
 
     @classmethod
     def of(cls, edges: Measurements, rows: np.ndarray, turned: np.ndarray) -> DirectedEdges:
-        """Direct the edges at ``rows``, from source to target where ``turned``."""
+        """Direct the edges at ``rows``: from source to target where ``turned``, otherwise from target to source."""
         a, b, measured, dim = edges.targets[rows], edges.sources[rows], edges.measured[rows], edges.dim
         covariance = edges.covariance[rows].copy()
         adjoint = measured[turned].adjoint()[:, :dim, :dim]
@@ -63,9 +64,8 @@ class DirectedEdges:
     def pairwise_consistent(
         self, first: np.ndarray, second: np.ndarray, drift: DriftModel, probability: float
     ) -> np.ndarray:
-        """Test pairs of edges: (P,) bool, True where both agree within their noise and the drift of the map between
-        them.
-        """
+        """Return a (P,) mask that is True if both edges of a pair agree within their noise and the drift of the map
+        between them."""
         poses, dim = drift.poses, self.covariance.shape[1]
         a, b, measured, covariance = self.near, self.far, self.measured, self.covariance
         limit = chi2_quantile(probability, dim)
@@ -87,7 +87,8 @@ class DirectedEdges:
 def agreeing_pairs(
     edges: Measurements, rows: np.ndarray, drift: DriftModel, ends: np.ndarray, probability: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find pairs (positions in ``rows``) of edges between two components that predict the same relative pose."""
+    """Find the pairs of edges between two components that predict the same relative pose; return positions in
+    ``rows``."""
     poses, labels = drift.poses, drift.labels
     # Direct every edge from the component of lower number.
     directed = DirectedEdges.of(edges, rows, labels[edges.targets[rows]] > labels[edges.sources[rows]])
@@ -102,7 +103,7 @@ def agreeing_pairs(
         first, offset = ranges(counts[begin:end])
         first = first + begin
         second = first + 1 + offset
-        # Cheap first test: the two predictions of the other component's orientation.
+        # A cheap first test compares the two predicted orientations of the second component.
         hops = drift.bound(directed.near[first], directed.near[second]) + drift.bound(
             directed.far[first], directed.far[second]
         )

@@ -1,12 +1,12 @@
-"""Contradictory loops: decide by the likelihood of the registrations which edge of a loop is wrong.
+"""Decide which edge of a contradictory loop is wrong, by the likelihood of the registrations.
 
-An edge that contradicts its own component makes a loop with the accepted edges between its ends, and one edge of that
-loop is wrong. Edges on agreeing cycles are supported; suspects are the edge itself and the accepted edges without such
-a cycle. The least likely suspect is excluded where it is probably the wrong one, whatever the order of the edges; where
-the evidence cannot separate them none of them is used.
+An edge that contradicts its own component forms a loop with the accepted edges between its two scenes, and one edge of
+that loop is wrong. Edges on agreeing cycles are not suspect; suspects are the contradicting edge and the accepted edges
+without an agreeing cycle. The least likely suspect is excluded if it is probably the wrong one, whatever the order of
+the edges. If the evidence cannot separate the suspects, none of them is used.
 
-Assumption: exactly one edge of a loop is wrong, and the suspects' evidence is independent. Where no likelihood is known
-(edges given by a person, scenes without cameras), accepted edges stay, tentative.
+Assumption: exactly one edge of a loop is wrong, and the evidence of the suspects is independent. Where no likelihood is
+known (edges added by a person, scenes without cameras), accepted edges remain accepted, but tentative.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from gsmap.optimize.params import Params
 from gsmap.optimize.state import State
 from gsmap.optimize.structure import bridges, component_labels
 
-CONTRADICTION_GATES = 10.0  # chi-square, in gates, beyond which an edge contradicts the edges that it makes a loop with
-MAX_SUSPECTS = 4  # if more may be wrong, none is excluded: the wrong one is not likely among them
+CONTRADICTION_GATES = 10.0  # an edge whose chi-square exceeds this many gates contradicts the edges of its loop
+MAX_SUSPECTS = 4  # with more suspects none is excluded
 
 
 def exclude_contradicted(m: Measurements, state: State, params: Params) -> bool:
-    """Exclude the edges of contradictory loops that are, or may be, wrong; poses are left as they are.
+    """Exclude edges of contradictory loops that are wrong or may be wrong; poses stay as they are.
 
     Returns:
-        True if accepted edges were excluded. Then other edges may join the separated parts, and loops that lost an
-        edge are not decided yet.
+        True if accepted edges were excluded. Then other edges may join the separated parts, and loops that lost an edge
+        are still undecided.
     """
     rows = find_contradicting_edges(m, state, params)
     if not len(rows):
@@ -56,7 +56,7 @@ def exclude_contradicted(m: Measurements, state: State, params: Params) -> bool:
 
 
 def find_contradicting_edges(m: Measurements, state: State, params: Params) -> np.ndarray:
-    """Find the rows of undoubted edges of known likelihood that contradict their own component."""
+    """Return the rows of undoubted edges of known likelihood that contradict their own component."""
     settled = state.accepted | state.undecided | state.rejected | state.doubtful
     labels = component_labels(m, np.flatnonzero(state.accepted))
     inside = labels[m.targets] == labels[m.sources]
@@ -68,7 +68,8 @@ def find_contradicting_edges(m: Measurements, state: State, params: Params) -> n
 
 
 def find_contested_edges(m: Measurements, state: State, params: Params) -> np.ndarray:
-    """Find the edges (E,) of known likelihood that would join two components and contradict other such edges."""
+    """Return an (E,) mask of the edges of known likelihood that would join two components and contradict other such
+    edges."""
     out = np.zeros(len(m), dtype=bool)
     rows = state.open()
     rows = rows[np.isfinite(m.log_odds_wrong[rows])]
@@ -79,16 +80,18 @@ def find_contested_edges(m: Measurements, state: State, params: Params) -> np.nd
 
 
 def _exclude_suspects(m: Measurements, state: State, row: int, loop: np.ndarray, params: Params) -> bool:
-    """Decide between an edge and the accepted edges that it contradicts; True if any of these was excluded."""
+    """Decide between an edge and the accepted edges that it contradicts; return True if any accepted edge was
+    excluded."""
     suspects = np.r_[row, loop]
     probability = np.exp(m.log_odds_wrong[suspects] - m.log_odds_wrong[suspects].max())
     probability /= probability.sum()
     order = np.argsort(-probability, kind="stable")
-    # The fewest suspects that probably include the wrong one. If they are many, excluding all would lose right edges.
+    # The fewest suspects that probably include the wrong edge. If there are many, excluding all would lose correct
+    # edges.
     count = 1 + int(np.searchsorted(probability[order].cumsum(), params.min_wrong_probability - 1e-9))
     found = suspects[order[: count if count <= MAX_SUSPECTS else 1]]
     if count == 1:
-        state.rejected[found] = found != row  # the map stands where it is the contradicting edge
+        state.rejected[found] = found != row  # if the contradicting edge is wrong, the map stays as it is
     else:
         state.ambiguous[found] = state.undecided[found] = True
     excluded = bool(state.accepted[found].any())

@@ -1,4 +1,4 @@
-"""Cycle consistency over triangles: an edge that closes a triangle within the noise is supported by it."""
+"""Test cycle consistency over triangles: a triangle that closes within its noise supports its three edges."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ class CycleSupport:
     """Cycle support of E edges.
 
     Args:
-        agree: (E,) number of triangles that agree.
-        support: (E,) fraction of the pairs of a neighbour of one end and one of the other that an edge connects (or
-            that are one scene). High inside a place, whose scenes share neighbours; low for edges to a place that only
-            looks the same, unless every pair there was mistaken. Neighbours are counted over edges with an agreeing
-            triangle.
+        agree: (E,) number of agreeing triangles through each edge.
+        support: (E,) of all pairs of a neighbour of the edge's target and a neighbour of its source, the fraction that
+            an edge connects (or that are one scene). It is high inside a place, whose scenes share neighbours, and low
+            for edges to a place that only looks the same, unless every pair there was mistaken. Only edges with an
+            agreeing triangle count.
     """
 
     agree: np.ndarray
     support: np.ndarray
 
     def spread(self, rows: np.ndarray, count: int) -> CycleSupport:
-        """Extend the support of the edges at ``rows`` to all ``count`` edges; the others have none."""
+        """Extend the support of the edges at ``rows`` to all ``count`` edges; the remaining edges get no support."""
         agree, support = np.zeros(count, dtype=self.agree.dtype), np.zeros(count)
         agree[rows], support[rows] = self.agree, self.support
         return CycleSupport(agree, support)
@@ -51,17 +51,17 @@ class CycleSupport:
                 for k in range(0, len(a), 20_000)
             ]
         )
-        # Paths a - i - j - b, less those that walk the edge itself to and fro.
+        # Count paths a - i - j - b, without those that pass the edge a - b itself.
         paths = three - own * (degree[a] + degree[b] - 1)
-        # Half a path of three is assumed, so that few neighbours count for little.
+        # Half of a supporting path out of three is assumed beforehand, so that few neighbours have little effect.
         return cls(agree, (paths + shared + 0.5) / ((degree[a] - own) * (degree[b] - own) + 3.0))
 
 
 def count_cycle_support(edges: Measurements, probability: float) -> CycleSupport:
     """Count the triangles through every edge that close within their noise.
 
-    A triangle agrees if the chi-square of the product of its three measurements, with their covariances transported
-    to one frame, is below the quantile ``probability``. All triangles at once; no loop over edges.
+    A triangle agrees if the chi-square of the product of its three measurements, with their covariances transported to
+    one frame, is below the quantile ``probability``. All triangles are computed at once.
     """
     triangles, signs = list_triangles(edges.targets, edges.sources, edges.num_scenes)
     agrees = cycle_chi2(edges, triangles, signs) < chi2_quantile(probability, edges.dim)
@@ -71,12 +71,12 @@ def count_cycle_support(edges: Measurements, probability: float) -> CycleSupport
 def list_triangles(targets: np.ndarray, sources: np.ndarray, num_scenes: int) -> tuple[np.ndarray, np.ndarray]:
     """List all triangles of a multigraph.
 
-    Every edge is directed from its end of lower degree to the other, which bounds the pairs of edges to look at by
-    E^1.5 however many edges one scene has (Chiba and Nishizeki 1985).
+    Every edge is directed from its scene of lower degree to its scene of higher degree. This bounds the number of pairs
+    of edges by E^1.5, however many edges one scene has (Chiba and Nishizeki 1985).
 
     Returns:
-        (T, 3) edges a-b, b-c, a-c of each triangle; (T, 3) +1 where that edge is stored as (target, source) = (a, b),
-        (b, c), (c, a) in the cycle a -> b -> c -> a, else -1.
+        (T, 3) rows of the edges a-b, b-c and a-c of each triangle, and (T, 3) signs: +1 if the edge is stored as
+        (target, source) = (a, b), (b, c) or (c, a), along the cycle a -> b -> c -> a, otherwise -1.
     """
     degree = np.bincount(np.concatenate([targets, sources]), minlength=num_scenes)
     rank = np.empty(num_scenes, dtype=np.int64)
@@ -95,7 +95,7 @@ def list_triangles(targets: np.ndarray, sources: np.ndarray, num_scenes: int) ->
     b, c = np.where(swap, c, b), np.where(swap, b, c)
     first, second = np.where(swap, second, first), np.where(swap, first, second)
 
-    # The edges that close the pair; several where the two scenes are tied more than once.
+    # The edges that close the triangle; several if more than one edge connects the two scenes.
     start = np.searchsorted(key, b * num_scenes + c, side="left")
     pair, offset = ranges(np.searchsorted(key, b * num_scenes + c, side="right") - start)
     triangles = np.stack([order[first[pair]], order[start[pair] + offset], order[second[pair]]], axis=1)
@@ -104,10 +104,11 @@ def list_triangles(targets: np.ndarray, sources: np.ndarray, num_scenes: int) ->
 
 
 def cycle_chi2(edges: Measurements, cycles: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """Compute the chi-square (T,) of the product around each cycle of three edges, with D degrees of freedom.
+    """Compute the (T,) chi-square, with D degrees of freedom, of the product of the three edges around each triangle.
 
-    The noise of a stored edge sits on its source side; traversed forwards it already sits at the far end of that edge,
-    traversed backwards it is moved there by the adjoint. From there the rest of the cycle carries it to the start.
+    The noise of a stored edge is on its source side. If the edge is traversed forwards, that is its far end already; if
+    it is traversed backwards, the adjoint moves the noise to the far end. From there the rest of the cycle carries it
+    to the start.
     """
     dim = edges.dim
     total = Similarities.identity(len(cycles))

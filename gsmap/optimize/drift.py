@@ -12,26 +12,27 @@ from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.structure import component_labels, roots
 
-_MAX_EXACT_HOPS = 20_000_000  # shortest paths (scenes times sources); beyond it hops are estimated from the distance
+# Limit of scenes times sources of exact shortest paths; beyond it distances give an estimate.
+_MAX_EXACT_HOPS = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class DriftModel:
     """Uncertainty of the predicted relative pose of two scenes: a random walk along the accepted edges between them.
 
-    After h edges with rotation variance sr^2, translation variance st^2 and length l, a walk is off by h sr^2 in
-    rotation and h st^2 + sr^2 l^2 h^3 / 3 in position (the rotation errors act on ever longer levers). Further
-    paths only reduce the error, so that the bound errs on the side of comparing edges.
+    After h edges with rotation variance sr^2, translation variance st^2 and length l, a walk has the variance h sr^2 in
+    rotation and h st^2 + sr^2 l^2 h^3 / 3 in position (rotation errors act on ever longer levers). Parallel paths only
+    reduce the error, so the model rather accepts than rejects edges.
 
-    Assumes that the edges between are right and their errors independent, and that one typical edge stands for all:
-    a component that holds a wrong edge, or whose edges share a bias, drifts further than this.
+    Assumes that the accepted edges are correct and their errors independent, and that all edges are like the median
+    edge. A component with a wrong edge, or with edges that share a bias, drifts further.
 
     Args:
-        graph: (N, N) 1 where accepted edges join two scenes.
+        graph: (N, N) adjacency matrix of the scenes by accepted edges.
         labels: (N,) component of each scene.
-        depth: (N,) hops to the first scene of its component.
+        depth: (N,) number of edges from each scene to the first scene of its component.
         step: (4,) median variances of an edge in rotation, translation and log scale, and its length in map units.
-        poses: N.
+        poses: N poses of the scenes.
     """
 
     graph: sp.csr_matrix
@@ -67,11 +68,12 @@ class DriftModel:
         return cls(graph, labels, depth, step, poses)
 
     def bound(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return an upper bound of the hops from a to b: through the root of their component."""
+        """Return an upper bound of the number of edges from a to b: the path through the first scene of their
+        component."""
         return self.depth[a] + self.depth[b]
 
     def hops(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Compute the hops between scenes of one component."""
+        """Compute the number of edges on the shortest path between scenes of one component."""
         out = np.zeros(len(a))
         starts, which = np.unique(a, return_inverse=True)
         if len(starts) * len(self.depth) > _MAX_EXACT_HOPS:
@@ -85,7 +87,7 @@ class DriftModel:
         return np.minimum(out, self.bound(a, b))
 
     def variances(self, hops: np.ndarray, at: np.ndarray, dim: int) -> np.ndarray:
-        """Compute the diagonal covariance (K, dim) after ``hops``, in the unit of scene ``at``."""
+        """Return the diagonal (K, dim) of the covariance after ``hops`` edges, in the unit of scene ``at``."""
         rotation, translation, scale, length = self.step
         unit = np.exp(-2 * self.poses.log_scales[at])
         out = np.empty((len(hops), dim))

@@ -1,13 +1,15 @@
-"""Log-odds that an edge is wrong, against another edge that it contradicts, from the evidence of registration.
+"""Compute the log-odds that an edge is wrong, rather than another edge that it contradicts, from the evidence of
+registration.
 
 A repeated facade agrees with itself under any shift by a period, so disagreement alone misleads: a shifted facade
-disagrees less than two captures that see one place from afar and overlap by a third. But a right pose of much overlap
-has nearly no surface in free space, and its colours agree closely. The log-odds are linear in the figures; a constant
-common to all edges of a map (the noise of its captures) cancels where the edges of one loop are compared.
+disagrees less than two captures that see one place from afar and overlap by a third. But a correct pose with a large
+overlap has nearly no surface in free space, and its colours agree closely. The log-odds are linear in the features
+below. A constant that all edges of a map share (the noise of its captures) cancels when the edges of one loop are
+compared.
 
-Weights: conditional logistic regression of wrong against right poses of the same map, on made street fronts with
-exposure, bent and noisy geometry and floaters (``tools/bench/front.py --fit``). The number of false alarms is not
-used: a repeated facade violates the independence that it assumes, and nothing corrects it for self-similarity.
+The weights come from a conditional logistic regression of wrong against correct poses of the same map, on synthetic
+street facades with varying exposure, distorted and noisy geometry and floaters (``tools/bench/front.py --fit``). The
+number of false alarms is not used: a repeated facade violates the independence that it assumes.
 """
 
 from __future__ import annotations
@@ -17,17 +19,17 @@ from collections.abc import Mapping
 import numpy as np
 
 COLOUR, DISAGREEMENT, FREE_SPACE, OVERLAP = 1.0, 1.7, 2.4, 1.6
-"""Weights of the figures of `features`, natural log-odds."""
+"""Weights of the features of `features`, in natural log-odds."""
 
-_LEAST, _LEAST_COLOUR = 0.003, 0.02  # shares below these are noise of rendering
+_LEAST, _LEAST_COLOUR = 0.003, 0.02  # smaller shares are noise of rendering
 
 
 def features(evidence: Mapping[str, float], overlap: float) -> np.ndarray:
-    """Compute 4 figures that each rise with the odds that a pose is wrong; NaN where no cameras could judge.
+    """Compute 4 features that rise with the odds that a pose is wrong; NaN if no camera observed the common surface.
 
     Args:
-        evidence: of the registration, by name (`gsmap.types.Registration`).
-        overlap: share of surface cells that coincide under the pose, the smaller of both directions.
+        evidence: evidence of the registration, by name (`gsmap.types.Registration`).
+        overlap: share of surface cells that coincide under the pose; the smaller of both directions.
     """
     colour, disagreement, free_space = (
         evidence.get(name, float("nan")) for name in ("colour_correlation", "disagreement", "free_space_violation")
@@ -37,8 +39,8 @@ def features(evidence: Mapping[str, float], overlap: float) -> np.ndarray:
 
 
 def log_odds_wrong(evidence: Mapping[str, float], overlap: float) -> float:
-    """Compute the log-odds that a pose is wrong, up to a constant common to all edges; NaN where no cameras could
-    judge.
+    """Compute the log-odds that a pose is wrong, up to a constant that all edges share; NaN if no camera observed the
+    common surface.
 
     Args:
         evidence, overlap: as in `features`.

@@ -1,4 +1,4 @@
-"""Final solve: poses and covariances of each component in its own frame."""
+"""Final solve: compute the poses and covariances of each component in its own frame."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ class FinalPoses:
     """Final poses of all scenes.
 
     Args:
-        poses: N.
-        component: (N,) largest first; components that priors fix completely share one frame, that of the priors.
-        covariances: (N, 7, 7), zero where there is none.
-        notes: missing covariances.
-        world: ties to the world of the components with observations.
+        poses: N poses.
+        component: (N,) number of each scene's component, the largest first. All components that priors fix completely
+            share the frame of the priors and one number.
+        covariances: (N, 7, 7), zero where not computed.
+        notes: messages about missing covariances.
+        world: georeferences of the components with observations.
     """
 
     poses: Similarities
@@ -81,7 +82,7 @@ def solve_components(
         if len(own):
             poses = move_onto_priors(poses, scenes, anchor, own, m.dim)
             if not len(free_gauge_directions(poses, scenes, anchor, own, m.dim)):
-                # Its priors leave nothing open: it shares their frame with every other such component.
+                # The priors fix the component completely: it shares the frame of the priors with all such components.
                 component[scenes] = world = index if world is None else world
         if len(mine) or len(own):
             solution = solve(m[mine], poses, anchor, own, max_scenes)
@@ -89,7 +90,7 @@ def solve_components(
             if solution.covariances is not None:
                 covariances[scenes] = solution.covariances[scenes]
             elif params.marginals:
-                reason = solution.problem or f"more than max_marginal_scenes, {max_scenes}"
+                reason = solution.problem or f"optimize.max_marginal_scenes is {max_scenes}"
                 missing.append((int(scenes[0]), len(scenes), reason))
         if survey:
             held = anchor_directions(m[mine], poses, scenes, anchor, own)
@@ -105,6 +106,6 @@ def solve_components(
         f"no covariances in component {component[scene]} ({size} scenes): {reason}" for scene, size, reason in missing
     )
     placed: dict[int, Georeference] = {}
-    for scene, tie in ties:  # of components in one frame of priors, the largest gives the tie
+    for scene, tie in ties:  # if components share the frame of the priors, the largest gives the georeference
         placed.setdefault(int(component[scene]), replace(tie, component=int(component[scene])))
     return FinalPoses(poses, component, covariances, notes, tuple(placed.values()))

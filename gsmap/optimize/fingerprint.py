@@ -1,4 +1,4 @@
-"""64-bit fingerprint of the measurements that an answer was computed from."""
+"""64-bit fingerprint of the measurements from which an answer was computed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from gsmap.types.world import Survey
 
 
 def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = (), survey: Survey | None = None) -> int:
-    """Compute a 64-bit sum over hashes of all measurements, by which unchanged measurements are recognized.
+    """Compute a 64-bit sum of the hashes of all measurements, by which unchanged measurements are recognized.
 
-    Independent of the order of measurements, and additive over sets (modulo 2^64). It detects changes, not attacks.
+    The fingerprint is independent of the order of measurements, and additive over sets of measurements (modulo 2^64).
+    It detects changes, not attacks.
     """
     flat = [(e.S_target_source, e.information, _named(e), 2 + e.confirmed) for e in edges]
     flat += [(p.S_map_scene, np.diag(p.sigmas), f"{p.scene}\0{p.up!r}{p.up_sigma_rad!r}", 4) for p in priors]
@@ -35,5 +36,5 @@ def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = (), survey: Sur
 
 
 def _named(edge: Edge) -> str:
-    """Return the text that is hashed of an edge besides its numbers."""
+    """Return the part of an edge's hashed text that is not numbers."""
     return f"{edge.target}\0{edge.source}\0{edge.disagreement!r}{edge.same_visit!r}{edge.log_odds_wrong!r}"

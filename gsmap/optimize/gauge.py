@@ -14,17 +14,17 @@ from gsmap.geometry.umeyama import umeyama
 from gsmap.optimize.priors import UP, PriorTerms
 from gsmap.types import PoseGraph, Sim3
 
-_LOOSE = 10.0  # directions that priors fix no better (radians, component sizes) are held by the anchor
-_OUTLIER_SIGMAS = 5.0  # a prior is an outlier if it stays off by more than so many of its standard deviations,
-_OUTLIER_ROTATION_DEG = 10.0  # and by more than this, so that drift is not mistaken for an outlier
-_OUTLIER_DRAWS = 200  # random triples of position priors that are tried as the frame of a component
+_LOOSE = 10.0  # the anchor fixes directions in which priors are looser (radians, component sizes)
+_OUTLIER_SIGMAS = 5.0  # a prior is an outlier if its residual exceeds this many of its standard deviations,
+_OUTLIER_ROTATION_DEG = 10.0  # and this angle (or the length of an edge), so that drift is no outlier
+_OUTLIER_DRAWS = 200  # number of random triples of position priors from which the frame of a component is tried
 
 
 def choose_anchor(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGraph | None) -> int:
-    """Choose the scene that fixes the component's frame: its oldest one from the largest component it had before.
+    """Choose the scene that fixes the component's frame: its oldest scene that was in the largest previous component.
 
-    Scenes come oldest first, so a component that absorbs another keeps its frame, and solving again moves no scene
-    without need.
+    Scenes come oldest first, so a component that absorbs another component keeps its frame, and solving again moves no
+    scene without need.
     """
     if previous is None:
         return int(scenes[0])
@@ -40,11 +40,11 @@ def choose_anchor(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: Pose
 def free_gauge_directions(
     poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int
 ) -> np.ndarray:
-    """Compute the directions (K, dim), as steps of the anchor, in which the component moves without residual of its
-    priors.
+    """Compute the directions (K, dim), as steps of the anchor, in which the component moves without changing the
+    residuals of its priors.
 
-    All of them (K = dim) without priors; none if the priors fix rotation, position and, in a graph of similarities,
-    scale.
+    Without priors these are all directions (K = dim); none if the priors fix rotation, position and, in a graph of
+    similarities, scale.
     """
     if not len(priors):
         return np.eye(dim)
@@ -59,7 +59,7 @@ def free_gauge_directions(
 
 
 def move_onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose: Sim3) -> Similarities:
-    """Move a component as one so that its anchor has the given pose."""
+    """Move a component as a whole so that its anchor has the given pose."""
     rows = np.full(len(scenes), anchor)
     move = Similarities.stack([pose] * len(scenes)) @ poses[rows].inverse()
     return poses.replaced(scenes, (move @ poses[scenes]).orthonormalised())
@@ -68,10 +68,10 @@ def move_onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose:
 def move_onto_priors(
     poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int
 ) -> Similarities:
-    """Move a component as a whole to fit its priors; the directions that they leave open stay.
+    """Move a component as a whole to fit its priors; it does not move along directions that the priors leave open.
 
-    A closed-form guess from full poses, positions or up directions, then Gauss-Newton over the component's own degrees
-    of freedom.
+    A closed-form estimate from full poses, positions or up directions is refined by Gauss-Newton over the component's
+    own degrees of freedom.
     """
     if not len(priors):
         return poses
@@ -92,13 +92,15 @@ def move_onto_priors(
 
 
 def find_outlier_priors(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarray:
-    """Find outlier priors (P,): those far off under the motion of the component that satisfies most priors.
+    """Return a (P,) mask of outlier priors: those with large residuals after the motion of the component that satisfies
+    most priors.
 
-    Far is more than `_OUTLIER_SIGMAS`, and than `_OUTLIER_ROTATION_DEG` or a typical edge's length. The motions tried
-    are those of single full poses and of triples of positions, drawn with a fixed seed.
+    A residual is large if it exceeds `_OUTLIER_SIGMAS` and, for a rotation, `_OUTLIER_ROTATION_DEG` or, for a position,
+    the length of a typical edge. The motions tried come from single full poses and from triples of positions, drawn
+    with a fixed seed.
 
     Args:
-        length: of a typical edge.
+        length: length of a typical edge in map units.
     """
     knows = priors.root_weights > 0
     motions = []
@@ -122,7 +124,7 @@ def find_outlier_priors(poses: Similarities, priors: PriorTerms, length: float) 
             turn = np.maximum(np.radians(_OUTLIER_ROTATION_DEG), _OUTLIER_SIGMAS / priors.root_weights[:, :3].min(1))
         angle = np.linalg.norm(rotation_vectors(priors.expected.rotations.transpose(0, 2, 1) @ moved.rotations), axis=1)
         good = (shift < allowed) & (angle < turn)
-        # Of motions that satisfy equally many, the closer one: positions along a line allow two.
+        # Of motions that satisfy equally many priors, take the closer one: positions along a line allow two motions.
         worth = good.sum() - 0.5 * float(((shift / allowed) ** 2)[good].mean()) if good.any() else 0.0
         best, most = (good, worth) if worth > most else (best, most)
     return ~best if best.any() else best

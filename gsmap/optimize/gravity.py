@@ -1,4 +1,4 @@
-"""Upright components: align z of the map with the vertical of its scenes."""
+"""Turn components upright: align z of the map with the vertical of its scenes."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from gsmap.optimize.params import Params
 from gsmap.types import PoseGraph, ScenePose, Sim3
 from gsmap.types.world import Georeference
 
-_MIN_AGREEMENT = 0.5  # length of the median of unit up directions below which scenes disagree on up
+_MIN_AGREEMENT = 0.5  # if the median of the unit up directions is shorter, the scenes disagree
 
 
 def gravity_align(
     graph: PoseGraph, ups: Mapping[str, np.ndarray], fixed: Collection[str] = (), params: Params | None = None
 ) -> PoseGraph:
-    """Rotate every component as a whole so that up is +z, unless it nearly is already.
+    """Rotate every component as a whole so that up is +z, unless the component is nearly upright already.
 
-    Poses relative to each other, and covariances (which are on the scenes' side), do not change.
+    Relative poses do not change, nor do covariances, which are on the scenes' side.
 
     Args:
         ups: (3,) direction against gravity in the scene's frame, by scene id, where known.
-        fixed: scenes held by a prior; their components stay as they are.
+        fixed: scenes with a pose prior; their components stay as they are.
         params: ``max_tilt_deg`` is used.
     """
     params = params or Params()
@@ -53,7 +53,7 @@ def gravity_align(
 
 
 def _turned(tie: Georeference, turn: Sim3) -> Georeference:
-    """Return the world tie of a component whose frame was turned."""
+    """Return the georeference of a component whose frame was rotated."""
     if tie.S_world_map is None or tie.covariance is None:
         return tie
     to_new = Similarities.stack([turn]).adjoint()[0]

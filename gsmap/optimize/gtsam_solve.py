@@ -1,4 +1,4 @@
-"""Exact solve with GTSAM: Levenberg-Marquardt and marginal covariances of one component without outlier edges."""
+"""Exact solve with GTSAM: Levenberg-Marquardt and marginal covariances of one component, without outlier edges."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.priors import PriorTerms
 
 GAUGE_SIGMAS = np.array([1e-4] * 3 + [1e-3] * 3 + [1e-4])
-"""(7,) standard deviations with which an anchor is held: radians, its own unit, log scale."""
+"""(7,) standard deviations of the gauge prior of an anchor: radians, the anchor's own unit, log scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,10 +22,10 @@ class Solution:
     """Result of `solve`.
 
     Args:
-        poses: all of them, those of other scenes as given.
-        covariances: (N, 7, 7) marginals on the scene side, zero for other scenes and in the log scale of a rigid
-            graph; None where they were not requested or could not be computed.
-        problem: reason why they could not be computed.
+        poses: poses of all scenes; scenes that the solve did not reach keep the given poses.
+        covariances: (N, 7, 7) marginals on the scene side, zero for scenes that the solve did not reach and in the log
+            scale of a rigid graph; None if not requested or not computable.
+        problem: reason why the covariances could not be computed.
     """
 
     poses: Similarities
@@ -34,13 +34,14 @@ class Solution:
 
 
 def solve(edges: Measurements, poses: Similarities, anchor: int, priors: PriorTerms, marginal_scenes: int) -> Solution:
-    """Optimize the scenes that ``edges`` reach, from a good guess, with one gauge prior on ``anchor``.
+    """Optimize the poses of the scenes that ``edges`` reach, from good initial poses, with one gauge prior on
+    ``anchor``.
 
-    The cost is gtsam's: half the sum of ``xi^T information xi`` with ``xi = Log(S_target_source^-1 S_target^-1
-    S_source)``, as of its `BetweenFactor`, plus the priors' terms.
+    The cost is that of GTSAM: half the sum of ``xi^T information xi`` with ``xi = Log(S_target_source^-1 S_target^-1
+    S_source)``, as in its `BetweenFactor`, plus the terms of the priors.
 
     Args:
-        marginal_scenes: largest number of scenes for which covariances are computed; 0 for never.
+        marginal_scenes: covariances are computed for at most this many scenes; 0 for none.
     """
     dim = edges.dim
     scenes = np.unique(np.r_[edges.targets, edges.sources, anchor])
@@ -64,14 +65,16 @@ def solve(edges: Measurements, poses: Similarities, anchor: int, priors: PriorTe
     try:
         return Solution(out, _marginals(factors, values, scenes, len(poses), dim))
     except RuntimeError as error:
-        # So badly conditioned (scales or levers of many powers of ten) that no covariance means anything.
+        # The system is so badly conditioned (scales or levers over many powers of ten) that covariances are
+        # meaningless.
         return Solution(out, None, str(error).strip().splitlines()[0] if str(error).strip() else "singular")
 
 
 def anchor_directions(
     edges: Measurements, poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms
 ) -> np.ndarray:
-    """Compute the whitened steps (K, D) of the anchor in which it is fixed: those that no prior determines."""
+    """Compute the whitened steps (K, D) in which the gauge prior fixes the anchor: the directions that no prior
+    determines."""
     held = free_gauge_directions(poses, scenes, anchor, priors, edges.dim)
     full = len(held) == edges.dim
     out: np.ndarray = held / (GAUGE_SIGMAS[: edges.dim] if full else np.full(edges.dim, GAUGE_SIGMAS[0]))
@@ -149,7 +152,7 @@ def _marginals(
 
 
 def objective(edges: Measurements, poses: Similarities) -> float:
-    """Compute GTSAM's ``graph.error`` of the edges alone: half the sum of their chi-squares."""
+    """Return the objective of the edges alone as GTSAM computes it: half the sum of their chi-squares."""
     values = gtsam.Values()
     for scene in np.unique(np.r_[edges.targets, edges.sources]).tolist():
         values.insert(scene, to_gtsam(poses, scene, edges.dim))

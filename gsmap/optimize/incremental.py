@@ -1,4 +1,4 @@
-"""Incremental placement of new scenes in a solved map, by their own edges and a solve of their neighbourhood."""
+"""Place new scenes in a solved map, by the edges of the new scenes and a solve of their neighbourhood."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from gsmap.optimize.structure import component_labels
 from gsmap.types import Edge, EdgeOutcome, PoseGraph, Prior, ScenePose, Sim3
 from gsmap.types.world import Survey
 
-_NEIGHBOURHOOD_HOPS = 2  # around a new scene's neighbours, that give way to it; the outermost scenes stay
+# Scenes within this many edges of a new scene's neighbours are solved; the outermost scenes stay fixed.
+_NEIGHBOURHOOD_HOPS = 2
 
 
 def place_new(
@@ -36,12 +37,12 @@ def place_new(
     params: Params,
     survey: Survey,
 ) -> PoseGraph | None:
-    """Place the new scenes in the previous answer, or return None where only a full solve will do.
+    """Place the new scenes in the previous answer; return None where only a full solve is correct.
 
-    A full solve is due when scenes, measurements between old scenes or the recipe changed, when the map grew by
-    ``params.max_growth`` since the last one, or when a new scene joins components, closes a long loop or has edges that
-    are doubtful or contradict each other. Poses placed here are provisional: only the neighbourhood of a new scene is
-    solved with it.
+    A full solve is due if scenes, measurements between old scenes or the recipe changed; if the map grew by
+    ``params.max_growth`` since the last full solve; or if a new scene joins components, closes a long loop or has edges
+    that are doubtful or contradict each other. Poses placed here are provisional: only the neighbourhood of a new scene
+    is solved with it.
     """
     new = _to_place(scene_ids, previous, params)
     if not new or not {*survey.scenes(), *(prior.scene for prior in priors)} <= set(previous.poses):
@@ -57,7 +58,7 @@ def grow(scene_ids: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, p
     """Place new scenes like `place_new`, if all measurements between old scenes, priors and observations are unchanged.
 
     Args:
-        edges: those between the `surroundings`; the others are not needed.
+        edges: the edges between scenes of the `surroundings`; no further edges are needed.
     """
     new = _to_place(scene_ids, previous, params)
     return _place_all(scene_ids, new, edges, previous, params) if new else None
@@ -66,10 +67,11 @@ def grow(scene_ids: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, p
 def surroundings(
     scene_ids: Sequence[str], pairs: Sequence[tuple[str, str]], previous: PoseGraph, params: Params
 ) -> tuple[set[str], set[str]]:
-    """Return the scenes needed to place the new ones, with two more rings around them, and the outermost ring.
+    """Return the scenes needed to place the new scenes, with two more rings of neighbours, and the outermost ring.
 
-    All edges of scenes inside the outermost ring are between the returned scenes, so that the result is exact if no
-    scene of that ring moves (`keep_unchanged_poses` may move more scenes). Empty where only a full solve will do.
+    All edges of scenes inside the outermost ring are between the returned scenes, so the result is exact if no scene of
+    that ring moves (`keep_unchanged_poses` may move more scenes). Both sets are empty where only a full solve is
+    correct.
 
     Args:
         pairs: (target, source) of all edges that may be used.
@@ -89,7 +91,7 @@ def surroundings(
 
 
 def _to_place(scene_ids: Sequence[str], previous: PoseGraph, params: Params) -> list[str]:
-    """Return the new scenes; none where they may not be placed one by one."""
+    """Return the new scenes in the order of placing; empty if they may not be placed one by one."""
     known, provenance = previous.poses, previous.provenance
     new = [scene for scene in scene_ids if scene not in known]
     if provenance.recipe != recipe_key(params).recipe or not provenance.measured or params.max_growth <= 0:
@@ -141,7 +143,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     mine = np.flatnonzero(after == after[-1])[:-1]
     if len(np.unique(before[mine])) > 1:
         return None
-    # A scene that one edge connects and another contradicts needs the whole map to decide.
+    # If one edge connects a scene and another one contradicts it, only the whole map can decide.
     at_odds = np.union1d(
         find_contradicting_edges(m, state, params), np.flatnonzero(find_contested_edges(m, state, params))
     )
@@ -152,7 +154,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     covariances = np.zeros((m.num_scenes, 7, 7))
     components = np.array([previous.poses[s].component for s in near] + [component])
     if len(mine):
-        # Joining moved whichever component was smaller; the map keeps its frame.
+        # Joining moved the smaller component; the map keeps its frame.
         first = mine[:1]
         back = poses[first] @ state.poses[first].inverse()
         state.poses = state.poses.replaced(np.array([len(near)]), back @ state.poses[np.array([len(near)])])
@@ -182,20 +184,20 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
         outcomes[key] = outcome if key in own_keys else _updated(previous.outcomes[key], outcome)
     notes = previous.notes
     if params.marginals and len(mine) and all(previous.poses[near[k]].covariance is None for k in mine.tolist()):
-        notes += (f"the covariance of scene {scene} counts from its neighbours, which have none",)
+        notes += (f"the covariance of scene {scene} is relative to its neighbours, which have no covariance",)
     return replace(previous, poses=poses_now, outcomes=outcomes, notes=notes)
 
 
 def _updated(old: EdgeOutcome, new: EdgeOutcome) -> EdgeOutcome:
-    """Update an edge between old scenes after a scene was placed beside it: it may only gain."""
+    """Update an edge between old scenes after a scene was placed beside it: an unused edge may become used, never the
+    reverse."""
     residual = old.residual_chi2 if new.residual_chi2 is None else new.residual_chi2
     return EdgeOutcome("used", residual) if new.use == "used" else replace(old, residual_chi2=residual)
 
 
 def _surroundings(scene: str, own: list[Edge], taken: list[Edge], hops: int) -> tuple[list[str], set[str], list[Edge]]:
-    """Return scenes within ``hops`` of the new scene's neighbours, the outermost of them, and the edges between
-    them.
-    """
+    """Return the scenes within ``hops`` edges of the new scene's neighbours, the outermost of these scenes, and the
+    edges between them."""
     reached = {e.source if e.target == scene else e.target: 0 for e in own}
     for hop in range(1, hops + 1):
         ring = {b for e in taken for a, b in ((e.target, e.source), (e.source, e.target)) if reached.get(a) == hop - 1}
@@ -207,9 +209,8 @@ def _surroundings(scene: str, own: list[Edge], taken: list[Edge], hops: int) -> 
 
 
 def _covariance(scene: int, rows: np.ndarray, m: Measurements, poses: Similarities, old: list[ScenePose]) -> np.ndarray:
-    """Estimate a provisional covariance: that of the best neighbour, propagated, plus that of the new scene's own
-    edges.
-    """
+    """Estimate a provisional covariance: the best neighbour's covariance, propagated, plus the covariance of the new
+    scene's edges."""
     dim = m.dim
     own = rows[(m.sources[rows] == scene) | (m.targets[rows] == scene)]
     information = np.zeros((dim, dim))

@@ -1,4 +1,4 @@
-"""Density of the edges between two parts of a map, which separates adjacent places from similar ones."""
+"""Compute the density of edges between two parts of a map, which separates adjacent places from similar places."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from scipy.special import betaln
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
 
-_SINGLE_WRONG = 0.3  # prior probability that a link of one edge is wrong
-_GROUP_WRONG = 0.01  # the same of a link of several edges that agree
-_NEAR_LENGTHS = 1.25  # scenes nearer than so many typical edges are near each other
+_SINGLE_WRONG = 0.3  # prior probability that a link of one edge is wrong ...
+_GROUP_WRONG = 0.01  # ... and that a link of several agreeing edges is wrong
+_NEAR_LENGTHS = 1.25  # two scenes are near each other below this distance, in lengths of a typical edge
 _CONCENTRATION = 20.0  # of the Beta distribution of the density of true links, in pairs
-_SPARSER = 3.0  # factor by which links between places that look alike are sparser than true ones
+_SPARSER = 3.0  # links between places that look alike are sparser than true links by this factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +23,9 @@ class Link:
     """A set of edges that connects two parts of a map.
 
     Args:
-        rows: its edges.
-        moving: (N,) bool, the side that would move.
-        log_odds_wrong: log odds that it is wrong; see `LinkDensity`.
+        rows: rows of the link's edges.
+        moving: (N,) mask of the scenes on the side that would move.
+        log_odds_wrong: log-odds that the link is wrong; see `LinkDensity`.
     """
 
     rows: np.ndarray
@@ -35,17 +35,17 @@ class Link:
 
 @dataclass(frozen=True)
 class LinkDensity:
-    """Density of the edges of a map, against which the density of a link is compared.
+    """Density of the edges of a map, with which the density of a link is compared.
 
-    Assumption: a true link has edges as often as any part of the map, one between places that look alike only where
-    registration was mistaken. Of the nearby pairs of a link's end scenes, one of either part, the fraction with an
-    edge is Beta distributed about that of the whole map for a true link, and about a part of it (`_SPARSER`) for a
-    wrong one. It fails where every pair of two places was mistaken, and where a true link is sparse because few
-    pairs were tried.
+    Assumption: a true link has edges as often as any part of the map; a link between places that look alike has edges
+    only where registration was mistaken. Consider the pairs of nearby scenes at the ends of a link, one scene from
+    either part. For a true link the fraction of pairs with an edge is Beta distributed about the fraction of the whole
+    map, for a wrong link about that fraction divided by `_SPARSER`. The assumption fails where every pair of two places
+    was mistaken, and where a true link is sparse because few pairs were tried.
 
     Args:
-        length: distance in map units up to which scenes are near each other.
-        share: fraction of near pairs with an edge.
+        length: largest distance of nearby scenes, in map units.
+        share: fraction of the pairs of nearby scenes that have an edge.
     """
 
     length: float
@@ -60,18 +60,18 @@ class LinkDensity:
         poses: Similarities,
     ) -> LinkDensity:
         length = _NEAR_LENGTHS * typical_length(edges, poses)
-        # Components have frames of their own: a fourth coordinate keeps them apart.
+        # Each component has its own frame, so a fourth coordinate separates components.
         apart = np.c_[poses.translations, 10.0 * length * labels]
         near = cKDTree(apart).query_pairs(length, output_type="ndarray")
         pairs = np.bincount(near.ravel(), minlength=edges.num_scenes)
         tied = np.bincount(_tied(edges, np.flatnonzero(accepted), poses, length).ravel(), minlength=edges.num_scenes)
         busy = pairs > 0
-        # The median scene's: where the map is folded, scenes that are not neighbours lie together.
+        # The median over scenes: where the map is folded, scenes that are no neighbours lie close together.
         share = np.median(tied[busy] / pairs[busy]) if busy.any() else 0.5
         return cls(length, float(np.clip(share, 0.05, 0.9)))
 
     def link(self, edges: Measurements, rows: np.ndarray, moving: np.ndarray, poses: Similarities) -> Link:
-        """Return a link with the log-odds that it is wrong."""
+        """Return a link of the edges at ``rows`` with the log-odds that it is wrong."""
         ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
         still = cKDTree(poses.translations[ends[~moving[ends]]])
         pairs = int(still.count_neighbors(cKDTree(poses.translations[ends[moving[ends]]]), self.length))
@@ -84,14 +84,14 @@ class LinkDensity:
 
 
 def _tied(edges: Measurements, rows: np.ndarray, poses: Similarities, length: float) -> np.ndarray:
-    """Return the pairs (P, 2) of nearby scenes that the edges at ``rows`` connect."""
+    """Return the pairs (P, 2) of nearby scenes that are connected by the edges at ``rows``."""
     ends = np.sort(np.stack([edges.targets[rows], edges.sources[rows]], axis=1), axis=1)
     near = np.linalg.norm(poses.translations[ends[:, 0]] - poses.translations[ends[:, 1]], axis=1) <= length
     return np.unique(ends[near], axis=0)
 
 
 def typical_length(edges: Measurements, poses: Similarities) -> float:
-    """Compute the median length of an edge in map units; 0 without edges."""
+    """Compute the median length of the edges in map units; 0 without edges."""
     if not len(edges):
         return 0.0
     unit = np.exp(poses.log_scales[edges.targets])

@@ -22,11 +22,11 @@ class Measurements:
         scene_ids: N ids, in the caller's order.
         targets, sources: (E,) rows of ``scene_ids``.
         measured: E measured ``S_target_source``.
-        information: (E, D, D); D is 6 where every edge is rigid, whatever the scale is then, else 7.
-        confirmed: (E,) bool.
-        disagreement: (E,) share of the surface seen twice that is not the same, NaN where unknown.
-        same_visit: (E,) bool, both captures are of one visit, so that nothing changed between them.
-        log_odds_wrong: (E,) of the evidence, up to a constant; NaN where unknown.
+        information: (E, D, D) information matrices; D is 6 if every edge is rigid, otherwise 7.
+        confirmed: (E,) mask of edges that a person confirmed.
+        disagreement: (E,) share of the surface seen in both captures that differs; NaN if unknown.
+        same_visit: (E,) mask of edges whose captures are of one visit, so that nothing changed between them.
+        log_odds_wrong: (E,) log-odds by the evidence that the edge is wrong, up to a constant; NaN if unknown.
     """
 
     scene_ids: tuple[str, ...]
@@ -52,17 +52,17 @@ class Measurements:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """(E, D, D)."""
+        """(E, D, D) covariances, the inverse information."""
         return np.linalg.inv(self.information)
 
     @cached_property
     def keys(self) -> list[tuple[str, str]]:
-        """(target, source) ids by edge."""
+        """(target, source) ids of each edge."""
         ids = self.scene_ids
         return [(ids[a], ids[b]) for a, b in zip(self.targets.tolist(), self.sources.tolist(), strict=True)]
 
     def __getitem__(self, rows: np.ndarray) -> Measurements:
-        """Select some of the edges, between the same scenes."""
+        """Select some of the edges; the scenes stay."""
         return Measurements(
             self.scene_ids,
             self.targets[rows],
@@ -77,10 +77,10 @@ class Measurements:
 
 
 def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool | None = None) -> Measurements:
-    """Check the edges and stack them.
+    """Check the edges and stack them in arrays.
 
     Args:
-        rigid: force the 6 (True) or 7 (False) dimensional form; None chooses 6 where every edge has scale 1.
+        rigid: use 6 (True) or 7 (False) dimensions; None chooses 6 if every edge has scale 1.
 
     Raises:
         InputError: names the first edge that is unusable, and why: a scene that is missing, a self-edge, the same
@@ -132,7 +132,7 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
 
 
 def all_rigid(edges: Sequence[Edge], priors: Sequence[Prior], previous: PoseGraph | None) -> bool:
-    """Return True if no measurement has a scale, so that six dimensions suffice."""
+    """Return whether no measurement has a scale, so that six dimensions suffice."""
     return (
         all(e.S_target_source.is_rigid for e in edges)
         and all(p.S_map_scene.is_rigid for p in priors)
@@ -141,7 +141,7 @@ def all_rigid(edges: Sequence[Edge], priors: Sequence[Prior], previous: PoseGrap
 
 
 def check_priors(scene_ids: Sequence[str], priors: Sequence[Prior]) -> None:
-    """Raise `InputError` naming the first prior that is unusable."""
+    """Raise `InputError` that names the first prior that is unusable."""
     known = set(scene_ids)
     for prior in priors:
         check_sim3(prior.S_map_scene, f"S_map_scene of the prior of scene {prior.scene!r}")
@@ -150,7 +150,8 @@ def check_priors(scene_ids: Sequence[str], priors: Sequence[Prior]) -> None:
             raise InputError(f"prior names scene {prior.scene!r}, which is not in the map", code="unknown_scene")
         if sigmas.shape != (7,) or np.isnan(sigmas).any() or (sigmas <= 0).any():
             raise InputError(
-                f"prior of scene {prior.scene!r} needs 7 positive sigmas, inf where unknown; got {sigmas.tolist()}",
+                f"prior of scene {prior.scene!r} needs 7 positive sigmas (inf for an unknown component), got "
+                f"{sigmas.tolist()}",
                 code="invalid_sigma",
             )
         if prior.up is not None:
@@ -164,7 +165,8 @@ def check_priors(scene_ids: Sequence[str], priors: Sequence[Prior]) -> None:
 
 
 def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
-    """Validate information matrices: GTSAM's noise models accept NaN, singular and non-SPD ones silently."""
+    """Check the information matrices, because GTSAM's noise models silently accept NaN, singular and indefinite
+    matrices."""
     if not len(information):
         return
     finite = np.isfinite(information).all((1, 2))
@@ -180,7 +182,7 @@ def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
             f"edge {_name(edges[int(np.argmax(skewed))])} has an information matrix that is not symmetric",
             code="invalid_information",
         )
-    # Scale to a unit diagonal first: a stiff scale row beside soft ones is well posed, however large the ratio.
+    # Scale to a unit diagonal first: a matrix with one very stiff row (the scale) is well posed after scaling.
     diagonal = np.einsum("eii->ei", information)
     bad = (diagonal <= 0).any(1)
     if not bad.any():
@@ -189,8 +191,8 @@ def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
     if bad.any():
         raise InputError(
             f"edge {_name(edges[int(np.argmax(bad))])} has an information matrix that is not positive definite: "
-            "every direction needs some certainty; reject the edge, or remove and ingest its captures again where an "
-            "older gsmap took them in at map coordinates",
+            "every direction needs some certainty. Reject the edge; if an older gsmap ingested its captures at map "
+            "coordinates, remove and ingest them again",
             code="invalid_information",
         )
 

@@ -1,4 +1,4 @@
-"""Settings of the pose-graph optimization; importing them loads no solver."""
+"""Settings of the pose-graph optimization, in a module of their own that loads no solver."""
 
 from __future__ import annotations
 

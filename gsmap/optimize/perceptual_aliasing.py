@@ -1,12 +1,13 @@
-"""Perceptual aliasing: groups of edges that agree with each other and contradict the map, because places look alike.
+"""Detect perceptual aliasing: groups of edges that agree with each other and contradict the map, because places look
+alike.
 
-One such edge is noise; a group means that two places look the same, or that the map is folded. The group alone does not
-decide between both; the weight of the edges that connect the map the other way round does.
+A single such edge is noise; a group means that two places look the same, or that the map is folded. The group alone
+does not decide between both; the edges that connect the map the other way round decide by their weight.
 
 Assumptions: of the links of one contradictory loop exactly one is wrong; links are wrong independently of each other;
-and a wrong link is sparser than the map around it (`gsmap.optimize.link_density`). They fail where a place is torn and
-mistaken for another one at once, where every pair of two places was mistaken, and where so few edges lead round that a
-true link is as sparse as a wrong one: the map may then fold, or single scenes get a wrong pose.
+and a wrong link is sparser than the map around it (`gsmap.optimize.link_density`). They fail where a place is both torn
+apart and mistaken for another place, where every pair of two places was mistaken, and where a true link has so few
+edges that it is as sparse as a wrong link: the map may then fold, or single scenes get a wrong pose.
 """
 
 from __future__ import annotations
@@ -30,29 +31,32 @@ from gsmap.optimize.params import Params
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.structure import component_labels
 
-_SPARE_RATIO = 3.0  # where no link is surely wrong, links so many times less probable than the likeliest are spared
-_WELL_SUPPORTED = 0.5  # edges with this share of the median support lie within a place, and are considered first
-_CUT_DEPTH = 5  # recursion to either side of the lightest cut of a loop
-_SUPPORT_POWER = 3.0  # an edge weighs this power of its share of agreeing neighbours when a loop is cut
-_PRIOR_SUPPORT_POWER = 2.0  # the same where contradicting priors are separated
-_MIN_MOTION_LENGTHS = 2.0  # a group matters if it demands a motion of more than so many typical edges
-_GROUP_LENGTHS = 1.0  # edges that demand motions within so many typical edges may be one group
-_CONTESTED_RATIO = 3  # scenes of which more than one edge in so many crosses a wrong link belong to neither side
-_PRIOR_EDGES = 10.0  # a prior weighs as much as so many edges without a triangle,
-_PRIOR_FACTOR = 2.0  # and is outweighed by a cut of more than so many times its weight
+# If no link is surely wrong, links are kept that are this many times less probably wrong than the worst.
+_SPARE_RATIO = 3.0
+# Edges with at least this share of the median support lie within a place; they are considered first.
+_WELL_SUPPORTED = 0.5
+_CUT_DEPTH = 5  # recursion depth on either side of the lightest cut of a loop
+_SUPPORT_POWER = 3.0  # when a loop is cut, the weight of an edge is its share of agreeing neighbours to this power
+_PRIOR_SUPPORT_POWER = 2.0  # the same power where contradicting priors are separated
+_MIN_MOTION_LENGTHS = 2.0  # a group matters if it demands a motion of more than this, in lengths of a typical edge
+_GROUP_LENGTHS = 1.0  # edges may form a group if the motions that they demand differ by less, in the same unit
+# A scene belongs to neither side of a wrong link if more than one in this many of its edges crosses it.
+_CONTESTED_RATIO = 3
+_PRIOR_EDGES = 10.0  # a prior has the weight of this many edges without a triangle,
+_PRIOR_FACTOR = 2.0  # and a cut of more than this many times its weight outweighs it
 MAX_WEIGHT = 20_000  # sums of weights must stay within 32 bits
-# The side of this direction separates a motion from its inverse; no motion is likely to be perpendicular to it.
+# The sign along this direction distinguishes a motion from its inverse; no likely motion is perpendicular to it.
 _GENERIC = np.array([0.8164, 0.5213, 0.2483])
 
 
 @dataclass(eq=False)
 class AliasingResult:
-    """Edges of contradictory loops, as (E,) bool.
+    """Edges of contradictory loops, as (E,) masks.
 
     Args:
         wrong: edges that are wrong.
-        right: edges of groups that are right against the map.
-        undecided: edges that may be wrong, where the evidence does not decide.
+        right: edges of groups that are correct although they contradict the map.
+        undecided: edges that may be wrong, but the evidence does not decide.
     """
 
     wrong: np.ndarray
@@ -72,15 +76,15 @@ def resolve_aliased_loops(
     cycles: CycleSupport,
     params: Params,
 ) -> AliasingResult:
-    """Find the edges to exclude, and the groups of edges that contradict them.
+    """Find the edges to exclude, and the groups of edges that contradict the edges to exclude.
 
-    A group of edges demands that one part of a component moves against another. It forms a loop with the accepted links
-    on the way round, and one link of the loop is wrong. A link that is probably wrong is excluded (the map stands if it
-    is the group); where none is, the group and all links that may be wrong are undecided, and the parts that they
-    connect become components.
+    A group of edges demands that one part of a component moves relative to another part. The group forms a loop with
+    the accepted links between both parts, and one link of the loop is wrong. A link that is probably wrong is excluded;
+    if that is the group, the map stays as it is. If no link is probably wrong, the group and all links that may be
+    wrong are undecided, and the parts that these links connect become separate components.
 
     Args:
-        settled: (E,) bool, edges that were excluded before and do not count.
+        settled: (E,) mask of edges that were excluded before and do not count.
     """
     found = AliasingResult.none(len(edges))
     labels = component_labels(edges, np.flatnonzero(accepted))
@@ -91,8 +95,8 @@ def resolve_aliased_loops(
     length = typical_length(edges, poses)
     density = LinkDensity.of(edges, accepted, labels, poses)
     drift = DriftModel.over(edges, np.flatnonzero(accepted), poses)
-    # The edges of a torn place and the wrong edges that tore it demand one motion: edges inside the place are
-    # supported by their neighbours, and are considered first.
+    # Both the edges of a torn place and the wrong edges that tore it demand one motion. Edges inside the place are
+    # supported by their neighbours, so they are considered first.
     supported = cycles.support >= _WELL_SUPPORTED * np.median(cycles.support[accepted])
     for group in _groups(edges, rows, drift, length, params.gate_probability):
         inner = supported[group.rows]
@@ -115,13 +119,13 @@ def _decide(
     loop: list[Link],
     params: Params,
 ) -> None:
-    """Decide which link of a loop is wrong; the first of ``loop`` is the candidate, all or a part of the group."""
+    """Decide which link of a loop is wrong; the first link of ``loop`` is the candidate, all or a part of the group."""
     log_odds = np.array([link.log_odds_wrong for link in loop])
     probability = np.exp(log_odds - log_odds.max())
     probability /= probability.sum()
     worst = int(probability.argmax())
     if probability[worst] >= params.min_wrong_probability and worst > 0:
-        # A link that too few edges contradict is undecided, not wrong.
+        # A link that is contradicted by too few edges is undecided, not wrong.
         least = loop[worst].rows
         verdict = found.wrong if len(candidate.rows) >= params.min_bridge_edges or len(least) == 1 else found.undecided
         verdict[least] = True
@@ -135,12 +139,12 @@ def _decide(
         suspects = [
             link for link, p in zip(loop[1:], probability[1:], strict=True) if p * _SPARE_RATIO > probability[worst]
         ]
-        # If many are suspect, the wrong one is not clearly among them, and excluding all would lose right edges.
+        # If many links are suspect, the wrong one need not be among them, and excluding all would lose correct edges.
         suspects = suspects if len(suspects) <= MAX_SUSPECTS else []
         for link in suspects:
             found.undecided[link.rows] = True
             found.undecided |= _contested(edges, accepted, link.rows)
-        # After a cut deep in the loop other ways round may remain: then the group is considered again.
+        # After a cut deep in the loop other paths may connect both parts: then the group is considered again.
         parts = component_labels(edges, np.flatnonzero(accepted & ~found.undecided))
         if not suspects or (parts[group.near] != parts[group.far]).all():
             found.undecided[group.rows] = True
@@ -148,9 +152,8 @@ def _decide(
 
 @dataclass(frozen=True, eq=False)
 class EdgeGroup:
-    """Edges (``rows``) that demand one motion of the scenes at their ``far`` ends against those at their ``near``
-    ends.
-    """
+    """Edges (``rows``) that demand the same motion of the scenes at their ``far`` ends relative to the scenes at their
+    ``near`` ends."""
 
     rows: np.ndarray
     near: np.ndarray
@@ -161,7 +164,7 @@ class EdgeGroup:
         return EdgeGroup(self.rows[keep], self.near[keep], self.far[keep], self.motion)
 
     def hypothesis(self, edges: Measurements, density: LinkDensity, poses: Similarities) -> Link:
-        """Return the link that the group would be once its scenes have moved."""
+        """Return the link that the group would form once its scenes have moved."""
         ends = np.zeros(edges.num_scenes, dtype=bool)
         ends[self.far] = True
         moved = self.motion[np.zeros(len(self.far), dtype=np.int64)] @ poses[self.far]
@@ -169,7 +172,8 @@ class EdgeGroup:
 
 
 def _contested(edges: Measurements, accepted: np.ndarray, link: np.ndarray) -> np.ndarray:
-    """Find edges (E,) of scenes of which one edge in `_CONTESTED_RATIO` or more crosses a link; they join no side."""
+    """Return an (E,) mask of the edges of contested scenes, which join no side: one edge in `_CONTESTED_RATIO`, or
+    more, crosses the link."""
     n = edges.num_scenes
     across = np.bincount(np.r_[edges.targets[link], edges.sources[link]], minlength=n)
     rows = np.union1d(np.flatnonzero(accepted), link)
@@ -190,7 +194,7 @@ def _links(
     far: np.ndarray,
     depth: int,
 ) -> list[Link]:
-    """Find the weak links between two sets of scenes: the lightest cut, then those on either side of it."""
+    """Find the weak links between two sets of scenes: the lightest cut, then the lightest cuts on either side of it."""
     parts = smallest_cut(edges, accepted, cycles, near, far, _SUPPORT_POWER) if depth else None
     if parts is None:
         return []
@@ -211,14 +215,14 @@ def _links(
 def contradicted_priors(
     edges: Measurements, accepted: np.ndarray, poses: Similarities, cycles: CycleSupport, priors: PriorTerms
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the edges to exclude because priors at their ends contradict each other, and the priors that are outweighed.
+    """Find the edges to exclude because priors at their ends contradict each other, and the outweighed priors.
 
-    The priors of a component are compared under the motion of the component that satisfies most of them. Outliers
-    either belong to a part of the component that lies elsewhere, and the smallest cut to it is excluded, or they are
-    wrong, if that cut weighs more than `_PRIOR_FACTOR` times as much.
+    The priors of a component are compared under the motion of the component that satisfies most of them. Outlier priors
+    may belong to a part of the component that lies elsewhere: then the lightest cut between both parts is excluded. If
+    that cut weighs more than `_PRIOR_FACTOR` times as much as the outlier priors, they are wrong instead.
 
     Returns:
-        (E,) bool: cut edges; (P,) bool: outweighed priors.
+        An (E,) mask of the cut edges and a (P,) mask of the outweighed priors.
     """
     cut, outweighed = np.zeros(len(edges), dtype=bool), np.zeros(len(priors), dtype=bool)
     labels = component_labels(edges, np.flatnonzero(accepted))
@@ -246,14 +250,14 @@ def _groups(
     motion = poses[a] @ edges.measured[rows] @ poses[b].inverse()
     middle = poses.translations.mean(0)
     way = motion.apply(np.tile(middle, (len(rows), 1))) - middle
-    # The same disagreement, seen from its other end, is the inverse motion.
+    # The same disagreement, seen from the other end of the edge, is the inverse motion.
     turned = way @ _GENERIC < 0
     motion = motion.replaced(turned, motion[turned].inverse())
     directed = DirectedEdges.of(edges, rows, turned)
     corners = middle + 10 * length * np.eye(3)
     feature = np.concatenate([motion.apply(np.tile(c, (len(rows), 1))) - c for c in corners], axis=1)
     off = np.abs(feature).max(1) > _MIN_MOTION_LENGTHS * length
-    # First similar motions, then those that are equal within the uncertainty of the map.
+    # First group similar motions, then motions that are equal within the uncertainty of the map.
     pairs = cKDTree(feature).query_pairs(_GROUP_LENGTHS * length, p=np.inf, output_type="ndarray")
     pairs = pairs[off[pairs].all(1) & (labels[a[pairs[:, 0]]] == labels[a[pairs[:, 1]]])]
     pairs = pairs[directed.pairwise_consistent(pairs[:, 0], pairs[:, 1], drift, probability)]
@@ -270,14 +274,14 @@ def _groups(
 def smallest_cut(
     edges: Measurements, accepted: np.ndarray, cycles: CycleSupport, near: np.ndarray, far: np.ndarray, power: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find the lightest set of accepted edges, none of them confirmed, that separates ``near`` from ``far`` (max-flow).
+    """Find the lightest set of accepted, unconfirmed edges that separates ``near`` from ``far`` (max-flow).
 
-    An edge weighs a power of its share of agreeing neighbours: edges inside a place are heavy, so that the cut runs
-    between places rather than around the few scenes that are named.
+    The weight of an edge is a power of its share of agreeing neighbours. Edges inside a place are heavy, so the cut
+    runs between places rather than around the few scenes of ``near`` or ``far``.
 
     Returns:
-        Rows of the edges, and (N,) bool for the side of ``far``; None where no such set exists, or where a scene would
-        have to be on both sides.
+        Rows of the edges, and an (N,) mask of the scenes on the side of ``far``; None if no such set exists, or if a
+        scene would have to be on both sides.
     """
     near, far = np.setdiff1d(near, far), np.setdiff1d(far, near)
     if not len(near) or not len(far):
@@ -306,9 +310,9 @@ def smallest_cut(
 
 
 def _smoothed(side: np.ndarray, a: np.ndarray, b: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Move scenes to the side that most of their edges go to, as long as fewer edges are cut.
+    """Move scenes to the side to which most of their edges lead, as long as fewer edges are cut.
 
-    Weights draw the cut between places; at its rim a scene of few and light edges may be left on the wrong side.
+    Weights keep the cut between places, but near the cut a scene with few light edges may end up on the wrong side.
     """
     n, crossing = len(side), int((side[a] != side[b]).sum())
     while True:

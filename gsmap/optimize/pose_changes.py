@@ -1,4 +1,4 @@
-"""Pose changes between two answers."""
+"""Compute pose changes between two answers."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from gsmap.types import PoseChange, PoseGraph, Sim3
 def diff(
     before: PoseGraph, after: PoseGraph, centroids: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, PoseChange]:
-    """Compare two answers: the change of each scene's pose by scene id, in the order of ``after``, then removed scenes.
+    """Compare two answers: return the change of each scene's pose by scene id, in the order of ``after``, then removed
+    scenes.
 
     Args:
-        centroids: (3,) middle of each scene in its own frame; the origin where it is not given. A rotation about the
-            middle of a scene moves it little, the same about a far origin moves it a lot: measure where the scene is.
+        centroids: (3,) centre of each scene's content in the scene's frame; the origin by default. Displacements are
+            measured there, because a rotation about a far origin displaces the content a lot.
     """
     centroids = centroids or {}
     out = {}
@@ -44,15 +45,15 @@ def diff(
 
 
 def motion(old: Sim3, new: Sim3, centroid: np.ndarray | None = None) -> tuple[float, float, float]:
-    """Compute rotation in degrees, displacement of the centroid in map units, and scale ratio between two poses."""
+    """Compute the rotation in degrees, the displacement of the centroid in map units, and the scale ratio between two
+    poses."""
     middle = np.zeros(3) if centroid is None else np.asarray(centroid, dtype=np.float64)
     turned = np.degrees(angle_between(old.rotation, new.rotation))
     return float(turned), float(np.linalg.norm(new.apply(middle) - old.apply(middle))), new.scale / old.scale
 
 
 def moved(old: Sim3, new: Sim3, threshold_m: float, corners: np.ndarray) -> bool:
-    """Return True if any of the points (N, 3), such as the corners of a scene's box, moves further than the
-    threshold.
-    """
+    """Return whether any of the points (N, 3), such as the corners of a scene's box, moves farther than the
+    threshold."""
     corners = np.asarray(corners, dtype=np.float64).reshape(-1, 3)
     return bool(np.linalg.norm(new.apply(corners) - old.apply(corners), axis=1).max(initial=0) > threshold_m)

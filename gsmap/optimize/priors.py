@@ -19,8 +19,10 @@ class PriorTerms:
     """P priors as residuals of 10 rows: [rotation (3), translation (3), log scale, up (3)].
 
     Args:
-        scenes: (P,) row of the scene. expected: P poses. root_weights: (P, 10), 0 where unknown.
-        ups: (P, 3) unit up direction in the scene, or 0.
+        scenes: (P,) row of each prior's scene.
+        expected: P expected poses.
+        root_weights: (P, 10) square roots of the weights, 0 where a component is unknown.
+        ups: (P, 3) unit up direction in the scene's frame, or 0.
     """
 
     scenes: np.ndarray
@@ -48,7 +50,8 @@ class PriorTerms:
         return PriorTerms(self.scenes[rows], self.expected[rows], self.root_weights[rows], self.ups[rows])
 
     def linearize(self, poses: Similarities) -> tuple[np.ndarray, np.ndarray]:
-        """Compute whitened residuals (P, 10) and their derivatives (P, 10, 7) by a step on the scene side."""
+        """Compute the whitened residuals (P, 10) and their derivatives (P, 10, 7) with respect to a step on the scene
+        side."""
         pose = poses[self.scenes]
         back = self.expected.rotations.transpose(0, 2, 1)
         shrink = np.exp(-self.expected.log_scales)
@@ -72,7 +75,7 @@ class PriorTerms:
 
 
 def _inverse_right_jacobian(omega: np.ndarray) -> np.ndarray:
-    """Compute the derivative (N, 3, 3) of ``Log(R Exp(x))`` at x = 0, with ``omega = Log(R)``."""
+    """Compute the derivative (N, 3, 3) of ``Log(R Exp(x))`` at x = 0, where ``omega = Log(R)``."""
     theta = np.linalg.norm(omega, axis=1)
     small = theta < 1e-4
     safe = np.where(small, 1.0, theta)

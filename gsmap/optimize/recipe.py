@@ -1,4 +1,4 @@
-"""Recipe of an answer: the versions, settings and solver that determine it."""
+"""Name an answer by its recipe: the versions, settings and solver that determine it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ VERSIONS = {
     "keep_unchanged_poses": 1,
     "survey": 2,
 }
-"""Version by part, raised whenever its answer changes for the same input. Here, because the modules load solvers."""
+"""Version of each part of the optimization, raised whenever the part's result changes for the same input. The versions
+are here because the modules of the parts load solvers."""
 
 
 def recipe_key(params: Params) -> RecipeKey:
-    """Return the recipe of a solve without its inputs (scenes, edges, reviews, priors); every setting takes part."""
+    """Return the recipe of a solve without its inputs (scenes, edges, reviews, priors); it includes every setting."""
     return RecipeKey("optimize", "pose_graph", dict(VERSIONS), plain(params), _gtsam())
 
 
 def _gtsam() -> str:
-    """Return the release of the solver of the exact step: another one may round differently."""
+    """Return the version of GTSAM, because another version may round differently."""
     try:
         return f"gtsam {version('gtsam')}"
     except PackageNotFoundError:

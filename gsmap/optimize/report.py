@@ -1,4 +1,4 @@
-"""Conversion of a solution to a pose graph with scenes and edges by id, and the reasons for excluded edges."""
+"""Convert a solution to a pose graph with scenes and edges by id, and state the reasons for excluded edges."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def pose_graph(
     cycles: CycleSupport,
     params: Params,
 ) -> PoseGraph:
-    """Build the `PoseGraph` of scenes and edges by id; its provenance is left to the caller."""
+    """Build the `PoseGraph` of scenes and edges by id; the caller adds its provenance."""
     sure = state.accepted & ~state.doubtful
     tied = component_labels(m, np.flatnonzero(sure))
     supported = state.accepted & state.doubtful & (tied[m.targets] == tied[m.sources])
     if not (state.doubtful & ~state.accepted).any():
-        sure |= supported  # two different places do not agree with the way round by chance
+        sure |= supported  # an edge between two different places does not close a cycle by chance
     firm = sure & (~bridges(m, sure) | m.confirmed)
-    # Otherwise doubtful edges confirm no other edge, and are confirmed by undoubted edges.
+    # Otherwise a doubtful edge confirms no other edge, and only undoubted edges confirm it.
     blocks = component_labels(m, np.flatnonzero(firm))
     firm |= state.accepted & state.doubtful & (blocks[m.targets] == blocks[m.sources])
     status = _statuses(m, state.accepted, firm)
@@ -72,34 +72,34 @@ def _outcomes(
         if firm[k]:
             out[key] = EdgeOutcome("used", residual)
         elif state.accepted[k] and state.doubtful[k]:
-            why = reason("surfaces_differ", f"{_disagreement_text(m, k)}: the place changed, or it is another")
+            why = reason("surfaces_differ", f"{_disagreement_text(m, k)}: the place changed, or these are two places")
             out[key] = EdgeOutcome("tentative", residual, why)
         elif state.accepted[k]:
-            why = reason("unconfirmed", "in no agreeing cycle: rests on its own verdict alone")
+            why = reason("unconfirmed", "in no agreeing cycle: no other edge confirms it")
             out[key] = EdgeOutcome("tentative", residual, why)
         elif not together[k]:
             why = state.pending.get(k) or reason(
-                "contradicts_component", "contradicts what else is known of the two components"
+                "contradicts_component", "contradicts other edges between the two components"
             )
             if state.doubtful[k]:
                 why = reason("surfaces_differ", f"{_disagreement_text(m, k)}; {why}")
             elif state.ambiguous[k]:
                 why = reason(
                     "contradicts_edge",
-                    "contradicts an edge whose evidence is about as good: one is of another place that looks alike",
+                    "contradicts an edge whose evidence is about as good: one of both joins two places that look alike",
                 )
             elif state.undecided[k]:
                 why = reason(
                     "contradicting_groups",
-                    "edges that agree among themselves contradict each other here: places that look alike?",
+                    "edges that agree among themselves contradict another such group here: places that look alike?",
                 )
             out[key] = EdgeOutcome("unused", None, why, undecided=True)
         else:
             why = reason("contradicts_edges", f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}")
             if cycles.agree[k] > 0:
-                why += "; it agrees with others that do too (a place that looks alike?)"
+                why += "; other edges that contradict them agree with it (a place that looks alike?)"
             if state.doubtful[k]:
-                why += f"; {_disagreement_text(m, k)}: another place that looks alike"
+                why += f"; {_disagreement_text(m, k)}: two places that look alike"
             doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
             undecided = bool(cycles.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
             out[key] = EdgeOutcome("unused", residual, why, undecided)
@@ -107,13 +107,12 @@ def _outcomes(
 
 
 def _disagreement_text(m: Measurements, row: int) -> str:
-    return f"{m.disagreement[row]:.0%} of what both saw is not the same in both"
+    return f"{m.disagreement[row]:.0%} of what both saw is not the same"
 
 
 def _statuses(m: Measurements, accepted: np.ndarray, firm: np.ndarray) -> np.ndarray:
-    """Return (N,) ``placed`` in the largest firmly connected part of a component, ``tentative`` beside it, ``isolated``
-    alone.
-    """
+    """Return the (N,) status of each scene: ``placed`` in the largest firmly connected part of its component,
+    ``tentative`` elsewhere in it, ``isolated`` without edges."""
     component = component_labels(m, np.flatnonzero(accepted))
     blocks = component_labels(m, np.flatnonzero(firm))
     sizes = np.bincount(blocks, minlength=1)[blocks]

@@ -1,4 +1,4 @@
-"""Robust poses from edges that may be wrong: spanning tree, chordal relaxation, graduated non-convexity."""
+"""Estimate robust poses from edges that may be wrong: spanning tree, chordal relaxation, graduated non-convexity."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ _GNC_SHRINK = 4.0  # factor by which the robust kernel narrows from one width to
 
 
 def spanning_tree_init(edges: Measurements, rows: np.ndarray, cost: np.ndarray, poses: Similarities) -> Similarities:
-    """Initialize poses along the cheapest spanning forest of the edges at ``rows``, from each component's first scene.
+    """Initialize poses along the minimum spanning forest of the edges at ``rows``, from the first scene of each
+    component.
 
     Args:
-        cost: (len(rows),) positive; a lower one is trusted more.
-        poses: where the first scene of each component stays.
+        cost: (len(rows),) positive cost of each edge; edges of lower cost are trusted more.
+        poses: initial poses; the first scene of each component keeps its pose.
     """
     n = edges.num_scenes
     order = np.lexsort((rows, cost))
     rank = np.empty(len(rows))
     rank[order] = np.arange(1, len(rows) + 1)
-    # Where two scenes are tied twice, only the better edge may enter the tree: sparse matrices would add them.
+    # Of several edges between two scenes only the best may enter the tree, because sparse matrices add entries.
     low = np.minimum(edges.targets[rows], edges.sources[rows])
     high = np.maximum(edges.targets[rows], edges.sources[rows])
     _, best = np.unique((low * n + high)[order], return_index=True)
@@ -58,15 +59,14 @@ def spanning_tree_init(edges: Measurements, rows: np.ndarray, cost: np.ndarray, 
 
 
 def residuals(edges: Measurements, poses: Similarities) -> np.ndarray:
-    """Compute ``Log(S_target_source^-1 S_map_target^-1 S_map_source)`` (E, D) on the source side."""
+    """Compute the residuals ``Log(S_target_source^-1 S_map_target^-1 S_map_source)`` (E, D) on the source side."""
     predicted = poses[edges.targets].inverse() @ poses[edges.sources]
     return (edges.measured.inverse() @ predicted).log()[:, : edges.dim]
 
 
 def linearize(edges: Measurements, poses: Similarities, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute derivatives (E, D, D) of the residuals ``r`` by a step of the target and of the source, on their source
-    sides.
-    """
+    """Compute the derivatives (E, D, D) of the residuals ``r`` with respect to steps of the target and of the source,
+    each on the scene's side."""
     d = edges.dim
     full = np.zeros((len(edges), 7))
     full[:, :d] = r
@@ -78,17 +78,17 @@ def linearize(edges: Measurements, poses: Similarities, r: np.ndarray) -> tuple[
 
 
 def chi_squares(edges: Measurements, poses: Similarities) -> np.ndarray:
-    """Compute the chi-square (E,) of every edge under ``poses``, with D degrees of freedom."""
+    """Compute the (E,) chi-square of each edge under ``poses``, with D degrees of freedom."""
     r = residuals(edges, poses)
     return np.einsum("ed,edf,ef->e", r, edges.information, r)
 
 
 def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Similarities:
-    """Estimate poses by least squares without a starting guess; fixed scenes keep theirs.
+    """Estimate poses by least squares without initial poses; fixed scenes keep their poses.
 
-    Rotations by the chordal relaxation (Martinec and Pajdla 2007; Carlone et al. 2015, sec. III-B): solve
-    ``R_source^T = R_target_source^T R_target^T`` over all edges as if the entries were free, then project to SO(3).
-    Log scales and then translations are linear once the rotations are known.
+    Rotations follow from the chordal relaxation (Martinec and Pajdla 2007; Carlone et al. 2015, sec. III-B): solve
+    ``R_source^T = R_target_source^T R_target^T`` over all edges as if the entries were free, then project to SO(3). Log
+    scales and then translations are linear once the rotations are known.
     """
     n, a, b = edges.num_scenes, edges.targets, edges.sources
     touched = np.zeros(n, dtype=bool)
@@ -99,7 +99,7 @@ def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Simi
     weight_t = 3 / np.einsum("eii->e", covariance[:, 3:6, 3:6])
 
     def solve(A: np.ndarray, B: np.ndarray, weight: np.ndarray, r: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Solve for x over all scenes, from 0 at the unknown ones and ``known`` at the fixed ones."""
+        """Solve for x over all scenes; free scenes start at 0, fixed scenes have the values of ``known``."""
         start = np.where(still[:, None, None], known, 0.0)
         system = BlockSystem(a, b, still, A.shape[2])
         W = weight[:, None, None] * np.eye(A.shape[1])
@@ -128,8 +128,8 @@ class GaussNewton:
     """Gauss-Newton optimization over a fixed set of edges.
 
     Args:
-        edges: what to fit.
-        fixed: (N,) scenes that stay where they are.
+        edges: edges to fit.
+        fixed: (N,) mask of scenes that do not move.
     """
 
     edges: Measurements
@@ -143,16 +143,15 @@ class GaussNewton:
         return BlockSystem(self.edges.targets, self.edges.sources, still, self.edges.dim)
 
     def step(self, poses: Similarities, weights: np.ndarray, r: np.ndarray) -> np.ndarray:
-        """Compute the Gauss-Newton step (N, D) from residuals ``r`` and a weight per edge."""
+        """Compute the Gauss-Newton step (N, D) from the residuals ``r`` and a weight per edge."""
         edges = self.edges
         A, B = linearize(edges, poses, r)
         W = edges.information * weights[:, None, None]
         return self.system.solve(A, B, W, r[:, :, None])[:, :, 0]
 
     def fit(self, poses: Similarities, max_steps: int = 20, tolerance: float = 1e-6) -> Similarities:
-        """Fit poses by least squares from a good guess, with step halving; stops when the cost gains less than
-        ``tolerance``.
-        """
+        """Fit poses by least squares from good initial poses, with step halving; stop when the cost falls by less than
+        ``tolerance``."""
         cost = self._cost(poses)
         ones = np.ones(len(self.edges))
         for _ in range(max_steps):
@@ -173,8 +172,8 @@ class GaussNewton:
     def solve_gnc(self, poses: Similarities, gate: float, widest: float, trusted: np.ndarray) -> Similarities:
         """Fit poses by iteratively reweighted least squares with Geman-McClure weights of decreasing width.
 
-        ``w = (c / (c + chi2))^2``; c starts at ``widest`` gates and shrinks by a factor (graduated non-convexity,
-        Yang et al. 2020, with a start that cycle consistency makes narrow). ``trusted`` edges keep weight 1.
+        ``w = (c / (c + chi2))^2``; c starts at ``widest`` gates and shrinks by a factor (graduated non-convexity, Yang
+        et al. 2020; cycle consistency allows a narrow start). ``trusted`` edges keep weight 1.
         """
         c = gate * max(1.0, widest)
         noise = float(np.sqrt(np.median(np.einsum("eii->ei", self.edges.covariance)[:, :3])))
@@ -185,7 +184,7 @@ class GaussNewton:
                 weights = np.where(trusted, 1.0, (c / (c + chi)) ** 2)
                 step = self.step(poses, weights, r)
                 poses = (poses @ exp(step)).orthonormalised()
-                # Settled: the step is small beside the noise of the edges it would have to explain.
+                # Converged: the step is small compared with the noise of the edges.
                 if np.abs(step).max(initial=0) < 1e-2 * noise:
                     break
             if c <= gate:

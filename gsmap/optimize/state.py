@@ -1,4 +1,4 @@
-"""State of the robust solve: poses and accepted edges, their initialization and refinement."""
+"""State of the robust solve: poses and accepted edges, with their initialization and refinement."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import GaussNewton, chi_squares, chordal, spanning_tree_init
 from gsmap.optimize.structure import component_labels, roots
 
-_MAX_FAILURES = 2  # an edge that was excluded so often is not taken in again
-_RESTART_GATES = 4.0  # poses from which an edge is further off are no start for Gauss-Newton; chordal relaxation is
+_MAX_FAILURES = 2  # an edge that was excluded this often is not accepted again
+_RESTART_GATES = 4.0  # if an edge has a larger residual, poses start from chordal relaxation instead
 
 
 @dataclass(eq=False)
@@ -25,13 +25,14 @@ class State:
     """Current poses of the scenes, and the edges that are accepted.
 
     Args:
-        poses: N. accepted: (E,) bool, accepted edges.
+        poses: N poses.
+        accepted: (E,) mask of accepted edges.
         failures: (E,) number of times that an edge was accepted and excluded again.
-        undecided, rejected: (E,) bool, edges left open by perceptual aliasing, and edges that are wrong.
+        undecided, rejected: (E,) masks of edges that perceptual aliasing leaves undecided, and of wrong edges.
         terms: priors in use.
-        pending: by edge, the reason why its components may not join.
-        doubtful: (E,) bool, edges whose captures disagree in too much of their common surface.
-        ambiguous: (E,) bool, edges that contradict each other where the evidence does not decide.
+        pending: reason by row of an edge why the edge's components may not join.
+        doubtful: (E,) mask of edges whose captures disagree on too much of their common surface.
+        ambiguous: (E,) mask of edges that contradict each other without evidence to decide.
     """
 
     poses: Similarities
@@ -48,11 +49,12 @@ class State:
     def fresh(cls, m: Measurements, poses: Similarities, accepted: np.ndarray, terms: PriorTerms) -> State:
         """Return a state in which no edge has failed yet."""
         failures = np.zeros(len(m), dtype=np.int64)
-        undecided, rejected, doubtful, ambiguous = np.zeros((4, len(m)), dtype=bool)  # they change in place
+        # Separate arrays, which change in place.
+        undecided, rejected, doubtful, ambiguous = np.zeros((4, len(m)), dtype=bool)
         return cls(poses, accepted, failures, undecided, rejected, terms, {}, doubtful, ambiguous)
 
     def spread(self, rows: np.ndarray, count: int) -> State:
-        """Extend the state of the edges at ``rows`` to all ``count`` edges, of which the others are not accepted."""
+        """Extend the state of the edges at ``rows`` to all ``count`` edges; the remaining edges are not accepted."""
 
         def put(values: np.ndarray) -> np.ndarray:
             out = np.zeros(count, dtype=values.dtype)
@@ -82,10 +84,10 @@ class State:
 
 
 def initial_state(m: Measurements, cycles: CycleSupport, terms: PriorTerms, params: Params) -> State:
-    """Initialize poses along the best supported edges, and accept the supported edges that agree with them."""
+    """Initialize poses along the best supported edges, and accept those supported edges that agree with the poses."""
     accepted = (cycles.agree > 0) | m.confirmed
     rows = np.flatnonzero(accepted)
-    # Confirmed edges first, then by support of neighbours, then by certainty.
+    # Confirmed edges come first, then edges sorted by the support of their neighbours, then by certainty.
     certainty = np.trace(m.covariance[rows], axis1=1, axis2=2)
     order = np.lexsort((certainty, -cycles.support[rows], ~m.confirmed[rows]))
     cost = np.empty(len(rows))
@@ -98,11 +100,11 @@ def initial_state(m: Measurements, cycles: CycleSupport, terms: PriorTerms, para
 
 
 def refine(m: Measurements, state: State, gate: float, widest: float = 1.0) -> None:
-    """Refine the poses of every component robustly from its accepted edges; edges that do not fit are excluded.
+    """Refine the poses of every component robustly from its accepted edges, and exclude edges that do not fit.
 
     Args:
-        gate: chi-square up to which an edge fits.
-        widest: width in gates at which the robust kernel starts.
+        gate: largest chi-square of an edge that fits.
+        widest: initial width of the robust kernel, in gates.
     """
     rows = np.flatnonzero(state.accepted)
     if not len(rows):

@@ -1,4 +1,4 @@
-"""Structure of the graph of scenes and edges: components, their first scenes, and bridges."""
+"""Analyse the graph of scenes and edges: components, their first scenes, and bridges."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from gsmap.optimize.measurements import Measurements
 
 
 def component_labels(edges: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Label the component (N,) of each scene, connected by the edges at ``rows``, numbered by their first scene."""
+    """Return the (N,) component of each scene, connected by the edges at ``rows``; components are numbered by their
+    first scene."""
     n = edges.num_scenes
     graph = sp.coo_matrix((np.ones(len(rows)), (edges.targets[rows], edges.sources[rows])), shape=(n, n))
     labels = connected_components(graph, directed=False)[1]
@@ -26,16 +27,17 @@ def roots(labels: np.ndarray) -> np.ndarray:
 
 
 def bridges(edges: Measurements, accepted: np.ndarray) -> np.ndarray:
-    """Find bridges (E,): accepted edges on no cycle of accepted edges.
+    """Return an (E,) mask of bridges: accepted edges on no cycle of accepted edges.
 
-    Direct the edges of a depth-first tree downwards and all others, which go to an ancestor, upwards: what is then
-    strongly connected is what two edge-disjoint paths connect (Robbins 1939), and the edges between are the bridges.
+    The edges of a depth-first tree are directed downwards, all remaining edges upwards to an ancestor. Scenes are then
+    strongly connected if two edge-disjoint paths connect them (Robbins 1939), and the edges between strongly connected
+    sets are the bridges.
     """
     n, rows = edges.num_scenes, np.flatnonzero(accepted)
     ends = np.sort(np.stack([edges.targets[rows], edges.sources[rows]]), axis=0)
     pairs, which, count = np.unique(ends[0] * n + ends[1], return_inverse=True, return_counts=True)
     low, high = pairs // n, pairs % n
-    # One more node above the first scene of every component makes the forest a tree.
+    # An additional node above the first scene of every component turns the forest into a tree.
     first = roots(component_labels(edges, rows))
     a, b = np.r_[low, first], np.r_[high, np.full(len(first), n)]
     graph = sp.coo_matrix((np.ones(len(a)), (a, b)), shape=(n + 1, n + 1)).tocsr()
@@ -53,7 +55,7 @@ def bridges(edges: Measurements, accepted: np.ndarray) -> np.ndarray:
 
 
 def ranges(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Repeat row k ``counts[k]`` times, with 0, 1, ... within each row."""
+    """Return row k repeated ``counts[k]`` times, and the numbers 0, 1, ... within each row."""
     rows = np.repeat(np.arange(len(counts)), counts)
     offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     return rows, offsets

@@ -1,9 +1,9 @@
-"""Georeferencing of a component: scene poses, ``S_world_map`` and control points from edges and observations together.
+"""Georeference a component: solve scene poses, ``S_world_map`` and control points from edges and observations together.
 
-The datum of the map stays as it was (its anchor scene, or priors), and ``S_world_map`` is free: so observations deform
-the component within the uncertainty of its edges, and never move it as a whole. All unknowns are solved together by
-Gauss-Newton on one sparse system, whose inverse tests every observation against all others and gives covariances. See
-docs/design/0024-world-frame.md.
+The datum of the map (its anchor scene, or priors) does not change, and ``S_world_map`` is free. So observations deform
+the component within the uncertainty of its edges, but never move it as a whole. All unknowns are solved together by
+Gauss-Newton on one sparse system, whose inverse gives covariances and tests every observation against the remaining
+ones. See docs/design/0024-world-frame.md.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ class ComponentSolution:
     """Solution of a component with its observations of the world.
 
     Args:
-        poses: all scenes; those of other components as given.
-        covariances: (n, 7, 7) of the component's scenes, in the map's frame; None where observations change nothing.
-        tie: its tie to the world.
+        poses: poses of all scenes; scenes of other components keep the given poses.
+        covariances: (n, 7, 7) covariances of the component's scenes, in the map's frame; None where observations change
+            nothing.
+        tie: georeference of the component.
     """
 
     poses: Similarities
@@ -44,11 +45,11 @@ class ComponentSolution:
 def tie_component(
     whole: Component, poses: Similarities, survey: Survey, index: int, marginal_scenes: int
 ) -> ComponentSolution | None:
-    """Solve a component with its observations, from the poses of its edges alone; None where it has no observations.
+    """Solve a component with its observations, from the poses computed by edges alone; None if it has no observations.
 
     Args:
-        index: of the component.
-        marginal_scenes: largest number of scenes for which covariances are computed.
+        index: number of the component.
+        marginal_scenes: covariances are computed for at most this many scenes.
     """
     own = whole.local()
     terms = SurveyTerms.of(survey, own.edges.scene_ids, own.dim)
@@ -58,7 +59,8 @@ def tie_component(
     try:
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # infinite results are handled below
             surveyed = _surveyed(system, whole, poses, survey, index, marginal_scenes)
-    except (np.linalg.LinAlgError, RuntimeError, InputError):  # of numpy, a singular factor in scipy, and Sim3
+    # Raised by numpy, by scipy for a singular factor, and by Sim3.
+    except (np.linalg.LinAlgError, RuntimeError, InputError):
         surveyed = None
     if surveyed is None or not _is_finite(surveyed):
         return ComponentSolution(poses, None, tie_by_bars(system, index, survey, SurveyFailure(UNSOLVED, "unsolved")))
@@ -95,7 +97,8 @@ def joint_of_answer(
 ) -> np.ndarray | None:
     """Compute `gsmap.optimize.joint_covariance` by linearizing at the answer.
 
-    Scenes and ``S_world_map`` stay; only control points, uncertain cameras and common errors are solved.
+    Scene poses and ``S_world_map`` keep their values; only control points, uncertain cameras and common errors are
+    solved.
     """
     ids = sorted(scene for scene, pose in answer.poses.items() if pose.component == component)
     inside = set(ids)

@@ -1,4 +1,5 @@
-"""Points common to the map and the world before the georeferenced solve, and what they determine."""
+"""Collect the points common to the map and the world before the georeferenced solve, and find what they leave
+undetermined."""
 
 from __future__ import annotations
 
@@ -16,27 +17,31 @@ from gsmap.types import Sim3
 from gsmap.types.world import PositionFix
 
 NOTHING = (
-    "position, rotation and scale are not determined: it takes three control points that photos of the map show, or "
+    "position, rotation and scale are not determined: add three control points that photos of the map show, or three "
     "positions of cameras or scenes, that are not on one line"
 )
-MAX_ROTATION_SIGMA_DEG = 5.0  # a component whose rotation is less certain is not tied
-MAX_LOG_SCALE_SIGMA = 0.1  # the same of its log scale
-_DRIFT_SHARE = 0.03  # of a map's extent, by which it may be bent before its edges give way
-_DRAWS = 500  # triples of places that are tried as a first guess where there are too many to try all
-SURVEYED = "survey"  # the name of a fix of a scene's origin; other fixes are photos
+MAX_ROTATION_SIGMA_DEG = 5.0  # a component with a less certain rotation is not georeferenced
+MAX_LOG_SCALE_SIGMA = 0.1  # the same limit for its log scale
+_DRIFT_SHARE = 0.03  # of the extent of a map, by which drift may deform it
+_DRAWS = 500  # number of triples of points that are tried as a first estimate if there are too many to try all
+SURVEYED = "survey"  # name of the fix of a scene's origin; the fixes of photos have other names
 
 
 @dataclass(frozen=True, eq=False)
 class CommonPoints:
-    """P points known in the map and in the world.
+    """P points with known positions in the map and in the world.
 
     Args:
-        names: for messages. in_map, in_world: (P, 3).
-        own_m: (P, 3) standard deviations of each by itself. common_m: (P, 3) of what it shares with its unit.
-        sea_m: (P,) of the sea level, which all places that count from it share.
-        kinds: (P,) ``points``, ``photos`` or ``scenes``. rows: (P,) row among the control points or fixes.
-        units: (P,) the unit that a place belongs to: the photos of a capture are one, other places are by themselves.
-        sources: (P,) control points, surveyed scenes, photos with and those without corrections are a source each.
+        names: names for messages.
+        in_map, in_world: (P, 3) positions.
+        own_m: (P, 3) standard deviations of each point's independent error.
+        common_m: (P, 3) standard deviations of the error that a point shares with its unit.
+        sea_m: (P,) standard deviation of the sea level, an error that all points measured from it share.
+        kinds: (P,) ``points``, ``photos`` or ``scenes``.
+        rows: (P,) row among the control points or fixes.
+        units: (P,) unit of each point: the photos of one capture are a unit, any other point is a unit of its own.
+        sources: (P,) source of each point; control points, surveyed scenes, photos with corrections and photos without
+            corrections are one source each.
     """
 
     names: tuple[str, ...]
@@ -60,13 +65,14 @@ class CommonPoints:
         return CommonPoints(tuple(self.names[k] for k in rows.tolist()), *(one[rows] for one in (*arrays, *labels)))
 
     def reach_m(self) -> np.ndarray:
-        """Compute standard deviations (P, 3) with all errors that a place shares."""
+        """Compute the standard deviations (P, 3) of the points, including the errors that a point shares with
+        others."""
         out = np.hypot(self.own_m, self.common_m)
         out[:, 2] = np.hypot(out[:, 2], self.sea_m)
         return out
 
     def missing(self, S: Sim3 | None = None) -> str | None:
-        """Explain what the points leave undetermined, and what would determine it; None if they determine all.
+        """Explain what the points leave undetermined, and what would determine it; None if they determine everything.
 
         Args:
             S: ``S_world_map`` near the answer; without it only the number of points is checked.
@@ -76,8 +82,8 @@ class CommonPoints:
             return NOTHING
         if n == 1:
             return (
-                f"rotation and scale are not determined: only {self.names[0]} is known both in the map and in the "
-                "world; add two more that are not on one line with it"
+                f"rotation and scale are not determined: only {self.names[0]} has a position both in the map and in "
+                "the world; add two more control points or positions that are not on one line with it"
             )
         best = float((1 / self.own_m.max(1) ** 2).mean() ** -0.5)
         limit = np.radians(MAX_ROTATION_SIGMA_DEG)
@@ -85,21 +91,22 @@ class CommonPoints:
         if scale > MAX_LOG_SCALE_SIGMA or turns[1] > limit:
             return (
                 f"rotation and scale are not determined: {_listed(self.names)} lie at one place within their errors; "
-                f"add others further off than {3 * best:.2g} m"
+                f"add control points or positions more than {3 * best:.2g} m away"
             )
         if n == 2 or (S is not None and turns[2] > limit):
-            turn = "" if n == 2 else f" (known to {min(180.0, float(np.degrees(turns[2]))):.2g} deg)"
+            turn = "" if n == 2 else f" (standard deviation {min(180.0, float(np.degrees(turns[2]))):.2g} deg)"
             return (
                 f"rotation about the line through {_listed(self.names)} is not determined{turn}: add a control point "
-                f"or position at least {best / limit:.2g} m off that line, better as far as they are apart"
+                f"or position at least {best / limit:.2g} m away from that line, better as far as these points are "
+                "apart"
             )
         return None
 
     def _sigmas(self, S: Sim3) -> tuple[np.ndarray, float]:
-        """Compute standard deviations of the rotation about its principal axes (3,), smallest first, and of the log
+        """Compute the standard deviations of the rotation about its principal axes (3,), smallest first, and of the log
         scale.
 
-        Sums the information of each point, with its common errors as unknowns.
+        The information of all points is summed, with common errors as unknowns.
         """
         q = S.apply(self.in_map)
         q = q - q.mean(0)
@@ -124,11 +131,11 @@ class CommonPoints:
     def robust_fit(self) -> tuple[Sim3, np.ndarray]:
         """Fit the ``S_world_map`` that most points agree with; also return (P,) bool, the points that agree.
 
-        Tries every triple, or `_DRAWS` of them; a point agrees within its error and the drift of the map. Errors common
-        to all points do not count.
+        Every triple of points is tried, or `_DRAWS` of them; a point agrees if its residual is within its error and the
+        drift of the map. Errors that all points share do not count.
 
         Raises:
-            InputError: no similarity fits, for all places coincide.
+            InputError: no similarity fits, because all points coincide.
         """
         n = len(self)
         middle = np.median(self.in_world, axis=0)
@@ -176,25 +183,25 @@ class CommonPoints:
         return float(np.sqrt((off**2).sum(1).mean()))
 
     def noise_m(self, *, sea: bool = True) -> float:
-        """Compute the residual allowed by stated errors and drift of the map: three standard deviations and 0.2 % of
-        the extent.
+        """Compute the largest residual that the stated errors and drift of the map explain: three standard deviations
+        and 0.2 % of the extent.
 
         Args:
-            sea: include the error of the sea level, which is common to some of the points.
+            sea: include the error of the sea level, which some of the points share.
         """
         reach = self.reach_m() if sea else np.hypot(self.own_m, self.common_m)
         extent = float(np.linalg.norm(np.ptp(self.in_world[:, :2], axis=0)))
         return 3 * float(np.sqrt((reach**2).sum(1).mean())) + 0.002 * extent
 
     def moved(self, rows: np.ndarray, by_m: np.ndarray) -> CommonPoints:
-        """Return the points with some of them moved in the world, by (n, 3) or (3,)."""
+        """Return the points, with those at ``rows`` moved in the world by (n, 3) or (3,)."""
         in_world = self.in_world.copy()
         in_world[rows] += by_m
         return replace(self, in_world=in_world)
 
 
 def collect_common_points(system: System) -> CommonPoints:
-    """Collect all common points of a component, before the map is bent."""
+    """Collect all common points of a component, before observations deform the map."""
     terms, x = system.terms, system.terms.start(system.scenes, Sim3.identity())
     in_map, _, determined = terms.triangulate(x, system.usable[1])
     chosen = np.flatnonzero(determined & ~system.is_check)
@@ -227,17 +234,17 @@ def collect_common_points(system: System) -> CommonPoints:
 
 
 def fix_kind(fix: PositionFix) -> str:
-    """Return the group of observations that a fix belongs to."""
+    """Return the group of observations to which a fix belongs."""
     return "scenes" if fix.name == SURVEYED else "photos"
 
 
 def _axes(sigmas_m: Sequence[tuple[float, float]]) -> np.ndarray:
-    """Expand horizontal and vertical standard deviations to (P, 3)."""
+    """Expand horizontal and vertical standard deviations to three axes (P, 3)."""
     return np.array(sigmas_m, dtype=np.float64).reshape(-1, 2)[:, [0, 0, 1]]
 
 
 def _spread(points: np.ndarray) -> np.ndarray:
-    """Compute the root of the sum of squares (3,) along the principal axes, largest first."""
+    """Compute the root of the sum of squares of points (P, 3) along their principal axes (3,), largest first."""
     found = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return np.r_[found, np.zeros(3)][:3]
 

@@ -1,9 +1,9 @@
-"""Groups of observations with common errors: select those that agree, and explain those that contradict.
+"""Select the groups of observations with common errors that agree, and explain the groups that contradict.
 
-Control points, the photos of a capture, surveyed scenes and scale bars each have common errors, so that no number of
-photos outweighs a control point. The most precise source that determines the component alone is the reference. Every
-other group is predicted from it, including the uncertainty of its common errors; one that agrees is used, one that does
-not is reported with its shift and likely cause. See docs/design/0024-world-frame.md.
+Control points, the photos of a capture, surveyed scenes and scale bars each have common errors, so no number of photos
+outweighs a control point. The most precise source that alone determines the component is the reference. Every other
+group is predicted from the reference, including the uncertainty of its common errors. A group that agrees is used; a
+group that does not is reported with its shift and likely cause. See docs/design/0024-world-frame.md.
 """
 
 from __future__ import annotations
@@ -35,16 +35,17 @@ from gsmap.optimize.survey_terms import Unknowns
 from gsmap.types import Sim3
 from gsmap.types.world import UNSOLVED, Contradiction, WorldFrame
 
-_EQUAL = 2.0  # groups whose sigmas differ by less than this factor are equally precise; a majority is larger by it
-_SPECIFIC = ("altitude_zero", "feet", "above_takeoff")  # causes with a characteristic pattern in the heights
+# Groups whose sigmas differ by less than this factor are equally precise; a majority is larger by this factor.
+_EQUAL = 2.0
+_SPECIFIC = ("altitude_zero", "feet", "above_takeoff")  # causes that leave a characteristic pattern in the heights
 
 
 @dataclass(frozen=True, eq=False)
 class _PartialSolution:
-    """A solution from some of the places.
+    """A solution from some of the common points.
 
     Args:
-        rows: the places that may be solved from.
+        rows: rows of the points that the solution may use.
     """
 
     x: Unknowns
@@ -58,8 +59,10 @@ class _ContradictingGroup:
     """A group that contradicts the reference.
 
     Args:
-        rows: its places. whole: whether most of its source does.
-        if_wrong: reasons if the group is wrong. if_right: reasons if the reference is.
+        rows: rows of the group's points.
+        whole: most of the group's source contradicts the reference.
+        if_wrong: likely causes if the group is wrong.
+        if_right: likely causes if the reference is wrong.
     """
 
     rows: np.ndarray
@@ -71,7 +74,7 @@ class _ContradictingGroup:
 
 @dataclass(eq=False)
 class _ContradictionLog:
-    """Contradictions found so far, and the places that each excludes."""
+    """Contradictions found so far, and the points that each of them excludes."""
 
     found: list[Contradiction] = field(default_factory=list)
     rows: list[np.ndarray] = field(default_factory=list)
@@ -86,7 +89,8 @@ class _ContradictionLog:
 
 
 def solve_groups(system: System, frame: WorldFrame | None) -> Solution | SurveyFailure:
-    """Georeference a component by the groups of observations that agree, or return what is missing or contradictory."""
+    """Georeference a component by the groups of observations that agree, or return which observations are missing or
+    contradictory."""
     places = collect_common_points(system)
     if frame is None or not len(places):
         return SurveyFailure(NOTHING, "undetermined")
@@ -111,12 +115,12 @@ class _GroupSolver:
                 return wrong
             if wrong is None:
                 break
-            left = wrong  # the reference itself is wrong: without it
+            left = wrong  # the reference itself is wrong: go on without it
         self._explain(reference)
         return self._all(reference, agreeing)
 
     def _explain(self, reference: _PartialSolution) -> None:
-        """Compare sources that contradict themselves with the reference, which may reveal the reason."""
+        """Compare the sources that contradict themselves with the reference, which may reveal the cause."""
         own = str(self.places.kinds[reference.rows[0]])
         for k, (one, rows) in enumerate(zip(self.contradictions.found, self.contradictions.rows, strict=True)):
             if one.cause == "split" and one.kept == "none" and len(rows) >= 2:
@@ -133,7 +137,7 @@ class _GroupSolver:
     # --- the reference -----------------------------------------------------------------------------------------------
 
     def _measured(self, rows: np.ndarray) -> np.ndarray:
-        """Drop photos whose device wrote no altitude."""
+        """Drop photos whose device did not measure the altitude."""
         keep = np.ones(len(rows), dtype=bool)
         for unit in np.unique(self.places.units[rows]):
             mine = rows[self.places.units[rows] == unit]
@@ -142,7 +146,10 @@ class _GroupSolver:
                 keep &= self.places.units[rows] != unit
         if not keep.all():
             some, scenes = self.places[rows[~keep]], self._scenes(rows[~keep])
-            text = f"the altitudes of {len(some)} photos of {len(set(scenes))} captures are 0: they were not measured"
+            text = (
+                f"the altitudes of {len(some)} photos of {len(set(scenes))} captures are 0: the device did not "
+                "measure them"
+            )
             one = Contradiction(
                 "photos", "photos", "altitude_zero", count=len(some), scenes=tuple(sorted(set(scenes))), text=text
             )
@@ -159,7 +166,7 @@ class _GroupSolver:
         ]
 
     def _sources(self, rows: np.ndarray) -> list[np.ndarray]:
-        """Group rows by source, the most precise first."""
+        """Group rows by source, the most precise source first."""
         sources = self.places.sources[rows]
         groups = [rows[sources == source] for source in np.unique(sources)]
         return sorted(groups, key=lambda one: self._sigma_m(one))
@@ -169,10 +176,10 @@ class _GroupSolver:
         return float(np.median(np.linalg.norm(reach, axis=1) if axis is None else reach[:, axis]))
 
     def _reference(self, rows: np.ndarray) -> tuple[_PartialSolution, np.ndarray] | str:
-        """Solve from the most precise source that determines the component alone, or from all; also return the
-        remaining places.
+        """Solve from the most precise source that alone determines the component, or from all sources; also return the
+        remaining rows.
 
-        A source that contradicts itself is left out.
+        Sources that contradict themselves are left out.
         """
         problem, sources = "", self._sources(rows)
         for mine in sources:
@@ -196,7 +203,7 @@ class _GroupSolver:
         return found if isinstance(found, str) else (found, rows)
 
     def _alone(self, rows: np.ndarray, *, bars: bool = False) -> _PartialSolution | Contradiction | str:
-        """Solve from some places alone; or return their contradiction, or the missing observations."""
+        """Solve from some points alone; or return their contradiction, or a text about missing observations."""
         some = self.places[rows]
         if (missing := some.missing()) is not None:
             return missing
@@ -225,10 +232,10 @@ class _GroupSolver:
         return describe_weakness(self.system, factor) or tie
 
     def _contradicted(self, rows: np.ndarray, others: np.ndarray, world: Sim3, missing: str) -> Contradiction:
-        """Describe places that contradict others that are too few to georeference the component.
+        """Describe points that contradict other points, which are too few to georeference the component.
 
         Args:
-            world: the similarity that the others agree with.
+            world: the similarity with which the other points agree.
         """
         some = self.places[rows]
         off = np.median(some.in_world - world.apply(some.in_map), axis=0)
@@ -249,7 +256,7 @@ class _GroupSolver:
         )
 
     def _most(self, rows: np.ndarray) -> str:
-        """Return the most frequent kind of some places."""
+        """Return the most frequent kind of the points at ``rows``."""
         kinds, counts = np.unique(self.places.kinds[rows], return_counts=True)
         return str(kinds[np.argmax(counts)])
 
@@ -261,7 +268,7 @@ class _GroupSolver:
         return points, usable[1].copy(), fixes, usable[3] & bars
 
     def _is_active(self, active: Active, rows: np.ndarray) -> np.ndarray:
-        """Return (n,) bool: the places that the solution uses."""
+        """Return an (n,) mask of the points that the solution uses."""
         some = self.places[rows]
         out = np.zeros(len(rows), dtype=bool)
         of_points = some.kinds == "points"
@@ -271,9 +278,8 @@ class _GroupSolver:
     def _without_units(
         self, x: Unknowns, active: Active, rows: np.ndarray
     ) -> tuple[Unknowns, Active, Factor, np.ndarray]:
-        """Apply data snooping to captures: exclude photos whose common error exceeds their stated one, the worst
-        first.
-        """
+        """Apply data snooping to captures: exclude photos whose common error exceeds the stated common error, the worst
+        first."""
         for _ in range(MAX_ROUNDS):
             factor, terms = self.system.factor(x, self.system.as_weights(active)), self.system.terms.observations(x)
             use = rows[self._is_active(active, rows)]
@@ -301,9 +307,8 @@ class _GroupSolver:
         return x, active, self.system.factor(x, self.system.as_weights(active)), rows
 
     def _split(self, tie: _PartialSolution, rows: np.ndarray) -> Contradiction | None:
-        """Return the contradiction if excluded places are too many, or agree too well with each other, to be
-        blunders.
-        """
+        """Return the contradiction if the excluded points are too many, or agree too well with each other, to be
+        blunders."""
         use = self._is_active(tie.active, rows)
         units, unit = np.unique(self.places.units[rows], return_inverse=True)
         kept = np.bincount(unit, use, len(units)) * 2 > np.bincount(unit, minlength=len(units))
@@ -331,11 +336,11 @@ class _GroupSolver:
                 why = tuple(dict.fromkeys(["feet", *why]))
             one = replace(one, other_causes=why)
         return replace(
-            one, text=f"{one.text} ({len(rows) - len(some)} against {len(some)}): cannot tell which are right"
+            one, text=f"{one.text} ({len(rows) - len(some)} against {len(some)}): cannot tell which are correct"
         )
 
     def _blunder(self, dropped: Sequence[np.ndarray], shifts: Sequence[CommonShift], rows: np.ndarray) -> None:
-        """Record a minority of several places that share a contradiction with their own source."""
+        """Record a minority of several points that share a contradiction with their own source."""
         mine = np.concatenate(dropped)
         if len(mine) < 2:
             return
@@ -345,7 +350,7 @@ class _GroupSolver:
         self.contradictions.add(describe_contradiction(some, self._scenes(mine), shift, kind, why, "against"), some)
 
     def _elsewhere(self, rows: np.ndarray) -> int:
-        """Count the units of some places that agree on a similarity of their own."""
+        """Count the units of some points that agree on a similarity of their own."""
         if len(rows) < 4:
             return 0
         try:
@@ -355,37 +360,41 @@ class _GroupSolver:
         return len(np.unique(self.places.units[rows[near]])) if near.sum() >= 4 else 0
 
     def _in_feet(self, rows: np.ndarray) -> Contradiction | None:
-        """Return a contradiction if places fit the map once their heights are converted from or to feet."""
+        """Return a contradiction if points fit the map only after their heights are converted from or to feet."""
         some = self.places[rows]
         if len(some) < 4:
             return None
-        # Shrunk heights shrink their own blunders by as much: feet must explain more than that.
+        # Smaller heights make blunders smaller by the same factor, so the conversion must explain more than that.
         if not self._fits_in_feet(rows, 2 / FEET):
             return None
         kind, scenes = str(some.kinds[0]), self._scenes(rows)
-        text = f"the heights of {len(some)} {GROUPS[kind]} have the shape of the map only as feet taken for metres"
+        text = (
+            f"the heights of {len(some)} {GROUPS[kind]} match the shape of the map only if they are feet taken for "
+            "metres"
+        )
         return Contradiction(kind, kind, "feet", count=len(some), scenes=tuple(sorted(set(scenes))), text=text)
 
     def _fits_in_feet(self, rows: np.ndarray, better: float) -> bool:
-        """Return True if heights converted from or to feet fit the map within their errors, and better by a factor."""
+        """Return whether heights converted from or to feet fit the map within their errors, and better by a factor."""
         some = self.places[rows]
         left = min(self._converted(rows, factor)[rows].misfit_m() for factor in (FEET, 1 / FEET))
         return bool(some.misfit_m() > better * left and left < some.noise_m(sea=False))
 
     def _converted(self, rows: np.ndarray, factor: float) -> CommonPoints:
-        """Return all places, with the altitudes of some multiplied."""
+        """Return all points, with the altitudes of the points at ``rows`` multiplied by a factor."""
         own = altitudes(self.frame, self.places[rows].in_world)
         return self.places.moved(rows, np.outer(own * (factor - 1), [0, 0, 1]))
 
     def _ground(self, rows: np.ndarray) -> np.ndarray | None:
-        """Return the altitudes of marks on the ground among some places."""
+        """Return the altitudes of the marks on the ground among some points; None if there are none."""
         marks = self.places[rows[self.places.kinds[rows] == "points"]]
         return altitudes(self.frame, marks.in_world) if len(marks) else None
 
     # --- every other group -------------------------------------------------------------------------------------------
 
     def _compared(self, reference: _PartialSolution, left: np.ndarray) -> tuple[list[_ContradictingGroup], np.ndarray]:
-        """Compare groups with the reference: those that contradict it, and the places that agree with it."""
+        """Compare groups with the reference: return the groups that contradict it, and the rows of the points that
+        agree with it."""
         rivals: list[_ContradictingGroup] = []
         agreeing: list[np.ndarray] = []
         terms = self.system.terms.observations(reference.x)
@@ -397,7 +406,7 @@ class _GroupSolver:
             ]
             alpha = np.log((1 - GATE_PROBABILITY) / len(units))
             bad = [k for k, one in enumerate(shifts) if one.log_p < alpha or not one.shaped]
-            # What is common to a source takes along those of its units that alone are just below the gate.
+            # A common shift of a source also excludes units of that source that alone are just below the gate.
             bad += [k for k, one in enumerate(shifts) if k not in bad and any(_is_similar(one, shifts[j]) for j in bad)]
             good = [k for k in range(len(units)) if k not in bad]
             agreeing += [units[k][shifts[k].agree] for k in good]
@@ -408,7 +417,7 @@ class _GroupSolver:
     def _rivals(
         self, units: Sequence[np.ndarray], shifts: Sequence[CommonShift], num_good: int, reference: _PartialSolution
     ) -> list[_ContradictingGroup]:
-        """Form groups of two or more places with a common shift; single ones are blunders and excluded."""
+        """Form groups of two or more points with a common shift; single points are blunders and excluded."""
         unshaped = [k for k, one in enumerate(shifts) if not one.shaped]
         shaped = [k for k in range(len(shifts)) if k not in unshaped]
         sets = [np.array(unshaped)] if unshaped else []
@@ -422,7 +431,7 @@ class _GroupSolver:
             used = reference.rows[self._is_active(reference.active, reference.rows)]
             wrong = likely_causes(self.places[rows], shift, self.frame, self._ground(used))
             back = replace(shift, shift_m=-shift.shift_m)
-            # A wrong reference deforms the component, so that its shape is no evidence.
+            # A wrong reference deforms the component, so the shape of the component is no evidence.
             right = likely_causes(self.places[used], replace(back, shaped=True), self.frame, self._ground(rows))
             together = np.concatenate([used, rows])
             shifted = self.places.moved(rows, -shift.shift_m)[together].misfit_m()
@@ -438,7 +447,7 @@ class _GroupSolver:
         """Decide between the reference and the groups that contradict it.
 
         Returns:
-            None where the reference holds; the places to go on with where the reference is wrong; or a failure.
+            None if the reference is correct; the rows to continue with if the reference is wrong; or a failure.
         """
         used = reference.rows[self._is_active(reference.active, reference.rows)]
         own = str(self.places.kinds[used[0]])
@@ -474,7 +483,7 @@ class _GroupSolver:
                 continue
             both = tuple(dict.fromkeys([*rival.if_wrong, *rival.if_right]))
             one = describe_contradiction(some, scenes, rival.shift, own, both, "none")
-            one = replace(one, text=f"{one.text} Cannot tell which are right")
+            one = replace(one, text=f"{one.text} Cannot tell which are correct")
             self.contradictions.add(one, some)
             return self._failure(one.text)
         for one, some in named:
@@ -482,7 +491,7 @@ class _GroupSolver:
         return None
 
     def _left_out(self) -> np.ndarray:
-        """Return the rows of places that a contradiction has excluded."""
+        """Return the rows of the points that a contradiction has excluded."""
         kinds = np.where(self.places.kinds == "points", "point", "fix")
         pairs = zip(kinds.tolist(), self.places.rows.tolist(), strict=True)
         return np.flatnonzero([pair in self.contradictions.reasons for pair in pairs])
@@ -497,9 +506,7 @@ class _GroupSolver:
     # --- everything that agrees --------------------------------------------------------------------------------------
 
     def _all(self, reference: _PartialSolution, agreeing: np.ndarray) -> Solution:
-        """Solve with all groups that agree; or with the reference alone where they leave more undetermined than it
-        does.
-        """
+        """Solve with all groups that agree; or with the reference alone, if more stays undetermined with all groups."""
         rows = np.concatenate([reference.rows, agreeing])
         bars = self._bars(reference)
         best = reference
@@ -522,7 +529,7 @@ class _GroupSolver:
         )
 
     def _name_units(self, tie: _PartialSolution, rows: np.ndarray) -> None:
-        """Record captures that were excluded at last."""
+        """Record the captures that the last step excluded."""
         terms = self.system.terms.observations(tie.x)
         for unit in np.unique(self.places.units[rows]):
             mine = rows[self.places.units[rows] == unit]
@@ -530,9 +537,8 @@ class _GroupSolver:
             self._blunder([mine], [shift], tie.rows)
 
     def _bars(self, reference: _PartialSolution) -> np.ndarray:
-        """Select the scale bars to solve from (G,) bool; bars with a common contradiction to the reference are
-        recorded.
-        """
+        """Return a (G,) mask of the scale bars to use; bars that contradict the reference by a common factor are
+        recorded."""
         bars = self.system.terms.bars
         if not bars:
             return np.zeros(0, dtype=bool)
@@ -541,7 +547,7 @@ class _GroupSolver:
         bad = tests.log_p[3] < np.log(1 - GATE_PROBABILITY)
         if not bad.any():
             return ~bad
-        # Both whitened: the residual, and the derivative of a bar's length in the map by the log scale.
+        # Both values are whitened: the residual, and the derivative of a bar's length in the map by the log scale.
         ratios = np.maximum(1 - terms.residuals[:, 0] / terms.parts[2][1][:, 0, 6], 1e-9)
         same = bad & (np.abs(np.log(ratios / np.median(ratios[bad]))) < 0.02)
         if same.sum() < 2 or same.sum() <= (~bad).sum():
@@ -551,7 +557,7 @@ class _GroupSolver:
         cause = "feet" if feet else "scale"
         own = str(self.places.kinds[reference.rows[0]])
         text = (
-            f"{int(same.sum())} scale bars say {ratio:.4g} times the length that the {GROUPS[own]} give: "
+            f"{int(same.sum())} scale bars give {ratio:.4g} times the length that the {GROUPS[own]} give: "
             f"{format_causes([cause])}"
         )
         self.contradictions.add(

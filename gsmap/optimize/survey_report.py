@@ -1,4 +1,4 @@
-"""Residuals of observations, and the tie of a component to the world."""
+"""Report the residuals of observations, and the georeference of a component."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from gsmap.optimize.survey_terms import Terms, Unknowns
 from gsmap.reason_codes import reason
 from gsmap.types.world import Contradiction, Georeference, Residual, Survey, WorldFrame
 
-_MIN_CHECKS = 2.5  # redundancy of points, fixes and bars below which a note warns of unchecked observations
+_MIN_CHECKS = 2.5  # below this redundancy of points, fixes and bars a note warns of unchecked observations
 _CONTRADICTS = reason("contradicts_observations", "it contradicts the other observations")
-_BARS_CONTRADICT = reason("contradicts_observations", "the other bars contradict it")
-_NO_RAY = reason("no_ray", "no two photos show it, and no surface was rendered where one does")
+_BARS_CONTRADICT = reason("contradicts_observations", "the other scale bars contradict it")
+_NO_RAY = reason("no_ray", "no two photos show it, and the photo that shows it has no rendered surface there")
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +23,9 @@ class Solution:
     """A georeferenced component.
 
     Args:
-        active: observations that it was solved from.
-        contradictions: groups that were left out, or the observations of which it is unknown which are right.
-        reasons: by (kind, row) of an observation, the contradiction that left it out.
+        active: observations that the solution uses.
+        contradictions: groups that were left out, or observations that contradict each other undecidedly.
+        reasons: contradiction that left out an observation, by (kind, row) of the observation.
     """
 
     x: Unknowns
@@ -41,7 +41,7 @@ class SurveyFailure:
 
     Args:
         problem: observations that are missing, or that contradict each other.
-        code: of `gsmap.types.world.PROBLEMS`.
+        code: key of `gsmap.types.world.PROBLEMS`.
         contradictions: groups that contradict each other.
     """
 
@@ -51,7 +51,7 @@ class SurveyFailure:
 
 
 def active_observations(system: System, tie: Georeference) -> Active:
-    """Return the observations that an answer was solved from."""
+    """Return the observations that a stored answer used."""
     out = tie.left_out()
     terms = system.terms
     names = (
@@ -68,7 +68,7 @@ def active_observations(system: System, tie: Georeference) -> Active:
 
 
 def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFrame | None) -> Georeference:
-    """Build the tie to the world with all residuals."""
+    """Build the georeference of a component with all residuals."""
     x, active, factor = solved.x, solved.active, solved.factor
     tests = system.tests(x, active, factor)
     rows = _point_rows(system, solved, tests)
@@ -78,7 +78,7 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
     notes = []
     if factor_of > 1:
         notes.append(
-            f"observations and edges disagree by {np.sqrt(factor_of):.2g} times their stated errors: the "
+            f"observations and edges disagree by {np.sqrt(factor_of):.2g} times their stated errors; the "
             "covariance is scaled accordingly"
         )
     if sum(float(tests.redundancies[kind].sum()) for kind in (0, 2, 3)) < _MIN_CHECKS:
@@ -98,7 +98,7 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
 
 
 def tie_by_bars(system: System, index: int, survey: Survey, failure: SurveyFailure) -> Georeference:
-    """Build a tie from scale bars alone, where positions do not determine the rest: metric scale and nothing else."""
+    """Build a georeference from scale bars alone if positions do not suffice: it determines the metric scale only."""
     terms, missing = system.terms, failure.problem
     nothing = Georeference(
         index, frame=survey.frame, problem=missing, problem_code=failure.code, contradictions=failure.contradictions
@@ -133,10 +133,10 @@ def tie_by_bars(system: System, index: int, survey: Survey, failure: SurveyFailu
 
 
 def world_covariance(system: System, factor: Factor) -> np.ndarray:
-    """Compute the covariance (7, 7) of ``S_world_map`` with the anchor's scene taken as exact."""
+    """Compute the covariance (7, 7) of ``S_world_map``, where the pose of the anchor scene is taken as exact."""
     joint = factor.joint([system.own.anchor])
     back = system.scenes[np.array([system.own.anchor])]
-    # W X: on the scene's side the steps of both add; then back to the map's side.
+    # For the product W X the steps of both add on the scene's side; then they are moved back to the map's side.
     to_scene, to_map = back.inverse().adjoint()[0], back.adjoint()[0]
     both = np.concatenate([to_scene, np.eye(7)], axis=1)
     out: np.ndarray = to_map @ both @ joint @ both.T @ to_map.T
@@ -144,7 +144,7 @@ def world_covariance(system: System, factor: Factor) -> np.ndarray:
 
 
 def _variance_factor(system: System, x: Unknowns, active: Active, tests: ObservationTests) -> float:
-    """Compute the variance factor of the residuals where chance does not explain it; at least 1."""
+    """Compute the variance factor of the residuals if chance does not explain them; at least 1."""
     terms = system.terms.observations(x)
     total = sum(float(t.squares[a].sum()) for t, a in zip(terms, active, strict=True))
     count = sum(int(t.residuals.shape[1] * a.sum()) for t, a in zip(terms, active, strict=True))
@@ -190,7 +190,7 @@ def _point_rows(system: System, solved: Solution, tests: ObservationTests) -> li
 def _carried(
     system: System, k: int, images: Terms, picking: np.ndarray, factor: Factor, show: np.ndarray
 ) -> np.ndarray:
-    """Propagate the uncertainty of poses to a triangulated point, (3, 3)."""
+    """Propagate the uncertainty of poses to a triangulated point; return a (3, 3) covariance."""
     mine = np.flatnonzero((system.terms.image_points == k) & show & images.valid)
     some = Terms(
         "image", images.residuals[mine], tuple((f[mine], J[mine]) for f, J in images.parts), images.valid[mine]
@@ -263,9 +263,8 @@ def _bar_rows(system: System, solved: Solution, tests: ObservationTests) -> list
 
 
 def _agreed(logs: np.ndarray, variances: np.ndarray, probability: float) -> tuple[float, np.ndarray]:
-    """Average values that agree; with three or more, those far from the median are excluded. Also return which were
-    used.
-    """
+    """Average values that agree; of three or more, values far from the median are excluded. Also return which values
+    were used."""
     use = np.ones(len(logs), dtype=bool)
     if len(logs) >= 3:
         use = (logs - np.median(logs)) ** 2 <= chi2_quantile(probability, 1) * (variances + np.median(variances))

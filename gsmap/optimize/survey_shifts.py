@@ -1,4 +1,4 @@
-"""Common shifts of groups of observations against the rest of a solution, and their likely causes."""
+"""Estimate the common shift of a group of observations against the rest of a solution, and its likely causes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from gsmap.types.world import Contradiction, WorldFrame
 FEET = 0.3048
 GEOID_M = 110.0  # the geoid is between 107 m below and 86 m above the ellipsoid
 _EARTH_M = 6_371_000.0
-_SITE_M = 10.0  # how far above or below the marks of a site a drone takes off
-_FLOWN_M = 150.0  # how high above that it flies
+_SITE_M = 10.0  # largest height difference between take-off and the marks of a site
+_FLOWN_M = 150.0  # largest height of a drone above take-off
 
 GROUPS = {"points": "control points", "photos": "photos", "scenes": "surveyed scenes", "bars": "scale bars"}
 _REASONS = {
-    "altitude_zero": "their altitudes are 0, which is not measured",
+    "altitude_zero": "their altitudes are 0, so the device did not measure them",
     "feet": "feet taken for metres",
     "above_takeoff": "heights above take-off",
     "height_system": "ellipsoidal against orthometric heights",
@@ -35,13 +35,14 @@ _REASONS = {
 
 @dataclass(frozen=True, eq=False)
 class CommonShift:
-    """The common shift of some places against a solution.
+    """The common shift of some points against a solution.
 
     Args:
-        shift_m: (3,) measured less predicted. covariance: (3, 3) with all common errors; of directions that nothing
-            checks without bound.
-        log_p: logarithm of the probability of a shift as large by chance.
-        agree: (n,) the places that share it. shaped: whether the places have the shape that the map has.
+        shift_m: (3,) measured minus predicted position.
+        covariance: (3, 3) covariance of the shift with all common errors; unbounded in directions that nothing checks.
+        log_p: logarithm of the probability that chance causes a shift as large.
+        agree: (n,) mask of the points that share the shift.
+        shaped: the relative positions of the points match the map.
     """
 
     shift_m: np.ndarray
@@ -54,13 +55,13 @@ class CommonShift:
 def estimate_shift(
     system: System, all_terms: Sequence[Terms], factor: Factor, places: CommonPoints, *, used: bool
 ) -> CommonShift:
-    """Estimate the shift that some places have in common.
+    """Estimate the shift that some points have in common.
 
     Args:
-        all_terms: of points, images, fixes and bars at the answer that the factor is of.
+        all_terms: terms of points, images, fixes and bars at the same estimate as ``factor``.
         places: all control points, or all fixes.
-        used: True if the solution uses them: then their own contribution is removed (Baarda 1968, with one
-            alternative hypothesis for all of them); otherwise they are predicted.
+        used: the solution uses these points. Then their own contribution is removed (Baarda 1968, with one alternative
+            hypothesis for all of them); otherwise they are predicted.
     """
     terms = all_terms[0 if places.kinds[0] == "points" else 2]
     weights = 1 / places.own_m
@@ -93,13 +94,13 @@ def estimate_shift(
 
 
 def _crossed(terms: Terms, rows: np.ndarray, W: np.ndarray, size: int) -> np.ndarray:
-    """Compute derivatives (size, 3) by all columns against a shift of some measured positions."""
+    """Compute the derivatives (size, 3) of all columns with respect to a shift of some measured positions."""
     out = np.zeros((size, 3))
     for first, J in terms.parts:
         there = first[rows] >= 0
         some = rows[there]
         at = first[some][:, None] + np.arange(J.shape[2])
-        # A residual is the prediction less the measurement, so that a shift of the measurement lowers it.
+        # A residual is prediction minus measurement, so a shift of the measurement lowers it.
         np.add.at(out, at, np.einsum("gmw,gm->gwm", J[some], W[there]))
     return out
 
@@ -107,7 +108,7 @@ def _crossed(terms: Terms, rows: np.ndarray, W: np.ndarray, size: int) -> np.nda
 def _shaped(
     system: System, factor: Factor, terms: Terms, rows: np.ndarray, apart: np.ndarray, W: np.ndarray, own: np.ndarray
 ) -> bool:
-    """Return True if the relative positions of places match the map, within their own errors and the map's."""
+    """Return whether the relative positions of some points match the map, within the errors of both."""
     gate = chi2_quantile(GATE_PROBABILITY, 3)
     mean = (W**2 * apart).sum(0) / own
     if len(rows) < 3 or np.median((((apart - mean) * W) ** 2).sum(1)) <= gate:
@@ -129,20 +130,19 @@ def _shaped(
 
 
 def altitudes(frame: WorldFrame, positions: np.ndarray) -> np.ndarray:
-    """Compute heights (N,) above the reference surface of the world frame's origin, of positions (N, 3) in that
-    frame.
-    """
+    """Compute the (N,) heights of positions (N, 3) in the world frame above the reference surface of the frame's
+    origin."""
     out: np.ndarray = positions[:, 2] + frame.height_m + (positions[:, :2] ** 2).sum(1) / (2 * _EARTH_M)
     return out
 
 
 def is_unmeasured(places: CommonPoints, frame: WorldFrame) -> bool:
-    """Return True if the altitudes of photos are all 0, which means that the device wrote none."""
+    """Return whether the altitudes of photos are all 0, which means that the device did not measure them."""
     return len(places) >= 3 and bool((np.abs(altitudes(frame, places.in_world)) < 0.02).all())
 
 
 def cluster_shifts(shifts: Sequence[CommonShift], probability: float) -> list[np.ndarray]:
-    """Cluster shifts that agree with each other, the largest set first."""
+    """Cluster shifts that agree with each other, the largest cluster first."""
     left, out = list(range(len(shifts))), []
     gate = chi2_quantile(probability, 3)
     while left:
@@ -162,7 +162,7 @@ def _agree(a: CommonShift, b: CommonShift, gate: float) -> bool:
 
 
 def average_shifts(shifts: Sequence[CommonShift]) -> CommonShift:
-    """Average shifts that agree; as uncertain as the best of them, for their errors are shared."""
+    """Average shifts that agree. The average is as uncertain as the best shift, because their errors are shared."""
     best = min(shifts, key=lambda one: float(np.trace(one.covariance)))
     mean = np.mean([one.shift_m for one in shifts], axis=0)
     return CommonShift(
@@ -173,10 +173,10 @@ def average_shifts(shifts: Sequence[CommonShift]) -> CommonShift:
 def likely_causes(
     places: CommonPoints, shift: CommonShift, frame: WorldFrame, ground_m: np.ndarray | None
 ) -> tuple[str, ...]:
-    """List causes that explain a shift, the likeliest first, if these places are wrong and the others right.
+    """List causes that explain a shift, the likeliest first, if these points are wrong and the reference is correct.
 
     Args:
-        ground_m: altitudes of marks on the ground, or None where there are none.
+        ground_m: altitudes of marks on the ground, or None if there are none.
     """
     if not shift.shaped:
         return ("shape",)
@@ -216,10 +216,10 @@ def _heights(
 def describe_contradiction(
     places: CommonPoints, scenes: Sequence[str], shift: CommonShift, against: str, why: tuple[str, ...], kept: str
 ) -> Contradiction:
-    """Build the record of a group of places that contradicts other observations.
+    """Build the record of a group of points that contradicts other observations.
 
     Args:
-        scenes: ids of the captures that the places are of.
+        scenes: ids of the scenes to which the points belong.
     """
     group, n = str(places.kinds[0]), len(places)
     size = [float(v) for v in shift.shift_m]
@@ -231,7 +231,7 @@ def describe_contradiction(
     known = sigma[2] if across <= abs(up) else max(sigma[:2])
     of = f" of {len(set(scenes))} captures" if group == "photos" else ""
     other = "where others of them put them" if group == against else f"where the {GROUPS[against]} put them"
-    text = f"{n} {GROUPS[group]}{of} lie {way} {other} (known to {known:.2g} m): {format_causes(why)}"
+    text = f"{n} {GROUPS[group]}{of} lie {way} {other} (standard deviation {known:.2g} m): {format_causes(why)}"
     return Contradiction(
         group, against, why[0], tuple(why[1:]), kept, tuple(size), tuple(sigma), None, n, tuple(sorted(set(scenes))),
         text,
@@ -239,5 +239,5 @@ def describe_contradiction(
 
 
 def format_causes(why: Sequence[str]) -> str:
-    """Format the likely causes as a question."""
+    """Format the likely causes, as a question if they are guesses."""
     return ", or ".join(_REASONS[one] for one in why) + ("" if why[0] in ("vertical_shift", "split") else "?")

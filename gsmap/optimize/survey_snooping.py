@@ -1,4 +1,4 @@
-"""Data snooping (Baarda 1968): least squares of observations without those that contradict the rest."""
+"""Data snooping (Baarda 1968): solve least squares without the observations that contradict the rest."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from gsmap.optimize.survey_report import world_covariance
 from gsmap.optimize.survey_system import GATE_PROBABILITY, Active, Factor, ObservationTests, System
 from gsmap.optimize.survey_terms import Terms, Unknowns
 
-MAX_ROUNDS = 50  # of leaving out the worst observation and solving again
+MAX_ROUNDS = 50  # number of times that the worst observation is left out and the system solved again
 
 
 def initial_points(system: System, x: Unknowns) -> np.ndarray:
-    """Return points (K, 3): check points triangulated from photos, the others as they are."""
+    """Return points (K, 3): check points are triangulated from photos, all other points stay as they are."""
     met, _, determined = system.terms.triangulate(x, np.ones(len(system.terms.images), dtype=bool))
     return np.where((determined & system.is_check)[:, None], met, x.points)
 
 
 def exclude_outliers(system: System, x: Unknowns, allowed: Active, gross: Active) -> tuple[Unknowns, Active]:
-    """Solve without outliers: graduated non-convexity (Geman-McClure), then exclude the worst and readmit what fits
-    again.
+    """Solve without outliers: graduated non-convexity (Geman-McClure), then exclude the worst observation or readmit
+    one that fits, repeatedly.
 
     Args:
-        allowed: observations that may be solved from. gross: those of them that are left out to begin with.
+        allowed: observations that may be used.
+        gross: allowed observations that are left out at the start.
     """
     active: Active = tuple(use & ~bad for use, bad in zip(allowed, gross, strict=True))  # type: ignore[assignment]
     x = system.fit(replace(x, points=system.points_at(x, active)), system.as_weights(active), max_steps=3)
@@ -59,12 +60,12 @@ def _seen(system: System, x: Unknowns, active: Active, bars: Sequence[float]) ->
 def _exchange(
     system: System, active: Active, allowed: Active, tests: ObservationTests, failures: list[np.ndarray]
 ) -> bool:
-    """Exclude the observation that contradicts the others most, or readmit one that fits; True if any changed."""
+    """Exclude the observation that contradicts the rest most, or readmit one that fits; return whether any changed."""
     worst, place = 0.0, None
     alpha = np.log(1 - GATE_PROBABILITY)
     for kind, (use, log_p) in enumerate(zip(active, tests.log_p, strict=True)):
         for k in np.flatnonzero(use & (log_p < alpha)).tolist():
-            # Of equivalent observations the survey of the point is excluded first: points come first.
+            # If observations are equivalent, the survey of the point is excluded first: points come first.
             if log_p[k] < worst - 1e-6 * abs(worst) - 1e-9 and not (kind == 1 and system.lone[k]):
                 worst, place = float(log_p[k]), (kind, k)
     if place is not None:
@@ -82,19 +83,19 @@ def _exchange(
 
 
 def describe_weakness(system: System, factor: Factor) -> str:
-    """Describe the directions that a solution leaves undetermined; empty where there are none."""
+    """Describe the directions that a solution leaves undetermined; empty if there are none."""
     covariance = world_covariance(system, factor)
     values, axes = np.linalg.eigh(covariance[:3, :3])
     turn = float(np.degrees(np.sqrt(max(0.0, values[-1]))))
     if turn > MAX_ROTATION_SIGMA_DEG:
         axis = ", ".join(f"{v:.2f}" for v in axes[:, -1])
         return (
-            f"rotation about the map's axis ({axis}) is not determined (known to {turn:.2g} deg): add control "
-            "points or positions far from the others, across that axis"
+            f"rotation about the map's axis ({axis}) is not determined (standard deviation {turn:.2g} deg): add "
+            "control points or positions far from that axis"
         )
     if np.sqrt(covariance[6, 6]) > MAX_LOG_SCALE_SIGMA:
         return (
-            f"scale is not determined (known to {100 * np.sqrt(covariance[6, 6]):.2g} %): add control points or "
-            "positions further apart, or a scale bar"
+            f"scale is not determined (standard deviation {100 * np.sqrt(covariance[6, 6]):.2g} %): add control "
+            "points or positions further apart, or a scale bar"
         )
     return ""

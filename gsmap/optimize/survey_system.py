@@ -1,4 +1,4 @@
-"""Sparse normal equations of one component with its observations: solve, covariances and tests."""
+"""Sparse normal equations of one component with its observations: solve, compute covariances and test observations."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import linearize, residuals
 from gsmap.optimize.survey_terms import SurveyTerms, Terms, Unknowns
 
-GATE_PROBABILITY = 0.999  # quantile of the chi-square of an observation against all others; beyond it is an outlier
-MIN_REDUNDANCY = 1e-3  # directions of an observation that the others check by no more than this are not tested
+GATE_PROBABILITY = 0.999  # an observation is an outlier if its chi-square exceeds this quantile
+MIN_REDUNDANCY = 1e-3  # directions of an observation with less redundancy are not tested
 
 Active = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Which points, images, fixes and bars are solved from, each (G,) bool."""
+"""The points, images, fixes and bars that a solution uses, as one (G,) mask of each kind."""
 
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """Scenes, edges and priors that a component is solved from, besides observations.
+    """Scenes, edges and priors of a component, without observations.
 
     Args:
-        scenes: (n,) its rows among all scenes.
-        edges: the accepted edges, between all scenes. priors: those of its scenes.
-        anchor: row of its anchor scene.
-        held: (K, dim) whitened directions in which the anchor is held, see `gsmap.optimize.gtsam_solve`.
+        scenes: (n,) rows of the component's scenes among all scenes.
+        edges: the accepted edges, with rows among all scenes.
+        priors: priors of the component's scenes.
+        anchor: row of the anchor scene.
+        held: (K, dim) whitened directions in which the anchor is fixed, see `gsmap.optimize.gtsam_solve`.
     """
 
     scenes: np.ndarray
@@ -46,7 +47,7 @@ class Component:
         return self.edges.dim
 
     def local(self) -> Component:
-        """Return the component with rows counted within it."""
+        """Return the component with rows counted among its own scenes."""
         row = np.full(int(self.scenes.max()) + 1, -1)
         row[self.scenes] = np.arange(len(self.scenes))
         ids = tuple(self.edges.scene_ids[k] for k in self.scenes.tolist())
@@ -57,10 +58,11 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Factorised normal equations at an answer.
+    """Factorized normal equations at an estimate.
 
     Args:
-        lu: of the matrix with a unit diagonal. root: (size,) what its diagonal was divided by.
+        lu: LU factors of the matrix, scaled to a unit diagonal.
+        root: (size,) square roots of the original diagonal.
     """
 
     lu: Any
@@ -92,7 +94,7 @@ class Factor:
         return out
 
     def joint(self, rows: Sequence[int]) -> np.ndarray:
-        """Compute the joint covariance of the world and of scenes, 7 each."""
+        """Compute the joint covariance of ``S_world_map`` and of some scenes, 7 rows each."""
         d, world = self.dim, self.num_scenes * self.dim
         places = [world + k for k in range(7)] + [row * d + k for row in rows for k in range(d)]
         found = self.columns(np.array(places))[places]
@@ -104,9 +106,8 @@ class Factor:
 
 @dataclass(frozen=True, eq=False)
 class ObservationTests:
-    """Test statistics of points, images, fixes and bars, (G,) each: chi-square against all other observations, its
-    degrees of freedom, its log p-value, and the redundancy of observations in use.
-    """
+    """Test statistics of points, images, fixes and bars, (G,) each: the chi-square of an observation against all
+    remaining observations, its degrees of freedom, its log p-value, and its redundancy if it is used."""
 
     statistics: tuple[np.ndarray, ...]
     dofs: tuple[np.ndarray, ...]
@@ -182,10 +183,10 @@ class System:
         return Factor(lu, root, self.own.dim, len(self.scenes))
 
     def factor(self, x: Unknowns, weights: Active, *, world_held: bool = False) -> Factor:
-        """Factorise the normal equations at an answer.
+        """Factorize the normal equations at an estimate.
 
         Args:
-            world_held: ``S_world_map`` is no unknown, for nothing was observed.
+            world_held: ``S_world_map`` is no unknown, because there are no observations.
         """
         H, _ = self._normal(self._all(x, x, self.as_weights(weights)))
         if world_held:
@@ -197,7 +198,7 @@ class System:
         """Fit by least squares with fixed weights: Gauss-Newton with step halving.
 
         Args:
-            hold: scenes and the world stay as they are.
+            hold: keep the scene poses and ``S_world_map``.
         """
         cost = self._cost(x, x, weights)
         for _ in range(max_steps):
@@ -228,15 +229,16 @@ class System:
         return points, images, fixes, bars
 
     def points_at(self, x: Unknowns, active: Active) -> np.ndarray:
-        """Triangulate the points that are not fixed by their survey."""
+        """Triangulate the points whose positions the survey does not fix."""
         met, _, determined = self.terms.triangulate(x, active[1])
         return np.where((determined & ~active[0])[:, None], met, x.points)
 
     def tests(self, x: Unknowns, active: Active, factor: Factor) -> ObservationTests:
-        """Test each observation against all others (Baarda 1968): its residual relative to its covariance given them.
+        """Test each observation against all remaining observations (Baarda 1968): compare its residual with the
+        covariance predicted from them.
 
-        Of one that was solved from, its own part is taken out: ``r^T (Q - A S A^T)^-1 r``; of another it is not in:
-        ``r^T (Q + A S A^T)^-1 r``.
+        The chi-square of an observation that the solution uses is ``r^T (Q - A S A^T)^-1 r``, which removes its own
+        contribution; for an unused observation it is ``r^T (Q + A S A^T)^-1 r``.
         """
         statistics, dofs, log_p, redundancies = [], [], [], []
         for terms, use in zip(self.terms.observations(x), active, strict=True):

@@ -1,9 +1,8 @@
 """Observations of the world as least-squares terms over scene poses, and the unknowns that they add.
 
-Unknowns are scene poses ``S_map_scene``, the component's ``S_world_map``, the control points (world frame), cameras of
-photos that were localised, and the errors that fixes have in common: offset and drift of a capture, the sea level.
-Steps are on the source side, as everywhere; a point ``x`` in the source frame moves by ``G(x) step`` with
-``G(x) = [-skew(x), I, x]``.
+Unknowns are scene poses ``S_map_scene``, the component's ``S_world_map``, control points (world frame), cameras of
+localized photos, and the errors that fixes share: offset and drift of a capture, and the sea level. Steps are on the
+source side, as everywhere; a point ``x`` in the source frame moves by ``G(x) step`` with ``G(x) = [-skew(x), I, x]``.
 
 All observations are stored as arrays by kind of term.
 """
@@ -22,10 +21,11 @@ from gsmap.geometry.similarities import Similarities, commutator, exp
 from gsmap.types import Sim3
 from gsmap.types.world import ControlPoint, ImagePoint, PositionFix, ScaleBar, Survey
 
-_FAR = 1e6  # m: sigma of points without other terms, which keeps the system regular without effect
-_BEHIND = 1e3  # residual in standard deviations of a point behind the camera
-_DRIFT = 0.5  # of a common sigma: errors of satellites last hours, a flight a quarter of one (Gauss-Markov, 2 h: 0.48)
-_CORRECTED = 0.5  # m: sigma below which a receiver has corrections (RTK, PPK)
+_FAR = 1e6  # m: sigma of a weak term of every point, which keeps the system regular where a point has no other term
+_BEHIND = 1e3  # residual of a point behind the camera, in standard deviations
+# Drift as a share of the common sigma: GNSS errors last hours, a flight 15 minutes (Gauss-Markov, 2 h: 0.48).
+_DRIFT = 0.5
+_CORRECTED = 0.5  # m: a receiver with a smaller sigma has corrections (RTK, PPK)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,12 @@ class Unknowns:
     """Estimate of all unknowns.
 
     Args:
-        scenes: N poses. world: ``S_world_map``, as one row. points: (K, 3). cameras: M poses, scene frame.
-        offsets: (B, 3) common errors of fixes in standard deviations: of groups, their drifts, and of the sea level.
+        scenes: N poses.
+        world: ``S_world_map``, as one row.
+        points: (K, 3) positions in the world frame.
+        cameras: M poses in the scene frame.
+        offsets: (B, 3) common errors of fixes in standard deviations: offsets of groups, their drifts, and the sea
+            level.
     """
 
     scenes: Similarities
@@ -59,7 +63,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Columns:
-    """Column layout of a step: scenes (``dim`` each), world (7), points (3), cameras (6), offsets (3)."""
+    """Column layout of a step: scenes (``dim`` columns each), world (7), points (3), cameras (6), offsets (3)."""
 
     num_scenes: int
     dim: int
@@ -93,10 +97,10 @@ class Terms:
     """G whitened terms of one kind, each of m rows.
 
     Args:
-        kind: of observation, as in `Residual`; empty for what is no observation (edges, priors, cameras, offsets).
-        residuals: (G, m).
-        parts: (first column (G,), derivative (G, m, width)) by unknown; a first column of -1 is none.
-        valid: (G,) bool, False where the term means nothing at this estimate (behind the camera).
+        kind: kind of observation, as in `Residual`; empty for edges, priors, cameras and offsets.
+        residuals: (G, m) residuals.
+        parts: (first column (G,), derivative (G, m, width)) for each unknown; a first column of -1 means no unknown.
+        valid: (G,) mask, False if the term is meaningless at this estimate (a point behind the camera).
     """
 
     kind: str
@@ -111,7 +115,7 @@ class Terms:
         return out
 
     def rows(self, size: int) -> np.ndarray:
-        """Expand dense derivatives (G, m, size) by all columns; of few terms only."""
+        """Expand the derivatives to dense rows (G, m, size) over all columns; only for few terms."""
         g, m = self.residuals.shape
         out = np.zeros((g, m, size))
         for first, J in self.parts:
@@ -125,9 +129,9 @@ class SurveyTerms:
     """The observations of one component as arrays.
 
     Args:
-        scene_ids: N, in the order of the scenes of `Unknowns`.
-        dim: unknowns of a scene's pose, 6 or 7.
-        points, images, fixes, bars: positions in the world frame.
+        scene_ids: N ids, in the order of the scenes of `Unknowns`.
+        dim: number of unknowns of a scene's pose, 6 or 7.
+        points, images, fixes, bars: the observations, with positions in the world frame.
     """
 
     scene_ids: tuple[str, ...]
@@ -139,9 +143,8 @@ class SurveyTerms:
 
     @classmethod
     def of(cls, survey: Survey, scene_ids: Sequence[str], dim: int) -> SurveyTerms:
-        """Select the observations of the scenes of one component; points that none of their photos shows are left
-        out.
-        """
+        """Select the observations of the scenes of one component; points that no photo of these scenes shows are left
+        out."""
         mine = set(scene_ids)
         known = {point.name for point in survey.points}
         images = tuple(i for i in survey.images if i.scene in mine and i.point in known)
@@ -172,12 +175,12 @@ class SurveyTerms:
 
     @cached_property
     def image_points(self) -> np.ndarray:
-        """Index (I,) of the point that each image shows."""
+        """(I,) index of the point that each image shows."""
         return np.array([self._point_row[i.point] for i in self.images], dtype=np.int64)
 
     @cached_property
     def image_scenes(self) -> np.ndarray:
-        """Index (I,) of the scene that each image's camera is in."""
+        """(I,) index of the scene to which each image's camera belongs."""
         return np.array([self._row[i.scene] for i in self.images], dtype=np.int64)
 
     @cached_property
@@ -195,21 +198,21 @@ class SurveyTerms:
 
     @cached_property
     def _image_cameras(self) -> np.ndarray:
-        """Index (I,) of the camera of each image, -1 where it is exact."""
+        """(I,) index of the camera of each image, -1 if the camera is exact."""
         return np.array([self._camera_rows.get((i.scene, i.image), -1) for i in self.images], dtype=np.int64)
 
     @cached_property
     def fix_groups(self) -> list[tuple[str, bool]]:
-        """Group (F) of each fix with a common error: its scene, and whether its receiver has corrections.
+        """(F) group of each fix with a common error: its scene, and whether its receiver has corrections.
 
-        Receivers with and without corrections have independent errors, even in one capture.
+        The errors of receivers with corrections and of receivers without are independent, even in one capture.
         """
         return [(f.scene, float(np.hypot(f.sigma_m[0], f.common_sigma_m[0])) < _CORRECTED) for f in self.fixes]
 
     @cached_property
     def _loads(self) -> tuple[list[tuple[np.ndarray, np.ndarray]], int]:
-        """By kind of common error (offset, drift, sea level): its row of each fix, -1 where none, and (F, 3) metres of
-        a standard deviation of it; and the number of rows.
+        """For each kind of common error (offset, drift, sea level) return the row of each fix, -1 if none, and (F, 3)
+        metres per standard deviation; also return the number of rows.
 
         Each fix has its own sigma of the common error, so that a poor fix does not degrade the others.
         """
@@ -228,7 +231,7 @@ class SurveyTerms:
         return kinds, 2 * len(groups) + int(sea.any())
 
     def start(self, scenes: Similarities, world: Sim3) -> Unknowns:
-        """Initialize points at their survey, cameras as localized, and no common errors."""
+        """Initialize points at their surveyed positions, cameras as localized, and common errors as zero."""
         cameras = [Sim3.from_matrix(image.T_scene_camera) for image in self._uncertain.values()]
         return Unknowns(
             scenes,
@@ -245,10 +248,10 @@ class SurveyTerms:
         return self._points(x), self._images(x), self._fixes(x), self._bars(x)
 
     def others(self, x: Unknowns, at: Unknowns) -> tuple[Terms, ...]:
-        """Return the terms of localized cameras and common errors, and very weak ones of the points.
+        """Return the terms of localized cameras and of common errors, and very weak terms of the points.
 
         Args:
-            at: where the steps of points are counted from.
+            at: points from which the steps of points are measured.
         """
         columns, k = self.columns, len(self.points)
         points = Terms(
@@ -263,7 +266,7 @@ class SurveyTerms:
         roots = roots.reshape(m, 6, 6)
         off = (start.inverse() @ x.cameras).log()
         ad = commutator(off)
-        back = (np.eye(7) + ad / 2 + ad @ ad / 12)[:, :6, :6]  # as of edges
+        back = (np.eye(7) + ad / 2 + ad @ ad / 12)[:, :6, :6]  # as for edges
         cameras = Terms(
             "",
             np.einsum("kij,kj->ki", roots, off[:, :6]),
@@ -297,7 +300,7 @@ class SurveyTerms:
         in_scene = pose.inverse().apply(in_map)
         camera = self.cameras_at(x)
         in_camera = camera.inverse().apply(in_scene)
-        # Each frame's own step, then the chain towards the camera.
+        # First the step of each frame itself, then the chain towards the camera.
         to_scene = _linear(pose.inverse())
         to_camera = _linear(camera.inverse())
         by_world = to_camera @ to_scene @ -_moves(in_map)
@@ -331,7 +334,7 @@ class SurveyTerms:
         return Terms("image", r, parts, valid)
 
     def cameras_at(self, x: Unknowns) -> Similarities:
-        """Return the camera (I) of each image in its scene."""
+        """Return the (I) camera poses of all images, each in its scene's frame."""
         rows = np.flatnonzero(self._image_cameras >= 0)
         exact = self._exact_cameras
         return exact.replaced(rows, x.cameras[self._image_cameras[rows]]) if len(rows) else exact
@@ -374,7 +377,7 @@ class SurveyTerms:
         return Terms("fix", residual, parts, np.ones(count, dtype=bool))
 
     def fix_points(self, scenes: Similarities) -> np.ndarray:
-        """Return the positions (F, 3) of fixes in the map."""
+        """Return the (F, 3) positions of fixes in the map."""
         rows = np.array([self._row[fix.scene] for fix in self.fixes], dtype=np.int64)
         return scenes[rows].apply(np.array([fix.point for fix in self.fixes], dtype=np.float64).reshape(-1, 3))
 
@@ -394,7 +397,7 @@ class SurveyTerms:
         sigma = np.array([bar.sigma_m for bar in self.bars])
         sizes = np.stack([np.exp(pose.log_scales) for pose in poses], axis=1)
         measured = np.array([bar.length_m for bar in self.bars])
-        # In metres by the bar itself: by the estimate, a larger world would reduce the weight of its own errors.
+        # Metres are defined by the bar: by the estimate, a larger world would reduce the weight of its own errors.
         metres = (measured / np.maximum(across, 1e-300))[:, None]
         picked = np.array([bar.point_sigmas for bar in self.bars]) * sizes * metres
         weight = 1 / np.sqrt(sigma**2 + (picked**2).sum(1))
@@ -414,15 +417,17 @@ class SurveyTerms:
     # --- points from photos alone ------------------------------------------------------------------------------------
 
     def triangulate(self, x: Unknowns, use: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Triangulate points from photos alone, all poses fixed.
+        """Triangulate points from photos alone, with all poses fixed.
 
-        Two or more rays intersect at their least-squares point; a single ray at the rendered surface.
+        The point of two or more rays is their least-squares intersection; a single ray gives its intersection with the
+        rendered surface.
 
         Args:
-            use: (I,) bool, images to take.
+            use: (I,) mask of the images to use.
 
         Returns:
-            (K, 3) world frame, (K, 3, 3) covariance of picking alone, (K,) bool, points that the photos determine.
+            (K, 3) positions in the world frame, (K, 3, 3) covariances due to picking alone, and a (K,) mask of the
+            points that the photos determine.
         """
         world = x.world[np.zeros(len(self.images), dtype=np.int64)]
         full = world @ x.scenes[self.image_scenes] @ self.cameras_at(x) if len(self.images) else world
@@ -452,9 +457,8 @@ class SurveyTerms:
         return at.points, covariances, determined
 
     def _meeting(self, cameras: Similarities, images: Sequence[ImagePoint]) -> np.ndarray | None:
-        """Return a first guess of the intersection of rays; None where they are too few or parallel and no surface is
-        known.
-        """
+        """Return a first estimate of the intersection of rays; None if they are too few or parallel and no surface is
+        known."""
         if not images:
             return None
         centres = cameras.translations
@@ -484,18 +488,18 @@ def _per_axis(sigma_m: tuple[float, float]) -> np.ndarray:
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Return the sort key of names in natural order: 2 before 10."""
+    """Return a sort key that puts names in natural order: 2 before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _linear(poses: Similarities) -> np.ndarray:
-    """Compute ``s R`` (N, 3, 3)."""
+    """Compute the matrices ``s R`` (N, 3, 3) of poses."""
     out: np.ndarray = poses.rotations * np.exp(poses.log_scales)[:, None, None]
     return out
 
 
 def _moves(points: np.ndarray) -> np.ndarray:
-    """Compute derivatives (N, 3, 7) of points by a step of their frame: ``[-skew(x), I, x]``."""
+    """Compute the derivatives (N, 3, 7) of points with respect to a step of their frame: ``[-skew(x), I, x]``."""
     out = np.zeros((len(points), 3, 7))
     out[:, :, :3] = -skew(points)
     out[:, :, 3:6] = np.eye(3)
@@ -504,6 +508,6 @@ def _moves(points: np.ndarray) -> np.ndarray:
 
 
 def _whitener(covariance: np.ndarray) -> np.ndarray:
-    """Compute ``L^-1`` (6, 6) of a covariance ``L L^T``."""
+    """Compute ``L^-1`` (6, 6), the whitening matrix of a covariance ``L L^T``."""
     out: np.ndarray = np.linalg.inv(np.linalg.cholesky((covariance + covariance.T) / 2))
     return out

@@ -1,4 +1,4 @@
-"""Unchanged poses: keep previous poses where the new ones differ by less than their uncertainty."""
+"""Keep previous poses where the new poses differ by less than their uncertainty."""
 
 from __future__ import annotations
 
@@ -11,28 +11,30 @@ from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.params import Params
 from gsmap.types import Edge, EdgeOutcome, PoseGraph, ScenePose, Sim3
 
-_MAX_VARIANCE_CHANGE = 1e-2  # of covariances as a fraction of the variances, and of chi-squares of edges
-_ROUNDING = 1e-9  # rad, scene units, log scale: below the precision of any pose
-_ROUNDS = 20  # of moving scenes at the rim of a group that moved; then no scene of the component stays
-_SEAM = 10.0  # factor on the tolerance of edges at the rim of a group that moved, where small steps add up
+_MAX_VARIANCE_CHANGE = 1e-2  # covariances and chi-squares that change by less (relative) are kept
+_ROUNDING = 1e-9  # in rad, scene units and log scale: below the precision of any pose
+_ROUNDS = 20  # number of times that scenes at the rim of a moved group are added to it; then the whole component moves
+_SEAM = 10.0  # factor on the tolerance of edges at the rim of a moved group, where small steps add up
 
 
 def keep_unchanged_poses(
     answer: PoseGraph, previous: PoseGraph | None, edges: Sequence[Edge], params: Params
 ) -> PoseGraph:
-    """Return the answer with the poses, covariances and chi-squares of the previous one where both are equivalent.
+    """Return the answer, with the poses, covariances and chi-squares of the previous answer wherever both are
+    equivalent.
 
-    A scene keeps its pose if the new one is within ``params.max_unchanged_sigmas`` of its standard deviations, and if
-    its relative pose to each neighbour is within as many standard deviations of their edge: far from the anchor,
-    rounding turns all scenes together, which moves each by more than the uncertainty of its edges, but none against
-    another. Scenes that moved are placed beside unchanged ones as in the answer.
+    A scene keeps its pose if the new pose is within ``params.max_unchanged_sigmas`` standard deviations of the previous
+    one, and if its relative pose to each neighbour is within as many standard deviations of their edge. Both tests are
+    needed: far from the anchor, rounding may rotate all scenes together, which moves each by more than the uncertainty
+    of its edges, but not relative to its neighbours. Scenes that moved are placed relative to unchanged scenes as in
+    the answer.
 
-    Every comparison is with an answer from all edges, so that small steps do not add up.
+    Every comparison uses an answer computed from all edges, so small steps do not add up.
 
     Args:
-        previous: the previous answer; None keeps nothing.
-        edges: the edges of the answer; at least those of all scenes whose pose is not the same object as before, and of
-            their neighbours.
+        previous: the previous answer; with None nothing is kept.
+        edges: the edges of the answer; at least the edges of all scenes whose pose is not the same object as before,
+            and of their neighbours.
         params: ``max_unchanged_sigmas`` is used.
     """
     if previous is None or not answer.poses:
@@ -61,10 +63,10 @@ class _PosePairs:
     """N scenes by id with their new and previous poses, and the E edges in use between them.
 
     Args:
-        known: (N,) bool, scenes with a previous pose; ``before`` has the new one for the others.
+        known: (N,) mask of scenes with a previous pose; ``before`` has the new pose of the remaining scenes.
         targets, sources: (E,) rows of ``scenes``.
-        information: (E, 7, 7).
-        component: (N,).
+        information: (E, 7, 7) information matrices.
+        component: (N,) component of each scene.
     """
 
     scenes: list[str]
@@ -100,7 +102,7 @@ class _PosePairs:
         )
 
     def still(self, answer: PoseGraph, sigmas: float) -> np.ndarray:
-        """Find scenes (N,) whose poses are unchanged."""
+        """Return an (N,) mask of the scenes whose poses are unchanged."""
         steps = (self.before.inverse() @ self.now).log()
         covariances = [answer.poses[scene].covariance for scene in self.scenes]
         sigma = np.array([np.zeros(7) if c is None else np.sqrt(np.maximum(np.diag(c), 0)) for c in covariances])
@@ -115,9 +117,9 @@ class _PosePairs:
         return still
 
     def beside(self, still: np.ndarray, sigmas: float) -> dict[int, Sim3]:
-        """Align each group of scenes that moved with an unchanged scene beside it; return their poses by row.
+        """Align each group of moved scenes with an unchanged scene beside it; return the aligned poses by row.
 
-        Where that leaves a gap to another unchanged scene, that one moves as well, and ``still`` is updated.
+        If a gap to another unchanged scene remains, that scene moves as well, and ``still`` is updated.
         """
         ends = np.stack([self.targets, self.sources])
         for _ in range(_ROUNDS):
@@ -133,10 +135,11 @@ class _PosePairs:
         return {row: poses.item(row) for row in rows.tolist()}
 
     def _put_beside(self, still: np.ndarray) -> tuple[Similarities, np.ndarray]:
-        """Align the groups that moved: all poses, and the rows of those that are neither previous nor new poses."""
+        """Align the groups of moved scenes; return all poses, and the rows of the poses that are neither previous nor
+        new."""
         ends, n = np.stack([self.targets, self.sources]), len(self.scenes)
         moved = ~still[ends].any(0)
-        import scipy.sparse as sp  # naming a recipe does without
+        import scipy.sparse as sp  # imported here, as the recipe key does not need it
         from scipy.sparse.csgraph import connected_components
 
         tied = sp.coo_matrix((np.ones(moved.sum()), ends[:, moved]), shape=(n, n))
@@ -145,7 +148,7 @@ class _PosePairs:
         stays = np.where(still[ends[0]], ends[0], ends[1])[seam]
         goes = np.where(still[ends[0]], ends[1], ends[0])[seam]
         contact = np.full(n, n)
-        np.minimum.at(contact, group[goes], stays)  # the first by id: whatever the order of edges
+        np.minimum.at(contact, group[goes], stays)  # the first scene by id, whatever the order of edges
         loose = np.flatnonzero(~still)
         poses = self.before.replaced(loose, self.now[loose])
         rows = loose[contact[group[loose]] < n]
@@ -154,7 +157,7 @@ class _PosePairs:
         return poses.replaced(rows, (back @ self.now[rows]).orthonormalised()), rows
 
     def _off(self, poses: Similarities, which: np.ndarray) -> np.ndarray:
-        """Compute the distance (K,) of some edges from the answer's relative poses, in standard deviations."""
+        """Compute the (K,) distances of some edges from the answer's relative poses, in standard deviations."""
         a, b = self.targets[which], self.sources[which]
         xi = ((poses[a].inverse() @ poses[b]).inverse() @ (self.now[a].inverse() @ self.now[b])).log()
         chi2: np.ndarray = np.einsum("ei,eij,ej->e", xi, self.information[which], xi)

@@ -21,8 +21,9 @@ _DEPTH_TOLERANCE = 0.02
 # as no camera of the capture need have looked there.
 _SYNTHESIZED_REACH_M = 1.0
 _MIN_ALPHA = 0.5  # a fainter pixel shows no surface
-# Patterns are compared within patches of _PATTERN_PX, where both scenes show one: RGB in [0, 1] has a standard deviation
-# of _MIN_PATTERN. They differ where their correlation is below _PATTERN_CORRELATION and far below that of the whole pair.
+# Patterns are compared within patches of _PATTERN_PX pixels where both scenes show one, that is, where RGB in [0, 1]
+# has a standard deviation of _MIN_PATTERN. They differ where their correlation is below _PATTERN_CORRELATION and far
+# below that of the whole pair.
 _PATTERN_PX = 8
 _MIN_PATTERN = 0.05
 _PATTERN_CORRELATION = 0.1

@@ -86,7 +86,7 @@ def test_missing_covariances_are_noted():
     more = optimize([*world.ids, "new"], [*world.edges, *attached(world)], previous=answer, params=few)
     assert more.provenance.method == "incremental"
     assert more.notes[: len(answer.notes)] == answer.notes
-    assert "scene new counts from its neighbours" in more.notes[-1]
+    assert "scene new is relative to its neighbours" in more.notes[-1]
 
 
 def attached(world):
