@@ -28,8 +28,9 @@ class Params:
         test: Test whether two correspondences are compatible: their distance in one scene may differ from their
             distance in the other scene by a fixed error (``absolute``) or by a fraction of the distance (``ratio``, as
             in Graph-GSReg).
-        height_slope: Largest difference in height per metre of distance, at least 0, where gravity is known in both
-            scenes; a larger value tolerates tilted scenes and inf switches the test off.
+        height_slope: Largest difference, per metre of distance, between the height difference of two correspondences in
+            one scene and that in the other, at least 0, where gravity is known in both scenes; a larger value tolerates
+            tilted scenes, and inf switches the test off.
     """
 
     test: Test = "absolute"
