@@ -6,7 +6,13 @@ import sys
 import time
 
 
+def at_work() -> None:
+    sys.stdout.write("working\n")  # at once: two workers write to one pipe
+    sys.stdout.flush()
+
+
 def sleep(seconds: float) -> float:
+    at_work()
     time.sleep(seconds)
     return seconds
 
@@ -15,6 +21,7 @@ def compute(seconds: float) -> float:
     """Native code that lets the interpreter go but does not come back."""
     import numpy as np
 
+    at_work()
     deadline = time.monotonic() + seconds
     big = np.ones((1500, 1500))
     while time.monotonic() < deadline:
@@ -26,6 +33,7 @@ def hog(seconds: float) -> float:
     """Native code that keeps the interpreter to itself: nothing of Python runs in this process meanwhile."""
     import ctypes
 
+    at_work()
     ctypes.PyDLL(None).sleep(int(seconds))
     return seconds
 
