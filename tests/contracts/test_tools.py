@@ -1,16 +1,36 @@
-"""Tools name modules and tests that exist."""
+"""Mutation testing runs the tests that reach a mutant, with the code of the mutant."""
 
-from pathlib import Path
+from __future__ import annotations
 
 import pytest
 
-from tools.check.mutation import TESTS
+from tools.check import mutation
 
-ROOT = Path(__file__).resolve().parents[2]
+SOURCE = """\
+LIMIT = 3
+
+def clipped(values):
+    if (
+        len(values)
+        > LIMIT
+    ):
+        return [value + 1 for value in values[:LIMIT]]
+    return values
+"""
 
 
-@pytest.mark.parametrize(("room", "module"), [(room, module) for room, tests in TESTS.items() for module in tests])
-def test_mutation_testing_names_modules_and_their_tests(room: str, module: str) -> None:
-    assert (ROOT / "gsmap" / room / f"{module}.py").is_file()
-    for name in TESTS[room][module].split():
-        assert (ROOT / "tests" / room / name).is_file()
+def test_the_code_of_functions_is_changed_in_place() -> None:
+    space: dict[str, object] = {}
+    exec(compile(SOURCE, "made.py", "exec"), space)
+    clipped = space["clipped"]
+    changed = mutation._changed_functions(SOURCE, SOURCE.replace("value + 1", "value - 1"), "made.py")
+    assert changed is not None
+    assert clipped([1, 2, 3, 4]) == [2, 3, 4]  # type: ignore[operator]
+    clipped.__code__ = changed[clipped.__code__]  # type: ignore[attr-defined]
+    assert clipped([1, 2, 3, 4]) == [0, 1, 2]  # type: ignore[operator]
+    assert mutation._changed_functions(SOURCE, SOURCE.replace("LIMIT = 3", "LIMIT = 4"), "made.py") is None
+
+
+@pytest.mark.parametrize(("line", "lines"), [(1, range(1, 2)), (6, range(4, 8)), (8, range(8, 9)), (9, range(9, 10))])
+def test_a_statement_has_the_lines_before_its_body(line: int, lines: range) -> None:
+    assert mutation._statement(SOURCE, line) == lines
