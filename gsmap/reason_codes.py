@@ -375,15 +375,18 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "not_probable": ("All evidence together is not strong enough.", r"not probable enough"),
     "pose_uncertain": (
         "The pose is too uncertain.",
-        r"(the overlap|what it shows) (determines|fixes) (the|its) pose only",
+        r"(the overlap|the photo|what it shows) (determines|fixes) (the|its) pose only",
     ),
     # Photos and scans that are refused.
     "no_match": ("Nothing in the map resembles it.", r"nothing in the map looks like it|no scene of the map has any"),
-    "no_views": ("The map has no views to compare a photo with.", r"the map shows nothing to compare it with"),
+    "no_views": ("The map has no views to compare a photo with.", r"the map (shows nothing|has no views) to compare"),
     "no_scene_matches": ("No scene that was compared shows it.", r"\d+ scenes were compared and none"),
-    "not_confirmed": ("Too few patches of the map are found again in the photo.", r"what the map shows there is not"),
+    "not_confirmed": (
+        "Too few patches of the map are found again in the photo.",
+        r"what the map shows there is not|patches of the map at this pose are not",
+    ),
     "too_far": ("The pose lies outside the area given.", r"it was taken .* from there"),
-    "too_few_features": ("The photo has too few features.", r"it shows too little"),
+    "too_few_features": ("The photo has too few features.", r"(it|the photo) shows too little"),
     # Edges that are accepted, and that optimize does not use or does not rely on.
     "aliased_places": (
         "Places that look alike cannot be told apart.",

@@ -1,4 +1,5 @@
-"""Localize photos, video clips and scans in a map: retrieve views, estimate a pose, refine it and judge it."""
+"""Localize photos, video clips and scans in a map: retrieve views, estimate a pose, refine it and accept or reject
+it."""
 
 from gsmap.localize.clips import read_clip
 from gsmap.localize.differences import CaptureViews, ChangedRegion, PhotoComparison, compare_photo, render_capture_views

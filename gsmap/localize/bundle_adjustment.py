@@ -1,12 +1,13 @@
-"""Adjust photos of one place jointly: bundle adjustment with poses by the map as priors.
+"""Adjust photos of one place jointly: a bundle adjustment that uses the poses from the map as priors.
 
-Features that several localized photos share are triangulated; a photo with enough of these points, or of points by the
-map's depth, is resected, one after another. Finally all poses and points are one least-squares problem: reprojection
-errors, and the poses by the map.
+Features that several localized photos share are triangulated. Then photos without a pose are resected one after
+another, if they show enough triangulated points, or points with a depth from the map. Finally one least-squares problem
+estimates all poses and points from reprojection errors and the poses from the map.
 
-Poses by the map have correlated errors, since maps bend and renders are displaced, and so have features of neighbouring
-photos. Covariances are therefore computed with inflated priors and feature noise, the more so the more photos there
-are, and scaled by how well the poses by the map agree with the adjustment (variance of unit weight).
+Poses from the map have correlated errors, because maps bend and the content of renders is displaced; features of
+neighbouring photos have correlated errors, too. Therefore covariances are computed with priors and feature noise that
+are inflated with the number of photos. They are scaled by the disagreement of the adjustment with the poses from the
+map (variance of unit weight).
 """
 
 from __future__ import annotations
@@ -22,40 +23,42 @@ from gsmap.localize import resection
 
 # Chosen by ``tools/fit/clips.py PLACES bundle``.
 MIN_POINTS = 12
-"""Features of a photo that must agree with known points for it to be resected."""
+"""Smallest number of features of a photo that must agree with known points for the photo to be resected."""
 
 MIN_SUPPORTERS = 2
-"""Photos that must each contribute half of these, since repeated structures can mislead one."""
+"""Smallest number of photos that must each contribute half of these features, since repeated structures can mislead one
+photo."""
 
 MAX_ERROR_PX = 4.0
-"""Reprojection error of an inlier, for a photo of 480 pixels."""
+"""Largest reprojection error of an inlier, for a photo of 480 pixels."""
 
 TOLERANCES = (2.0, 1.0)
 """Factors on `MAX_ERROR_PX` in successive adjustments."""
 
 MAX_SHIFT_SIGMAS = 8.0
-"""Sigmas by which an adjusted pose may differ from that by the map; farther photos are left out."""
+"""Largest difference of an adjusted pose from the pose from the map, in sigmas; a photo with a larger one is left
+out."""
 
 ROBUST_SIGMAS = 1.0
-"""Scale of Cauchy's loss on features and on poses by the map."""
+"""Scale of Cauchy's loss on features and on poses from the map."""
 
 POSE_CORRELATION = 0.35
-"""Correlation of the errors of poses by the map, for the covariance."""
+"""Correlation of the errors of poses from the map, for the covariance."""
 
 CORRELATED_FEATURE_PX = 1.6
-"""Standard deviation of a feature, for the covariance."""
+"""Standard deviation of a feature in pixels, for the covariance."""
 
 VARIANCE_PRIOR = 4.0
 """Number of imaginary photos with the expected disagreement, in the variance of unit weight."""
 
-_MIN_SINE = 0.02  # of the angle between rays that a point is triangulated from
+_MIN_SINE = 0.02  # of the angle between the rays from which a point is triangulated
 _MAX_POINTS = 150  # points per photo, those in most photos first
 _FEATURE_PX = 1.0  # standard deviation of a feature
-_DEPTH_SIGMA_M = 0.05  # of a point by the map's depth
-_DISAGREEMENT_WEIGHT = 2.5  # in the variance of unit weight
+_DEPTH_SIGMA_M = 0.05  # of a point with a depth from the map
+_DISAGREEMENT_WEIGHT = 2.5  # of the disagreement in the variance of unit weight
 _CHI2_MEDIAN = 5.35  # of six degrees of freedom
-_LENS_SIGMA = 0.03  # relative, of the median focal length by the map
-_POINT_SIGMA_M = 10.0  # keeps points that lost their photos determined
+_LENS_SIGMA = 0.03  # relative, of the median focal length from the map
+_POINT_SIGMA_M = 10.0  # weak prior that keeps points determined after they lost their photos
 _MIN_DEPTH_M = 0.1
 _POSE, _POINT, _LENS = "x", "l", "k"
 
@@ -65,13 +68,13 @@ class BundlePhoto:
     """A photo as input of the adjustment.
 
     Args:
-        pixels: (N, 2) of its features.
-        intrinsics_px: (4,).
+        pixels: (N, 2) positions of the photo's features.
+        intrinsics_px: (4,) ``fx fy cx cy``.
         size_px: width and height.
         focal_sigma: as in `gsmap.types.localization.Photo`; photos of one size share a lens.
-        T_metric_camera: (4, 4), by the map; None without one.
-        covariance: (6, 6) of that pose.
-        rows, points: (n,) features with positions (n, 3) by the map's depth.
+        T_metric_camera: (4, 4) pose from the map; None without one.
+        covariance: (6, 6) covariance of that pose.
+        rows, points: (n,) features that have a depth from the map, and their (n, 3) positions.
     """
 
     pixels: np.ndarray
@@ -86,15 +89,15 @@ class BundlePhoto:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedPose:
-    """A photo's pose by the adjustment.
+    """The pose of a photo after the adjustment.
 
     Args:
         T_metric_camera: (4, 4).
         intrinsics_px: (4,).
         covariance: (6, 6) over [rot_rad, trans] on the camera's side.
-        num_points: number of its features in the adjustment.
-        resected_from: photos that it was resected from, those with most common points first; empty if placed by the
-            map.
+        num_points: number of the photo's features in the adjustment.
+        resected_from: photos from which the photo was resected, sorted by their number of common points; empty if it
+            has a pose from the map.
     """
 
     T_metric_camera: np.ndarray
@@ -105,18 +108,19 @@ class AdjustedPose:
 
 
 Matches = Mapping[tuple[int, int], tuple[np.ndarray, np.ndarray]]
-"""Rows of matching features by pair of photos; both orders of a pair."""
+"""Rows of matching features for each pair of photos, in both orders of the pair."""
 
 
 def adjust_photos(photos: Sequence[BundlePhoto], matches: Matches) -> tuple[dict[int, AdjustedPose], list[int]]:
-    """Adjust the photos with poses by the map, and resect others from them; nothing with fewer than two poses.
+    """Adjust the photos that have poses from the map, and resect further photos from them; empty with fewer than two
+    poses.
 
     Args:
         photos: in one frame, metres.
 
     Returns:
-        The poses; and photos that the others led far from their pose by the map, and that were left out: either is
-        wrong.
+        The poses, and the photos that were left out because the adjustment moved them far from their pose from the map:
+        one of the two poses is wrong.
     """
     photos = _share_lenses(photos)
     displaced: list[int] = []
@@ -137,13 +141,13 @@ def adjust_photos(photos: Sequence[BundlePhoto], matches: Matches) -> tuple[dict
         displaced.append(worst)
         photos[worst] = replace(photos[worst], T_metric_camera=None)
         matches = {pair: rows for pair, rows in matches.items() if worst not in pair}
-    if displaced:  # the last two contradict each other, and nothing decides between them
+    if displaced:  # the last two photos contradict each other, and nothing decides between them
         displaced += [k for k, one in enumerate(photos) if one.T_metric_camera is not None]
     return {}, displaced
 
 
 def _share_lenses(photos: Sequence[BundlePhoto]) -> list[BundlePhoto]:
-    """Set unknown focal lengths to the median of those by the map of photos of the same size."""
+    """Set unknown focal lengths to the median of those that the map determined for photos of the same size."""
     out = list(photos)
     for size in {one.size_px for one in photos if resection.is_free(one.focal_sigma)}:
         same = [k for k, one in enumerate(photos) if one.size_px == size and resection.is_free(one.focal_sigma)]
@@ -156,7 +160,7 @@ def _share_lenses(photos: Sequence[BundlePhoto]) -> list[BundlePhoto]:
 def _resect_next(
     photos: Sequence[BundlePhoto], at: Mapping[int, np.ndarray], tried: set[int], matches: Matches
 ) -> _ResectedPhoto | None:
-    """Resect the photo without a pose that sees most known points, of those not tried before."""
+    """Resect the photo that sees most known points, of all photos without a pose that were not tried before."""
     left = [k for k in range(len(photos)) if k not in at and k not in tried]
     if not left:
         return None
@@ -166,7 +170,7 @@ def _resect_next(
 
 
 def _squared_shift(photo: BundlePhoto, pose: np.ndarray) -> float:
-    """Return the squared Mahalanobis distance of a pose from that by the map."""
+    """Return the squared Mahalanobis distance of a pose from the photo's pose from the map."""
     assert photo.T_metric_camera is not None
     assert photo.covariance is not None
     xi = resection.relative_xi(photo.T_metric_camera, pose)
@@ -174,7 +178,7 @@ def _squared_shift(photo: BundlePhoto, pose: np.ndarray) -> float:
 
 
 def _rays(photo: BundlePhoto, pose: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return (K, 3) unit vectors towards features."""
+    """Return (K, 3) unit vectors towards the features at ``rows``."""
     fx, fy, cx, cy = photo.intrinsics_px
     x, y = photo.pixels[rows].T
     local = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones(len(rows))], axis=1)
@@ -188,7 +192,7 @@ PairMatches = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
 def _consistent_matches(
     photos: Sequence[BundlePhoto], at: Mapping[int, np.ndarray], matches: Matches, tolerance: float
 ) -> PairMatches:
-    """Return the matches of all pairs of photos whose rays meet in front of both."""
+    """Return those matches of all pairs of photos whose rays meet in front of both cameras."""
     out = {}
     for k in at:
         for other in at:
@@ -222,7 +226,7 @@ def _consistent_pair(
 def _is_inlier(
     photo: BundlePhoto, pose: np.ndarray, points: np.ndarray, rows: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """Return (K,) bool: points in front of the camera that project to the features."""
+    """Return a (K,) mask of points that lie in front of the camera and project to the features."""
     pixels, depth = project(points, np.linalg.inv(pose), photo.intrinsics_px)
     bar = tolerance * MAX_ERROR_PX * max(photo.size_px) / 480
     out: np.ndarray = (depth > _MIN_DEPTH_M) & (np.linalg.norm(pixels - photo.pixels[rows], axis=1) < bar)
@@ -234,8 +238,8 @@ class _Structure:
     """Points with their observations.
 
     Args:
-        points: (T, 3), those in most photos first.
-        photo, row, point: (M,) photo, feature and point of each observation.
+        points: (T, 3) positions, sorted by their number of photos, largest first.
+        photo, row, point: (M,) photo, feature and point of each of M observations.
     """
 
     points: np.ndarray
@@ -286,7 +290,7 @@ def _triangulate(photos: Sequence[BundlePhoto], at: Mapping[int, np.ndarray], pa
 
 @dataclass(frozen=True, eq=False)
 class _ResectedPhoto:
-    """A photo that was resected from others; as `AdjustedPose`."""
+    """A photo that was resected from others; fields as in `AdjustedPose`."""
 
     photo: int
     pose: np.ndarray
@@ -297,7 +301,7 @@ class _ResectedPhoto:
 def _resect(
     k: int, photos: Sequence[BundlePhoto], at: Mapping[int, np.ndarray], structure: _Structure, matches: Matches
 ) -> _ResectedPhoto | None:
-    """Resect a photo from the points of photos with poses; None with too few inliers."""
+    """Resect a photo from the points of photos with poses; return None with too few inliers."""
     rows, points, sources = [np.zeros(0, np.int64)], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for other in at:
         of_other, positions = _known_points(k, other, photos, matches, structure)
@@ -323,8 +327,8 @@ def _resect(
 def _known_points(
     k: int, other: int, photos: Sequence[BundlePhoto], matches: Matches, structure: _Structure | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return features of a photo that match known points of another one, and (n, 3) their positions: triangulated, if
-    ``structure`` is given, or by the map's depth."""
+    """Return features of a photo that match known points of another photo, and the (n, 3) positions of these points:
+    triangulated if ``structure`` is given, otherwise from the map's depth."""
     if (k, other) not in matches:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     rows, columns = matches[k, other]
@@ -342,10 +346,10 @@ class _BundleProblem:
     """A bundle adjustment problem.
 
     Args:
-        at: poses of photos.
-        resected: photos that were resected, with those that they were resected from.
+        at: pose of each photo.
+        resected: for each resected photo, the photos from which it was resected.
         structure: triangulated points.
-        lifted: points by the map's depth that resected photos see.
+        lifted: points with a depth from the map that resected photos see.
     """
 
     photos: Sequence[BundlePhoto]
@@ -363,7 +367,7 @@ class _BundleProblem:
         matches: Matches,
         tolerance: float,
     ) -> _BundleProblem:
-        """Collect the inliers, without resected photos that have too few."""
+        """Collect the inliers, and drop resected photos that have too few of them."""
         structure = _triangulate(photos, at, _consistent_matches(photos, at, matches, tolerance))
         lifted = _lifted_points(photos, at, resected, structure, matches, tolerance)
         made = cls(photos, at, resected, structure, lifted)
@@ -383,7 +387,7 @@ class _BundleProblem:
         return [free[size] for size in sorted(free)]
 
     def lens_of(self, k: int) -> int | None:
-        """Return the index of a photo's lens in `free_lenses`."""
+        """Return the index of a photo's lens in `free_lenses`; None if its focal length is not adjusted."""
         sizes = [one.size_px for one in self.free_lenses()]
         return sizes.index(self.photos[k].size_px) if resection.is_free(self.photos[k].focal_sigma) else None
 
@@ -404,8 +408,8 @@ class _BundleProblem:
         """Return the factor graph.
 
         Args:
-            feature_px: standard deviation of a feature, for a photo of 480 pixels.
-            prior_scale: factor on the covariances of poses by the map.
+            feature_px: standard deviation of a feature in pixels, for a photo of 480 pixels.
+            prior_scale: factor on the covariances of poses from the map.
         """
         import gtsam
 
@@ -446,7 +450,7 @@ class _BundleProblem:
         return out
 
     def solve(self) -> Any:
-        """Return the optimal values, or the initial ones where the problem is singular."""
+        """Return the optimal values, or the initial values if the problem is singular."""
         import gtsam
 
         values = self.values()
@@ -462,7 +466,7 @@ def _adjust(
     resected: Mapping[int, tuple[int, ...]],
     matches: Matches,
 ) -> dict[int, np.ndarray]:
-    """Return the adjusted poses, and update the lenses of the photos, with decreasing tolerances."""
+    """Adjust poses with decreasing tolerances; return them, and update the lenses in ``photos``."""
     import gtsam
 
     for tolerance in TOLERANCES:
@@ -480,7 +484,7 @@ def _adjust(
 
 
 def _with_covariances(problem: _BundleProblem) -> dict[int, AdjustedPose]:
-    """Return the poses of a solved problem with their covariances; none where it is singular."""
+    """Return the poses of a solved problem with their covariances; empty if the problem is singular."""
     import gtsam
 
     by_map = {k: pose for k, pose in problem.at.items() if k not in problem.resected}
@@ -511,7 +515,8 @@ def _lifted_points(
     matches: Matches,
     tolerance: float,
 ) -> _Structure:
-    """Return points by the map's depth for features of resected photos that are not in the structure."""
+    """Return the points with a depth from the map for those features of resected photos that are not in the
+    structure."""
     points, photo, rows = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for k in (k for k in resected if k in at):
         free = np.ones(len(photos[k].pixels), bool)
@@ -529,7 +534,7 @@ def _lifted_points(
 
 
 def _variance_of_unit_weight(photos: Sequence[BundlePhoto], poses: Mapping[int, np.ndarray]) -> float:
-    """Return the factor on covariances from the disagreement of poses by the map with the adjustment."""
+    """Return the factor on covariances, from the disagreement of the poses from the map with the adjustment."""
     squared = [_squared_shift(photos[k], pose) for k, pose in poses.items()]
     disagreement = _DISAGREEMENT_WEIGHT * float(np.median(squared)) / _CHI2_MEDIAN
     return (VARIANCE_PRIOR + len(squared) * disagreement) / (VARIANCE_PRIOR + len(squared))

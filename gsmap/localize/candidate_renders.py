@@ -13,9 +13,9 @@ from gsmap.localize.map_scene import MapScene
 from gsmap.render import render
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
-"""Weights of red, green and blue in grey (Rec. 601)."""
+"""Weights of red, green and blue in a grey value (Rec. 601)."""
 
-_STRIDE_PX = 12  # rows and columns of a render that its motion is measured at
+_STRIDE_PX = 12  # spacing of the rows and columns at which the motion of a render is measured
 _MOTION_QUANTILE = 0.9
 
 
@@ -28,12 +28,13 @@ def downsample(image: np.ndarray, by: int) -> np.ndarray:
 
 
 def downsample_mask(mask: np.ndarray | None, by: int) -> np.ndarray | None:
-    """Return (H // by, W // by) bool: blocks in which all of a mask (H, W) is true; None of None."""
+    """Return the (H // by, W // by) mask of blocks in which a mask (H, W) is True everywhere; None if the mask is
+    None."""
     return None if mask is None else downsample(mask, by) == 1
 
 
 def sample_mask(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return (K,) bool values of a mask (H, W) at pixels (K, 2), those outside at its edge."""
+    """Return the (K,) values of a mask (H, W) at pixels (K, 2); pixels outside get the value at the edge."""
     column, row = np.clip(pixels, 0, np.array(mask.shape[1::-1]) - 1).astype(np.int64).T
     out: np.ndarray = mask[row, column]
     return out
@@ -49,10 +50,10 @@ class SceneRender:
         grey: (H, W) float32.
         alpha: (H, W) float32.
         depth_m: (H, W) float32 along the axis, 0 where nothing is rendered.
-        smooth: (H, W) bool: opaque, and away from depth edges.
+        smooth: (H, W) mask of pixels that are opaque and away from depth edges.
         T_metric_camera: (4, 4) camera-to-component, metres.
-        intrinsics_px: (4,) of this size.
-        displacement: (R, C, 2) of `gsmap.localize.displacement`, or None.
+        intrinsics_px: (4,) intrinsics at this size.
+        displacement: (R, C, 2) displacement map (`gsmap.localize.displacement`), or None.
     """
 
     scene: str
@@ -66,7 +67,7 @@ class SceneRender:
     displacement: np.ndarray | None = None
 
     def downsampled(self, by: int) -> SceneRender:
-        """Return the render at a smaller size; all pixels that are not empty count as smooth."""
+        """Return the render at a smaller size; all pixels with content count as smooth."""
         alpha = downsample(self.alpha, by)
         rgb, grey, depth = (downsample(image, by) for image in (self.rgb, self.grey, self.depth_m))
         return SceneRender(
@@ -74,7 +75,7 @@ class SceneRender:
         )
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
-        """Return (K, 3) positions in the component's frame, metres, of pixels (K, 2)."""
+        """Return the (K, 3) positions of pixels (K, 2) in the component's frame, in metres."""
         column, row = pixels.astype(np.int64).T
         z = self.depth_m[row, column].astype(np.float64)
         fx, fy, cx, cy = self.intrinsics_px
@@ -83,7 +84,7 @@ class SceneRender:
         return out
 
     def displaced_px(self, pixels: np.ndarray) -> np.ndarray:
-        """Return (K, 2) displacements of the content of pixels (K, 2); 0 without a displacement map."""
+        """Return the (K, 2) displacements of the content of pixels (K, 2); 0 without a displacement map."""
         if self.displacement is None:
             return np.zeros((len(pixels), 2))
         rows, columns = self.displacement.shape[:2]
@@ -94,12 +95,13 @@ class SceneRender:
         return out
 
     def corrected_points(self, pixels: np.ndarray) -> np.ndarray:
-        """Return (K, 3) positions of the content of pixels (K, 2), with their displacement undone."""
+        """Return the (K, 3) positions of the content of pixels (K, 2), with the displacement undone."""
         limit = np.array(self.depth_m.shape[1::-1]) - 1e-3
         return self.points(np.clip(pixels + self.displaced_px(pixels), 0, limit))
 
     def motion_px(self, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray) -> float:
-        """Return how far the content moves to another camera, in pixels (90th percentile); inf of an empty render."""
+        """Return the motion of the content in pixels if the camera moves to another pose (90th percentile); inf for an
+        empty render."""
         row, column = np.nonzero(self.alpha[::_STRIDE_PX, ::_STRIDE_PX] > 0.5)
         if not len(row):
             return np.inf
@@ -118,11 +120,11 @@ def render_scenes(
     *,
     with_displacement: bool = False,
 ) -> list[SceneRender]:
-    """Render every scene alone from one camera, since two captures in one render blur each other.
+    """Render every scene by itself from one camera, because two captures in one render blur each other.
 
     Args:
-        previous: renders of this size, which are reused where their content moved by at most ``max_motion_px``.
-        with_displacement: also compute the displacement of what the renders show.
+        previous: renders of this size; those whose content moved by at most ``max_motion_px`` are reused.
+        with_displacement: also compute the displacement map of each render.
     """
     reused = {one.scene: one for one in previous if one.motion_px(T_metric_camera, intrinsics_px) <= max_motion_px}
     out = []

@@ -1,8 +1,8 @@
 """Estimate candidate poses of a photo from its matches with views of the map.
 
-Most matches are wrong, and of a thousand a dozen agree on some pose by chance. Since a single match gives the camera's
-orientation roughly (`gsmap.localize.feature_frames`), poses are estimated from matches with a common orientation, and
-only these count as inliers. Four of them then suffice for a candidate.
+Most matches are wrong, and in a thousand matches a dozen agree on some pose by chance. A single match gives the
+camera's orientation roughly (`gsmap.localize.feature_frames`). So poses are estimated from matches with a common
+orientation, and only these matches count as inliers. Four of them then suffice for a candidate.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from gsmap.localize import feature_frames, matching, resection
 from gsmap.localize.map_scene import MapScene
 
 MAX_TURN_DEG = 30.0
-"""Angle between the orientation from a match and that of the pose."""
+"""Largest angle between the orientation from an inlier match and the orientation of the pose."""
 
 MAX_ORIENTATIONS = 10
-"""Clusters of orientations that poses are estimated from, the largest first."""
+"""Number of clusters of orientations from which poses are estimated, the largest clusters first."""
 
 DUPLICATE_M, DUPLICATE_DEG = 0.4, 12.0
-"""Poses that are nearer to each other would be refined to one pose."""
+"""Two poses that are nearer to each other would be refined to the same pose."""
 
-_MAX_SEEDS = 1000  # matches that clusters of orientations are grown from
+_MAX_SEEDS = 1000  # number of matches around which clusters of orientations are grown
 _SAME_CLUSTER = 1 / 3  # of MAX_TURN_DEG: nearer orientations lead to the same cluster
 
 
@@ -34,12 +34,12 @@ class PoseCandidate:
     """A candidate pose.
 
     Args:
-        component: of the map.
+        component: number of the component.
         T_metric_camera: (4, 4) camera-to-component, metres.
-        intrinsics_px: (4,).
+        intrinsics_px: (4,) ``fx fy cx cy``.
         num_inliers: number of different features of the photo among the inliers.
-        scenes: ids, those with most inliers first.
-        pixels, points: (K, 2), (K, 3) the inlier matches, metres.
+        scenes: ids of the matched scenes, sorted by their number of inliers.
+        pixels, points: (K, 2) pixels and (K, 3) points (metres) of the inlier matches.
     """
 
     component: int
@@ -57,11 +57,11 @@ class PointMatches:
 
     Args:
         feature: (K,) rows of the photo's features.
-        points: (K, 3) in the frame of the component, metres.
+        points: (K, 3) positions in the frame of the component, in metres.
         scene: (K,) index of the scene in ``scenes``.
         view: (K,) index of the view.
-        orientations: (K, 4) of the camera in the frame of the component, from each match alone.
-        scenes: ids.
+        orientations: (K, 4) orientation of the camera in the frame of the component, from each match alone.
+        scenes: ids of the scenes.
     """
 
     feature: np.ndarray
@@ -78,12 +78,12 @@ def match_views(
     views: Sequence[tuple[str, int]],
     scenes: Mapping[str, MapScene],
 ) -> dict[int, PointMatches]:
-    """Match a photo with views (of scenes, by number), and pool the matches of each component.
+    """Match a photo with views of scenes (by number), and pool the matches of each component.
 
-    Captures that each show a part of the place thus add up.
+    Thus matches with captures that each show a part of the place add up.
 
     Args:
-        frames: (N, 4) of the photo's features in its camera (`gsmap.localize.feature_frames`).
+        frames: (N, 4) frames of the photo's features in its camera (`gsmap.localize.feature_frames`).
     """
     chosen: dict[int, list[tuple[str, int]]] = {}
     for scene, view in views:
@@ -133,12 +133,12 @@ def propose_poses(
     *,
     has_angles: bool = True,
 ) -> list[PoseCandidate]:
-    """Estimate poses from clusters of matches, most inliers first, without duplicates.
+    """Estimate candidate poses from clusters of matches, without duplicates; the pose with most inliers comes first.
 
     Args:
-        pixels: (N, 2) of all features of the photo.
-        has_angles: the extractor measures the angles of features; else orientations from matches share an unknown
-            roll.
+        pixels: (N, 2) positions of all features of the photo.
+        has_angles: the extractor measures the angles of features; without angles all orientations from matches share an
+            unknown roll.
     """
     min_inliers = resection.min_inliers(focal_sigma)
     out: list[PoseCandidate] = []
@@ -167,7 +167,8 @@ def propose_poses(
 
 
 def _cluster_orientations(matches: PointMatches) -> list[np.ndarray]:
-    """Return clusters (n,) of matches by orientation: of all views the largest ones, and of each view the largest."""
+    """Return clusters (n,) of matches with similar orientations: the largest clusters over all views, and the largest
+    of each view."""
     if not len(matches.feature):
         return []
     seeds = np.unique(np.linspace(0, len(matches.feature) - 1, _MAX_SEEDS).astype(int))
@@ -191,7 +192,7 @@ def _cluster_orientations(matches: PointMatches) -> list[np.ndarray]:
 
 
 def _count_features(chosen: np.ndarray, feature: np.ndarray) -> np.ndarray:
-    """Return (S,) number of different features among the chosen matches (S, K)."""
+    """Return the (S,) number of different features among the chosen matches (S, K)."""
     order = np.argsort(feature, kind="stable")
     first = np.flatnonzero(np.r_[True, np.diff(feature[order]) > 0])
     out: np.ndarray = np.logical_or.reduceat(chosen[:, order], first, axis=1).sum(1)
@@ -207,7 +208,7 @@ def _without_duplicates(found: Sequence[PoseCandidate]) -> list[PoseCandidate]:
 
 
 def is_duplicate(one: PoseCandidate, other: PoseCandidate) -> bool:
-    """Check whether two candidates are so near that they would be refined to one pose."""
+    """Return whether two candidates are so near to each other that they would be refined to one pose."""
     if one.component != other.component:
         return False
     far = np.linalg.norm(one.T_metric_camera[:3, 3] - other.T_metric_camera[:3, 3])
@@ -216,7 +217,7 @@ def is_duplicate(one: PoseCandidate, other: PoseCandidate) -> bool:
 
 
 def _scenes_by_inliers(matches: PointMatches, inliers: np.ndarray) -> tuple[str, ...]:
-    """Return ids of all matched scenes, those with most inliers first."""
+    """Return the ids of all matched scenes, sorted by their number of inliers."""
     counts = np.bincount(matches.scene[inliers], minlength=len(matches.scenes))
     order: Sequence[int] = np.argsort(-counts, kind="stable").tolist()
     return tuple(matches.scenes[k] for k in order)

@@ -1,4 +1,4 @@
-"""Read video clips: the sharpest frame of every interval, as photos of one place."""
+"""Read video clips: return the sharpest frame of every interval as a photo."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsmap.errors import InputError, MissingDependencyError, NotFoundError
 from gsmap.localize.photos import Lens, make_photo
 from gsmap.types.localization import Photo
 
-_MAX_FRAME_PX = 35_651_584  # 8192 x 4352, the largest frame of H.264, H.265 and AV1 (level 6.2)
+_MAX_FRAME_PX = 35_651_584  # 8192 x 4352, the largest frame that H.264, H.265 and AV1 allow (level 6.2)
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,12 @@ class Params:
 def read_clip(
     path: str | os.PathLike[str], lens: Lens | None = None, params: Params | None = None
 ) -> list[tuple[float, Photo]]:
-    """Read frames of a clip with their times in seconds, upright by the clip's rotation.
+    """Read frames of a clip, rotated as the clip specifies, with their times in seconds.
 
     Raises:
         MissingDependencyError: PyAV is not installed.
         NotFoundError: no such file.
-        InputError: FFmpeg cannot read the clip, its frames have more than 36 million pixels, or it has none.
+        InputError: FFmpeg cannot read the clip, its frames have more than 36 million pixels, or it has no frames.
     """
     try:
         import av
@@ -50,36 +50,37 @@ def read_clip(
 
     path, lens, params = Path(path), lens or Lens(), params or Params()
     if not path.is_file():
-        raise NotFoundError(f"no clip at {path}", code="file_not_found")
+        raise NotFoundError(f"the clip {path} does not exist", code="file_not_found")
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
-                raise InputError(f"{path} holds no pictures: give a clip", code="clip_unreadable")
+                raise InputError(f"{path} has no video: give a video clip", code="clip_unreadable")
             _require_size(path, container.streams.video[0])
             chosen = _sharpest(container, params)
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        raise InputError(f"{path} is not a clip that can be read ({error})", code="clip_unreadable") from error
+        raise InputError(f"{path} is not a readable video clip ({error})", code="clip_unreadable") from error
     if not chosen:
-        raise InputError(f"{path} has no frame that can be read", code="clip_unreadable")
+        raise InputError(f"{path} has no readable frame", code="clip_unreadable")
     return [(at, make_photo(rgb, lens, None, f"{path.name}#{at:.2f}")) for at, rgb in chosen]
 
 
 def _require_size(path: Path, stream) -> None:  # type: ignore[no-untyped-def]
-    """Reject frames larger than any codec level, also those later in the stream."""
+    """Reject frames that are larger than any codec level allows, also frames later in the stream."""
     codec = stream.codec_context
     if codec.width * codec.height > _MAX_FRAME_PX:
         raise InputError(
-            f"{path} has frames of {codec.width} x {codec.height} pixels, more than {_MAX_FRAME_PX:,}: reduce the clip",
+            f"{path} has frames of {codec.width} x {codec.height} pixels, more than {_MAX_FRAME_PX:,}: scale the clip "
+            "down",
             code="picture_too_large",
         )
     codec.options = {"max_pixels": str(_MAX_FRAME_PX)}
 
 
 def _sharpest(container, params: Params) -> list[tuple[float, np.ndarray]]:  # type: ignore[no-untyped-def]
-    """Return the frame of each interval with most fine detail, as (seconds, (H, W, 3) uint8), at most ``max_frames``.
+    """Return the frame with most fine detail of each interval, at most ``max_frames``, as (seconds, (H, W, 3) uint8).
 
-    The duration in the header may be wrong or missing. Whenever there are too many frames, the interval doubles, and
-    the sharper of two neighbours is kept.
+    The duration in the header may be wrong or missing. Whenever there are too many frames, the interval is doubled, and
+    the sharper frame of each two neighbours is kept.
     """
     start = None
     interval_s = max(params.interval_s, float(container.duration or 0) / 1e6 / params.max_frames)

@@ -1,10 +1,10 @@
 """Find regions of a localized photo that differ from the map.
 
-Each supporting scene is rendered from the photo's pose. A robust line per channel (`gsmap.compare.colours`) first
-adapts the render's colours to the photo's light. The rest is compared by hue, which shading does not change, and by
-lightness only where neither a smooth light field nor an equal pattern explains it. A pixel is compared where its
-surface is known: opaque, away from edges by the uncertainty of the pose, and seen by the capture's own cameras from a
-similar direction. A pixel that agrees with any scene does not differ.
+Each supporting scene is rendered from the photo's pose. First a robust line per channel (`gsmap.compare.colours`)
+adapts the render's colours to the photo's light. Then hues are compared, because shading does not change them;
+lightness is compared only where neither a smooth light field nor an equal pattern explains a difference. A pixel is
+compared only if its surface is known: opaque, farther from edges than the uncertainty of the pose, and seen by the
+capture's own cameras from a similar direction. A pixel differs only if it differs from all scenes.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from gsmap.types.change import ChangeKind
 from gsmap.types.localization import Photo
 
 _HALF_PX = 6  # half width of the patches over which differences are averaged
-_MIN_CHROMA, _CHROMA_SPREADS = 0.1, 4.0  # difference of hue that counts: absolute, and in robust standard deviations
-_MIN_LIGHTNESS, _LIGHTNESS_SPREADS = 0.11, 5.0  # the same of lightness, without the light field
+_MIN_CHROMA, _CHROMA_SPREADS = 0.1, 4.0  # smallest difference of hue: absolute, and in robust standard deviations
+_MIN_LIGHTNESS, _LIGHTNESS_SPREADS = 0.11, 5.0  # the same for lightness, without the light field
 _LIGHT_FIELD_PX = 40.0  # standard deviation of the blur that estimates the light field
-_SAME_PATTERN = 0.4  # correlation of patterns, from which on a difference of lightness is one of light
+_SAME_PATTERN = 0.4  # if patterns correlate more, a difference of lightness is due to light
 _MIN_STRENGTH = 1.6  # mean difference of a region, in units of the thresholds
 _CAPTURE_VIEWS, _CAPTURE_VIEW_SIDE_PX = 32, 128
-_MIN_CAPTURE_VIEWS = 2  # that must have seen a surface
+_MIN_CAPTURE_VIEWS = 2  # number of capture views that must have seen a surface
 _SURFACE_M, _SURFACE_FRACTION = 0.05, 0.03  # tolerance of depths: absolute, and per depth
-_MAX_TURN_DEG = 60.0  # between the photo's direction and that of a capture view
-_MIN_SHARE = 0.05  # of the photo that a scene must cover to be compared ...
-_MIN_AGREEING = 0.5  # ... and share of it that must agree, else the scene shows another place
-_MIN_COLOUR = 0.02  # of logarithms
-_MAP_ERROR_PX = 1.0  # of renders from an exact pose
+_MAX_TURN_DEG = 60.0  # between the viewing directions of the photo and of a capture view
+_MIN_SHARE = 0.05  # share of the photo that a scene must cover to be compared ...
+_MIN_AGREEING = 0.5  # ... and share of the compared pixels that must agree; with fewer the scene shows another place
+_MIN_COLOUR = 0.02  # lower limit of colours in logarithms
+_MAP_ERROR_PX = 1.0  # position error of a render from an exact pose
 _RECOLOURED_PATTERN = 0.6  # median correlation of patterns in a recoloured region
-_RIM_PX = 4  # reach of the outline of a region, to either side
-_OUTLINE_RATIO = 1.4  # of the contrast of an outline in photo and render, for it to belong to one of them
+_RIM_PX = 4  # half width of the outline of a region
+_OUTLINE_RATIO = 1.4  # an outline belongs to photo or render if its contrast there is larger by this factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +50,14 @@ class ChangedRegion:
     """A region of a photo that differs from the map.
 
     Args:
-        box_px: ``x0 y0 x1 y1`` in pixels of the photo itself.
-        share: of the photo.
-        strength: mean difference in units of what light and noise explain.
-        kind: ``appeared`` (the photo shows something before the map's surface), ``disappeared`` (the map's content is
-            gone), ``recoloured`` or ``replaced``, as far as one photo shows it.
-        mask: (H, W) bool, at the size of comparison.
-        point: (3,) median of the map's surface there, metres, in its component's frame.
-        scene: id of the scene that it is compared with.
+        box_px: ``x0 y0 x1 y1`` in pixels of the original photo.
+        share: share of the photo that the region covers.
+        strength: mean difference, in units of the largest difference that light and noise explain.
+        kind: ``appeared`` (the photo shows something in front of the map's surface), ``disappeared`` (content of the
+            map is gone), ``recoloured`` or ``replaced``; a guess from a single photo.
+        mask: (H, W) mask of the region, at the size of the comparison.
+        point: (3,) median of the map's surface in the region, metres, in the frame of the component.
+        scene: id of the scene with which the photo is compared.
     """
 
     box_px: np.ndarray
@@ -74,13 +74,13 @@ class PhotoComparison:
     """Comparison of a localized photo with the map.
 
     Args:
-        regions: the strongest first.
+        regions: changed regions, the strongest first.
         compared_fraction: share of the photo that is compared.
-        compared: (H, W) bool pixels that are compared.
-        agrees: (H, W) bool compared pixels that agree with the map.
-        rendered: (H, W, 3) float32 render of the map, in the light of the photo.
-        points: (H, W, 3) float64 surface of the map, metres; NaN where it is not compared.
-        scale: (4,) factors on the photo's intrinsics to this size.
+        compared: (H, W) mask of the pixels that are compared.
+        agrees: (H, W) mask of the compared pixels that agree with the map.
+        rendered: (H, W, 3) float32 render of the map, adapted to the light of the photo.
+        points: (H, W, 3) float64 surface of the map in metres; NaN at pixels that are not compared.
+        scale: (4,) factors from the photo's intrinsics to those at this size.
     """
 
     regions: tuple[ChangedRegion, ...]
@@ -94,14 +94,14 @@ class PhotoComparison:
 
 @dataclass(frozen=True, eq=False)
 class CaptureViews:
-    """A scene's own cameras, in its frame and unit, with the depth (h, w) that each sees, 0 for nothing."""
+    """The own cameras of a scene, in its frame and unit, with the (h, w) depth image of each; 0 means no surface."""
 
     cameras: tuple[Cameras, ...]
     depths: tuple[np.ndarray, ...]
 
 
 def render_capture_views(scene: MapScene, cameras: Cameras | None) -> CaptureViews:
-    """Render the depth of a scene from its own cameras; without cameras there are no views."""
+    """Render the depth of a scene from its own cameras; without cameras the result is empty."""
     if cameras is None or not len(cameras):
         return CaptureViews((), ())
     small = cameras.evenly(_CAPTURE_VIEWS).resized(_CAPTURE_VIEW_SIDE_PX)
@@ -124,12 +124,12 @@ def compare_photo(
 
     Args:
         T_metric_camera: (4, 4) camera-to-component, metres.
-        covariance: (6, 6) over [rot_rad, trans_m], camera's side.
-        intrinsics_px: (4,) of the photo's own size.
-        scenes: that support its pose, those with most support first.
-        capture_views: of `render_capture_views`, by scene id.
-        image_size_px: longer side at which they are compared.
-        min_change_fraction: share of the photo that a region must cover.
+        covariance: (6, 6) over [rot_rad, trans_m], on the camera's side.
+        intrinsics_px: (4,) intrinsics at the original size of the photo.
+        scenes: scenes that support the photo's pose, the strongest support first.
+        capture_views: result of `render_capture_views`, by scene id.
+        image_size_px: longer side of the compared images.
+        min_change_fraction: smallest share of the photo that a region covers.
     """
     scaled, scale = scale_photo(photo, image_size_px)
     lens = intrinsics_px * scale
@@ -176,21 +176,21 @@ def compare_photo(
 
 
 def _all_points(one: SceneRender) -> np.ndarray:
-    """Return (H, W, 3) positions of all pixels of a render, metres."""
+    """Return the (H, W, 3) positions of all pixels of a render, in metres."""
     height, width = one.grey.shape
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
     return one.points(pixels).reshape(height, width, 3)
 
 
 def _uncertainty_px(depth_m: np.ndarray, covariance: np.ndarray, lens: np.ndarray) -> np.ndarray:
-    """Return (H, W) standard deviation of the surface at each pixel, in the least certain direction."""
+    """Return the (H, W) standard deviation in pixels of the surface at each pixel, in the least certain direction."""
     turn, shift = (float(np.linalg.eigvalsh(covariance[p, p])[-1].clip(0)) for p in (slice(3), slice(3, 6)))
     out: np.ndarray = lens[0] * np.sqrt(turn + shift / np.maximum(depth_m, 0.1) ** 2)
     return out
 
 
 def _away_from_edges(smooth: np.ndarray, sigma_px: np.ndarray) -> np.ndarray:
-    """Return (H, W) bool: pixels whose surroundings within two standard deviations of the pose are smooth."""
+    """Return an (H, W) mask of pixels that are smooth everywhere within two standard deviations of the pose."""
     out = smooth.copy()
     for step in range(1, 9):
         wide = 2 * sigma_px + _MAP_ERROR_PX > step + 2  # smooth pixels keep a few pixels from edges
@@ -203,7 +203,8 @@ def _away_from_edges(smooth: np.ndarray, sigma_px: np.ndarray) -> np.ndarray:
 def _is_observed(
     scene: MapScene, capture_views: CaptureViews, points: np.ndarray, T_metric_camera: np.ndarray
 ) -> np.ndarray:
-    """Return (K,) bool: points (metres) that the scene's own cameras saw from a similar direction as a camera."""
+    """Return a (K,) mask of points (metres) that the scene's own cameras saw from a direction similar to the
+    camera's."""
     S = scene.S_metric_scene.inverse()
     at, here, unit = S.apply(points), S.apply(T_metric_camera[:3, 3]), scene.S_metric_scene.scale
     direction = at - here
@@ -227,7 +228,8 @@ def _is_observed(
 def _measure_difference(
     line: Balance, rendered: np.ndarray, photo: np.ndarray, known: np.ndarray, sigma_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (H, W) differences in units of what light and noise explain, and (H, W) correlations of patterns."""
+    """Return the (H, W) differences, in units of the largest difference that light and noise explain, and the (H, W)
+    correlations of patterns."""
     side = 2 * _HALF_PX + 1
     weight = known.astype(np.float32)
     share = np.maximum(uniform_filter(weight, side), 1e-3)
@@ -249,7 +251,7 @@ def _measure_difference(
 
 
 def _correlate_patterns(rendered: np.ndarray, photo: np.ndarray, sigma_px: np.ndarray, side: int) -> np.ndarray:
-    """Return (H, W) best correlation of patches over shifts within the uncertainty of the pose."""
+    """Return the (H, W) correlation of patches, the best over all shifts within the uncertainty of the pose."""
     a, b = (np.log(x @ GREY + _MIN_COLOUR).astype(np.float64) for x in (rendered, photo))
     reach = int(np.clip(np.ceil(2 * np.median(sigma_px)), 1, 3)) if len(sigma_px) else 1
     mean_a, mean_b = uniform_filter(a, side), uniform_filter(b, side)
@@ -265,7 +267,7 @@ def _correlate_patterns(rendered: np.ndarray, photo: np.ndarray, sigma_px: np.nd
 
 
 def _connected_regions(difference: np.ndarray, compared: np.ndarray, min_fraction: float) -> list[np.ndarray]:
-    """Return masks of the connected regions that differ and are large enough."""
+    """Return masks of the connected, sufficiently large regions that differ."""
     differs = compared & (difference > 1)
     labels, count = label(differs)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
@@ -298,7 +300,7 @@ def _describe_region(
 
 
 def _classify(mask: np.ndarray, rendered: np.ndarray, photo: np.ndarray, pattern: float) -> ChangeKind:
-    """Classify a region by whether its outline is one of the photo, of the map, or of both."""
+    """Classify a region: its outline is visible in the photo, in the map, or in both."""
     if pattern > _RECOLOURED_PATTERN:
         return "recoloured"
     rim = binary_dilation(mask, iterations=_RIM_PX) & ~binary_erosion(mask, iterations=_RIM_PX)

@@ -13,20 +13,20 @@ from gsmap.localize.candidate_renders import SceneRender
 from gsmap.localize.filters import blur, box_means, gradients
 
 BLUR_PX = (8.0, 4.0, 2.0)
-"""Standard deviation of the blur of each round, for a photo of 480 pixels."""
+"""Standard deviation of the blur in each round, in pixels of a photo of 480 pixels."""
 
 MAX_POINTS = 3000
-"""Pixels of a render that are aligned, those with most contrast relative to their neighbourhood."""
+"""Number of pixels of a render that are aligned: those with most contrast relative to their neighbourhood."""
 
-_BAND = 4.0  # content that is so many times broader than the blur is removed, for light and exposure change it
+_BAND = 4.0  # content broader than this many blurs is removed, because light and exposure change it
 _WINDOW_BLURS = 12.0  # width of a neighbourhood, per blur
-_WEIGHT_POWER = 2.0  # of the correlation of a pixel's neighbourhood, which is its weight
-_MIN_CORRELATION = 0.03  # in place of lower ones
-_MAX_GAIN = 2.5  # between the contrast of photo and render, and its inverse
+_WEIGHT_POWER = 2.0  # a pixel's weight is the correlation of its neighbourhood to this power
+_MIN_CORRELATION = 0.03  # lower correlations are raised to this value
+_MAX_GAIN = 2.5  # largest ratio of the contrasts of photo and render, or its inverse
 _ROBUST_SIGMAS = 2.0  # scale of Cauchy's loss, in standard deviations of the residuals
 _ITERATIONS = 10
-_MAX_BEND = 0.03  # relative curvature of the inverse depth, from which on it is an edge ...
-_BEND_REACH_PX = 2  # ... over so many pixels to either side
+_MAX_BEND = 0.03  # with a larger relative curvature of the inverse depth a pixel is at an edge ...
+_BEND_REACH_PX = 2  # ... measured over this many pixels to either side
 _MIN_ALPHA = 0.9
 _MIN_POINTS = 200
 
@@ -37,11 +37,12 @@ class DirectAlignment:
 
     Args:
         T_metric_camera: (4, 4) camera-to-component, metres.
-        intrinsics_px: (4,) of the aligned size.
-        pixels: (K, 2) aligned points in the photo; empty where there were too few, and the pose is the initial one.
-        residuals: (K, 3) of their colours.
-        weights: (K, 3) of the residuals.
-        jacobian: (K, 3, 6 or 7) of the colours by the pose, as in `gsmap.localize.resection.LeastSquaresPose`.
+        intrinsics_px: (4,) intrinsics at the aligned size.
+        pixels: (K, 2) aligned points in the photo; empty if there were too few, and then the pose is the initial pose.
+        residuals: (K, 3) residuals of the colours of the points.
+        weights: (K, 3) weights of the residuals.
+        jacobian: (K, 3, 6 or 7) derivatives of the colours with respect to the pose, as in
+            `gsmap.localize.resection.LeastSquaresPose`.
         agreement: mean weight of the points at the initial pose; NaN without points.
     """
 
@@ -57,7 +58,7 @@ class DirectAlignment:
 def measure_agreements(
     rgb: np.ndarray, renders: Sequence[SceneRender], blur_px: float, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return (L,) how well each render agrees with a photo: the sum of the weights of its pixels."""
+    """Return the (L,) agreement of each render with a photo: the sum of the weights of its pixels."""
     photo = _band_pass(rgb, mask, blur_px)
     return np.array([_select_pixels(photo, one, blur_px, mask)[3].sum() for one in renders])
 
@@ -71,20 +72,20 @@ def align(
     focal: tuple[float, float] | None = None,
     mask: np.ndarray | None = None,
 ) -> DirectAlignment:
-    """Minimize robust differences of band-passed photo and render over the pose.
+    """Minimize robust differences between the band-passed photo and the band-passed render over the pose.
 
-    The gradient is the mean of that of the photo and of the render (efficient second-order minimization, Malis 2004),
-    which about doubles the basin of convergence. One gain for the whole render compensates for lost contrast.
+    The gradient is the mean of the photo's and the render's gradients (efficient second-order minimization, Malis
+    2004), which about doubles the basin of convergence. One gain for the whole render compensates for lost contrast.
 
     Args:
         rgb: (H, W, 3) float32 in [0, 1].
-        one: a render of this size from near the initial pose, of one scene: where two scenes disagree by a centimetre,
-            the pose would lie between them.
+        one: a render of this size, of one scene, from near the initial pose. With two scenes that disagree by a
+            centimetre, the pose would lie between both.
         T_metric_camera: initial pose.
-        intrinsics_px: (4,) of this size.
-        blur_px: of this round, at this size.
-        focal: expected focal length and ``focal_sigma``, where it is estimated.
-        mask: (H, W) bool: valid pixels of the photo; None where all are.
+        intrinsics_px: (4,) intrinsics at this size.
+        blur_px: standard deviation of the blur of this round, at this size.
+        focal: expected focal length and ``focal_sigma``; None if the focal length is not estimated.
+        mask: (H, W) mask of valid pixels of the photo; None if all are valid.
     """
     empty = np.zeros((0, 3))
     unaligned = DirectAlignment(T_metric_camera, intrinsics_px, empty[:, :2], empty, empty, np.zeros((0, 3, 6)))
@@ -108,7 +109,7 @@ def align(
     scale = _ROBUST_SIGMAS * max(1.4826 * float(np.median(left)), 1e-3)
     pose, lens, gain = _minimize(problem, T_metric_camera, intrinsics_px, gain, scale)
     state = problem.project(pose, lens)
-    # Gradients of the render alone: those of the photo's noise would pass for information.
+    # Use gradients of the render alone: gradients of the photo's noise would count as information.
     without = replace(state, sampled=np.concatenate([state.sampled[:, :3], gain * slope.reshape(-1, 6)], axis=1))
     residuals, weights, J = _linearize(without, colours, slope, gain, scale)
     return DirectAlignment(pose, lens, state.pixels, residuals, weights, J, float(weight.mean()))
@@ -117,7 +118,7 @@ def align(
 def _minimize(
     problem: _PhotometricProblem, pose: np.ndarray, lens: np.ndarray, gain: float, scale: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return pose, lens and gain at the minimum (Levenberg-Marquardt)."""
+    """Return pose, lens and gain at the minimum, found by Levenberg-Marquardt."""
     damping = 1e-4
     for _ in range(_ITERATIONS):
         now = problem.normal_equations(pose, lens, gain, scale)
@@ -147,9 +148,9 @@ class _NormalEquations:
 
     Args:
         cost: mean of Cauchy's loss over the points inside the photo.
-        gain: that would match the render's band to the photo's.
-        information: (dim, dim) left side.
-        right: (dim,) right side.
+        gain: factor that would match the render's band to the photo's band.
+        information: (dim, dim) left-hand side.
+        right: (dim,) right-hand side.
     """
 
     cost: float
@@ -160,14 +161,14 @@ class _NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class _PhotometricProblem:
-    """Points of a render, and the photo that they are aligned with.
+    """Points of a render, and the photo with which they are aligned.
 
     Args:
-        planes: (H, W, 9) float32 band of the photo: colours, their gradients along rows, and along columns.
-        points: (K, 3) in the component's frame, metres.
-        colours: (K, 3) float32 of the render's band.
+        planes: (H, W, 9) float32 band of the photo: colours, gradients along rows, gradients along columns.
+        points: (K, 3) positions in the component's frame, in metres.
+        colours: (K, 3) float32 colours of the render's band.
         slope: (K, 2, 3) float32 gradients of the colours along rows and along columns.
-        weight: (K,) float64.
+        weight: (K,) float64 weights.
         focal: as in `align`.
     """
 
@@ -179,7 +180,7 @@ class _PhotometricProblem:
     focal: tuple[float, float] | None
 
     def normal_equations(self, pose: np.ndarray, lens: np.ndarray, gain: float, scale: float) -> _NormalEquations:
-        """Linearize at a pose, with the prior of the focal length."""
+        """Linearize the problem at a pose, including the prior of the focal length."""
         arrays = (self.planes, self.points, self.colours, self.slope, self.weight)
         dim = 6 if self.focal is None else 7
         cost, within, both, own, A, b = native_normal_equations(*arrays, pose, lens, gain, scale, dim)
@@ -191,7 +192,7 @@ class _PhotometricProblem:
         return _NormalEquations(cost / max(within, 1e-9), both / max(own, 1e-9), A, b)
 
     def project(self, pose: np.ndarray, lens: np.ndarray) -> _ProjectedPoints:
-        """Project all points and sample the photo there."""
+        """Project all points into the photo and sample the photo there."""
         dim = 6 if self.focal is None else 7
         minus, jacobian = resection.linearize(np.zeros((len(self.points), 2)), self.points, pose, lens, dim)
         pixels, size = -minus, np.array(self.planes.shape[1::-1])
@@ -204,10 +205,10 @@ class _ProjectedPoints:
     """Points projected from one pose.
 
     Args:
-        pixels: (K, 2).
-        sampled: (K, 9) of the photo there: the band's colours, their gradients along rows, and along columns.
-        weight: (K,) 0 outside the photo.
-        jacobian: (K, 2, dim) of the pixels.
+        pixels: (K, 2) positions in the photo.
+        sampled: (K, 9) samples of the photo's band: colours, gradients along rows, gradients along columns.
+        weight: (K,) weights, 0 outside the photo.
+        jacobian: (K, 2, dim) derivatives of the pixels.
     """
 
     pixels: np.ndarray
@@ -219,7 +220,7 @@ class _ProjectedPoints:
 def _linearize(
     state: _ProjectedPoints, colours: np.ndarray, slope: np.ndarray, gain: float, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return residuals of colours (K, 3), their weights (K, 3) and derivatives (K, 3, dim)."""
+    """Return the residuals of colours (K, 3), their weights (K, 3) and their derivatives (K, 3, dim)."""
     residuals = state.sampled[:, :3] - gain * colours
     weights = state.weight[:, None] / (1 + (residuals / scale) ** 2)
     down = (state.sampled[:, 3:6] + gain * slope[:, 0]) / 2
@@ -254,7 +255,8 @@ def _select_pixels(
 
 
 def _smooth_surface(one: SceneRender) -> np.ndarray:
-    """Return (H, W) bool: opaque and away from edges; the inverse depth of any plane is linear in the pixels."""
+    """Return an (H, W) mask of pixels that are opaque and away from edges; the inverse depth of a plane is linear in
+    the pixels."""
     reach, (height, width) = _BEND_REACH_PX, one.alpha.shape
     solid = (one.alpha > _MIN_ALPHA) & (one.depth_m > 0)
     inverse = np.where(solid, 1 / np.maximum(one.depth_m, 1e-3), 0)
@@ -267,7 +269,8 @@ def _smooth_surface(one: SceneRender) -> np.ndarray:
 
 
 def _band_pass(rgb: np.ndarray, mask: np.ndarray | None, blur_px: float) -> np.ndarray:
-    """Return (H, W, 3) without content finer than ``blur_px`` or `_BAND` times broader, of the valid pixels alone."""
+    """Return (H, W, 3) without content finer than ``blur_px`` or broader than `_BAND` times ``blur_px``, computed from
+    valid pixels alone."""
     fine, broad = (_blur_valid(rgb, mask, sigma) for sigma in (blur_px, _BAND * blur_px))
     return fine - broad
 
@@ -282,7 +285,7 @@ def _blur_valid(rgb: np.ndarray, mask: np.ndarray | None, sigma: float) -> np.nd
 
 
 def _sample(planes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return (K, C) bilinear samples, outside of the image those at its edge."""
+    """Return (K, C) bilinear samples; pixels outside the image get the value at its edge."""
     height, width = planes.shape[:2]
     x = np.clip(pixels[:, 0] - 0.5, 0, width - 1.001)
     y = np.clip(pixels[:, 1] - 0.5, 0, height - 1.001)
@@ -295,7 +298,7 @@ def _sample(planes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def _estimate_gain(sampled: np.ndarray, colours: np.ndarray, weights: np.ndarray) -> float:
-    """Return the factor that matches the render's band to the photo's."""
+    """Return the factor that matches the contrast of the render's band to that of the photo's band."""
     return float((weights * sampled[:, :3] * colours).sum() / max(float((weights * colours**2).sum()), 1e-9))
 
 

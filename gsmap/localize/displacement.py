@@ -1,9 +1,10 @@
-"""Estimate by how much the content of a splat render is displaced towards the image centre.
+"""Estimate the displacement of the content of a splat render towards the image centre.
 
-Gaussians that overlap are drawn front to back. On a slanted surface those with nearer means cover those behind them,
-so a pixel shows more of the nearer ones: content is pulled towards the middle of the image, since nearer is further
-out. Training corrects most of it but not all, for views from other sides need another correction. Renders of splats are
-thus a little smaller than photos, the more so the larger their Gaussians are, and uncorrected poses lie too near.
+Gaussians that overlap are drawn front to back. On a slanted surface, Gaussians with nearer means cover those with
+farther means, so a pixel shows more of the nearer Gaussians. These lie farther from the image centre, so content is
+pulled towards the centre. Training corrects most of the displacement but not all, because views from other directions
+need another correction. Thus content is a little smaller in renders than in photos, the more so the larger the
+Gaussians are, and uncorrected poses lie too near.
 """
 
 from __future__ import annotations
@@ -16,16 +17,18 @@ from gsmap.localize.map_scene import MapScene
 from gsmap.render import render
 
 FRACTION = 0.16
-"""Share of the distance from a pixel to the means of its Gaussians that training left (``tools/fit/localize.py``)."""
+"""Share of the distance from a pixel to the means of its Gaussians that remains after training
+(``tools/fit/localize.py``)."""
 
 MAX_PX = 2.0
-"""Limit of that distance along each axis, for a render of 480 pixels: larger Gaussians have no defined position."""
+"""Limit of that distance along each axis, for a render of 480 pixels: larger Gaussians have no well-defined
+position."""
 
 WINDOW_PX = 36.0
-"""Width of the square over which it is averaged, for a render of 480 pixels."""
+"""Width of the square over which the displacement is averaged, for a render of 480 pixels."""
 
 RENDER_SIDE_PX = 120
-"""Longer side of the small render that it is computed from."""
+"""Longer side of the small render from which the displacement is computed."""
 
 
 def displacement_map(
@@ -35,11 +38,11 @@ def displacement_map(
     size_px: tuple[int, int],
     fraction: float | None = None,
 ) -> np.ndarray:
-    """Return (R, C, 2) float32 displacements of a render's content to the right and down in pixels, on a coarser grid.
+    """Return (R, C, 2) float32 displacements of a render's content (right and down, in pixels) on a coarser grid.
 
     Args:
-        intrinsics_px: (4,) of the render, which is of this size.
-        fraction: in place of `FRACTION`.
+        intrinsics_px: (4,) intrinsics of the render at ``size_px``.
+        fraction: used instead of `FRACTION`.
     """
     longest = max(size_px)
     by = max(1, round(longest / RENDER_SIDE_PX))

@@ -1,4 +1,4 @@
-"""Compare a photo with renders from its pose, patch by patch."""
+"""Compare a photo, patch by patch, with renders from the photo's pose."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from gsmap.localize.filters import box_means
 from gsmap.localize.mismatch import MismatchMap
 
 HALF_PX = 8
-"""Half width of the compared patches."""
+"""Half width of the compared patches, in pixels."""
 
 STEP_PX = 8
-"""Distance between the centres of neighbouring patches."""
+"""Distance between the centres of neighbouring patches, in pixels."""
 
 EXPLAINED_CORRELATION, CONTRADICTED_CORRELATION = 0.5, 0.15
-"""Normalized correlations from which on a patch is explained by the map, and below which it is contradicted."""
+"""Normalized correlations: from the first on the map explains a patch, below the second the map is contradicted."""
 
 COARSE = 4
-"""Reduction of the second comparison, at which renders are as sharp as photos."""
+"""Factor by which images are reduced for the second comparison, at which renders are as sharp as photos."""
 
-_MIN_CONTRAST = 0.02  # standard deviation in the photo or the render, grey in [0, 1], for a patch to be compared
-_BLOCKING_M = 0.1  # surfaces nearer than this block the camera
+_MIN_CONTRAST = 0.02  # a patch is compared if photo or render has this standard deviation, grey in [0, 1]
+_BLOCKING_M = 0.1  # a surface nearer than this blocks the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +33,9 @@ class RenderComparison:
     """Agreement of a photo with renders from one pose.
 
     Args:
-        correlation: (R, C) of each patch with the best scene; NaN where none can be compared.
-        seen: share of the photo in which some scene is opaque.
-        colour: correlation of the chroma of photo and renders over patches; NaN where neither has any.
+        correlation: (R, C) correlation of each patch with the best scene; NaN if it cannot be compared.
+        seen: share of the photo in which at least one scene is opaque.
+        colour: correlation over patches between the chroma of photo and renders; NaN if both are grey.
         blocked: share of the photo in which a surface blocks the camera.
     """
 
@@ -45,12 +45,12 @@ class RenderComparison:
     blocked: float
 
     def explained(self, min_correlation: float = EXPLAINED_CORRELATION) -> float:
-        """Return the share of compared patches that the map explains; 0 without any."""
+        """Return the share of compared patches that the map explains; 0 without compared patches."""
         compared = self.correlation[np.isfinite(self.correlation)]
         return float((compared >= min_correlation).mean()) if len(compared) else 0.0
 
     def contradicted(self) -> float:
-        """Return the share of compared patches that the map contradicts; 0 without any."""
+        """Return the share of compared patches that contradict the map; 0 without compared patches."""
         compared = self.correlation[np.isfinite(self.correlation)]
         return float((compared < CONTRADICTED_CORRELATION).mean()) if len(compared) else 0.0
 
@@ -67,12 +67,12 @@ def compare(
     mask: np.ndarray | None = None,
     step_px: int = STEP_PX,
 ) -> RenderComparison:
-    """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose.
+    """Compare a photo (H, W, 3), float32 in [0, 1], with renders from the photo's pose.
 
     Args:
-        mismatch: its largest part is excluded.
-        reduction: of this photo's size to that of the mismatch map.
-        mask: (H, W) bool: valid pixels of the photo; None where all are.
+        mismatch: mismatch map, whose largest part is excluded.
+        reduction: ratio of the photo's size at which the mismatch map was computed to this size.
+        mask: (H, W) mask of valid pixels of the photo; None if all are valid.
     """
     grey = rgb @ GREY
     around = partial(_patch_means, rows=rgb.shape[0] - 2 * HALF_PX, columns=rgb.shape[1] - 2 * HALF_PX, step_px=step_px)
@@ -111,7 +111,7 @@ def compare(
 
 
 def _patch_means(image: np.ndarray, rows: int, columns: int, step_px: int) -> np.ndarray:
-    """Return means over the patches that lie wholly within the photo."""
+    """Return the means over the patches that lie completely within the photo."""
     found = box_means(image, 2 * HALF_PX + 1, first=HALF_PX, step=step_px)
     return found[: -(-rows // step_px), : -(-columns // step_px)]
 
@@ -122,13 +122,13 @@ def compare_coarsely(
     mismatch: MismatchMap | None = None,
     mask: np.ndarray | None = None,
 ) -> RenderComparison:
-    """Compare as `compare` at a size reduced by `COARSE`, with patches of the same number of pixels."""
+    """Compare as `compare` does, at a size reduced by `COARSE`, with patches of the same number of pixels."""
     small = [one.downsampled(COARSE) for one in renders]
     return compare(downsample(rgb, COARSE), small, mismatch, COARSE, downsample_mask(mask, COARSE), HALF_PX // 2)
 
 
 def _chroma_correlation(photo: np.ndarray, rendered: np.ndarray) -> float:
-    """Correlate two log ratios of channels, which brightness and white balance do not change."""
+    """Return the correlation of two log ratios of channels, which brightness and white balance do not change."""
     if len(photo) < 12:
         return float("nan")
     products, squares = 0.0, [0.0, 0.0]

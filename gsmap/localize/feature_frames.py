@@ -1,8 +1,8 @@
-"""Estimate a camera's orientation from single matches, by the coordinate frames of features.
+"""Estimate a camera's orientation from a single match, by the coordinate frames of features.
 
-A feature has a frame: its ray, and its orientation across the ray. Where photo and view see a feature from the same
-side the two frames coincide, which gives the camera's orientation; the farther from the side, the less exactly. It is
-exact to some 20 degrees for most right matches, and random for most wrong ones.
+A feature has a coordinate frame: its ray, and its orientation across the ray. If photo and view see a feature from the
+same direction, both frames coincide, which gives the camera's orientation. The more the directions differ, the less
+accurate it is: within some 20 degrees for most correct matches, and random for most wrong matches.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from gsmap.types.localization import Keypoints, SceneFeatures
 
 
 def camera_frames(found: Keypoints, intrinsics_px: np.ndarray) -> np.ndarray:
-    """Return (N, 4) quaternions ``wxyz`` of the frames of features in their camera; see `feature_frames`."""
+    """Return the (N, 4) quaternions ``wxyz`` of the frames of features in their camera; see `feature_frames`."""
     angles = np.zeros(len(found)) if found.angles_rad is None else found.angles_rad
     return feature_frames(found.pixels, angles, intrinsics_px)
 
 
 def scene_frames(found: SceneFeatures, rows: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """Return (n, 4) quaternions of the frames of features in their scene.
+    """Return the (n, 4) quaternions of the frames of features in their scene.
 
     Args:
-        rows: (n,) features.
-        view: (n,) their views.
+        rows: (n,) rows of the features.
+        view: (n,) views of the features.
     """
     cameras, out = found.cameras, np.empty((len(rows), 4))
     for number in np.unique(view):
@@ -39,12 +39,13 @@ def scene_frames(found: SceneFeatures, rows: np.ndarray, view: np.ndarray) -> np
 
 
 def camera_orientations(in_scene: np.ndarray, in_camera: np.ndarray) -> np.ndarray:
-    """Return (K, 4) orientations of the camera in the scene, from matched frames in the scene and in the camera."""
+    """Return the (K, 4) orientations of the camera in the scene that follow from matched frames in the scene and in the
+    camera."""
     return multiply_quats(in_scene, conjugate_quats(in_camera))
 
 
 def feature_frames(pixels: np.ndarray, angles_rad: np.ndarray, intrinsics_px: np.ndarray) -> np.ndarray:
-    """Return (N, 4) quaternions ``wxyz`` of the frames of features in their camera.
+    """Return the (N, 4) quaternions ``wxyz`` of the frames of features in their camera.
 
     The third axis is the ray of a feature; the first is the direction of the feature across the ray.
     """
@@ -58,15 +59,17 @@ def feature_frames(pixels: np.ndarray, angles_rad: np.ndarray, intrinsics_px: np
 
 
 def fit_roll(orientation: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Roll a camera's orientation (1, 4) about its axis to fit those from matches (N, 4) best."""
+    """Rotate a camera's orientation (1, 4) about its optical axis so that it best fits the orientations from matches
+    (N, 4)."""
     off = multiply_quats(conjugate_quats(orientation), others)
-    twist = (off[:, 0] + 1j * off[:, 3]) ** 2  # of twice the half angle, so that a quaternion and its negative are one
+    twist = (off[:, 0] + 1j * off[:, 3]) ** 2  # squared, so that a quaternion and its negative give the same value
     half = np.angle(twist.sum()) / 2
     out: np.ndarray = multiply_quats(orientation, np.array([[np.cos(half), 0.0, 0.0, np.sin(half)]]))
     return out
 
 
 def within_angle(one: np.ndarray, other: np.ndarray, max_deg: float) -> np.ndarray:
-    """Return (N, M) bool: pairs of quaternions (N, 4) and (M, 4) whose rotation is at most ``max_deg``."""
+    """Return an (N, M) mask of pairs of quaternions, (N, 4) and (M, 4), that differ by a rotation of at most
+    ``max_deg``."""
     out: np.ndarray = np.abs(one @ other.T) >= np.cos(np.radians(max_deg / 2))
     return out

@@ -12,18 +12,19 @@ from gsmap.types import Cameras, Gaussians
 from gsmap.types.localization import Keypoints, SceneFeatures
 
 VERSION = 3
-"""Raised whenever the features of a scene change, its views (`gsmap.localize.views`), or `INDEXED_FEATURES`."""
+"""Version, raised whenever the features of a scene, its views (`gsmap.localize.views`) or `INDEXED_FEATURES` change."""
 
 UNIT = 254.0
-"""Length of quantized descriptors; unit vectors of 64 and more dimensions hardly have a component above a half."""
+"""Length of quantized descriptors; unit vectors of 64 or more dimensions hardly have a component above a half."""
 
 INDEXED_FEATURES = 150
-"""Features of a view that are indexed, the largest: small ones repeat. Without sizes, the first."""
+"""Number of features of a view that are indexed: the largest, because small features repeat. Without sizes, the
+first."""
 
 _MIN_ALPHA = 0.9
-_MAX_DEPTH_STEP = 0.05  # relative depth difference around a pixel, from which on it lies at an edge ...
-_EDGE_REACH_PX = 3  # ... within so many pixels
-_MIN_COVERAGE = 0.2  # of a view; others look out of the scene, or stand inside an object
+_MAX_DEPTH_STEP = 0.05  # with a larger relative depth difference around it a pixel lies at an edge ...
+_EDGE_REACH_PX = 3  # ... measured within this many pixels
+_MIN_COVERAGE = 0.2  # of a view; with less the camera looks out of the scene, or is inside an object
 
 
 def scene_features(
@@ -33,7 +34,7 @@ def scene_features(
 
     Args:
         scene: id of the scene.
-        gaussians, cameras: scene frame and unit.
+        gaussians, cameras: Gaussians and cameras in the scene's frame and unit.
     """
     params = params or views.Params()
     chosen = views.select_views(gaussians, cameras, params)
@@ -64,23 +65,23 @@ def scene_features(
 
 
 def _order_by_size(found: Keypoints, rows: np.ndarray) -> np.ndarray:
-    """Return (n,) order of features by decreasing size; as they are without sizes."""
+    """Return the (n,) order of features by decreasing size; the given order without sizes."""
     if found.sizes_px is None:
         return np.arange(len(rows))
     return np.argsort(-found.sizes_px[rows], kind="stable")
 
 
 def to_uint8(rendered: Rendering, row: int = 0) -> np.ndarray:
-    """Return (H, W, 3) uint8 of a render."""
+    """Return the image of one row of a render, (H, W, 3) uint8."""
     return (np.clip(np.nan_to_num(rendered.colour[row]), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def lift(found: Keypoints, rendered: Rendering, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Lift features to the rendered surface.
+    """Lift features to 3D points on the rendered surface.
 
     Args:
-        rendered: the render that the features are from, with depth.
-        camera: of the render.
+        rendered: the render from which the features were extracted, with depth.
+        camera: camera of the render.
 
     Returns:
         (n,) rows of the features on smooth surfaces, and (n, 3) their positions in the camera's frame of reference.
@@ -95,7 +96,7 @@ def lift(found: Keypoints, rendered: Rendering, camera: Cameras) -> tuple[np.nda
 
 
 def smooth_depth(rendered: Rendering) -> np.ndarray:
-    """Return (H, W) depth where the surface is opaque and away from depth edges, else 0."""
+    """Return the (H, W) depth where the surface is opaque and away from depth edges; 0 elsewhere."""
     depth, size = rendered.depth[0], 2 * _EDGE_REACH_PX + 1
     solid = rendered.alpha[0] > _MIN_ALPHA
     near = minimum(np.where(solid, depth, 0), size)
@@ -104,7 +105,8 @@ def smooth_depth(rendered: Rendering) -> np.ndarray:
 
 
 def unproject(pixels: np.ndarray, depth: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return (N, 3) positions of pixels (N, 2) at depths (N,) along the axis, in the frame of the camera's pose."""
+    """Return the (N, 3) positions of pixels (N, 2) with depths (N,) along the axis, in the frame of the camera's
+    pose."""
     fx, fy, cx, cy = camera.intrinsics_px[0]
     local = np.stack([(pixels[:, 0] - cx) / fx * depth, (pixels[:, 1] - cy) / fy * depth, depth], axis=1)
     out: np.ndarray = local @ camera.T_frame_camera[0, :3, :3].T + camera.centers[0]
@@ -112,13 +114,14 @@ def unproject(pixels: np.ndarray, depth: np.ndarray, camera: Cameras) -> np.ndar
 
 
 def quantize(descriptors: np.ndarray) -> np.ndarray:
-    """Return (N, D) int8 of unit vectors; dot products are those of the vectors times 254 squared, to a percent."""
+    """Quantize unit vectors to (N, D) int8; dot products equal the original dot products times 254 squared, to a
+    percent."""
     out: np.ndarray = np.clip(np.round(descriptors * UNIT), -127, 127).astype(np.int8)
     return out
 
 
 def quantize_angles(found: Keypoints) -> np.ndarray:
-    """Return (N,) uint8 angles of features, 256 to a full turn; zeros without angles."""
+    """Return the (N,) uint8 angles of features, where 256 is a full turn; zeros without angles."""
     if found.angles_rad is None:
         return np.zeros(len(found), np.uint8)
     out: np.ndarray = np.round(found.angles_rad * (128 / np.pi)).astype(np.int64).astype(np.uint8)

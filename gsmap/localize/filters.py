@@ -1,6 +1,6 @@
-"""Moving-window image filters: Gaussian blur, box means, maxima, gradients; (H, W) or (H, W, C), float32.
+"""Moving-window filters of float32 images (H, W) or (H, W, C): Gaussian blur, box means, maxima, gradients.
 
-Equal to `scipy.ndimage`, in a tenth of its time.
+Results equal those of `scipy.ndimage`, in a tenth of the time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def blur(image: np.ndarray, sigma_px: float, truncate: float = 4.0, *, reflect: 
 
     Args:
         truncate: radius of the kernel in standard deviations.
-        reflect: mirror the image at its edges; else repeat its last row.
+        reflect: mirror the image at its edges instead of repeating its last row and column.
     """
     reach = int(truncate * sigma_px + 0.5)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
@@ -25,23 +25,24 @@ def blur(image: np.ndarray, sigma_px: float, truncate: float = 4.0, *, reflect: 
 
 
 def box_means(image: np.ndarray, size_px: int, *, reflect: bool = True, first: int = 0, step: int = 1) -> np.ndarray:
-    """Return means over squares of ``size_px`` (odd) around every pixel of ``[first::step, first::step]``."""
+    """Return the means over squares of ``size_px`` (odd) around every pixel of ``[first::step, first::step]``."""
     return _convolve(image, np.full(size_px, 1 / size_px), reflect, first, step)
 
 
 def maximum(image: np.ndarray, size_px: int) -> np.ndarray:
-    """Return maxima over squares of ``size_px`` around every pixel; even squares reach one pixel farther before it."""
+    """Return the maxima over squares of ``size_px`` around every pixel; an even square reaches one pixel farther to the
+    left and up."""
     out: np.ndarray = native_highest(_as_planes(image), size_px // 2, (size_px - 1) // 2)
     return out.reshape(image.shape)
 
 
 def minimum(image: np.ndarray, size_px: int) -> np.ndarray:
-    """Return minima over squares of ``size_px`` around every pixel."""
+    """Return the minima over squares of ``size_px`` around every pixel."""
     return -maximum(-image, size_px)
 
 
 def gradients(image: np.ndarray) -> np.ndarray:
-    """Return (H, W, 2, ...) central differences from row to row and from column to column."""
+    """Return the (H, W, 2, ...) central differences between rows and between columns."""
     out: np.ndarray = native_slopes(_as_planes(image))
     return out.reshape(*image.shape[:2], 2, *image.shape[2:])
 

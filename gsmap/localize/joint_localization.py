@@ -1,9 +1,9 @@
 """Localize several photos of one place, or the frames of a clip, together.
 
-Photos match each other far better than renders. The map's depth lifts the features of a localized photo, and its
-neighbours are resected from them, then refined and judged on renders as any photo. Matches link photos: linked poses
-are right or wrong together, so their evidence is combined. Finally the accepted poses are adjusted jointly, and further
-photos are resected from several of them (`gsmap.localize.bundle_adjustment`).
+Photos match each other far better than they match renders. The map's depth lifts the features of a localized photo to
+3D; neighbouring photos are resected from these points, then refined and verified on renders as any photo. Matches link
+photos: linked poses are correct or wrong together, so their evidence is combined. Finally the accepted poses are
+adjusted jointly, and further photos are resected from several accepted photos (`gsmap.localize.bundle_adjustment`).
 """
 
 from __future__ import annotations
@@ -36,26 +36,28 @@ from gsmap.methods.extractor import Extractor
 from gsmap.types.localization import Keypoints, LocalizationResult, Photo
 
 NEIGHBOURS = 6
-"""Most similar photos that each photo is matched with."""
+"""Number of most similar photos with which each photo is matched."""
 
 MIN_LINK_FEATURES = 20
-"""Inliers with the features of another photo for the two to be linked."""
+"""Smallest number of inliers with the features of another photo for both photos to be linked."""
 
 HELPER_PROBABILITY = 0.3
-"""Probability from which on a photo proposes poses to its neighbours."""
+"""A photo whose pose has at least this probability proposes poses to its neighbours."""
 
 # Chosen by ``tools/fit/clips.py``.
 LINK_PROBABILITY = 0.97
-"""Probability that the relative pose of two linked photos is right."""
+"""Probability that the relative pose of two linked photos is correct."""
 
 SHARED_EVIDENCE = 0.75
-"""Share of a photo's log-odds against an aliased room that counts for the others, since photos show similar content."""
+"""Share of a photo's log-odds against an aliased room that counts for other photos, since photos show similar
+content."""
 
 EXPECTED_LOG_ODDS = 1.75
-"""Log-odds against an aliased room that photos of a mapped place have; less is evidence against the other photos."""
+"""Typical log-odds against an aliased room of a photo of a mapped place; lower log-odds are evidence against other
+photos."""
 
 MAX_LOG_ODDS = 4.0
-"""Limit of the log-odds that one photo adds to the others."""
+"""Largest log-odds that one photo adds to another."""
 
 
 @dataclass(eq=False)
@@ -63,14 +65,14 @@ class PhotoState:
     """A photo during joint localization.
 
     Args:
-        photo: as given.
-        scaled, scale: of `gsmap.localize.localization.scale_photo`.
-        found, features: its features.
-        poses: evaluated poses, the preferred one first.
-        reason: why there is no pose.
-        helped: it has proposed poses to its neighbours from its present pose.
-        unsupported: the map shows nothing of it at the pose from other photos.
-        displaced: other photos lead it far from its pose by the map.
+        photo: the photo as given.
+        scaled, scale: result of `gsmap.localize.localization.scale_photo`.
+        found, features: features of the photo.
+        poses: evaluated poses, the preferred pose first.
+        reason: reason why there is no pose.
+        helped: the photo has proposed poses to its neighbours from its present pose.
+        unsupported: the map does not show the photo at the pose from other photos.
+        displaced: other photos give a pose far from the pose from the map.
     """
 
     photo: Photo
@@ -108,7 +110,7 @@ def localize_together(
     """Localize overlapping photos of one place; see `gsmap.localize.localize_photo`.
 
     Returns:
-        A placement for each, in order.
+        The results, in the order of the photos.
     """
     states, near, links = evaluate_photos(photos, index, scenes, extractor, params)
     _adjust(states, near, scenes, params.verdict, links)
@@ -132,7 +134,7 @@ def localize_together(
         if state.displaced and found.is_placed:
             found = LocalizationResult(
                 found.name,
-                "ambiguous: other photographs lead it elsewhere",
+                "ambiguous: other photos place it elsewhere",
                 component=found.component,
                 probability=found.probability,
                 evidence=found.evidence,
@@ -148,7 +150,8 @@ def evaluate_photos(
     extractor: Extractor,
     params: Params,
 ) -> tuple[list[PhotoState], list[list[int]], Links]:
-    """Evaluate the poses of photos, with proposals from their neighbours; return states, neighbours and links."""
+    """Evaluate the poses of photos, including proposals from neighbouring photos; return states, neighbours and
+    links."""
     states = [_evaluate_photo(photo, index, scenes, extractor, params) for photo in photos]
     near = _find_neighbours(states)
     links: Links = {}
@@ -164,10 +167,10 @@ def evaluate_photos(
 def _combine_evidence(
     states: Sequence[PhotoState], links: Mapping[tuple[int, int], bool], aliased_prior: float
 ) -> list[tuple[EvaluatedPose, float, int] | None]:
-    """Return each photo's best pose with the probability from all photos, that of a rival place, and the number of
-    inliers it needs; None without a pose.
+    """For each photo return its best pose with three values, or None without a pose: the probability of the pose from
+    all photos, the probability of a rival place, and the number of inliers that the pose needs.
 
-    A rival place counts as far as the linked photos may lie there as well.
+    A rival place counts to the extent that the linked photos may lie there as well.
     """
     out: list[tuple[EvaluatedPose, float, int] | None] = []
     rivals = [rival_probability(state.poses) if state.poses else 0.0 for state in states]
@@ -180,17 +183,17 @@ def _combine_evidence(
         if state.best is None:
             out.append(None)
             continue
-        # Linked photos make up for a photo's own missing inliers.
+        # Linked photos compensate for missing inliers of a photo.
         min_inliers = 0 if probable > state.probability else verdict.MIN_INLIERS
         out.append((replace(state.best, probability=probable), rival * factor, min_inliers))
     return out
 
 
 def rival_factors(leads: Sequence[float], links: Mapping[tuple[int, int], bool]) -> list[float]:
-    """Return, for each photo, the probability that the photos linked to it may be at another place as well.
+    """For each photo return the probability that its linked photos may be at another place as well.
 
     Args:
-        leads: of each photo, the probability of its place minus that of the best other place.
+        leads: for each photo, the probability of its place minus the probability of the best other place.
     """
     out = []
     for k in range(len(leads)):
@@ -207,7 +210,7 @@ def _adjust(
     params: verdict.Params,
     links: Links,
 ) -> None:
-    """Adjust the accepted photos of each component jointly, and resect others from them."""
+    """Adjust the accepted photos of each component jointly, and resect further photos from them."""
     by_component: dict[int, list[int]] = {}
     left: set[int] = set()
     for k, one in enumerate(_combine_evidence(states, links, params.aliased_prior)):
@@ -236,7 +239,7 @@ def _adjust(
 
 
 def match_neighbours(states: Sequence[PhotoState], near: Sequence[Sequence[int]]) -> bundle_adjustment.Matches:
-    """Match the features of photos with those of their neighbours."""
+    """Match the features of each photo with the features of its neighbours."""
     out: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
     for k, other in sorted({(max(k, other), min(k, other)) for k, others in enumerate(near) for other in others}):
         rows, columns = matching.match_features(states[k].features, states[other].features)
@@ -266,10 +269,10 @@ def _set_adjusted_pose(
     scenes: Mapping[str, MapScene],
     aliased_prior: float,
 ) -> None:
-    """Set a photo's adjusted pose; one that was resected from other photos is evaluated on renders first.
+    """Set a photo's adjusted pose; if the photo was resected from other photos, evaluate the pose on renders first.
 
     Args:
-        of_scenes: scenes of the photo with most common points, where it was resected.
+        of_scenes: scenes of the photo with most common points, if this photo was resected.
     """
     pose, lens = adjusted.T_metric_camera, adjusted.intrinsics_px
     if not adjusted.resected_from:
@@ -298,7 +301,7 @@ def _evaluate_photo(
 
 
 def _find_neighbours(states: Sequence[PhotoState]) -> list[list[int]]:
-    """Return, for each photo, those just before and after it, and the most similar ones."""
+    """For each photo return the photos just before and after it, and the most similar photos."""
     vectors = np.stack([word_histogram(state.found) for state in states])
     cosines = vectors @ vectors.T
     np.fill_diagonal(cosines, -2)
@@ -311,7 +314,8 @@ def _find_neighbours(states: Sequence[PhotoState]) -> list[list[int]]:
 
 
 def word_histogram(found: Keypoints) -> np.ndarray:
-    """Return (W,) unit vector of the roots of visual word counts; the root reduces the weight of repeated words."""
+    """Return the (W,) square roots of visual word counts, of unit length; the root reduces the weight of repeated
+    words."""
     vocabulary = load_vocabulary(found.descriptors.shape[1])
     word = vocabulary.nearest(vocabulary.reduce(found.descriptors))[:, 0]
     counts = np.sqrt(np.bincount(word, minlength=len(vocabulary.centres)))
@@ -327,7 +331,8 @@ def _propose_to_neighbours(
     aliased_prior: float,
     links: Links,
 ) -> None:
-    """Resect a photo's neighbours from its lifted features, and replace their poses by more probable ones."""
+    """Resect a photo's neighbours from its lifted features, and replace their poses where the new poses are more
+    probable."""
     helper = states[k]
     assert helper.best is not None
     points, known = _lift_features(helper, helper.best)
@@ -351,14 +356,15 @@ def _propose_to_neighbours(
             continue
         evaluated = evaluate_pose(scaled, start, scenes, aliased_prior)
         if evaluated.refined.covariance is None or not _still_at(evaluated, start):
-            continue  # features of another photo do not suffice without support by the map
+            continue  # features of another photo do not suffice without support from the map
         if max(evaluated.probability, helper.probability) >= state.probability:
             state.poses, state.helped = [evaluated, *state.poses], False
             links[k, other] = True
 
 
 def _lift_features(state: PhotoState, best: EvaluatedPose) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 3) positions of a photo's features by the depth of its supporting scenes, and their rows."""
+    """Return the (n, 3) positions of a photo's features from the depth of its supporting scenes, and the rows of the
+    features."""
     pixels = state.found.pixels
     points, known = np.zeros((len(pixels), 3)), np.zeros(len(pixels), bool)
     for one in best.refined.renders:
@@ -370,7 +376,7 @@ def _lift_features(state: PhotoState, best: EvaluatedPose) -> tuple[np.ndarray, 
 
 
 def _still_at(evaluated: EvaluatedPose, candidate: PoseCandidate) -> bool:
-    """Check whether a refined pose is near a candidate."""
+    """Return whether a refined pose is near a candidate."""
     refined = replace(evaluated.candidate, T_metric_camera=evaluated.refined.T_metric_camera)
     return is_duplicate(refined, candidate)
 
@@ -378,11 +384,12 @@ def _still_at(evaluated: EvaluatedPose, candidate: PoseCandidate) -> bool:
 def combine_probabilities(
     states: Sequence[PhotoState], links: Mapping[tuple[int, int], bool], aliased_prior: float
 ) -> list[float]:
-    """Return, for each photo, the probability that its pose is right, given the evidence of all photos.
+    """For each photo return the probability that its pose is correct, given the evidence of all photos.
 
-    An unrelated place is refuted by a photo's own evidence or that of the two most probable photos linked to it; only
-    own evidence is passed on, weighted by the links, so that photos cannot confirm each other in a circle. An aliased
-    room is the same for all photos, linked or not: log-odds against it add up, those of other photos in part.
+    Evidence against an unrelated place comes from the photo itself and from the two most probable photos linked to it.
+    Photos pass on only their own evidence, weighted by the links, so they cannot confirm each other in a circle. An
+    aliased room is the same for all photos, linked or not: the log-odds against it add up, where other photos count in
+    part.
     """
     model = probability.load_model()
     own, rooms = np.zeros((2, len(states)))
@@ -402,7 +409,8 @@ def combine_probabilities(
 
 
 def _linked(k: int, links: Mapping[tuple[int, int], bool]) -> list[tuple[int, float]]:
-    """Return a photo and all photos that are linked to it, also over others, with the probability of the links."""
+    """Return a photo and all photos that are linked to it, directly or over other photos, with the probability of the
+    links."""
     reached, fringe = {k: 1.0}, [k]
     while fringe:
         at = fringe.pop()

@@ -1,4 +1,4 @@
-"""Localize one photo: retrieve views, estimate candidate poses, refine them, and judge the best one."""
+"""Localize one photo: retrieve views, estimate candidate poses, refine them, and accept or reject the best pose."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from gsmap.reason_codes import reason
 from gsmap.types.localization import Keypoints, LocalizationResult, Photo
 
 MAX_ENLARGEMENT = 2.0
-"""Factor by which small photos are enlarged at most: patches and blurs have sizes in pixels."""
+"""Largest factor by which small photos are enlarged, because patches and blurs have fixed sizes in pixels."""
 
 SMOOTH_PX = 1.2
-"""Blur of a photo before features are extracted, as renders have no finer detail."""
+"""Blur of a photo before features are extracted, because renders have no finer detail."""
 
 MORE_VIEWS = 5
-"""Factor on ``max_views`` in the second attempt, which also uses features of the photo as it is."""
+"""Factor on ``max_views`` in the second attempt, which also uses features of the unblurred photo."""
 
 HIGH_PROBABILITY = 0.97
-"""Once a pose is this probable, only candidates with at least `RIVAL_INLIERS` of its inliers are refined."""
+"""Once a pose has this probability, only candidates with at least `RIVAL_INLIERS` of its inliers are refined."""
 
 RIVAL_INLIERS = 0.5
 
 MIN_COMPARED_PROBABILITY = 0.05
-"""Best possible probability below which a pose is not compared for mismatches."""
+"""A pose whose best possible probability is lower is not compared for mismatches."""
 
-_SKIP_PROBABILITY = 0.5  # of a pose, for candidates whose matches agree with it to be skipped
-_OTHER_PLACE_M = 0.5  # distance of poses at different places
-_OCCLUSION = 1.05  # depth of a Gaussian relative to the rendered one, up to which it is visible
+_SKIP_PROBABILITY = 0.5  # candidates whose matches agree with a pose of at least this probability are skipped
+_OTHER_PLACE_M = 0.5  # smallest distance between poses at different places
+_OCCLUSION = 1.05  # largest ratio of a visible Gaussian's depth to the rendered depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,10 @@ class EvaluatedPose:
 
     Args:
         candidate: the pose before refinement.
-        refined: the pose.
-        covariance: (6, 6), metres; None where too few measurements constrain it.
-        evidence: by name.
-        probability: that the pose is right.
+        refined: the refined pose.
+        covariance: (6, 6) covariance of the pose, metres; None if too few measurements constrain it.
+        evidence: pieces of evidence by name.
+        probability: probability that the pose is correct.
     """
 
     candidate: PoseCandidate
@@ -74,9 +74,9 @@ def localize_photo(
     """Localize a photo in the map.
 
     Args:
-        index: of the views of the scenes.
-        scenes: by id, all that the index names.
-        metres_per_unit: of the frame of each component; 1 by default.
+        index: index of the views of the scenes.
+        scenes: all scenes that the index names, by id.
+        metres_per_unit: metres per unit of each component's frame; 1 by default.
 
     Returns:
         The pose in the frame and unit of its component, or the reason for rejecting it.
@@ -100,11 +100,11 @@ def make_placement(
     metres_per_unit: Mapping[int, float] | None = None,
     min_inliers: int = verdict.MIN_INLIERS,
 ) -> LocalizationResult:
-    """Judge a pose, and convert it to the unit of its component.
+    """Accept or reject a pose, and convert it to the unit of its component.
 
     Args:
         rival: probability of the best pose at another place.
-        scale: of `scale_photo`.
+        scale: factors from `scale_photo`.
     """
     rejection = rejection_reason(best, rival, params, min_inliers)
     component = best.candidate.component
@@ -135,13 +135,13 @@ def make_placement(
 def rejection_reason(
     best: EvaluatedPose, rival: float, params: verdict.Params, min_inliers: int = verdict.MIN_INLIERS
 ) -> str:
-    """Return why a pose is rejected; empty where it is accepted. See `make_placement`."""
+    """Return the reason why a pose is rejected; empty if it is accepted. See `make_placement`."""
     sigmas = max_sigmas(best.covariance)
     return verdict.rejection_reason(best.evidence, best.probability, sigmas, rival, params, min_inliers)
 
 
 def scale_photo(photo: Photo, max_side_px: int) -> tuple[ScaledPhoto, np.ndarray]:
-    """Scale a photo to the size of renders; also return the (4,) factors on its intrinsics."""
+    """Scale a photo to the size of renders; return it with the (4,) factors on its intrinsics."""
     width, height = photo.size_px
     factor = min(MAX_ENLARGEMENT, max_side_px / max(width, height))
     rgb, scale = photo.rgb, np.ones(4)
@@ -151,7 +151,7 @@ def scale_photo(photo: Photo, max_side_px: int) -> tuple[ScaledPhoto, np.ndarray
         rgb = np.asarray(Image.fromarray(rgb).resize(size, resampling, reducing_gap=gap))
         scale = np.tile([size[0] / width, size[1] / height], 2)
     real, mask = rgb.astype(np.float32) / 255, photo.known
-    if mask is not None and factor != 1:  # a pixel that is masked in part is masked
+    if mask is not None and factor != 1:  # a pixel that is partly masked counts as masked
         box = Image.fromarray(np.where(mask, 255, 0).astype(np.uint8))
         mask = np.asarray(box.resize(rgb.shape[1::-1], Image.Resampling.BOX)) == 255
     return ScaledPhoto(real, real @ GREY, photo.intrinsics_px * scale, photo.focal_sigma, mask), scale
@@ -164,23 +164,24 @@ def evaluate_candidates(
     extractor: Extractor,
     params: Params,
 ) -> tuple[list[EvaluatedPose], str]:
-    """Return refined poses of the best candidates, the most probable first; and the reason why there are none."""
+    """Return the refined poses of the best candidates, the most probable first, and the reason if there are none."""
     if not len(index):
-        return [], reason("no_views", "the map shows nothing to compare it with")
+        return [], reason("no_views", "the map has no views to compare the photo with")
     out: list[EvaluatedPose] = []
     rejection = ""
     parts: list[Keypoints] = []
-    # The second attempt is for photos that the first one does not place.
+    # The second attempt is for photos that the first attempt does not localize.
     for max_views, smooth_px in ((params.max_views, SMOOTH_PX), (MORE_VIEWS * params.max_views, 0.0)):
         parts.append(extract_features(photo, extractor, smooth_px))
         found = concatenate_keypoints(parts)
         min_inliers = resection.min_inliers(photo.focal_sigma)
         if len(found) < min_inliers:
-            return [], reason("too_few_features", f"it shows too little: {len(found)} features")
+            return [], reason("too_few_features", f"the photo shows too little: {len(found)} features")
         candidates, num_matches = _candidates(photo, found, index, scenes, max_views)
         rejection = reason(
             "no_match",
-            f"nothing in the map looks like it: {num_matches} features match, no {min_inliers} agree on a pose",
+            f"nothing in the map looks like it: {num_matches} features match, but no {min_inliers} of them agree on a "
+            "pose",
         )
         new = [one for one in candidates if not any(is_duplicate(one, other.candidate) for other in out)]
         for candidate in new[: params.max_candidates]:
@@ -195,7 +196,7 @@ def evaluate_candidates(
 
 
 def _agrees_with(candidate: PoseCandidate, found: EvaluatedPose, photo: ScaledPhoto) -> bool:
-    """Check whether most matches of a candidate are inliers of a refined pose that is probable enough."""
+    """Return whether most matches of a candidate are inliers of a refined pose that is probable enough."""
     if found.probability < _SKIP_PROBABILITY or candidate.component != found.candidate.component:
         return False
     refined = (found.refined.T_metric_camera, found.refined.intrinsics_px, photo.size_px)
@@ -210,7 +211,7 @@ def _candidates(
     scenes: Mapping[str, MapScene],
     max_views: int,
 ) -> tuple[list[PoseCandidate], int]:
-    """Return candidate poses, and the number of matches."""
+    """Return the candidate poses of a photo, and the number of its matches."""
     features = matching.FeatureSet(quantize(found.descriptors), quantize_angles(found))
     views = retrieve_views(index, found, photo.intrinsics_px, max_views)
     frames = feature_frames.camera_frames(found, photo.intrinsics_px)
@@ -232,7 +233,7 @@ def extract_features(photo: ScaledPhoto, extractor: Extractor, smooth_px: float)
 
 
 def concatenate_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
-    """Concatenate keypoints, without their sizes; with angles where all parts have them."""
+    """Concatenate keypoints, without their sizes; angles are kept if all parts have them."""
     angles = [part.angles_rad for part in parts if part.angles_rad is not None]
     return Keypoints(
         np.concatenate([part.pixels for part in parts]),
@@ -247,7 +248,7 @@ def evaluate_pose(
     """Refine a candidate pose, compare the photo with renders from it, and compute its probability.
 
     Args:
-        aliased_prior: as in `gsmap.localize.verdict.Params`.
+        aliased_prior: see `gsmap.localize.verdict.Params`.
     """
     of_candidate = [scenes[scene] for scene in candidate.scenes]
     refined = refine_pose(photo, candidate.T_metric_camera, candidate.intrinsics_px, of_candidate)
@@ -263,7 +264,7 @@ def evaluate_pose(
 
 
 def max_sigmas(covariance: np.ndarray | None) -> tuple[float, float]:
-    """Return the largest standard deviation of rotation (rad) and of translation; inf of None."""
+    """Return the largest standard deviations of rotation (rad) and of translation; inf if the covariance is None."""
     if covariance is None:
         return np.inf, np.inf
     turn, shift = (
@@ -273,7 +274,7 @@ def max_sigmas(covariance: np.ndarray | None) -> tuple[float, float]:
 
 
 def rival_probability(poses: Sequence[EvaluatedPose]) -> float:
-    """Return the probability of the best pose at another place than the first one; 0 without any."""
+    """Return the probability of the best pose at another place than the first pose; 0 without such a pose."""
     best = poses[0]
     for other in poses[1:]:
         far = np.linalg.norm(best.refined.T_metric_camera[:3, 3] - other.refined.T_metric_camera[:3, 3])
@@ -285,10 +286,11 @@ def rival_probability(poses: Sequence[EvaluatedPose]) -> float:
 def _supporting_scenes(
     best: EvaluatedPose, scenes: Mapping[str, MapScene], photo: ScaledPhoto
 ) -> tuple[list[tuple[MapScene, float]], int]:
-    """Return scenes with their shares of the inlier patches, largest first, and the number of visible Gaussians."""
+    """Return scenes with their shares of the inlier patches, the largest share first, and the number of visible
+    Gaussians."""
     inliers = best.refined.inliers(photo.size_px)
     counts = np.bincount(best.refined.scene[inliers], minlength=len(best.refined.renders))
-    if not counts.any():  # placed by other photos: weigh scenes by what they render there
+    if not counts.any():  # the pose comes from other photos: weigh scenes by the content that they render there
         counts = np.array([int((one.alpha > 0.5).sum()) for one in best.refined.renders])
     order = [k for k in np.argsort(-counts, kind="stable") if counts[k]]
     support = [(scenes[best.refined.renders[k].scene], counts[k] / counts.sum()) for k in order]

@@ -1,4 +1,4 @@
-"""A scene of the map with its pose, whose arrays are read on first use."""
+"""A scene of the map with its pose; its arrays are read on first use."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gsmap.types.localization import SceneFeatures
 
 @dataclass(eq=False)
 class MapScene:
-    """A scene that photos can be localized in.
+    """A scene in which photos can be localized.
 
     Args:
         scene: id of the scene.
         S_metric_scene: transform from the scene frame to the frame of its component, in metres.
         component: number of the component.
         covariance: (7, 7) of the scene's pose, on the scene's side and in its unit, or None.
-        read_gaussians, read_features: return the arrays, scene frame and unit.
+        read_gaussians, read_features: functions that return the arrays, in the scene's frame and unit.
     """
 
     scene: str
@@ -42,13 +42,13 @@ class MapScene:
 
     @cached_property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Minimum (3,) and extent (3,) of the Gaussians' means, scene frame."""
+        """Minimum (3,) and extent (3,) of the Gaussians' means, in the scene's frame."""
         low = self.gaussians.means.min(0).astype(np.float64)
         return low, np.maximum(self.gaussians.means.max(0) - low, 1e-9)
 
     @cached_property
     def coloured_by_position(self) -> Gaussians:
-        """The Gaussians with their means, scaled to the box, as colours: their renders are maps of positions."""
+        """The Gaussians with their means, scaled to the box, as colours: renders of them show positions."""
         low, span = self.box
         sh = sh0_of_rgb((self.gaussians.means - low) / span)[:, None].astype(np.float32)
         return replace(self.gaussians, sh=sh)
@@ -59,7 +59,7 @@ class MapScene:
             self.__dict__.pop(name, None)
 
     def camera(self, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray, size_px: tuple[int, int]) -> Cameras:
-        """Return a camera that is posed in the component's frame as a camera of the scene's frame and unit."""
+        """Convert a camera with a pose in the component's frame to a camera in the scene's frame and unit."""
         S = self.S_metric_scene
         pose = np.eye(4)
         pose[:3, :3] = S.rotation.T @ T_metric_camera[:3, :3]

@@ -10,18 +10,19 @@ from gsmap._native import mutual_nearest
 from gsmap.localize.features import UNIT
 
 MAX_RATIO = 0.85
-"""Ratio of the distances to the nearest and the second nearest feature of a view (Lowe 2004)."""
+"""Largest ratio of the distances to the nearest and to the second nearest feature of a view (Lowe 2004)."""
 
 MAX_DISTANCE = 0.9
-"""Distance of two matched unit vectors."""
+"""Largest distance of two matched unit vectors."""
 
 MAX_TURN = 18
-"""Difference of a match's rotation from the most frequent one of its view, in 256ths of a full turn."""
+"""Largest difference between a match's rotation and the most frequent rotation of its view, in 256ths of a full
+turn."""
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureSet:
-    """Features as they are matched.
+    """Descriptors and angles of features, quantized for matching.
 
     Args:
         descriptors: (N, D) int8 (`gsmap.localize.features.quantize`).
@@ -33,7 +34,7 @@ class FeatureSet:
 
 
 def match_features(photo: FeatureSet, view: FeatureSet) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows of the photo's features (K,) and of the view's (K,) that match."""
+    """Return the matching rows (K,) of the photo's features and (K,) of the view's features."""
     if len(photo.angles) < 2 or len(view.angles) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     rows, columns, top, next_ = mutual_nearest(photo.descriptors, view.descriptors)
@@ -45,7 +46,7 @@ def match_features(photo: FeatureSet, view: FeatureSet) -> tuple[np.ndarray, np.
 
 
 def _common_rotation(photo: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """Return (K,) bool: pairs whose difference of angles is near the most frequent one."""
+    """Return a (K,) mask of pairs whose difference of angles is near the most frequent difference."""
     if not len(photo):
         return np.zeros(0, bool)
     turn = photo - view  # uint8 wraps at a full turn

@@ -1,9 +1,10 @@
-"""Compute the mismatch map: the probability, cell by cell, that a photo shows something else than a render.
+"""Compute the mismatch map: the probability, for each cell of a photo, that the photo shows something other than a
+render.
 
-An aliased room has the same walls with other furniture and pictures before them; the right room differs in at most one
-part (an open door, a person) and agrees in the rest. A small network classifies each cell, since a render that is
-blurred where cameras saw little still shows the same. ``tools/fit/localize.py`` fits it on synthetic places with known
-changes.
+An aliased room has the same walls, but other furniture and pictures in front of them. The correct room differs in at
+most one part (an open door, a person) and agrees in the rest. A small network classifies each cell, because a render
+that is blurred where cameras saw little may still show the same content. ``tools/fit/localize.py`` fits it on synthetic
+places with known changes.
 """
 
 from __future__ import annotations
@@ -21,34 +22,34 @@ from gsmap.localize.candidate_renders import GREY, SceneRender, downsample, down
 from gsmap.localize.filters import blur, box_means
 
 MISMATCH_PROBABILITY = 0.5
-"""Probability from which on a cell counts as a mismatch."""
+"""A cell with at least this probability counts as a mismatch."""
 
 STEP, SIDE = 4, 9
-"""Distance and width of cells, in pixels of the photo at half size; the network is valid for these values only."""
+"""Spacing and width of cells, in pixels of the photo at half size; the network is valid for these values only."""
 
 STEP_PX = 2 * STEP
-"""Distance of cells in pixels of the photo."""
+"""Spacing of cells, in pixels of the photo."""
 
 _FILE = "mismatch.npz"
 # The network is valid for these values only.
 _WIDE = 17  # pixels at half size
-_LIGHT_CELLS = 5.0  # standard deviation of the blur that estimates light
-_COLOUR_STRIDE = 5  # pixels that the colour balance is fitted to
+_LIGHT_CELLS = 5.0  # standard deviation of the blur that estimates light, in cells
+_COLOUR_STRIDE = 5  # spacing of the pixels to which the colour balance is fitted
 _OPAQUE = 0.9
-_CLIPPED = 0.98  # colours of the photo that are overexposed
+_CLIPPED = 0.98  # brighter colours of the photo are overexposed
 _MIN_VALID = 0.6  # share of a cell that must be opaque and not overexposed
-_MIN_VALUE = 1e-3  # of logarithms
+_MIN_VALUE = 1e-3  # lower limit of values in logarithms
 _MAX_DEVIATIONS = 6.0
 
 
 @dataclass(frozen=True, eq=False)
 class MismatchMap:
-    """Probability, cell by cell, that a photo shows something else than the map.
+    """The probability, for each cell of a photo, that the photo shows something other than the map.
 
     Args:
-        probability: (R, C) of the scene that matches best; NaN where none is rendered. Cells lie `STEP_PX` pixels of
-            the photo apart, the first one at its corner.
-        part: (R, C) bool: the largest connected part that mismatches; one object may have changed, or a person hide it.
+        probability: (R, C) for the scene that matches best; NaN where no scene is rendered. Cells are `STEP_PX` pixels
+            of the photo apart; the first cell is at the photo's corner.
+        part: (R, C) mask of the largest connected mismatch: one object may have changed, or a person may hide it.
     """
 
     probability: np.ndarray
@@ -62,7 +63,7 @@ class MismatchMap:
         return cls(probability, labels == 1 + sizes.argmax() if count else np.zeros(probability.shape, bool))
 
     def part_share(self) -> float:
-        """Return the share of the compared cells in the largest part; NaN without cells."""
+        """Return the share of the compared cells that is in the largest part; NaN without cells."""
         known = np.isfinite(self.probability)
         return float(self.part.sum() / known.sum()) if known.any() else float("nan")
 
@@ -72,18 +73,19 @@ class MismatchMap:
         return float(rest.mean()) if len(rest) else float("nan")
 
     def share_outside(self, min_probability: float) -> float:
-        """Return the share of the compared cells outside the largest part above a probability; NaN without cells."""
+        """Return the share of the compared cells that is outside the largest part and above a probability; NaN without
+        cells."""
         known = np.isfinite(self.probability)
         if not known.any():
             return float("nan")
         return float(((np.nan_to_num(self.probability) > min_probability) & ~self.part).sum() / known.sum())
 
     def covers(self, shape: tuple[int, ...], first_px: int, step_px: int) -> np.ndarray:
-        """Return (R, C) bool of patches that the largest part, dilated by a cell, covers.
+        """Return an (R, C) mask of patches that the largest part, dilated by a cell, covers.
 
         Args:
-            shape: number of patches.
-            first_px, step_px: distance of the first patch from the photo's corner, and of the patches.
+            shape: number of rows and columns of patches.
+        first_px, step_px: distance of the first patch from the photo's corner, and spacing of the patches.
         """
         wide = binary_dilation(self.part)
         rows, columns = (
@@ -95,16 +97,16 @@ class MismatchMap:
 
 @lru_cache(maxsize=1)
 def load_network() -> tuple[np.ndarray, ...]:
-    """Load the network of this package: mean and spread of the features, then weights and offsets of each layer."""
+    """Load the network of this package: mean and spread of the features, then the weights and offsets of each layer."""
     with np.load(str(files("gsmap.localize") / _FILE)) as stored:
         return tuple(stored[name].astype(np.float32) for name in stored.files)
 
 
 def mismatch_map(rgb: np.ndarray, renders: Sequence[SceneRender], mask: np.ndarray | None = None) -> MismatchMap:
-    """Compare a photo (H, W, 3) float32 in [0, 1] with renders of its size from its pose.
+    """Compare a photo (H, W, 3), float32 in [0, 1], with renders of the same size from the photo's pose.
 
     Args:
-        mask: (H, W) bool: valid pixels of the photo; None where all are.
+        mask: (H, W) mask of valid pixels of the photo; None if all are valid.
     """
     half, half_mask = downsample(rgb, 2), downsample_mask(mask, 2)
     least: np.ndarray | None = None
@@ -118,7 +120,7 @@ def mismatch_map(rgb: np.ndarray, renders: Sequence[SceneRender], mask: np.ndarr
 
 
 def classify(features: np.ndarray) -> np.ndarray:
-    """Return the mismatch probabilities (R, C) of features (R, C, F)."""
+    """Return the (R, C) mismatch probabilities of features (R, C, F)."""
     mean, spread, *layers = load_network()
     x = normalize(features, mean, spread)
     for weights, offsets in zip(layers[:-2:2], layers[1:-2:2], strict=True):
@@ -128,16 +130,17 @@ def classify(features: np.ndarray) -> np.ndarray:
 
 
 def normalize(features: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Normalize features for the network, with outliers clipped."""
+    """Normalize features for the network, and clip outliers."""
     out: np.ndarray = np.clip((features - mean) / spread, -_MAX_DEVIATIONS, _MAX_DEVIATIONS)
     return out
 
 
 def cell_features(half: np.ndarray, one: SceneRender, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Compute features (R, C, F) float32 of the cells of a photo at half size and a full-size render, and validity.
+    """Compute the features (R, C, F), float32, of the cells of a photo at half size and of a full-size render; also
+    return validity.
 
     Args:
-        mask: (H, W) bool: valid pixels of the photo at half size; None where all are.
+        mask: (H, W) mask of valid pixels of the photo at half size; None if all are valid.
     """
     rendered = downsample(one.rgb, 2)
     valid = (downsample(one.alpha, 2) > _OPAQUE) & (half.max(2) < _CLIPPED)
@@ -172,7 +175,8 @@ def cell_features(half: np.ndarray, one: SceneRender, mask: np.ndarray | None = 
 
 
 def _correlation(found: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the correlation of two patterns and the log contrast of each, from means of values, squares, products."""
+    """Return the correlation of two patterns and the log contrast of each, from the means of values, squares and
+    products."""
     a, b, square_a, square_b, product = np.moveaxis(found[..., :5], 2, 0)
     var_a, var_b = np.maximum(square_a - a**2, 0), np.maximum(square_b - b**2, 0)
     correlation = (product - a * b) / np.sqrt(np.maximum(var_a * var_b, 1e-10))
@@ -182,7 +186,8 @@ def _correlation(found: np.ndarray) -> tuple[np.ndarray, ...]:
 def _colour_differences(
     half: np.ndarray, rendered: np.ndarray, valid: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Return differences of hue and lightness after colour balance (0 where invalid), and its residual spreads."""
+    """Return differences of hue and of lightness after colour balance (0 where invalid), and the residual spreads of
+    the balance."""
     line = balance(rendered[valid][::_COLOUR_STRIDE], half[valid][::_COLOUR_STRIDE])
     chroma, light = line.differences(rendered, half, valid)
     hue, light = (np.where(valid, plane, np.float32(0)) for plane in (np.abs(chroma).max(2), light))

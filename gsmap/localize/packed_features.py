@@ -1,7 +1,7 @@
-"""Pack the features of a scene's views into two dozen bytes each, with about as many matches.
+"""Pack each feature of a scene's views into two dozen bytes, which keeps about as many matches.
 
-Descriptors are rotated to their principal axes and rounded to one step (transform coding); the rotation is stored with
-them. Positions are steps along a Morton curve.
+Descriptors are rotated to their principal axes and rounded to multiples of one step (transform coding); the rotation is
+stored with them. Positions are steps along a Morton curve.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ NAMES = (
     *("features.descriptors", "features.angles", "views.poses", "views.intrinsics", "views.sizes"),
 )
 
-_STEP = 0.08  # of a unit vector, along each axis
-_MIN_NONZERO = 0.02  # share of nonzero components below which an axis is dropped
+_STEP = 0.08  # rounding step of a unit vector along each axis
+_MIN_NONZERO = 0.02  # an axis with a smaller share of nonzero components is dropped
 _AXIS = 127.0  # length of an axis
 
 
@@ -30,8 +30,8 @@ def pack(features: SceneFeatures, step: float, first: int) -> dict[str, np.ndarr
     """Pack a scene's features into arrays.
 
     Args:
-        step: to which positions are rounded, in the scene's unit.
-        first: number of indexed features of a view; they stay the first, in any order.
+        step: step to which positions are rounded, in the scene's unit.
+        first: number of indexed features of a view; they remain the first features, in any order.
     """
     starts = features.starts
     split = np.minimum(starts[:-1] + first, starts[1:])
@@ -59,21 +59,21 @@ def pack(features: SceneFeatures, step: float, first: int) -> dict[str, np.ndarr
 
 
 def unpack(scene: str, arrays: Mapping[str, np.ndarray], most: int) -> SceneFeatures:
-    """Unpack the features of `pack`.
+    """Unpack features that `pack` packed.
 
     Args:
-        most: largest possible number of features; arrays of more are damaged.
+        most: largest possible number of features; arrays with more features are damaged.
 
     Raises:
-        ValueError, KeyError, InputError: the arrays are not those of `pack`.
+        ValueError, KeyError, InputError: the arrays do not come from `pack`.
     """
     counts, grid, poses = (arrays[name] for name in ("features.counts", "features.grid", "views.poses"))
     mean, axes = arrays["features.mean"], arrays["features.axes"]
     views, total = len(poses), int(counts.sum())
     if counts.shape != (2, views) or counts.dtype != np.int64 or counts.min(initial=0) < 0 or not 0 <= total <= most:
-        raise ValueError("feature counts that do not fit the views")
+        raise ValueError("the feature counts do not fit the views")
     if grid.shape != (4,) or not np.isfinite(grid).all() or arrays["features.angles"].shape != (total,):
-        raise ValueError("arrays that do not fit each other")
+        raise ValueError("the feature arrays differ in length")
     if mean.dtype != np.int8 or axes.dtype != np.int8 or axes.ndim != 2 or not len(mean) == len(axes) >= axes.shape[1]:
         raise ValueError("invalid axes")
     ends = np.cumsum(counts.T.reshape(-1))
@@ -82,7 +82,7 @@ def unpack(scene: str, arrays: Mapping[str, np.ndarray], most: int) -> SceneFeat
     )
     along = compression.decompress(arrays["features.descriptors"], (axes.shape[1], total), np.int8).T
     values = mean + along * np.float32(_STEP * UNIT) @ (axes.T / np.float32(_AXIS))
-    values *= UNIT / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)  # a unit vector again
+    values *= UNIT / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)  # to unit vectors again
     return SceneFeatures(
         scene,
         Cameras(poses.reshape(-1, 4, 4), arrays["views.intrinsics"], arrays["views.sizes"]),

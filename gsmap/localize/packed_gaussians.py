@@ -1,8 +1,8 @@
-"""Pack Gaussians of one colour into four to six bytes each, for renders that photos are aligned with.
+"""Pack each Gaussian, with one colour, into four to six bytes, for renders with which photos are aligned.
 
 Values are rounded to steps that renders do not show: means to a share of the Gaussians' size, shapes as logarithms of
 their covariances (Log-Euclidean metrics, Arsigny et al. 2006), so that the rotation of a round Gaussian costs nothing.
-They are sorted along a Morton curve, on which colours change little.
+Gaussians are sorted along a Morton curve, on which colours change little.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from gsmap.types import Gaussians
 NAMES = ("gaussians.grid", "gaussians.ranges", "gaussians.places", "gaussians.shapes", "gaussians.colours")
 
 _PLACE_STEP = 0.2  # of the median size of a Gaussian
-_SHAPE_STEPS = (0.08, 0.15)  # of the logarithm of a deviation: of a Gaussian's size, and of its shape
-_COLOUR_STEPS = (0.05, 0.1)  # of the first coefficient of SH (.014 and .028 of a colour in [0, 1]): green, and the rest
+_SHAPE_STEPS = (0.08, 0.15)  # of the log standard deviation: for a Gaussian's size, and for its shape
+_COLOUR_STEPS = (0.05, 0.1)  # of the first SH coefficient (0.014 and 0.028 of a colour in [0, 1]): green, and the rest
 _OPACITY_LEVELS = 15.0
 _BYTE = 255.0
 
 
 def pack(gaussians: Gaussians, coarse: float = 1.0) -> dict[str, np.ndarray]:
-    """Pack finite Gaussians into arrays, sorted along a curve; colours without view dependence.
+    """Pack finite Gaussians into arrays, sorted along a curve; view-dependent colour is dropped.
 
     Args:
         coarse: factor on the rounding steps; 1 for steps that renders hardly show.
@@ -50,13 +50,13 @@ def pack(gaussians: Gaussians, coarse: float = 1.0) -> dict[str, np.ndarray]:
 
 
 def unpack(arrays: Mapping[str, np.ndarray], most: int) -> Gaussians:
-    """Unpack the Gaussians of `pack`.
+    """Unpack Gaussians that `pack` packed.
 
     Args:
-        most: largest possible number of Gaussians; arrays of more are damaged.
+        most: largest possible number of Gaussians; arrays with more Gaussians are damaged.
 
     Raises:
-        ValueError, KeyError: the arrays are not those of `pack`.
+        ValueError, KeyError: the arrays do not come from `pack`.
     """
     grid, ranges = arrays["gaussians.grid"], arrays["gaussians.ranges"]
     if grid.shape != (5,) or ranges.shape != (2, 9) or not (np.isfinite(grid).all() and np.isfinite(ranges).all()):
@@ -87,11 +87,11 @@ def place_step(gaussians: Gaussians) -> float:
 
 
 def _quantize(values: np.ndarray, coarse: float, first: float, others: float) -> tuple[np.ndarray, np.ndarray]:
-    """Quantize values to (N, D) uint8; also return (2, D) offsets and steps.
+    """Quantize values to (N, D) uint8; return them with the (2, D) offsets and steps.
 
     Args:
         coarse: factor on the steps.
-        first, others: steps of the first column and of the others.
+        first, others: step of the first column, and step of the remaining columns.
     """
     low = values.min(0) if len(values) else np.zeros(values.shape[1])
     spread = values.max(0) - low if len(values) else np.zeros(values.shape[1])
@@ -100,9 +100,10 @@ def _quantize(values: np.ndarray, coarse: float, first: float, others: float) ->
 
 
 def _log_covariances(gaussians: Gaussians) -> np.ndarray:
-    """Return (N, 6) halved log covariances: mean of the diagonal, two differences from it, and off-diagonal elements.
+    """Return (N, 6) halved log covariances: the mean of the diagonal, two differences from that mean, and the
+    off-diagonal elements.
 
-    All but the first are zero for round Gaussians.
+    For a round Gaussian all elements but the first are zero.
     """
     turned = quats_to_matrices(gaussians.quats.astype(np.float64))
     logs = np.einsum("nij,nj,nkj->nik", turned, gaussians.log_scales.astype(np.float64), turned)
@@ -113,7 +114,7 @@ def _log_covariances(gaussians: Gaussians) -> np.ndarray:
 
 
 def _from_log_covariances(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return quaternions (N, 4) and log scales (N, 3), float32."""
+    """Return the quaternions (N, 4) and log scales (N, 3), float32, of halved log covariances."""
     mean, first, second, xy, xz, yz = values.T
     logs = np.empty((len(values), 3, 3))
     logs[:, 0, 0], logs[:, 1, 1], logs[:, 2, 2] = mean + first, mean + second, mean - first - second
@@ -126,7 +127,7 @@ def _from_log_covariances(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _green_first(rgb: np.ndarray) -> np.ndarray:
-    """Return green, and the differences of red and blue from it."""
+    """Return green, and the differences of red and of blue from green."""
     return np.stack([rgb[:, 1], rgb[:, 0] - rgb[:, 1], rgb[:, 2] - rgb[:, 1]], axis=1)
 
 

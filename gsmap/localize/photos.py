@@ -13,9 +13,9 @@ from gsmap.formats.pictures import open_picture
 from gsmap.types.localization import Photo
 
 _EXIF_IFD, _FOCAL_35MM = 0x8769, 0xA405
-_FILM_DIAGONAL_MM = 43.267  # of a frame of 36 x 24 mm, which equivalent focal lengths mean
+_FILM_DIAGONAL_MM = 43.267  # of a frame of 36 x 24 mm, to which equivalent focal lengths refer
 _EXIF_SIGMA = 0.05  # relative: focal lengths are rounded to millimetres, and phones do not record crops
-_DEFAULT_FOCAL, _UNKNOWN = 0.8, float("inf")  # per longer side: 64 degrees, between phones and kit lenses
+_DEFAULT_FOCAL, _UNKNOWN = 0.8, float("inf")  # per longer side: a view of 64 degrees, between phones and kit lenses
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Lens:
         given = (*(self.intrinsics_px or ()), *((self.focal_px,) if self.focal_px is not None else ()))
         if not np.isfinite(given).all() or any(value <= 0 for value in given):
             raise ConfigError(
-                "intrinsics are fx,fy,cx,cy in pixels, and a focal length is in pixels: all above 0",
+                "intrinsics are fx,fy,cx,cy and a focal length is a number, in pixels and above 0",
                 code="invalid_intrinsics",
             )
 
@@ -47,7 +47,7 @@ def read_photo(
     """Read a photo, upright by its EXIF orientation.
 
     Args:
-        masks: folder of its mask (`read_mask`).
+        masks: folder of the photo's mask (`read_mask`).
 
     Raises:
         NotFoundError: the file or its mask does not exist.
@@ -57,7 +57,7 @@ def read_photo(
 
     path, lens = Path(path), lens or Lens()
     if not path.is_file():
-        raise NotFoundError(f"no photo at {path}", code="file_not_found")
+        raise NotFoundError(f"the photo {path} does not exist", code="file_not_found")
 
     with open_picture(path) as picture:
         focal_35mm = picture.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
@@ -68,7 +68,7 @@ def read_photo(
 
 
 def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_px: tuple[int, int]) -> np.ndarray:
-    """Read a photo's mask (H, W) bool from a folder of masks; true at valid pixels.
+    """Read a photo's mask (H, W) from a folder of masks; True at valid pixels.
 
     As in COLMAP, the mask of ``photo.jpg`` is ``photo.jpg.png``, of the size of the upright photo, and black at invalid
     pixels. ``photo.png`` is accepted as well.
@@ -79,29 +79,29 @@ def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_
     """
     folder, name = Path(masks), Path(path)
     if not folder.is_dir():
-        raise NotFoundError(f"no folder of masks at {folder}", code="folder_not_found")
+        raise NotFoundError(f"the folder of masks {folder} does not exist", code="folder_not_found")
     offered = [folder / f"{name.name}.png", folder / f"{name.stem}.png"]
     found = next((one for one in offered if one.is_file()), None)
     if found is None:
         raise NotFoundError(
-            f"{name.name} has no mask in {folder}: call it {offered[0].name}, white where all counts",
+            f"{name.name} has no mask in {folder}: add {offered[0].name}, all white if every pixel is valid",
             code="mask_missing",
         )
     with open_picture(found) as picture:
         known = np.asarray(picture.convert("L")) > 0
     if known.shape[::-1] != size_px:
         raise InputError(
-            f"{found} has {known.shape[1]} x {known.shape[0]} pixels, its photo {size_px[0]} x {size_px[1]}: "
-            "masks are of the upright photo's size",
+            f"{found} has {known.shape[1]} x {known.shape[0]} pixels, but its photo has {size_px[0]} x {size_px[1]}: "
+            "a mask has the size of the upright photo",
             code="size_mismatch",
         )
     if not known.any():
-        raise InputError(f"{found} is black everywhere: it leaves nothing of its photo", code="black_mask")
+        raise InputError(f"{found} is black everywhere, so its photo has no valid pixel", code="black_mask")
     return known
 
 
 def make_photo(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str = "photo") -> Photo:
-    """Return a photo of pixels (H, W, 3) uint8 with intrinsics as specified, from EXIF, or by default.
+    """Return a photo of pixels (H, W, 3), uint8, with intrinsics as specified, from EXIF, or by default.
 
     Args:
         focal_35mm: equivalent focal length in millimetres from EXIF; invalid values are ignored.
@@ -124,7 +124,7 @@ def make_photo(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str
 
 
 def _number(value: object) -> float | None:
-    """Parse a plausible focal length in millimetres; None if it is not."""
+    """Parse a plausible focal length in millimetres; return None if it is implausible."""
     try:
         found = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):

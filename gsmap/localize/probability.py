@@ -1,9 +1,9 @@
-"""Probability that a photo's pose is right, from all evidence together.
+"""Compute the probability that a photo's pose is correct from all evidence together.
 
-A pose is right, or lies at an unrelated place, or in an aliased room (one that looks like the photo's). The evidence
-has other weights against each of the two wrong answers, and each has its own prior (`gsmap.localize.verdict.Params`).
-The curves of `gsmap.compare.odds` are fitted by ``tools/fit/localize.py`` on synthetic places with changed light,
-lenses and content, and on streets with aliased rooms.
+A pose is correct, or lies at an unrelated place, or in an aliased room (a room that looks like that of the photo). The
+evidence has different weights against both wrong alternatives, and each alternative has its own prior
+(`gsmap.localize.verdict.Params`). The curves of `gsmap.compare.odds` are fitted by ``tools/fit/localize.py`` on
+synthetic places with changed light, lenses and content, and on streets with aliased rooms.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gsmap.localize.mismatch import MISMATCH_PROBABILITY, MismatchMap
 from gsmap.localize.refinement import RefinedPose, ScaledPhoto
 
 PRIOR = 0.3
-"""Share of the candidate poses that are right."""
+"""Share of the candidate poses that are correct."""
 
 _FILE = "probability.json"
 _BLOCKS = (8, 6)  # columns and rows of the photo over which inliers should be spread
@@ -34,8 +34,8 @@ class EvidenceModel:
     """Log-odds of evidence for a pose against two alternatives.
 
     Args:
-        other: against an unrelated place.
-        aliased: against an aliased room.
+        other: log-odds against an unrelated place.
+        aliased: log-odds against an aliased room.
     """
 
     other: Odds
@@ -44,20 +44,21 @@ class EvidenceModel:
     def probability(
         self, evidence: Mapping[str, float], aliased_prior: float, prior: float = PRIOR, *, optimistic: bool = False
     ) -> float:
-        """Return the probability that a pose is right.
+        """Return the probability that a pose is correct.
 
         Args:
-            evidence: by name.
-            aliased_prior: share of the candidate poses that are of an aliased room.
-            prior: share of the candidate poses that are right.
-            optimistic: missing evidence is as good as possible.
+            evidence: pieces of evidence by name.
+        aliased_prior: share of the candidate poses that lie in an aliased room.
+        prior: share of the candidate poses that are correct.
+        optimistic: assume that missing evidence is as good as possible.
         """
         against = (1 - prior - aliased_prior) * np.exp(-self.other.log_odds(evidence, at_best=optimistic))
         against += aliased_prior * np.exp(-self.aliased.log_odds(evidence, at_best=optimistic))
         return float(np.clip(prior / (prior + against), self.other.least, 1 - self.other.least))
 
     def shortfalls(self, evidence: Mapping[str, float]) -> list[str]:
-        """Return the names of the evidence against the likelier alternative, that which lacks most log-odds first."""
+        """Return the names of the evidence against the likelier alternative, sorted by the log-odds that each lacks to
+        its best value, most first."""
         return min((self.other, self.aliased), key=lambda odds: odds.log_odds(evidence)).shortfalls(evidence)
 
 
@@ -71,7 +72,7 @@ def load_model() -> EvidenceModel:
 def refinement_evidence(
     photo: ScaledPhoto, refined: RefinedPose, sigmas: tuple[float, float], num_matches: int
 ) -> dict[str, float]:
-    """Return the evidence of refining a pose, scaled so that equal steps weigh about the same.
+    """Return the evidence from refining a pose, scaled so that equal steps have about equal weight.
 
     Args:
         sigmas: largest standard deviation of rotation (rad) and translation (metres).
@@ -92,10 +93,10 @@ def refinement_evidence(
 def render_evidence(
     comparison: evidence.RenderComparison, coarse: evidence.RenderComparison, mismatch: MismatchMap
 ) -> dict[str, float]:
-    """Return the evidence of comparing the photo with renders, scaled likewise; NaN where there is none.
+    """Return the evidence from comparing the photo with renders, scaled likewise; NaN where a piece is missing.
 
     Args:
-        comparison, coarse: at full and at reduced size, without the largest part of the mismatch.
+        comparison, coarse: comparisons at full and at reduced size, without the largest part of the mismatch.
     """
     return {
         "explained": comparison.explained(),
@@ -114,6 +115,6 @@ def render_evidence(
 
 
 def block_coverage(pixels: np.ndarray, size_px: tuple[int, int]) -> float:
-    """Return the share of the photo's blocks that hold any of the pixels (K, 2)."""
+    """Return the share of the photo's blocks that contain any of the pixels (K, 2)."""
     at = np.clip((pixels / size_px * _BLOCKS).astype(int), 0, np.array(_BLOCKS) - 1)
     return len(np.unique(at[:, 1] * _BLOCKS[0] + at[:, 0])) / (_BLOCKS[0] * _BLOCKS[1])

@@ -1,4 +1,4 @@
-"""Recipe key of the stored features of a scene."""
+"""Compute the recipe key of a scene's stored features."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsmap.types.plain import plain
 
 
 def recipe_key(params: Params, models: Mapping[str, ModelSpec] | None = None) -> RecipeKey:
-    """Return the recipe of the features of a scene's views; settings that only judge photos take no part.
+    """Return the recipe of the features of a scene's views; settings of the verdict on photos are not part of it.
 
     The caller adds the scene as input with `RecipeKey.of`.
     """

@@ -1,8 +1,8 @@
 """Reduce a scene to what localization needs, for small maps.
 
-Every view keeps the same number of features, the first ones of its extractor, so that the whole scene stays covered.
-Gaussians that contribute little to the scene's own views are dropped, and so is view dependence; the others are merged
-(`gsmap.export.levels`) until they fit. The rest is packed (`gsmap.localize.packed_features`,
+Every view keeps the same number of features, the first of its extractor, so that the whole scene stays covered.
+View-dependent colour and Gaussians that contribute little to the scene's own views are dropped; the remaining Gaussians
+are merged (`gsmap.export.levels`) until they fit the size. Then both are packed (`gsmap.localize.packed_features`,
 `gsmap.localize.packed_gaussians`).
 """
 
@@ -23,32 +23,33 @@ FEATURES_FRACTION = 0.35
 """Share of a scene's bytes for features; the rest is for Gaussians."""
 
 MIN_FEATURES = 40
-"""Features of a view below which hardly any photo is localized."""
+"""With fewer features per view hardly any photo is localized."""
 
 MIN_GAUSSIANS_FRACTION = 0.15
-"""Share of the visible Gaussians below which renders are full of holes."""
+"""With a smaller share of the visible Gaussians renders are full of holes."""
 
 MIN_BLENDING_WEIGHT = 0.02
-"""Largest blending weight in any view, below which a Gaussian is dropped."""
+"""A Gaussian is dropped if its largest blending weight in any view is smaller."""
 
 REFINE_BELOW_FRACTION = 0.5
-"""Share of the Gaussians below which merged ones are fitted to renders; above it merging alone is closer."""
+"""If a smaller share of the Gaussians remains, merged Gaussians are fitted to renders; with more, merging alone is
+closer."""
 
 REFINE_STEPS, REFINE_VIEWS = 100, 32
-"""Iterations of that fit, and views that it uses."""
+"""Number of iterations of that fit, and of views that it uses."""
 
-_VIEWS, _VIEW_SIDE_PX = 32, 240  # own views in which blending weights are measured
+_VIEWS, _VIEW_SIDE_PX = 32, 240  # number and size of the own views in which blending weights are measured
 
 
 def measure_visibility(scene: MapScene, cameras: Cameras | None) -> tuple[np.ndarray, Gaussians]:
-    """Measure the blending weights of a scene's Gaussians in its own views.
+    """Measure the blending weights of a scene's Gaussians in the scene's own views.
 
     Args:
-        cameras: of the scene, its frame and unit; by default those of its features.
+        cameras: cameras of the scene, in its frame and unit; by default the cameras of its features.
 
     Returns:
-        (N,) float32 largest blending weight of each Gaussian in any view; and the Gaussians in one colour each, their
-        mean colour in these views.
+        The (N,) float32 largest blending weight of each Gaussian in any view; and the Gaussians with one colour each,
+        the mean colour in these views.
     """
     own = cameras if cameras is not None and len(cameras) else scene.features.cameras
     small = own.evenly(_VIEWS).resized(_VIEW_SIDE_PX)
@@ -69,9 +70,10 @@ def measure_visibility(scene: MapScene, cameras: Cameras | None) -> tuple[np.nda
 
 
 def limit_features(features: SceneFeatures, total: int) -> SceneFeatures:
-    """Keep at most ``total`` features: the first of each view, evenly over views."""
+    """Keep at most ``total`` features: the first features of each view, evenly over views."""
     counts = np.sort(np.diff(features.starts))
-    rest = total - np.r_[0, np.cumsum(counts)[:-1]]  # for this and all larger views, if the smaller ones are whole
+    # What is left for this and all larger views, if the smaller views are complete.
+    rest = total - np.r_[0, np.cumsum(counts)[:-1]]
     most = int(np.max(np.minimum(rest // np.arange(len(counts), 0, -1), counts), initial=1))
     rows = [np.arange(a, min(b, a + most)) for a, b in zip(features.starts[:-1], features.starts[1:], strict=True)]
     keep = np.concatenate([np.zeros(0, np.int64), *rows])
@@ -85,7 +87,8 @@ def limit_features(features: SceneFeatures, total: int) -> SceneFeatures:
 
 
 def remove_features(features: SceneFeatures, means: np.ndarray, removed: np.ndarray) -> SceneFeatures:
-    """Remove the features whose nearest Gaussian (of means (N, 3)) is removed (N,) bool."""
+    """Remove the features whose nearest Gaussian is removed; ``means`` (N, 3) and ``removed`` (N,) describe the
+    Gaussians."""
     from scipy.spatial import cKDTree
 
     _, nearest = cKDTree(means).query(features.points)

@@ -13,25 +13,25 @@ from gsmap.localize.candidate_renders import GREY, SceneRender, downsample, down
 from gsmap.localize.map_scene import MapScene
 
 MAX_SCENES = 3
-"""Scenes that are rendered for a pose, those with most matches first."""
+"""Number of scenes that are rendered for a pose: those with most matches."""
 
 FAR_PX, NEAR_PX = 32, 6
-"""Search radii of the first round (renders of half size) and of the last one, in pixels of the full size."""
+"""Search radii of the first round (renders of half size) and of the last round, in pixels of the full size."""
 
 MIN_PATCHES = 8
-"""Patches below which they do not constrain a pose."""
+"""Fewer patches do not constrain a pose."""
 
 MIN_AGREEMENT = 0.1
-"""Agreement of a repeated direct alignment below which the photo shows another place (``tools/fit/localize.py``)."""
+"""If a repeated direct alignment agrees less, the photo shows another place (``tools/fit/localize.py``)."""
 
 REPEAT_BELOW_AGREEMENT = 0.5
-"""Agreement below which the refinement is run once more from its own result."""
+"""If a refinement agrees less, it is run once more from its own result."""
 
 MAX_INLIER_PX = 2.0
-"""Distance of a tracked patch from its prediction up to which it is an inlier, for a photo of 480 pixels."""
+"""Largest distance between an inlier patch and its prediction, for a photo of 480 pixels."""
 
-_MAX_MOTION_PX = 0.5  # scenes are rendered again once their content has moved farther than this ...
-_MAX_MOTION_BLURS = 0.5  # ... or, for direct alignment, farther than so many times the blur
+_MAX_MOTION_PX = 0.5  # scenes are rendered again if their content moves farther than this ...
+_MAX_MOTION_BLURS = 0.5  # ... or, for direct alignment, farther than this many blurs
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +41,9 @@ class ScaledPhoto:
     Args:
         rgb: (H, W, 3) float32 in [0, 1].
         grey: (H, W) float32.
-        intrinsics_px: (4,) of this size.
+        intrinsics_px: (4,) intrinsics at this size.
         focal_sigma: as in `gsmap.types.localization.Photo`.
-        mask: (H, W) bool: valid pixels; None where all are.
+        mask: (H, W) mask of valid pixels; None if all are valid.
     """
 
     rgb: np.ndarray
@@ -68,16 +68,16 @@ class RefinedPose:
 
     Args:
         T_metric_camera: (4, 4) camera-to-component, metres.
-        intrinsics_px: (4,) of the photo's size.
-        fit: the last least-squares fit to patches, with residuals from the pose; None where too few were found.
-        covariance: (6, 6) of the pose, metres; None where no measurement constrains it.
+        intrinsics_px: (4,) intrinsics at the photo's size.
+        fit: the last least-squares fit to patches, with residuals from the pose; None with too few patches.
+        covariance: (6, 6) covariance of the pose, metres; None if no measurement constrains it.
         pixels: (K, 2) tracked patches in the photo.
-        points: (K, 3) their positions, metres.
+        points: (K, 3) positions of the patches, metres.
         scene: (K,) int, index of each patch's scene in ``renders``.
-        num_tracked: patches that were searched for in the last round.
-        agreement: correlation of render and photo in the last direct alignment, before it moved
+        num_tracked: number of patches that were searched for in the last round.
+        agreement: correlation of render and photo at the start of the last direct alignment
             (`gsmap.localize.direct_alignment.DirectAlignment`); 0 without one.
-        renders: renders from the pose, or close to it; empty where the photo shows another place.
+        renders: renders from the pose or from nearby; empty if the photo shows another place.
     """
 
     T_metric_camera: np.ndarray
@@ -92,7 +92,7 @@ class RefinedPose:
     renders: Sequence[SceneRender]
 
     def inliers(self, size_px: tuple[int, int]) -> np.ndarray:
-        """Return (K,) bool: patches within `MAX_INLIER_PX` of their prediction."""
+        """Return a (K,) mask of patches within `MAX_INLIER_PX` of their prediction."""
         if self.fit is None:
             return np.zeros(0, bool)
         out: np.ndarray = np.linalg.norm(self.fit.residuals_px, axis=1) < MAX_INLIER_PX * max(size_px) / 480
@@ -102,14 +102,14 @@ class RefinedPose:
 def refine_pose(
     photo: ScaledPhoto, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray, scenes: Sequence[MapScene]
 ) -> RefinedPose:
-    """Track patches from afar, align renders directly, track patches again, and fuse both estimates.
+    """Track patches within a large radius, align renders directly, track patches again, and fuse both estimates.
 
     Patches are accurate where renders are sharp and have corners; direct alignment also holds where renders are blurred
     or show little but edges. A result that agrees little with the photo is refined once more.
 
     Args:
-        intrinsics_px: (4,) of the photo's size, as far as they are known.
-        scenes: that may show the place, those with most matches first.
+        intrinsics_px: (4,) intrinsics at the photo's size, as far as known.
+        scenes: scenes that may show the place, sorted by their number of matches.
     """
     found = _refine_once(photo, T_metric_camera, intrinsics_px, scenes)
     if found.fit is None or found.agreement >= REPEAT_BELOW_AGREEMENT:
@@ -128,13 +128,13 @@ def _refine_once(
 
     renders = render_scenes(scenes, pose, lens / 2, half.size_px)
     patches = _track_patches(half, 0.5, renders, FAR_PX)
-    if len(patches.pixels) >= MIN_PATCHES:  # RANSAC first, for patches that were found far away are often wrong
+    if len(patches.pixels) >= MIN_PATCHES:  # RANSAC first, because patches found far away are often wrong
         robust = resection.resect(patches.pixels, patches.points, lens, photo.size_px, 0.0)
         start = pose if robust is None else robust.T_map_camera
         rough = resection.refine(patches.pixels, patches.points, start, lens, focal=free)
         pose, lens = rough.T_map_camera, rough.intrinsics_px
 
-    # Direct alignment uses one scene: that with most patches, or where these are few, the one that agrees most.
+    # Direct alignment uses one scene: the scene with most patches or, with few patches, the scene that agrees most.
     counts = np.bincount(patches.scene, minlength=len(scenes))
     if counts.max() < MIN_PATCHES:
         renders = render_scenes(scenes, pose, lens / 2, half.size_px)
@@ -185,17 +185,17 @@ def _refine_once(
 
 
 def _unconstrained(pose: np.ndarray, lens: np.ndarray, agreement: float) -> RefinedPose:
-    """Return the result for a pose from which the map shows something else than the photo."""
+    """Return the result for a pose from which the map shows something other than the photo."""
     return RefinedPose(pose, lens, None, None, np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, int), 0, agreement, [])
 
 
 def _fuse(
     pose: np.ndarray, lens: np.ndarray, known: np.ndarray, fit: resection.LeastSquaresPose, by_patches: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fuse the pose of direct alignment and that of patches by covariance intersection (Julier and Uhlmann 1997).
+    """Fuse the poses of direct alignment and of patches by covariance intersection (Julier and Uhlmann 1997).
 
-    Both used the same images, so their errors are correlated by an unknown amount. A share of the square of their
-    difference is added to the covariance, since residuals do not show all errors.
+    Both estimates use the same images, so their errors are correlated by an unknown amount. A share of their squared
+    difference is added to the covariance, because residuals do not reveal all errors.
     """
     dim = len(known)
     xi = np.r_[resection.relative_xi(pose, fit.T_map_camera), np.log(fit.intrinsics_px[0] / lens[0])][:dim]
@@ -211,7 +211,7 @@ def _fuse(
 
 @dataclass(frozen=True, eq=False)
 class _TrackedPatches:
-    """Patches of renders that were found in a photo; arrays as in `RefinedPose`."""
+    """Patches of renders that were found in a photo; fields as in `RefinedPose`."""
 
     pixels: np.ndarray
     points: np.ndarray
@@ -222,7 +222,7 @@ class _TrackedPatches:
 def _track_patches(
     photo: ScaledPhoto, factor: float, renders: Sequence[SceneRender], radius_px: int
 ) -> _TrackedPatches:
-    """Track patches of renders in a photo that has ``factor`` times its full size; pixels are of the full size."""
+    """Track patches of renders in a photo that is scaled by ``factor``; pixels in the result are at full size."""
     pixels, points, scene, num_tracked = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros(0, int)], 0
     for number, one in enumerate(renders):
         tracks = tracking.track(one.grey, one.smooth, photo.grey, int(np.ceil(radius_px * factor)))

@@ -11,10 +11,11 @@ from gsmap.geometry.rotations import exp_so3, skew
 from gsmap.geometry.similarities import rotation_vectors
 
 MAX_ERROR_PX = 6.0
-"""Reprojection error of an inlier, for a photo of 480 pixels; it scales with the longer side."""
+"""Largest reprojection error of an inlier, for a photo of 480 pixels; it scales with the longer side."""
 
 MIN_INLIERS, MIN_INLIERS_FREE_FOCAL = 4, 6
-"""Different features of the photo that must agree; four always fit a pose with a free focal length."""
+"""Smallest number of different features of a photo that must agree; four features always fit a pose with a free focal
+length."""
 
 ROBUST_SCALE_PX = 1.5
 """Scale of Cauchy's loss in the least squares."""
@@ -23,7 +24,7 @@ ITERATIONS = 12
 """Maximum number of Gauss-Newton steps."""
 
 _MAX_TRIALS = 6000  # of RANSAC
-_FIXED_FOCAL_SIGMA = 0.01  # standard deviation of the log focal length up to which it is not estimated
+_FIXED_FOCAL_SIGMA = 0.01  # a log focal length with a smaller standard deviation is not estimated
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +32,9 @@ class Resection:
     """A camera pose estimated by RANSAC.
 
     Args:
-        T_map_camera: (4, 4).
-        intrinsics_px: (4,).
-        inliers: (K,) bool of the given matches.
+        T_map_camera: (4, 4) pose.
+        intrinsics_px: (4,) ``fx fy cx cy``.
+        inliers: (K,) mask of the matches that agree with the pose.
     """
 
     T_map_camera: np.ndarray
@@ -42,12 +43,12 @@ class Resection:
 
 
 def is_free(focal_sigma: float) -> bool:
-    """Check whether a focal length with this uncertainty (as in `Photo`) is estimated."""
+    """Return whether a focal length with this uncertainty (as in `Photo`) is estimated."""
     return focal_sigma > _FIXED_FOCAL_SIGMA
 
 
 def min_inliers(focal_sigma: float) -> int:
-    """Return the number of features that must agree on a pose and on its orientation."""
+    """Return the number of features that must agree on a pose and its orientation."""
     return MIN_INLIERS_FREE_FOCAL if is_free(focal_sigma) else MIN_INLIERS
 
 
@@ -60,11 +61,11 @@ def resect(
     *,
     min_inliers: int = MIN_INLIERS_FREE_FOCAL,
 ) -> Resection | None:
-    """Estimate the pose with most inliers by LO-RANSAC (Chum et al. 2003); None where there are too few.
+    """Estimate the pose with most inliers by LO-RANSAC (Chum et al. 2003); return None with too few inliers.
 
     Args:
-        pixels: (K, 2) in the photo.
-        points: (K, 3) map.
+        pixels: (K, 2) positions in the photo.
+        points: (K, 3) positions in the map.
         focal_sigma: as in `Photo`; see `is_free`.
     """
     import pycolmap
@@ -83,7 +84,7 @@ def resect(
     options.estimate_focal_length = free
     options.ransac.max_error = MAX_ERROR_PX * max(size_px) / 480
     options.ransac.max_num_trials = _MAX_TRIALS
-    # As many trials as a pose with so few inliers takes; with few matches these are few.
+    # The number of trials that a pose with so few inliers needs; it is small with few matches.
     options.ransac.min_inlier_ratio = max(0.01, min(min_inliers / len(pixels), 1.0))
     options.ransac.confidence = 0.9999
     options.ransac.random_seed = 1
@@ -108,7 +109,7 @@ def find_inliers(
     intrinsics_px: np.ndarray,
     size_px: tuple[int, int],
 ) -> np.ndarray:
-    """Return (K,) bool: matches within `MAX_ERROR_PX` of their projection."""
+    """Return a (K,) mask of matches within `MAX_ERROR_PX` of their projection."""
     at, depth = project(points, np.linalg.inv(T_map_camera), intrinsics_px)
     bar = MAX_ERROR_PX * max(size_px) / 480
     out: np.ndarray = (depth > 0) & (np.linalg.norm(at - pixels, axis=1) < bar)
@@ -117,14 +118,14 @@ def find_inliers(
 
 @dataclass(frozen=True, eq=False)
 class LeastSquaresPose:
-    """A pose by least squares.
+    """A pose estimated by least squares.
 
     Args:
         T_map_camera, intrinsics_px: the estimate.
         residuals_px: (K, 2) measured minus predicted.
-        weights: (K,) of Cauchy's loss at the estimate, times the given ones.
-        jacobian: (K, 2, 6 or 7) of the prediction by [rot_rad, trans] on the camera's side, and the log focal length
-            where it is estimated.
+        weights: (K,) weights of Cauchy's loss at the estimate, times the given weights.
+        jacobian: (K, 2, 6 or 7) derivatives of the prediction with respect to [rot_rad, trans] on the camera's side,
+            and to the log focal length if it is estimated.
     """
 
     T_map_camera: np.ndarray
@@ -146,10 +147,10 @@ def refine(
     """Minimize robust reprojection errors over the pose, and the focal length if it is free (Gauss-Newton).
 
     Args:
-        pixels: (K, 2).
-        points: (K, 3) map.
-        weights: (K,) of the matches.
-        focal: expected focal length and ``focal_sigma``, where it is estimated.
+        pixels: (K, 2) positions in the photo.
+        points: (K, 3) positions in the map.
+        weights: (K,) weights of the matches.
+        focal: expected focal length and ``focal_sigma``; None if the focal length is not estimated.
     """
     pose, intrinsics = T_map_camera.copy(), intrinsics_px.astype(float).copy()
     given = np.ones(len(pixels)) if weights is None else weights
@@ -181,7 +182,7 @@ def refine(
 
 
 def retract_pose(T_map_camera: np.ndarray, xi: np.ndarray) -> np.ndarray:
-    """Return ``T Exp(xi)`` of xi = [rot_rad (3), trans (3)], on the camera's side."""
+    """Return ``T Exp(xi)`` for xi = [rot_rad (3), trans (3)] on the camera's side."""
     out = np.eye(4)
     out[:3, :3] = T_map_camera[:3, :3] @ exp_so3(xi[:3])
     u, _, vt = np.linalg.svd(out[:3, :3])
@@ -191,7 +192,7 @@ def retract_pose(T_map_camera: np.ndarray, xi: np.ndarray) -> np.ndarray:
 
 
 def relative_xi(T_map_camera: np.ndarray, to: np.ndarray) -> np.ndarray:
-    """Return (6,) xi by which `retract_pose` takes a pose to another one."""
+    """Return the (6,) xi by which `retract_pose` moves a pose to another pose."""
     apart = np.linalg.inv(T_map_camera) @ to
     return np.r_[rotation_vectors(apart[:3, :3])[0], apart[:3, 3]]
 
@@ -199,7 +200,8 @@ def relative_xi(T_map_camera: np.ndarray, to: np.ndarray) -> np.ndarray:
 def linearize(
     pixels: np.ndarray, points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray, dim: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals (K, 2) and the prediction's derivative (K, 2, dim); 0 for points behind the camera."""
+    """Return the residuals (K, 2) and the derivatives of the prediction (K, 2, dim); both are 0 for points behind the
+    camera."""
     fx, fy, cx, cy = intrinsics
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     z = local[:, 2]
@@ -210,7 +212,7 @@ def linearize(
     by_point = np.zeros((len(points), 2, 3))
     by_point[:, 0, 0], by_point[:, 0, 2] = fx / z, -fx * x / z
     by_point[:, 1, 1], by_point[:, 1, 2] = fy / z, -fy * y / z
-    # local' = Exp(-w) local - v: points move against the camera.
+    # local' = Exp(-w) local - v: points move opposite to the camera.
     jacobian = np.zeros((len(points), 2, dim))
     jacobian[:, :, :3] = by_point @ skew(local)
     jacobian[:, :, 3:6] = -by_point
@@ -222,7 +224,7 @@ def linearize(
 
 
 def robust_weights(residuals: np.ndarray) -> np.ndarray:
-    """Return (K,) weights of Cauchy's loss."""
+    """Return the (K,) weights of Cauchy's loss."""
     out: np.ndarray = 1 / (1 + (residuals**2).sum(1) / ROBUST_SCALE_PX**2)
     return out
 

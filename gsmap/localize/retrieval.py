@@ -1,9 +1,9 @@
 """Retrieve the views of the map that are most similar to a photo, from an inverted index of their features.
 
-The indexed features of each view lie in the list of their visual word (`gsmap.localize.vocabulary`). A feature of the
-photo is matched with the lists of its nearest words; a match weighs more the fewer features of the map are as near.
-Each match also gives the camera's orientation (`gsmap.localize.feature_frames`), and only matches with a common
-orientation count (weak geometric consistency, Jegou et al. 2008, with rotations in place of angles).
+Each indexed feature of a view is stored in the list of its visual word (`gsmap.localize.vocabulary`). A feature of the
+photo is matched with the lists of its nearest words; the fewer features of the map are as near, the larger the weight
+of a match. Each match also gives the camera's orientation (`gsmap.localize.feature_frames`), and only matches with a
+common orientation count (weak geometric consistency, Jegou et al. 2008, with rotations in place of angles).
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from gsmap.types.retrieval import IndexedScene
 from gsmap.types.segments import PLACE_BYTES, InMemory, Segment, in_lists, lists_of, places_of, write_places
 
 NUM_WORDS = 4
-"""Nearest words whose lists a feature of the photo is matched with."""
+"""Number of nearest words with whose lists a feature of the photo is matched."""
 
 MAX_HAMMING = 20
-"""Signs, of 64, that two matching features may differ in."""
+"""Largest number of the 64 signs in which two matching features may differ."""
 
 PRIOR_SCENES = 200
-"""Imaginary scenes with the expected number of chance matches, in the weight of a match."""
+"""Number of imaginary scenes with the expected number of chance matches, in the weight of a match."""
 
 MIN_WEIGHT = 0.3
-"""Negative log probability of a chance match, below which a match is dropped."""
+"""A match with a smaller negative log probability of being a chance match is dropped."""
 
 MAX_TURN_DEG = 25.0
-"""Angle between the orientations of two consistent matches."""
+"""Largest angle between the orientations of two consistent matches."""
 
 _VERIFIED_SCENES = 60  # scenes whose matches are checked for a common orientation
-_MAX_MATCHES = 400  # of a scene, those of largest weight
+_MAX_MATCHES = 400  # of a scene; those of largest weight are kept
 _RANKED_SCENES = 12  # scenes whose views are ranked
 _SCENE_WEIGHT = 0.3  # share of a scene's score that each of its views gets
 _SIGNS = slice(0, 8)
 _TURN = slice(8, 12)
 _VIEW = slice(12, 14)
 _WIDTH = 14 + PLACE_BYTES
-_BLOCK_ROWS = 200_000  # of the index that are in memory at a time: 4 MB
+_BLOCK_ROWS = 200_000  # of the index that are in memory at the same time: 4 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class ViewIndex:
     """An inverted index of the views of many scenes.
 
     Args:
-        segments: of their features.
+        segments: index segments of the views' features.
         wanted: ids of the scenes that may be returned.
     """
 
@@ -65,7 +65,7 @@ class ViewIndex:
         return len(self.wanted)
 
     def only(self, scenes: Collection[str]) -> ViewIndex:
-        """Restrict the index to some scenes; weights of matches are still by all scenes."""
+        """Restrict the results to some scenes; the weights of matches still depend on all scenes."""
         return replace(self, wanted=self.wanted & frozenset(scenes))
 
 
@@ -75,7 +75,7 @@ def view_index(segments: Sequence[Segment]) -> ViewIndex:
 
 
 def index_recipe() -> str:
-    """Return the recipe of the segments; the features have a key of their own."""
+    """Return the recipe of the index segments; features have a recipe key of their own."""
     return RecipeKey("localize", "index", {"index": VERSION}).recipe
 
 
@@ -83,7 +83,7 @@ def new_segment(scenes: Sequence[tuple[SceneFeatures, str]]) -> InMemory:
     """Index the features of scenes as a new segment.
 
     Args:
-        scenes: features, and the key that they are stored under.
+        scenes: the features of each scene, and the key under which they are stored.
     """
     rows, lists = [np.zeros((0, _WIDTH), np.uint8)], [np.zeros(0, np.int64)]
     for place, (found, _) in enumerate(scenes):
@@ -108,11 +108,11 @@ def new_segment(scenes: Sequence[tuple[SceneFeatures, str]]) -> InMemory:
 
 
 def retrieve_views(index: ViewIndex, found: Keypoints, intrinsics_px: np.ndarray, count: int) -> list[tuple[str, int]]:
-    """Return the ``count`` most similar views, best first, as scenes and numbers of their views.
+    """Return the ``count`` most similar views, best first, each as a scene id and the number of the view.
 
     Args:
         found: features of the photo.
-        intrinsics_px: (4,) of the photo.
+        intrinsics_px: (4,) intrinsics of the photo.
 
     Raises:
         CorruptError: the index is damaged.
@@ -144,15 +144,15 @@ def retrieve_views(index: ViewIndex, found: Keypoints, intrinsics_px: np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class _Matches:
-    """K matches of a photo's features with those of views.
+    """K matches between features of a photo and features of views.
 
     Args:
-        feature: (K,) of the photo.
+        feature: (K,) row of the photo's feature.
         scene: (K,) index of the scene in ``scenes``.
         view: (K,) number of the view in its scene.
-        frame: (K, 4) of the view's feature in the scene.
-        weight: (K,).
-        scenes: ids.
+        frame: (K, 4) frame of the view's feature in the scene.
+        weight: (K,) weights.
+        scenes: ids of the scenes.
     """
 
     feature: np.ndarray
@@ -163,7 +163,8 @@ class _Matches:
     scenes: Sequence[str]
 
     def of(self, scene: int) -> _Matches:
-        """Return the matches with one scene, at most `_MAX_MATCHES`, by decreasing weight and then by feature."""
+        """Return the matches with one scene, at most `_MAX_MATCHES`, sorted by decreasing weight and then by
+        feature."""
         rows = np.flatnonzero(self.scene == scene)
         rows = rows[np.lexsort((self.view[rows], self.feature[rows], -self.weight[rows]))][:_MAX_MATCHES]
         parts = (self.feature[rows], self.scene[rows], self.view[rows], self.frame[rows], self.weight[rows])
@@ -198,11 +199,11 @@ def _match(index: ViewIndex, found: Keypoints) -> _Matches:
 
 @dataclass(frozen=True, eq=False)
 class _Probes:
-    """Lists that the features of a photo are matched with.
+    """Inverted lists with which the features of a photo are matched.
 
     Args:
-        words: (P,) sorted.
-        feature: (P,) of the photo.
+        words: (P,) sorted visual words.
+        feature: (P,) row of the photo's feature.
         signs: (P,) uint64 signature of the feature relative to the word.
     """
 
@@ -220,7 +221,8 @@ def _probe_lists(found: Keypoints, vocabulary: Vocabulary) -> _Probes:
 
 
 def _near(segment: Segment, probes: _Probes) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield features of the photo (k,), Hamming distances (k,) to features of a segment, and rows (k, B) of these."""
+    """Yield blocks of near pairs: features of the photo (k,), Hamming distances (k,) to features of a segment, and rows
+    (k, B) of the latter."""
     keys, starts = lists_of(segment)
     wanted, first = np.unique(probes.words, return_index=True)
     last = np.r_[first[1:], len(probes.words)]
@@ -241,7 +243,7 @@ def _near(segment: Segment, probes: _Probes) -> Iterator[tuple[np.ndarray, np.nd
 
 
 def _score_scenes(matches: _Matches) -> np.ndarray:
-    """Return the weight of the matches with each scene, each feature of the photo once."""
+    """Return the weight of the matches with each scene, where each feature of the photo counts once."""
     order = np.lexsort((-matches.weight, matches.feature, matches.scene))
     scene, feature = matches.scene[order], matches.feature[order]
     first = np.r_[True, (scene[1:] != scene[:-1]) | (feature[1:] != feature[:-1])][: len(order)]
@@ -255,7 +257,8 @@ def _best(scores: np.ndarray, count: int) -> list[int]:
 
 
 def _consistent_weight(agree: np.ndarray, feature: np.ndarray, weight: np.ndarray) -> float:
-    """Return the largest weight of matches that agree with one of them, each feature of the photo once."""
+    """Return the largest weight of all matches that agree with one match, where each feature of the photo counts
+    once."""
     order = np.argsort(feature, kind="stable")
     first = np.flatnonzero(np.r_[True, np.diff(feature[order]) > 0])
     weights = np.where(agree[:, order], weight[order], 0.0)
@@ -266,7 +269,7 @@ def _consistent_weight(agree: np.ndarray, feature: np.ndarray, weight: np.ndarra
 
 
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
-    """Return (N, 4) int8 of unit quaternions, to half a degree."""
+    """Pack unit quaternions into (N, 4) int8, accurate to half a degree."""
     return np.round(quats * 127).astype(np.int8)
 
 

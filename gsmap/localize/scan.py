@@ -1,4 +1,4 @@
-"""Convert a scan to Gaussians, so that it can be registered as a capture is."""
+"""Convert a scan to Gaussians, so that it can be registered like a capture."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from gsmap.types import Gaussians
 from gsmap.types.scan import Scan
 
 NEUTRAL = 0.5
-"""Grey of scans without colours."""
+"""Grey value of scans without colours."""
 
 MAX_POINTS = 250_000
-"""Gaussians of a scan: of larger ones the cells grow until no more are left."""
+"""Largest number of Gaussians of a scan; the cells of a larger scan grow until no more are left."""
 
 AGREE_SIGMAS = 5.0
-"""Poses of two scenes contradict each other from so many standard deviations on, beyond the tolerances of one pose in
-`gsmap.register.pose_selection`."""
+"""Poses of two scenes contradict each other if they differ by more than this many standard deviations and by more than
+the\ntolerances of one pose in `gsmap.register.pose_selection`."""
 
-_NEIGHBOURS = 10  # for the normal and the spacing of a point
-_RADIUS_FRACTION = 0.7  # standard deviation of a disc in its plane, per spacing of the points around it
-_FLATNESS = 0.1  # thickness of a disc, per standard deviation in its plane
-_OPAQUE_LOGIT = 7.0  # an opacity of 0.999, which renderers cannot tell from 1
+_NEIGHBOURS = 10  # nearest points that give the normal and the spacing of a point
+_RADIUS_FRACTION = 0.7  # standard deviation of a disc in its plane, relative to the spacing of the points
+_FLATNESS = 0.1  # thickness of a disc, relative to the standard deviation in its plane
+_OPAQUE_LOGIT = 7.0  # an opacity of 0.999, which renderers treat as 1
 _CELL_GROWTH = 2.0**0.5  # a cell of twice the area has half as many points
 
 
@@ -56,15 +56,15 @@ class Params:
 
 
 def as_gaussians(scan: Scan, cell: float, max_points: int = MAX_POINTS) -> Gaussians:
-    """Return a flat, opaque disc for every cell of a scan, in the frame and unit of its points.
+    """Return a flat, opaque disc for every occupied cell of a scan, in the frame and unit of the scan's points.
 
     A disc lies in the plane of the nearest points (the two larger principal axes of their spread; Hoppe et al. 1992)
-    and is as wide as they are apart, so that evenly sampled surfaces are closed. Colours are of SH degree 0; `NEUTRAL`
-    grey where the scan has none.
+    and is as wide as the spacing of these points, so that evenly sampled surfaces are closed. Colours have SH degree 0;
+    they are `NEUTRAL` grey if the scan has no colours.
 
     Args:
-        cell: size of the cells, in the unit of the scan.
-        max_points: cells grow until no more are occupied.
+        cell: edge length of the cells, in the unit of the scan.
+        max_points: cells grow until at most this many are occupied.
     """
     points, colours = _average_over_cells(scan, cell, max_points)
     quats, spacing = _fit_planes(points)
@@ -75,7 +75,7 @@ def as_gaussians(scan: Scan, cell: float, max_points: int = MAX_POINTS) -> Gauss
 
 
 def _average_over_cells(scan: Scan, cell: float, max_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Average points (N, 3) and colours (N, 3) over cells, which grow until no more than ``max_points`` are left."""
+    """Average points (N, 3) and colours (N, 3) over cells, which grow until at most ``max_points`` are left."""
     colours = np.full((len(scan), 3), NEUTRAL) if scan.colours is None else scan.colours.astype(np.float64)
     while True:
         labels, counts = cell_labels(np.floor(scan.points / cell))
@@ -87,7 +87,8 @@ def _average_over_cells(scan: Scan, cell: float, max_points: int) -> tuple[np.nd
 
 
 def _fit_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotations (N, 4) whose third axis is the normal of the nearest points, and their spacing (N,)."""
+    """Return rotations (N, 4) whose third axis is the normal of the plane of the nearest points, and the spacing (N,)
+    of the points."""
     count = min(_NEIGHBOURS + 1, len(points))
     quats, spacing = np.zeros((len(points), 4)), np.zeros(len(points))
     for rows, distances, near in chunks_of_neighbours(points, count):
@@ -98,5 +99,5 @@ def _fit_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         quats[rows] = matrices_to_quats(axes)
         spacing[rows] = np.median(distances[:, 1 : 1 + (count // 2 or 1)], axis=1) if count > 1 else 1.0
     middle = float(np.median(spacing)) or 1.0
-    # Outliers would become huge discs, and duplicates points of no size.
+    # Without limits, outliers would become huge discs and duplicates would have no size.
     return quats, np.clip(spacing, 0.5 * middle, 2.0 * middle)

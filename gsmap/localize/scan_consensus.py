@@ -1,4 +1,4 @@
-"""Combine the poses of a scan by several scenes of a map, or report that they contradict each other."""
+"""Combine the poses of a scan in several scenes of a map, or report that they contradict each other."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _ROUNDS = 5
 
 @dataclass(frozen=True, eq=False)
 class ScanPose:
-    """The pose of a scan by one scene of the map.
+    """The pose of a scan that follows from one scene of the map.
 
     Args:
-        scene: its id.
-        component: of the map, whose frame the pose is in.
+        scene: id of the scene.
+        component: number of the component in whose frame the pose is.
         S_map_scan: the pose.
-        covariance: (7, 7) over [rot_rad, trans, log_scale] on the scan's side, its unit: of the registration, and of
-            the scene's own pose.
-        probability: that the registration is right.
-        tentative: the scene's own pose rests on edges that no cycle confirms.
+        covariance: (7, 7) over [rot_rad, trans, log_scale] on the scan's side, in the scan's unit; it includes the
+            covariances of the registration and of the scene's own pose.
+        probability: probability that the registration is correct.
+        tentative: the scene's own pose depends on edges that no cycle confirms.
     """
 
     scene: str
@@ -39,7 +39,7 @@ class ScanPose:
 
     @classmethod
     def from_registration(cls, pose: ScenePose, found: Registration) -> ScanPose:
-        """Compose the pose of a scene with an accepted registration of the scan in it."""
+        """Compose the pose of a scene with an accepted registration of the scan in the scene."""
         S_scene_scan = found.S_target_source
         assert S_scene_scan is not None
         assert found.information is not None
@@ -60,12 +60,12 @@ class ScanPose:
 
 @dataclass(frozen=True, eq=False)
 class ConsensusPose:
-    """The pose of a scan by all scenes that show it.
+    """The pose of a scan from all scenes that show it.
 
     Args:
-        S_map_scan, covariance: the pose (see `ScanPose`); None where scenes contradict each other.
-        reason: the contradiction; else empty.
-        probability: of the most probable scene.
+        S_map_scan, covariance: the pose (see `ScanPose`); None if scenes contradict each other.
+        reason: the contradiction; empty if there is none.
+        probability: probability of the pose from the most probable scene.
     """
 
     S_map_scan: Sim3 | None
@@ -76,12 +76,12 @@ class ConsensusPose:
 
 @dataclass(frozen=True)
 class PoseTolerance:
-    """Differences up to which two poses of a scan are consistent.
+    """Largest differences of two consistent poses of a scan.
 
     Args:
-        rotation_deg, distance, log_scale: consistent within these, whatever the covariances; the distance is that of
-            the scan's middle, in the map's unit.
-        sigmas: consistent within so many standard deviations of the difference.
+        rotation_deg, distance, log_scale: poses within all three limits are consistent, whatever their covariances; the
+            distance is measured at the scan's middle, in the map's unit.
+        sigmas: poses within this many standard deviations of their difference are consistent as well.
     """
 
     rotation_deg: float
@@ -93,20 +93,20 @@ class PoseTolerance:
 def combine_poses(
     poses: Sequence[ScanPose], middle: np.ndarray, tolerance: PoseTolerance, names: dict[str, str]
 ) -> ConsensusPose:
-    """Return the mean pose, unless two scenes contradict each other.
+    """Return the mean pose, or the contradiction if the poses from two scenes are inconsistent.
 
-    Poses of scenes of one map have unknown correlations, so the mean is that of covariance intersection with equal
-    weights (Julier and Uhlmann 1997), whose covariance is never too small. It is widened by the scatter of the poses.
+    The correlations of the poses are unknown, so the mean uses covariance intersection with equal weights (Julier and
+    Uhlmann 1997), whose covariance is never too small. The scatter of the poses increases it further.
 
     Args:
-        poses: at least one.
-        middle: (3,) of the scan, its frame.
-        names: of scenes, for messages.
+        poses: at least one pose.
+        middle: (3,) middle of the scan in its own frame.
+        names: names of scenes, for messages.
     """
     best = max(poses, key=lambda s: (s.probability, s.scene))
     for other in poses:
         if other.component != best.component:
-            return _contradiction(best, other, names, "which nothing ties together")
+            return _contradiction(best, other, names, "in components that no edge joins")
         if not _consistent(best, other, middle, tolerance):
             apart = np.linalg.norm(best.S_map_scan.apply(middle) - other.S_map_scan.apply(middle))
             turned = np.degrees(angle_between(best.S_map_scan.rotation, other.S_map_scan.rotation))
@@ -116,7 +116,7 @@ def combine_poses(
 
 
 def _contradiction(a: ScanPose, b: ScanPose, names: dict[str, str], how: str) -> ConsensusPose:
-    places = " and ".join(f"where {names[s.scene]} shows it (component {s.component})" for s in (a, b))
+    places = " and ".join(f"the place in scene {names[s.scene]} (component {s.component})" for s in (a, b))
     return ConsensusPose(None, None, reason("ambiguous", f"it fits two places, {how}: {places}"), 0.5)
 
 
@@ -133,7 +133,7 @@ def _consistent(a: ScanPose, b: ScanPose, middle: np.ndarray, one: PoseTolerance
 
 
 def _mean(measured: Sequence[ScanPose], best: ScanPose) -> tuple[Sim3, np.ndarray]:
-    """Return the weighted mean on Sim(3), rigid where all poses are, and its covariance (7, 7)."""
+    """Return the weighted mean on Sim(3), which is rigid if all poses are, and its covariance (7, 7)."""
     informations = np.linalg.inv(np.array([s.covariance for s in measured]))
     rigid = all(s.S_map_scan.scale == best.S_map_scan.scale for s in measured)
     weights = without_scale(informations) if rigid else informations

@@ -10,15 +10,15 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from gsmap.localize.filters import blur, box_means, gradients, maximum
 
 MAX_PATCHES = 400
-"""Patches of one render, those with most structure."""
+"""Number of patches of one render: those with most structure."""
 
 _HALF_PX = 7  # half width of a patch
-_CELL_PX = 14  # each cell of this size yields one patch at most
-_MIN_STRUCTURE = 0.012  # standard deviation along the direction that varies least, grey in [0, 1]
+_CELL_PX = 14  # each cell of this size gives at most one patch
+_MIN_STRUCTURE = 0.012  # smallest standard deviation along the direction that varies least, grey in [0, 1]
 _MIN_CORRELATION = 0.6
-_MIN_MARGIN = 0.04  # of the best correlation over those farther away than ...
-_RIVAL_PX = 3  # ... this
-_SMOOTH_PX = 0.8  # blur before structure is measured
+_MIN_MARGIN = 0.04  # lead of the best correlation over all correlations farther away than ...
+_RIVAL_PX = 3  # ... this distance
+_SMOOTH_PX = 0.8  # blur of the render before its structure is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +28,8 @@ class PatchTracks:
     Args:
         render_px: (K, 2) centres in the render, ``column row`` with pixel centres at +0.5.
         photo_px: (K, 2) positions in the photo.
-        correlation: (K,) in [-1, 1].
-        found: (K,) bool: correlated, unique, and not at the border of the search window.
+        correlation: (K,) normalized correlation in [-1, 1].
+        found: (K,) mask of patches that are correlated, unique, and not at the border of the search window.
     """
 
     render_px: np.ndarray
@@ -39,11 +39,11 @@ class PatchTracks:
 
 
 def track(render: np.ndarray, valid: np.ndarray, photo: np.ndarray, reach_px: int) -> PatchTracks:
-    """Search for patches of a render in a photo of the same size, within ``reach_px`` of their position.
+    """Search for patches of a render in a photo of the same size, within ``reach_px`` of their position in the render.
 
     Args:
         render, photo: (H, W) float32 grey in [0, 1].
-        valid: (H, W) bool: pixels of the render with a known position.
+        valid: (H, W) mask of pixels of the render with a known position.
     """
     half = _HALF_PX
     row, column = _corners(render, valid)
@@ -104,7 +104,7 @@ def _corners(grey: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the vertex of the parabola through three values, relative to the middle one, within half a step."""
+    """Return the vertex of the parabola through three values, relative to the middle value, within half a step."""
     bend = before - 2 * at + after
     safe = np.where(bend < -1e-9, bend, -1e-9)
     out: np.ndarray = np.where(bend < -1e-9, np.clip(0.5 * (before - after) / safe, -0.5, 0.5), 0.0)

@@ -1,4 +1,4 @@
-"""Accept a photo's pose, or give the reason for rejecting it."""
+"""Accept a photo's pose, or state the reason for rejecting it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from gsmap.localize.probability import PRIOR, load_model
 from gsmap.reason_codes import reason
 
 MIN_INLIERS = 1
-"""Tracked patches that must lie where the pose predicts them."""
+"""Smallest number of tracked patches that must lie where the pose predicts them."""
 
 
 @dataclass(frozen=True)
 class Params:
-    """Thresholds of accepting a pose; a wrong pose is worse than none.
+    """Thresholds for accepting a pose; a wrong pose is worse than no pose.
 
     Args:
         min_probability: Smallest probability in [0, 1], given all evidence, that an accepted pose is correct; larger
@@ -54,10 +54,10 @@ def rejection_reason(
     params: Params,
     min_inliers: int = MIN_INLIERS,
 ) -> str:
-    """Return why a pose is rejected; empty where it is accepted.
+    """Return the reason why a pose is rejected; empty if it is accepted.
 
     Args:
-        evidence: by name (`gsmap.localize.probability`).
+        evidence: pieces of evidence by name (`gsmap.localize.probability`).
         sigmas: largest standard deviation of rotation (rad) and translation (metres).
         rival: probability of the best pose at another place.
     """
@@ -65,7 +65,7 @@ def rejection_reason(
     if inliers < min_inliers or not np.isfinite(sigmas).all():
         return reason(
             "not_confirmed",
-            f"what the map shows there is not in the picture: {inliers} patches found, needs {min_inliers}",
+            f"patches of the map at this pose are not found in the photo: {inliers} found, needs {min_inliers}",
         )
     if probability < params.min_probability:
         return reason(
@@ -73,35 +73,37 @@ def rejection_reason(
             f"not probable enough: {probability:.1%}, needs {params.min_probability:.0%}: {_weakest(evidence)}",
         )
     if rival > params.max_rival_probability:
-        return reason("ambiguous", f"ambiguous: another place of the map shows the same ({rival:.0%} probable)")
+        return reason("ambiguous", f"ambiguous: another place of the map looks the same ({rival:.0%} probable)")
     degrees = np.degrees(sigmas[0])
     if degrees > params.max_rotation_sigma_deg or sigmas[1] > params.max_translation_sigma_m:
         return reason(
-            "pose_uncertain", f"what it shows fixes its pose only to {degrees:.1f} deg and {100 * sigmas[1]:.0f} cm"
+            "pose_uncertain", f"the photo determines the pose only to {degrees:.1f} deg and {100 * sigmas[1]:.0f} cm"
         )
     return ""
 
 
 def _weakest(evidence: Mapping[str, float]) -> str:
-    """Describe the two pieces of evidence that lack most."""
+    """Describe the two pieces of evidence that lack most log-odds."""
     words = {
         "matches": f"{round(10 ** evidence['matches'] - 1)} features agree",
-        "inliers": f"{round(10 ** evidence['inliers'] - 1)} patches are found again",
-        "found_again": f"{evidence['found_again']:.0%} of the patches are found again",
-        "laid": f"a render that is laid over it agrees by {evidence['laid']:.2f}",
-        "spread": f"what is found again covers {evidence['spread']:.0%} of the picture",
-        "explained": f"the map explains {evidence['explained']:.0%} of what can be compared",
-        "contradicted": f"{evidence['contradicted']:.0%} of what can be compared differs",
-        "explained_coarsely": f"the map explains {evidence['explained_coarsely']:.0%} of the coarse picture",
-        "contradicted_coarsely": f"{evidence['contradicted_coarsely']:.0%} of the coarse picture differs",
-        "unlike_part": f"one part, {evidence['unlike_part']:.0%} of what is compared, is something else",
-        "unlike": f"{evidence['unlike']:.0%} of the rest is something else",
-        "unlike_likely": f"other parts, {evidence['unlike_likely']:.0%} of what is compared, are likely something else",
-        "unlike_surely": f"other parts, {evidence['unlike_surely']:.0%} of what is compared, are surely something else",
-        "compared": "little can be compared",
+        "inliers": f"{round(10 ** evidence['inliers'] - 1)} patches are found in the photo",
+        "found_again": f"{evidence['found_again']:.0%} of the patches are found in the photo",
+        "laid": f"an aligned render agrees by {evidence['laid']:.2f}",
+        "spread": f"the patches found cover {evidence['spread']:.0%} of the photo",
+        "explained": f"the map explains {evidence['explained']:.0%} of the comparable patches",
+        "contradicted": f"{evidence['contradicted']:.0%} of the comparable patches differ",
+        "explained_coarsely": f"the map explains {evidence['explained_coarsely']:.0%} of the downscaled photo",
+        "contradicted_coarsely": f"{evidence['contradicted_coarsely']:.0%} of the downscaled photo differs",
+        "unlike_part": f"one region, {evidence['unlike_part']:.0%} of the compared area, shows something else",
+        "unlike": f"outside the largest region {evidence['unlike']:.0%} shows something else",
+        "unlike_likely": f"further regions, {evidence['unlike_likely']:.0%} of the compared area, likely show "
+        "something else",
+        "unlike_surely": f"further regions, {evidence['unlike_surely']:.0%} of the compared area, surely show "
+        "something else",
+        "compared": "little of the photo can be compared",
         "colour": f"colours agree by {evidence['colour']:.2f}",
-        "seen": f"the map covers {evidence['seen']:.0%} of the picture",
-        "blocked": f"{evidence['blocked']:.0%} of the picture would be blocked",
-        "sigma_m": f"its place is known to {10 ** evidence['sigma_m']:.2g} m",
+        "seen": f"the map covers {evidence['seen']:.0%} of the photo",
+        "blocked": f"a surface would block {evidence['blocked']:.0%} of the photo",
+        "sigma_m": f"its position is certain to {10 ** evidence['sigma_m']:.2g} m",
     }
     return ", ".join(words[name] for name in load_model().shortfalls(evidence)[:2])

@@ -1,4 +1,4 @@
-"""Select the views of a scene that photos are matched with: its own cameras, and synthetic ones off their path."""
+"""Select the views of a scene with which photos are matched: its own cameras, and synthetic views off their path."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.projection import in_image, project
 from gsmap.types import Cameras, Gaussians
 
-_TURN_FRACTION = 0.6  # distance, per median distance of the content, that changes a view as much as a radian
+_TURN_FRACTION = 0.6  # a shift by this share of the median content distance changes a view as much as a radian
 _MAX_POINTS = 4000  # opaque Gaussians that represent the scene
-_MIN_GAIN = 0.01  # mean gain in resolution below which no more synthetic views are added
-_OCCLUSION = 1.15  # depth relative to the nearest point of a pixel, up to which a point is visible
+_MIN_GAIN = 0.01  # if the mean gain in resolution is smaller, no more synthetic views are added
+_OCCLUSION = 1.15  # largest ratio of a visible point's depth to the depth of the nearest point in its pixel
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Params:
 
 
 def select_views(gaussians: Gaussians, cameras: Cameras, params: Params | None = None) -> Cameras:
-    """Select cameras from which a scene is rendered: first its own, then synthetic ones.
+    """Select the cameras from which a scene is rendered: first its own cameras, then synthetic ones.
 
-    Of its own cameras those farthest from each other in position and direction are taken, so that a standstill does not
-    use them up. Synthetic ones stand in free space and see surfaces that the own ones do not see from the front or from
-    near.
+    Of the scene's own cameras, those farthest from each other in position and direction are selected, so that the
+    images of a standstill do not use up the number. Synthetic cameras are placed in free space and see surfaces that
+    the own cameras do not see from the front or from nearby.
 
     Returns:
         At most ``max_own_views + max_synthetic_views`` cameras, resized to the size of the renders.
@@ -64,14 +64,15 @@ def select_views(gaussians: Gaussians, cameras: Cameras, params: Params | None =
 
 
 def _sample_points(gaussians: Gaussians) -> np.ndarray:
-    """Return (P, 3) means of opaque Gaussians, at most `_MAX_POINTS`."""
+    """Return the (P, 3) means of opaque Gaussians, at most `_MAX_POINTS`."""
     solid = np.flatnonzero(gaussians.logit_opacities > 0.0)
     rows = np.linspace(0, len(solid) - 1, min(len(solid), _MAX_POINTS)).astype(int)
     return gaussians.means[solid[rows]].astype(np.float32)
 
 
 def _farthest_points(cameras: Cameras, points: np.ndarray, count: int) -> np.ndarray:
-    """Return rows of the cameras that are farthest from each other in position and direction, in their order."""
+    """Return the rows of the cameras that are farthest from each other in position and direction, in their original
+    order."""
     if len(cameras) <= count or not len(points):
         return np.arange(len(cameras))[:count]
     from_middle = np.linalg.norm(points - np.median(cameras.centers, axis=0), axis=1)
@@ -86,14 +87,14 @@ def _farthest_points(cameras: Cameras, points: np.ndarray, count: int) -> np.nda
 
 
 def _complement(points: np.ndarray, own: Cameras, synthetic: Cameras, count: int) -> list[int]:
-    """Return rows of the synthetic cameras that add most resolution to what the own cameras see."""
+    """Return the rows of the synthetic cameras that add most resolution to the views of the own cameras."""
     best = np.zeros(len(points))
     for camera in range(len(own)):
         best = np.maximum(best, _resolution(points, own, camera))
     details = [_resolution(points, synthetic, camera) for camera in range(len(synthetic))]
     chosen: list[int] = []
     while len(chosen) < count:
-        # At most a factor of two counts: splats have no finer detail.
+        # A gain in resolution counts up to a factor of two, because splats have no finer detail.
         gains = [np.log2(np.maximum(d, 1e-9) / np.maximum(best, d / 2 + 1e-9)).clip(0, 1).sum() for d in details]
         pick = int(np.argmax(gains)) if gains else -1
         if pick < 0 or gains[pick] < _MIN_GAIN * len(points):
@@ -104,7 +105,7 @@ def _complement(points: np.ndarray, own: Cameras, synthetic: Cameras, count: int
 
 
 def _resolution(points: np.ndarray, cameras: Cameras, row: int) -> np.ndarray:
-    """Return (P,) resolution with which a camera sees each point, per image size; 0 for hidden points."""
+    """Return the (P,) resolution at which a camera sees each point, relative to the image size; 0 for hidden points."""
     coarse = cameras[[row]].resized(24)
     width, height = (int(v) for v in coarse.sizes_px[0])
     pixels, depth = project(points, coarse.T_camera_frame[0], coarse.intrinsics_px[0])

@@ -1,9 +1,9 @@
 """Quantize local features to visual words with binary signatures: Hamming embedding (Jegou et al. 2008).
 
 A descriptor is reduced by principal components and assigned to its nearest word; the signs of the residual along 64
-axes are its signature. Features of one place share words and most signs. Words, axes and the rate of chance matches are
-fitted on synthetic places by ``tools/fit/localize.py`` and stored beside this file; descriptors of other sizes get a
-fixed random vocabulary.
+axes are its signature. Features of one place have the same word and most signs in common. Words, axes and the rate of
+chance matches were fitted on synthetic places by ``tools/fit/localize.py`` and are stored beside this file. For
+descriptors of other lengths a fixed random vocabulary is used.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NUM_SIGNS = 64
 
 _FILE = "vocabulary.npz"
 _NUM_RANDOM = 1024
-_BLOCK = 4096  # descriptors that are compared with all words at a time
+_BLOCK = 4096  # number of descriptors that are compared with all words at the same time
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Vocabulary:
     """A quantizer of descriptors.
 
     Args:
-        mean: (D,) float32 of descriptors.
+        mean: (D,) float32 mean of descriptors.
         axes: (D, P) float32 principal axes.
         centres: (W, P) float32 words.
         sign_axes: (P, 64) float32 axes of the signatures.
@@ -42,12 +42,12 @@ class Vocabulary:
     chance: np.ndarray
 
     def reduce(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return (N, P) float32 principal components of unit vectors (N, D)."""
+        """Return the (N, P) float32 principal components of unit vectors (N, D)."""
         out: np.ndarray = (descriptors.astype(np.float32) - self.mean) @ self.axes
         return out
 
     def nearest(self, reduced: np.ndarray, count: int = 1) -> np.ndarray:
-        """Return (N, count) int64 words of reduced descriptors, nearest first."""
+        """Return the (N, count) int64 words nearest to reduced descriptors, nearest first."""
         half = (self.centres**2).sum(1) / 2
         out = np.empty((len(reduced), count), np.int64)
         for start in range(0, len(reduced), _BLOCK):
@@ -59,7 +59,7 @@ class Vocabulary:
         return out
 
     def signatures(self, reduced: np.ndarray, words: np.ndarray) -> np.ndarray:
-        """Return (N,) uint64 signs of the residuals of reduced descriptors from a word each."""
+        """Return (N,) uint64: the signs of the residuals of reduced descriptors from one word each."""
         left = (reduced - self.centres[words]) @ self.sign_axes
         return np.packbits(left > 0, axis=1).view("<u8")[:, 0]
 
@@ -88,7 +88,7 @@ def random_vocabulary(width: int) -> Vocabulary:
 
 
 def random_sign_axes(num_axes: int) -> np.ndarray:
-    """Return (P, 64) float32 random axes, orthogonal in groups of P."""
+    """Return the (P, 64) float32 random axes of signatures, orthogonal in groups of P."""
     rng = np.random.default_rng([num_axes, 13])
     parts = [np.linalg.qr(rng.normal(size=(num_axes, num_axes)))[0] for _ in range(-(-NUM_SIGNS // num_axes))]
     out: np.ndarray = np.concatenate(parts, axis=1)[:, :NUM_SIGNS].astype(np.float32)

@@ -282,7 +282,7 @@ def test_a_photo_that_others_lead_elsewhere_is_not_said(world, beside_each_other
     monkeypatch.setattr(together_module.bundle_adjustment, "adjust_photos", lambda *given: (adjust(*given)[0], [2]))
     placed = localize_together(photos, world.index, {"scene": world.placed}, SIFT, Params())
     assert [one.is_placed for one in placed] == [True, True, False, True]
-    assert "lead it elsewhere" in placed[2].reason
+    assert "place it elsewhere" in placed[2].reason
     assert placed[2].T_map_camera is None
 
 

@@ -21,7 +21,7 @@ from gsmap.types.model import ModelSpec
 VERSION = 1
 MODELS = ("extractor",)
 
-_MULTIPLE = 32  # of image sides, which all these networks accept
+_MULTIPLE = 32  # image sides are multiples of this, which all these networks accept
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,17 @@ def probe(spec: ModelSpec) -> None:
     """Reject a model that is no extractor, by running it once.
 
     Raises:
-        InputError: its inputs or outputs do not fit, or it fails.
+        InputError: the model's inputs or outputs do not fit, or it fails.
     """
     shape = spec.inputs[0].shape if len(spec.inputs) == 1 else ()
     if len(shape) != 4 or shape[1] not in (1, 3, None):
-        raise misfit(spec, "an extractor takes one input of shape (1, 1, H, W) or (1, 3, H, W)")
+        raise misfit(spec, "an extractor has one input of shape (1, 1, H, W) or (1, 3, H, W)")
     picture = np.random.default_rng(0).integers(0, 255, (192, 256, 3)).astype(np.uint8)
     OnnxExtractor(spec, Params()).extract(picture)
 
 
 class OnnxExtractor:
-    """Run the network on one image at a time. Size, channels and names are read from the model."""
+    """An extractor that runs the network on one image at a time; size, channels and names come from the model."""
 
     def __init__(self, spec: ModelSpec, params: Params) -> None:
         self.spec, self.params = spec, params
@@ -77,7 +77,7 @@ class OnnxExtractor:
         names = [tensor.name for tensor in self.spec.outputs]
         outputs = dict(zip(names, run(self.spec, self.session, names, feed), strict=True))
         pixels, descriptors, scores = self._read(outputs)
-        if len(pixels) and np.abs(pixels).max() <= 1.0 + 1e-6:  # relative to the image, as of ALIKED
+        if len(pixels) and np.abs(pixels).max() <= 1.0 + 1e-6:  # relative to the image, as ALIKED gives them
             pixels = (pixels + 1) / 2 * (np.array([width, height]) - 1)
         pixels = (pixels + 0.5) * [rgb.shape[1] / width, rgb.shape[0] / height]
         order = np.argsort(-scores, kind="stable")
@@ -98,8 +98,8 @@ class OnnxExtractor:
         if pixels is None or descriptors is None:
             found = ", ".join(f"{name} {list(value.shape)}" for name, value in outputs.items())
             raise InputError(
-                f"{self.spec.path} is no extractor: it gives {found or 'nothing'}, wanted are keypoints (N, 2) and "
-                "descriptors (N, D)",
+                f"{self.spec.path} is no extractor: its outputs are {found or 'empty'}, but keypoints (N, 2) and "
+                "descriptors (N, D) are needed",
                 code="model_misfit",
             )
         if len(descriptors) != len(pixels) and descriptors.shape[1] == len(pixels):
@@ -110,14 +110,15 @@ class OnnxExtractor:
         finite = np.isfinite(descriptors.astype(np.float32)).all(1) if len(descriptors) == len(pixels) else None
         if finite is None or not finite.all():
             raise InputError(
-                f"{self.spec.path} gives {len(descriptors)} descriptors of {len(pixels)} keypoints, or NaN",
+                f"{self.spec.path} returned {len(descriptors)} descriptors for {len(pixels)} keypoints, or NaN",
                 code="model_misfit",
             )
         return pixels.astype(np.float64), descriptors, scores.astype(np.float64)
 
 
 def _find_output(outputs: Mapping[str, np.ndarray], words: tuple[str, ...], fits) -> np.ndarray | None:  # type: ignore[no-untyped-def]
-    """Return the output with a fitting shape whose name contains one of the words, else the only fitting one."""
+    """Return the output with a fitting shape whose name contains one of the words; by default the only output that
+    fits."""
     fitting = {name: value for name, value in outputs.items() if fits(value)}
     named = [value for name, value in fitting.items() if any(word in name.lower() for word in words)]
     if named:
@@ -126,5 +127,5 @@ def _find_output(outputs: Mapping[str, np.ndarray], words: tuple[str, ...], fits
 
 
 def _round_side(side: int) -> int:
-    """Round a side to a multiple of 32."""
+    """Round the side of an image to a multiple of 32."""
     return max(_MULTIPLE, round(side / _MULTIPLE) * _MULTIPLE)

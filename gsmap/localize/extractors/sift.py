@@ -1,6 +1,8 @@
-"""Extract SIFT features (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012), as COLMAP on the CPU.
+"""Extract SIFT features (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012), as COLMAP does on the
+CPU.
 
-A native kernel, since extraction dominates the cost of scene views; features equal those of VLFeat up to rounding.
+A native kernel extracts the features, because extraction dominates the cost of scene views. Features equal those of
+VLFeat up to rounding.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ def make(models: Mapping[str, ModelSpec], params: Params) -> SiftExtractor:
 
 
 class SiftExtractor:
-    """Extract SIFT features of grey images; the result does not depend on the number of threads."""
+    """An extractor of SIFT features from grey images; results do not depend on the number of threads."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -56,7 +58,7 @@ class SiftExtractor:
         if min(rgb.shape[:2]) < 16:  # smaller than the smallest octave
             none = np.zeros(0, np.float32)
             return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), none, none)
-        # Rec. 601, as grey JPEG decoding does.
+        # Rec. 601, as in decoding a JPEG to grey.
         grey = np.ascontiguousarray((rgb @ np.array([0.299, 0.587, 0.114])).round().astype(np.uint8))
         params = self._params
         found, descriptors = sift(grey, params.max_features, PEAK_THRESHOLD, EDGE_THRESHOLD, params.upsampled)
