@@ -1,4 +1,4 @@
-"""Camera orientations of a capture, as evidence of the vertical."""
+"""Estimate the vertical from the camera orientations of a capture."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import numpy as np
 
 from gsmap.types import Cameras
 
-_STEEP = 0.85  # cosine: cameras within 32 degrees of straight down or up, where image up is unreliable
-_UPWARD = np.sin(np.radians(20))  # cameras that look up by more than this on average may be held upside down
-_ROLL = np.sin(np.radians(20))  # a camera held level has its rows, or its columns, this nearly level
-_SWAY = 0.2  # of the distance to the scene: a narrower path may be the sway of an arm
+_STEEP = 0.85  # cosine: within 32 degrees of straight down or up the up direction of images is unreliable
+_UPWARD = np.sin(np.radians(20))  # cameras that look up by more than this on average may be upside down
+_ROLL = np.sin(np.radians(20))  # the rows or the columns of a level camera are tilted by less than this
+_SWAY = 0.2  # of the distance to the scene: a narrower path may come from swaying arms
 _THIN = 0.35  # a path that rises and falls by less than this share of its width is level
 
 
 @dataclass(frozen=True)
 class VerticalEstimate:
-    """A vertical estimated from cameras that turn about it.
+    """A vertical estimated from cameras that rotate about it.
 
     Args:
         up: (3,) unit vector against gravity.
-        cone_deg: largest error.
-        sure: True if its sign is known.
+        cone_deg: largest error in degrees.
+        sure: True if the sign is known.
     """
 
     up: np.ndarray
@@ -35,8 +35,8 @@ class CameraOrientations:
     """Camera orientations of a capture.
 
     Args:
-        rotation: (C, 3, 3) camera to frame, OpenCV axes.
-        centres: (C, 3) frame.
+        rotation: (C, 3, 3) rotations from camera (OpenCV axes) to frame.
+        centres: (C, 3) camera centres in the frame.
     """
 
     rotation: np.ndarray
@@ -54,32 +54,34 @@ class CameraOrientations:
 
     @property
     def at_all_angles(self) -> bool:
-        """True where cameras look from all angles, as around an object: no image direction is constant."""
+        """True if cameras look in all directions, as around an object, so that no image direction is constant."""
         return bool(np.linalg.norm(self.mean, axis=0).max() < 0.3)
 
     def is_allowed(self, up: np.ndarray) -> bool:
-        """Return True if cameras on one heading may have this vertical: not upside down, not looking up, no edge
-        tilted.
-        """
+        """Return whether cameras with one heading may have this vertical: they are neither upside down nor look up, and
+        an image edge is level."""
         right, down, forward = self.mean.T
         level = min(abs(right @ up), abs(down @ up)) < _ROLL
-        # Held upright; or on its side or straight down, where the image's up is level itself.
+        # The camera is upright; or it is on its side or looks straight down, and then the image's up direction is
+        # level.
         return bool(level and down @ up < _ROLL and forward @ up < _UPWARD)
 
     def is_upright(self, up: np.ndarray) -> bool:
-        """Return True if the images' own up gives the sign of a vertical: not where they lie or look straight down."""
+        """Return whether the up direction of the images gives the sign of a vertical: cameras are neither on their side
+        nor look straight down."""
         return bool(-self.mean[:, 1] @ up > 0.25)
 
     def looks_along(self, axis: np.ndarray) -> bool:
-        """Return True if the cameras look along an axis, up or down."""
+        """Return whether the cameras look along an axis, in either direction."""
         return bool(abs(self.mean[:, 2] @ axis) > _STEEP)
 
     def normal_of_path(self, points: np.ndarray) -> np.ndarray | None:
-        """Estimate the axis (3,) along which the cameras hardly move while they do along both others; its sign is
+        """Estimate the axis (3,) along which the cameras move far less than along both other axes; its sign is
         arbitrary.
 
         Args:
-            points: (N, 3) of the scene; cameras that move little against its distance have no path.
+            points: (N, 3) points of the scene. If cameras move little, compared with the distance to these, the result
+                is None.
         """
         if len(self.centres) < 6:
             return None
@@ -89,7 +91,7 @@ class CameraOrientations:
         return vectors[:, 0] if wide else None
 
     def normal_of_rows(self) -> np.ndarray | None:
-        """Estimate the axis (3,) about which the cameras turn far more than they roll; its sign is arbitrary."""
+        """Estimate the axis (3,) about which the cameras rotate far more than they roll; its sign is arbitrary."""
         right = self.rotation[:, :, 0]
         values, vectors = np.linalg.eigh(right.T @ right / len(right))
         small = values[1] > np.sin(np.radians(5)) ** 2 and values[0] < 0.4**2 * values[1]
@@ -97,12 +99,13 @@ class CameraOrientations:
 
 
 def estimate_turn_axis(cameras: CameraOrientations) -> VerticalEstimate | None:
-    """Estimate the axis about which cameras turn; None where they do not: on one heading, or at all angles.
+    """Estimate the axis about which cameras rotate; None if they have one heading or look in all directions.
 
-    The direction that stays where it is in all images is that axis, however they are held: with ``b`` in the camera,
-    ``a`` in the frame and ``R`` from camera to frame, the pair of largest mean ``a . R b``, which are the first
-    singular vectors of the mean rotation. Where the pitch varies too much for that, it is the axis most nearly
-    perpendicular to the rows of all images. Up is where the image's up is; seen from straight above, against the view.
+    The axis is the direction that is constant in all images, whatever their pitch and roll. With ``b`` in the camera,
+    ``a`` in the frame and ``R`` from camera to frame, it is the pair with the largest mean ``a . R b``: the first
+    singular vectors of the mean rotation. If the pitch varies too much for that, it is the axis most nearly
+    perpendicular to the rows of all images. The sign follows from the images' up direction or, for views from straight
+    above, from the viewing direction.
     """
     axis, cone_deg, mean = _kept(cameras), 15.0, cameras.mean
     if axis is None:
@@ -116,28 +119,29 @@ def estimate_turn_axis(cameras: CameraOrientations) -> VerticalEstimate | None:
         sign = np.sign(up)
         return VerticalEstimate(axis * sign, cone_deg, sure=bool(forward * sign < _UPWARD))
     sign = -np.sign(forward) or 1.0
-    # Cameras on their side: only steep views determine which side.
+    # The cameras are on their side: only steep views determine the sign.
     return VerticalEstimate(axis * sign, cone_deg, sure=bool(abs(forward) > _STEEP))
 
 
 def _kept(cameras: CameraOrientations) -> np.ndarray | None:
-    """Estimate the axis of a turn at constant pitch and roll, where the turn is wide against their variation."""
+    """Estimate the axis of a rotation at constant pitch and roll, if the rotation is large compared with their
+    variation."""
     axes, kept, _ = np.linalg.svd(cameras.mean)
     lost, turned = 1 - kept[:2]
     return axes[:, 0] if turned > 0.08 and lost < 0.15 * turned else None
 
 
 def _level(cameras: CameraOrientations) -> np.ndarray | None:
-    """Estimate the axis perpendicular to all images' rows, where they turn far enough to have one."""
+    """Estimate the axis perpendicular to the rows of all images, if the rows turn far enough to determine one."""
     right = cameras.rotation[:, :, 0]
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
-    # Over less than half a turn, rows that are askew seem to turn about an axis that is askew as well.
+    # Over less than half a turn, tilted rows seem to turn about a tilted axis.
     askew = 0.25 if values[1] > 0.3 else 0.05
     return vectors[:, 0] if values[1] > 0.1 and values[0] < askew * values[1] else None
 
 
 def _spread(mean: np.ndarray) -> bool:
-    """Return True if images are mostly upright and look in all directions about the vertical."""
+    """Return whether images are mostly upright and look in all directions about the vertical."""
     down = np.linalg.norm(mean[:, 1])
     if down < 0.3:
         return False

@@ -1,4 +1,4 @@
-"""Surface of a scene as a coloured point cloud, from its Gaussians without rendering."""
+"""Extract the surface of a scene as a coloured point cloud, from its Gaussians without rendering."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians
 from gsmap.types.views import PointCloud
 
-_MAX_RELATIVE_SCALE = 3.5  # a Gaussian whose largest scale is so many times the median one is no surface
-_FLOATER_LAB = 20.0  # L*a*b* distance from the neighbours' colours from which a Gaussian floats
+_MAX_RELATIVE_SCALE = 3.5  # a Gaussian whose largest scale exceeds this many times the median is no surface
+_FLOATER_LAB = 20.0  # a Gaussian whose colour differs more from its neighbours (L*a*b*) is a floater
 
 
 def surface_cloud(gaussians: Gaussians, min_opacity: float = 0.1) -> PointCloud:
-    """Return the centres of the Gaussians of the surface: opaque, not huge, not floating, not of a stray colour.
+    """Return the centres of surface Gaussians: opaque, not huge, and no floaters.
 
-    All criteria are relative to the capture, so that the cloud of a scene does not depend on its unit: a Gaussian is
-    dropped when its largest scale exceeds a multiple of the median one, or it floats (`find_floaters`). Colour is the
-    view-independent part (SH degree 0).
+    All criteria are relative to the capture, so the cloud does not depend on the scene's unit: a Gaussian is dropped if
+    its largest scale exceeds a multiple of the median, or if it is a floater (`find_floaters`). Colours are
+    view-independent (SH degree 0).
 
     Args:
-        gaussians: any frame and unit; NaN and infinity are left out.
-        min_opacity: Gaussians below it are left out.
+        gaussians: Gaussians in any frame and unit; those with NaN or infinity are left out.
+        min_opacity: Gaussians of lower opacity are left out.
 
     Returns:
-        Points in the Gaussians' frame and unit.
+        Points in the frame and unit of the Gaussians.
     """
     x, y, z = gaussians.scales.T
     scale = np.maximum(np.maximum(x, y), z)
@@ -50,7 +50,8 @@ def downsample(points: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.
 
 
 def local_planes(points: np.ndarray, num_neighbours: int = 16) -> tuple[np.ndarray, np.ndarray]:
-    """Compute normals (N, 3; sign arbitrary) and planarity (N,) in [0, 1] from the principal axes of neighbourhoods."""
+    """Compute the normals (N, 3; sign arbitrary) and planarity (N,) in [0, 1] of points from the principal axes of
+    their neighbourhoods."""
     k = min(num_neighbours, len(points))
     if k < 4:
         return np.zeros((len(points), 3)), np.zeros(len(points))

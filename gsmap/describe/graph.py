@@ -1,4 +1,4 @@
-"""Scene graph of a capture: surface, vertical, unit, landmark layers, object layer and segments."""
+"""Describe a capture by a scene graph: surface, vertical, unit, landmark layers, object layer and segments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from gsmap.types.scene import SCALE_POLICIES
 from gsmap.types.views import SceneContext
 
 VERSION = 5
-_FEW_NODES = 20  # a scene none of whose layers has as many nodes gets a note
+_FEW_NODES = 20  # a scene gets a note if none of its layers has this many nodes
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class Params:
 
 
 def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | None = None) -> RecipeKey:
-    """Return the recipe of the graphs that `describe` makes, without the scene and its scale policy.
+    """Return the recipe of the graphs that `describe` computes, without the scene and its scale policy.
 
     Raises:
-        ConfigError: a segmenter or embedder that does not exist.
+        ConfigError: a segmenter or embedder does not exist.
     """
     params, models = params or Params(), models or {}
     version = {"describe": VERSION}
@@ -95,17 +95,17 @@ def describe(
     """Describe one capture: find its surface, vertical and unit, then compute each layer of its scene graph.
 
     Args:
-        scene_id: recorded in the graph.
-        gaussians, cameras: the capture, scene frame; cameras may be None or synthesised.
+        scene_id: id that is recorded in the graph.
+        gaussians, cameras: the capture in the scene's frame; cameras may be None or synthesized.
         models: checked ONNX models by kind, for the methods that need them (`gsmap.describe.onnx.check`).
-        scale_policy: ``known`` (the unit is the metre: no layers at estimated units), ``unknown`` (only those),
-            ``auto`` (both, where a metre is plausible).
+        scale_policy: ``known`` (the unit is the metre: no layers at estimated units), ``unknown`` (only layers at
+            estimated units), or ``auto`` (both, where a metre is plausible).
 
     Returns:
-        Layers, vertical and extents in the scene's frame and unit; ``notes`` for the user.
+        The scene graph, with layers, vertical and extents in the scene's frame and unit; ``notes`` are for the user.
 
     Raises:
-        ConfigError: an unknown policy, segmenter or embedder, or one of these without its model.
+        ConfigError: the policy, segmenter or embedder is unknown, or a method lacks its model.
     """
     params = params or Params()
     if scale_policy not in SCALE_POLICIES:
@@ -118,15 +118,17 @@ def describe(
     guess_m = estimate_unit_m(cloud.points, cameras, up, params.view_distance_m)
     working_m = working_unit_m(guess_m, cameras)
     units = landmark_units(guess_m, scale_policy, working_m=working_m)
-    if "landmarks" not in units:  # the unit is no metre
+    if "landmarks" not in units:  # the unit is not the metre
         working_m = guess_m
     unit_m = 1.0 if scale_policy == "known" else guess_m
     layers: dict[str, NodeLayer] = {}
     notes: list[str] = []
     if len(cloud) == 0:
-        notes.append("no opaque Gaussians: nothing to describe")
+        notes.append("the capture has no opaque Gaussians, so there is nothing to describe")
     elif up is None:
-        notes.append("up is unknown (no cameras that turn about it, no clear floor): landmarks are matched without it")
+        notes.append(
+            "the vertical is unknown (no cameras that turn about it, no clear floor): landmarks are matched without it"
+        )
     if params.landmarks:
         octaves = OctaveCache()
         for i, (name, layer_unit_m) in enumerate(units.items()):

@@ -1,4 +1,4 @@
-"""Estimation of the vertical from cameras and planes."""
+"""Estimate the vertical of a scene from its cameras and planes."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from gsmap.geometry.directions import fibonacci_sphere, level_frame
 from gsmap.types import Cameras
 
 _KERNEL_DEG = 4.0  # scatter of the normals of a floor or wall
-_MAX_NORMALS = 6000  # the surface is thinned to about so many
-_MIN_PLAN_COVER = 0.7  # without cameras: share of the plan that floor and ceiling must cover together
-_MIN_LEAD = 1.2  # without cameras: factor by which the vertical must cover more than the next axis
-_MIN_IMBALANCE = 1.15  # without cameras: factor by which the lower half must have more surface than the upper
-_COMMON_DEG = 15.0  # directions nearer than this may be one
+_MAX_NORMALS = 6000  # the surface is thinned to about this many points
+_MIN_PLAN_COVER = 0.7  # without cameras: smallest share of the plan that floor and ceiling cover together
+_MIN_LEAD = 1.2  # without cameras: smallest ratio of the vertical's cover to the cover of the next axis
+_MIN_IMBALANCE = 1.15  # without cameras: smallest ratio of the surface in the lower half to that in the upper half
+_COMMON_DEG = 15.0  # directions nearer to each other than this may be the same
 
 
 def estimate_up(points: np.ndarray, cameras: Cameras | None) -> np.ndarray | None:
-    """Estimate the unit vector against gravity (3,) in the points' frame; None where it is ambiguous.
+    """Estimate the unit vector against gravity (3,) in the points' frame; return None if it is ambiguous.
 
-    Cameras that turn about the vertical determine it, whatever their pitch (`estimate_turn_axis`); within a cone around
-    their estimate, take the direction that most surface normals are parallel to (floors, tables, ceilings) or
-    perpendicular to (walls). Cameras on one heading leave the pitch open: a wall to a camera that looks ahead is the
-    ground to one that looks down. There a second cue must confirm the same axis of the scene: the camera path, a small
-    turn, or the room (`_up_of_room`). Without cameras, or with synthesised ones, the room alone decides.
+    Cameras that rotate about the vertical determine it, whatever their pitch (`estimate_turn_axis`). Within a cone
+    around their estimate, the result is the direction to which most surface normals are parallel
+    (floors, tables, ceilings) or perpendicular (walls). Cameras with one heading leave the pitch open: what is a wall
+    to a camera that looks ahead would be the ground to a camera that looks down. Then a second cue must confirm the
+    same axis of the scene: the camera path, a small rotation, or the room (`_up_of_room`). Without cameras, or with
+    synthesized ones, the room alone decides.
 
     Args:
-        points: (N, 3) surface points, any unit.
-        cameras: in the points' frame.
+        points: (N, 3) surface points in any unit.
+        cameras: cameras in the frame of the points.
     """
     orientations = (
         None if cameras is None or cameras.synthesised or not len(cameras) else CameraOrientations.of(cameras)
@@ -56,13 +57,12 @@ def estimate_up(points: np.ndarray, cameras: Cameras | None) -> np.ndarray | Non
 def _confirmed(
     orientations: CameraOrientations, points: np.ndarray, axes: list[np.ndarray], room: np.ndarray | None
 ) -> np.ndarray | None:
-    """Return the vertical of cameras on one heading: an axis of the scene's planes that the cameras allow and a second
-    cue confirms; None where two are confirmed, or none.
-    """
+    """Return the vertical for cameras with one heading: an axis of the scene's planes that the cameras allow and a
+    second cue confirms. Return None if two axes are confirmed, or none."""
     named = [] if room is None else [room]
     for cue in (orientations.normal_of_path(points), orientations.normal_of_rows()):
-        # Replace the rough cue by the exact axis of planes near it. Where the cameras look along that axis (a drone
-        # along a facade, or over the ground), the cue is invalid.
+        # Replace the rough cue by the exact axis of planes near it. If the cameras look along that axis (a drone along
+        # a facade, or over the ground), the cue is invalid.
         of_planes = [] if cue is None else [a for a in axes if abs(a @ cue) > np.cos(np.radians(_COMMON_DEG))]
         if of_planes:
             axis = max(of_planes, key=lambda a: abs(a @ cue))
@@ -74,7 +74,7 @@ def _confirmed(
 
 
 def _planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute normals and weights of a sample of the surface, and the sample."""
+    """Return normals, weights and points of a sample of the surface."""
     span = np.ptp(np.percentile(points, [2, 98], axis=0), axis=0)
     cell = float(np.sort(span)[1:].mean()) / 60 or 1.0
     sample, _ = downsample(points, points, cell)
@@ -84,15 +84,16 @@ def _planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _uprightness(directions: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Score directions (D,): weight of the normals along each, plus half of that of those across it."""
+    """Score directions (D,): the weight of the normals along each direction, plus half of the weight of the normals
+    across it."""
     squared = (directions.astype(np.float32) @ normals.T.astype(np.float32)) ** 2
-    sharp = np.float32(0.5 / np.radians(_KERNEL_DEG) ** 2)  # the sine of an angle stands for the angle
+    sharp = np.float32(0.5 / np.radians(_KERNEL_DEG) ** 2)  # the sine of an angle approximates the angle
     score = np.exp(-sharp * (1 - squared)) + 0.5 * np.exp(-sharp * squared)
     return score @ (weights / weights.sum()).astype(np.float32)
 
 
 def _refine(up: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Refine the direction near ``up`` to the horizontal and vertical planes by least squares."""
+    """Refine the direction near ``up`` by a least-squares fit to the horizontal and vertical planes."""
     for kernel_deg in (4.0, 3.0, 2.0, 1.5, 1.5):
         angle = np.degrees(np.arccos(np.minimum(np.abs(normals @ up), 1)))
         along = weights * np.exp(-0.5 * (angle / kernel_deg) ** 2)
@@ -103,7 +104,7 @@ def _refine(up: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndar
 
 
 def _plane_axes(normals: np.ndarray, weights: np.ndarray, directions: np.ndarray) -> list[np.ndarray]:
-    """Find the axes of the strongest clusters of normals, strongest first, six at most."""
+    """Find the axes of the strongest clusters of normals, strongest first, at most six."""
     score = _uprightness(directions, normals, weights)
     axes: list[np.ndarray] = []
     for i in np.argsort(-score):
@@ -115,11 +116,12 @@ def _plane_axes(normals: np.ndarray, weights: np.ndarray, directions: np.ndarray
 
 
 def _up_of_room(points: np.ndarray, axes: list[np.ndarray]) -> np.ndarray | None:
-    """Estimate the vertical of a room by its shape alone, or None.
+    """Estimate the vertical of a room from its shape alone; None if it is ambiguous.
 
-    A vertical has what no horizontal axis has: nearly every cell of the plan seen along it lies over a floor or under a
-    ceiling, and the plan is large. None when floor and ceiling together cover too little of the plan (a part of a
-    room), the best axis does not clearly beat the next, or the halves balance.
+    Seen along the vertical, unlike along a horizontal axis, nearly every cell of the plan lies over a floor or under a
+    ceiling, and the plan is large. The vertical is ambiguous if floor and ceiling together cover too little of the plan
+    (a part of a room), if the best axis is not clearly better than the next, or if both halves have about as much
+    surface.
     """
     covers, shares = np.array([_plan_cover(points, a) for a in axes]).T
     best = int(np.argmax(covers))
@@ -133,9 +135,8 @@ def _up_of_room(points: np.ndarray, axes: list[np.ndarray]) -> np.ndarray | None
 
 
 def _side(points: np.ndarray, axis: np.ndarray) -> int:
-    """Return 1 where ``axis`` points up, -1 where down, 0 where undecided: a room has more surface in its lower
-    half.
-    """
+    """Return 1 if ``axis`` points up, -1 if it points down, 0 if undecided: a room has more surface in its lower
+    half."""
     height = points @ axis
     low, high = np.percentile(height, [2, 98])
     t = (height - low) / max(high - low, 1e-12)
@@ -146,10 +147,10 @@ def _side(points: np.ndarray, axis: np.ndarray) -> int:
 
 
 def _plan_cover(points: np.ndarray, axis: np.ndarray) -> tuple[float, float]:
-    """Measure the cover of the plan seen along ``axis`` by the lowest and the highest plane.
+    """Measure how much of the plan seen along ``axis`` the lowest and the highest plane cover.
 
     Returns:
-        The mean area of the two, and the sum of both as shares of the plan.
+        The mean area of both planes, and the sum of their shares of the plan.
     """
     local = points @ level_frame(axis).T
     low, high = np.percentile(local[:, 2], [2, 98])

@@ -1,4 +1,4 @@
-"""Embedding of a user's picture or text, comparable with node features."""
+"""Embed a picture or text that a user queries, comparably with the features of nodes."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from gsmap.methods import family
 from gsmap.types.model import ModelSpec
 from gsmap.types.views import PointCloud, SceneContext
 
-_MIN_PX, _MAX_PX = 8, 512  # sides: smaller pictures show too little, larger ones are reduced
+_MIN_PX, _MAX_PX = 8, 512  # side of a picture: smaller ones show too little, larger ones are downscaled
 
 
 def embed_query_picture(
     path: str | os.PathLike[str], params: Params, models: Mapping[str, ModelSpec]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Embed a picture of one object with the nodes' embedder: features (F,), and (F,) bool, those that are valid.
+    """Embed a picture of one object with the embedder of the nodes: return features (F,), and an (F,) mask of the valid
+    features.
 
     Raises:
-        NotFoundError: no such file.
-        InputError, MissingDependencyError: no picture that gsmap reads, or one too small to show anything.
-        ConfigError: the embedder reads no pictures by themselves, or its model is missing.
+        NotFoundError: the file does not exist.
+        InputError, MissingDependencyError: gsmap cannot read the picture, or it is too small.
+        ConfigError: the embedder cannot embed a separate picture, or its model is missing.
     """
     rgb = _picture(Path(path))
     chosen = choose_methods(params, models)
@@ -51,7 +52,7 @@ def embed_query_picture(
 
 
 def embed_query_text(text: str, params: Params, models: Mapping[str, ModelSpec]) -> np.ndarray:
-    """Embed a text with the text tower of the nodes' embedder: a unit vector (F,).
+    """Embed a text with the text tower of the nodes' embedder; return a unit vector (F,).
 
     Raises:
         ConfigError: the embedder has no text tower, or the map lacks its model.
@@ -72,7 +73,7 @@ def embed_query_text(text: str, params: Params, models: Mapping[str, ModelSpec])
 
 
 def _picture(path: Path) -> np.ndarray:
-    """Read a picture (H, W, 3) uint8, at most `_MAX_PX` on each side."""
+    """Read a picture (H, W, 3) uint8, downscaled to at most `_MAX_PX` on each side."""
     with open_picture(path) as image:
         picture = image.convert("RGB")
         picture.thumbnail((_MAX_PX, _MAX_PX))

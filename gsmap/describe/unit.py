@@ -1,18 +1,17 @@
-"""Estimation of the metric unit of a scene without known scale, and the units of its landmark layers.
+"""Estimate the metric unit of a scene without known scale, and choose the units of its landmark layers.
 
-Landmarks have sizes: a blob of 8 cm, a cylinder of 1.1 m. A capture in an unknown unit is described at an estimated
-unit, from the distance of its cameras to the surface. Two captures of one place may give different estimates, but
-landmarks tolerate a mismatch (on the test house recall falls from 0.83 to 0.70 at 20 percent, and three quarters of the
-correct matches remain), and estimates differ by less than a factor of 3. So each scene is described at the estimate
-times 1.45 to the powers -2, 0 and 1: differences of these three cover -3 to 3, hence for any relative error of two
-estimates up to 1.45^3.5 = 3.7 one pair of layers agrees within 1.45^0.5 = 20 percent. The true scale then comes from
-registration.
+Landmarks have fixed sizes: a blob of 8 cm, a cylinder of 1.1 m. A capture in an unknown unit is described at an
+estimated unit, which follows from the distance of its cameras to the surface. Estimates from two captures of one place
+may differ by a factor of up to 3. Landmarks tolerate a small mismatch: at 20 percent the recall on the test house falls
+from 0.83 to 0.70, and three quarters of the correct matches remain. So each scene is described at the estimate times
+1.45 to the powers -2, 0 and 1. The differences of these powers cover -3 to 3; so for a ratio of two estimates of up to
+1.45^3.5 = 3.7, one pair of layers agrees within 1.45^0.5, or 20 percent. Registration then gives the true scale.
 
-Landmarks in metres are not suitable for every scene, even if the metre is known. A court seen from 7 m has corners,
-patterns and Gaussians four times as large as a room seen from 1.7 m. So a capture whose views are not those of a room
-is described at other sizes as well: at the powers of two about its estimate, which are the same for every capture, so
-that two captures of one place share one; and lengths of its registration are in its *working metres*, under which it
-looks like a room.
+Landmarks of a fixed size in metres do not suit every scene, even if the metre is known. A court seen from 7 m has
+corners, patterns and Gaussians four times as large as a room seen from 1.7 m. So a capture with other viewing distances
+than a room is described at other sizes as well: at the two powers of two around its estimate. Powers of two are the
+same for every capture, so two captures of one place have one in common. The lengths used in its registration are in its
+*working metres*, in which it looks like a room.
 """
 
 from __future__ import annotations
@@ -26,26 +25,27 @@ from gsmap.types import Cameras
 LEVEL_STEP = 1.45
 LEVELS = (-2, 0, 1)
 VIEW_DISTANCE_M = 1.7
-"""Default of the typical distance from a camera to what it sees: indoors."""
+"""Default of the typical distance in metres from a camera to the surface that it sees; valid indoors."""
 
-_ROOM_HEIGHT_M = 2.4  # assumed where there are no cameras but up is known
-_ROOM_WIDTH_M = 5.0  # assumed where up is unknown too
-_ROOM = 1.0  # octaves from 1 that are still a room: the estimate is right to a factor of about two
-_MAX_OCTAVES = 5  # places seen from farther than 50 m, or nearer than 5 cm, are described as from there
+_ROOM_HEIGHT_M = 2.4  # assumed without cameras, if the vertical is known
+_ROOM_WIDTH_M = 5.0  # assumed without cameras, if the vertical is unknown as well
+_ROOM = 1.0  # an estimate within this many octaves of 1 is a room, as it is accurate to a factor of about two
+_MAX_OCTAVES = 5  # larger and smaller places are described as if seen from 50 m and from 5 cm
 
 
 def estimate_unit_m(
     points: np.ndarray, cameras: Cameras | None, up: np.ndarray | None, view_distance_m: float = VIEW_DISTANCE_M
 ) -> float:
-    """Estimate metres per scene unit, to a factor of about two; scales exactly inversely with the scene.
+    """Estimate metres per scene unit, to a factor of about two; the estimate is exactly inverse to the scene's size.
 
-    From the median distance of the nearest surface in 16 x 12 parts of the images; without cameras from the height of
-    the room, or its width where up is unknown too; 1 without any evidence.
+    The estimate follows from the median distance of the nearest surface in 16 x 12 parts of the images. Without cameras
+    it follows from the height of the room or, if the vertical is unknown as well, from its width; without any evidence
+    it is 1.
 
     Args:
-        points: (N, 3) surface points, scene frame and unit.
-        cameras: scene frame; synthesised ones are ignored.
-        up: (3,) against gravity, scene frame.
+        points: (N, 3) surface points in the scene's frame and unit.
+        cameras: cameras in the scene's frame; synthesized ones are ignored.
+        up: (3,) direction against gravity in the scene's frame.
     """
     if cameras is not None and len(cameras) and not cameras.synthesised:
         distance = _view_distance(points, cameras)
@@ -77,10 +77,10 @@ def _view_distance(points: np.ndarray, cameras: Cameras, max_cameras: int = 32, 
 
 
 def landmark_units(guess_m: float, scale_policy: str, *, working_m: float = 1.0) -> dict[str, float]:
-    """Return the metres per scene unit that each landmark layer assumes, by the layer's name.
+    """Return the metres per scene unit that each landmark layer assumes, by the name of the layer.
 
-    ``landmarks`` and ``landmarks@K``, whose lengths are 2 to the power K times as many metres, where the unit may be
-    the metre; ``landmarks:I`` at estimates.
+    If the unit may be the metre there are layers ``landmarks`` and ``landmarks@K``, in which lengths are larger by 2 to
+    the power K; layers ``landmarks:I`` are at estimated units.
 
     Args:
         guess_m: metres per scene unit, from `estimate_unit_m`.
@@ -99,10 +99,11 @@ def landmark_units(guess_m: float, scale_policy: str, *, working_m: float = 1.0)
 
 
 def working_unit_m(guess_m: float, cameras: Cameras | None) -> float:
-    """Return working metres per metre: 1 where views are those of a room, otherwise the power of two that makes them
-    so.
+    """Return working metres per metre: 1 if the viewing distances are like those in a room, otherwise the factor that
+    makes them so.
 
-    Without cameras the viewing distance is unknown, and the height of the content is no measure of it: 1.
+    Without cameras the viewing distance is unknown, and the height of the content is no measure of it; then the result
+    is 1.
     """
     if cameras is None or not len(cameras) or cameras.synthesised:
         return 1.0

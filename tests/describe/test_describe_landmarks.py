@@ -140,7 +140,7 @@ def test_a_ball_without_cameras_has_no_up_and_says_so():
     ball = Gaussians(p, np.tile([1.0, 0, 0, 0], (5000, 1)), np.full((5000, 3), -4.0), np.full(5000, 3.0), rgb[:, None])
     graph = describe("ball", ball, None, LANDMARKS, scale_policy="known")
     assert graph.up is None
-    assert any("up is unknown" in note for note in graph.notes)
+    assert any("the vertical is unknown" in note for note in graph.notes)
     # Its landmarks are found all the same, compare in any frame, and never with those of upright scenes.
     S = Sim3(Rotation.random(random_state=2).as_matrix(), np.array([1.0, 2, 3]))
     turned, _ = moved(ball, room(n=100)[1], S)

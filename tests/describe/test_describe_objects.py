@@ -134,7 +134,7 @@ def test_masks_of_low_confidence_make_no_objects():
 def test_auto_falls_back_to_the_built_in_ones_and_says_so():
     gaussians, cameras = room(n=2000)
     fallen = describe("room", gaussians, cameras, small())
-    assert "built-in segmenter and embedder: no models were added for others" in fallen.notes
+    assert "built-in segmenter and embedder used, because the map has no models for other methods" in fallen.notes
     asked = describe("room", gaussians, cameras, small(segmenter="builtin", embedder="builtin"))
     assert not any("built-in" in note for note in asked.notes)
     assert recipe_key(small()).digest == recipe_key(small(segmenter="builtin", embedder="builtin")).digest

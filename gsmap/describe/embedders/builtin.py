@@ -1,6 +1,7 @@
 """Embedder without a network: histograms of colour, texture and shape of a mask.
 
-Four histograms, each the root of a distribution (so that a dot product is a Bhattacharyya coefficient), side by side:
+The feature consists of four histograms. Each is the square root of a distribution, so that a dot product is a
+Bhattacharyya coefficient:
 
 - *hue*: a*b* direction in 12 soft bins where there is colour, one bin for grey. Gain and gamma hardly change it.
 - *lightness*: L* relative to the median of the view, in 7 soft bins: exposure moves both.
@@ -28,14 +29,15 @@ _LIGHTNESS = np.linspace(-45, 45, 7)
 _TEXTURE = np.linspace(-5, 0, 6)  # natural log of |grad L| / L per pixel
 _SIZE = np.log(np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4]))
 _RATIO = np.linspace(0, 1, 5)
-_WEIGHTS = np.array([1.0, 0.7, 0.5, 0.9])  # of hue, lightness, texture and shape; squares are shares of the cosine
-_GREY_CHROMA = 8.0  # a pixel of this chroma, L*a*b* units, counts half as coloured and half as grey
+# Weights of hue, lightness, texture and shape; their squares are shares of the cosine.
+_WEIGHTS = np.array([1.0, 0.7, 0.5, 0.9])
+_GREY_CHROMA = 8.0  # a pixel with this chroma (L*a*b* units) counts half as coloured and half as grey
 _PARTS = (_HUES + 1, len(_LIGHTNESS), len(_TEXTURE), len(_SIZE) + 3 * len(_RATIO))
 
 
 @dataclass(frozen=True)
 class Params:
-    """No settings: layers compare only under the same weights."""
+    """Settings of the embedder: none, because layers are comparable only under the same weights."""
 
 
 def make(context: SceneContext, params: Params) -> BuiltinEmbedder:
@@ -59,7 +61,7 @@ class BuiltinEmbedder:
         middle = np.median(lab[seen, 0]) if seen.any() else 50.0
         slope = np.hypot(*np.gradient(lab[..., 0])) / np.maximum(lab[..., 0], 5.0)
         rows = []
-        # Bins of every pixel, once: masks overlap, and there are many.
+        # Compute the bins of every pixel once, because there are many masks and they overlap.
         hues = _hues(lab)
         lightness = _soft_bins(lab[..., 0] - middle, _LIGHTNESS)
         texture = _soft_bins(np.log(np.maximum(slope, 1e-4)), _TEXTURE)
@@ -75,14 +77,14 @@ class BuiltinEmbedder:
         return np.stack(rows).astype(np.float32)
 
     def embed_picture(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute features of a picture by its colours alone: it has no size in metres, no 3D shape, no known
-        resolution.
+        """Compute features of a picture from its colours alone, because size in metres, 3D shape and resolution are
+        unknown.
 
         Args:
             rgb: (H, W, 3) uint8.
 
         Returns:
-            (F,) features, and (F,) bool, those of them that are valid.
+            (F,) features, and an (F,) mask of the valid features.
         """
         lab = srgb_to_lab(rgb / 255.0)
         valid = np.repeat([True, False, False, False], _PARTS)
@@ -105,10 +107,10 @@ class _SoftBins:
     """Soft histogram bins of N values, each shared between two bins.
 
     Args:
-        low, high: (N,) the two bins.
-        low_share, high_share: (N,) weight in each bin.
+        low, high: (N,) the two bins of each value.
+        low_share, high_share: (N,) weights in the two bins.
         size: number of bins.
-        rest: (N,) weight in one additional bin; None without such a bin.
+        rest: (N,) weight in an additional last bin; None without such a bin.
     """
 
     low: np.ndarray
@@ -119,14 +121,14 @@ class _SoftBins:
     rest: np.ndarray | None = None
 
     def of(self, rows: np.ndarray | slice) -> np.ndarray:
-        """Return the histogram of some of the values."""
+        """Return the histogram of the values at ``rows``."""
         out = np.bincount(self.low[rows], self.low_share[rows], self.size)
         out = out + np.bincount(self.high[rows], self.high_share[rows], self.size)
         return out if self.rest is None else np.concatenate([out, [self.rest[rows].sum()]])
 
 
 def _soft_bins(values: np.ndarray, centres: np.ndarray) -> _SoftBins:
-    """Distribute values over evenly spaced centres, each linearly between its two neighbours."""
+    """Distribute each value linearly between the two nearest of evenly spaced centres."""
     at = np.clip((values.ravel() - centres[0]) / (centres[1] - centres[0]), 0, len(centres) - 1)
     low = np.minimum(at.astype(int), len(centres) - 2)
     share = at - low
@@ -139,7 +141,8 @@ def _soft(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def _hues(lab: np.ndarray) -> _SoftBins:
-    """Distribute pixels over the hue circle and grey, by how far their chroma exceeds `_GREY_CHROMA`."""
+    """Distribute pixels over bins of the hue circle and one bin for grey, depending on their chroma relative to
+    `_GREY_CHROMA`."""
     a, b = lab[..., 1].ravel(), lab[..., 2].ravel()
     chroma = np.hypot(a, b)
     coloured = chroma / (chroma + _GREY_CHROMA)

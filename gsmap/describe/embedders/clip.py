@@ -1,4 +1,5 @@
-"""Embedder that runs an image encoder from the user: CLIP's visual tower, DINO, MobileNet or any similar ONNX file."""
+"""Embedder that runs an image encoder supplied by the user: CLIP's visual tower, DINO, MobileNet or a similar ONNX
+file."""
 
 from __future__ import annotations
 
@@ -14,15 +15,15 @@ from gsmap.types.views import Mask, SceneContext, View
 
 VERSION = 1
 MODELS = ("clip",)
-_MARGIN = 0.1  # the crop is the mask's box and this share of it around, made square
-_BACKGROUND = 0.5  # weight of the pixels outside the mask; the rest is the view's mean
-_SIDE_PX = 224  # where the model leaves its input size free
-_BATCH = 16  # crops per run, where the model takes several
+_MARGIN = 0.1  # the crop is the mask's box, enlarged by this share on each side and made square
+_BACKGROUND = 0.5  # weight of pixels outside the mask; the remaining weight is on the view's mean colour
+_SIDE_PX = 224  # input size of models that accept any size
+_BATCH = 16  # crops per run of a model that accepts several
 
 
 @dataclass(frozen=True)
 class Params:
-    """No settings: crops are made as the constants of this module have it."""
+    """Settings of the embedder: none; the constants of this module define the crops."""
 
 
 def make(context: SceneContext, params: Params) -> ClipEmbedder:
@@ -31,27 +32,27 @@ def make(context: SceneContext, params: Params) -> ClipEmbedder:
 
 
 def embed_text(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
-    """Compute the vector (F,) of a text, by the text tower of the same model; see `gsmap.describe.onnx.text`."""
+    """Compute the vector (F,) of a text with the text tower of the same model; see `gsmap.describe.onnx.text`."""
     from gsmap.describe.onnx import text as tower
 
     return tower.embed(text, models)
 
 
 def probe(spec: ModelSpec) -> None:
-    """Refuse a model that is not an image encoder; it is run once, for declared shapes are not sufficient.
+    """Reject a model that is not an image encoder, by running it once; declared shapes are not sufficient.
 
     Raises:
-        InputError: its inputs and outputs do not fit, or it does not run.
+        InputError: the model's inputs and outputs do not fit, or it does not run.
     """
     if len(spec.inputs) != 1 or not spec.inputs[0].is_image or len(spec.inputs[0].shape) != 4:
-        raise misfit(spec, "an image encoder takes one input of shape (N, 3, H, W) or (N, H, W, 3)")
+        raise misfit(spec, "an image encoder has one input of shape (N, 3, H, W) or (N, H, W, 3)")
     if not spec.outputs:
-        raise misfit(spec, "it has no outputs")
+        raise misfit(spec, "the model has no outputs")
     ClipEmbedder(spec)
 
 
 class ClipEmbedder:
-    """Image encoder run on one crop per mask. Size, layout and names are read from the model."""
+    """An image encoder that runs on one crop per mask; size, layout and names come from the model."""
 
     def __init__(self, spec: ModelSpec) -> None:
         self.spec = spec
@@ -63,7 +64,7 @@ class ClipEmbedder:
         self.size = (sides[0] or _SIDE_PX, sides[1] or _SIDE_PX)  # height, width
         self.batch = _BATCH if n is None else n
         self.fixed = n is not None
-        # The output that the model names as embedding, or its first output with one vector per picture.
+        # Use the output that the model names as an embedding, or its first output with one vector per picture.
         named = [o.name for o in spec.outputs if o.name in ("image_embeds", "embedding", "embeddings", "pooler_output")]
         flat = [o.name for o in spec.outputs if len(o.shape) == 2]
         self.output = (named or flat or [spec.outputs[0].name])[0]
@@ -78,14 +79,15 @@ class ClipEmbedder:
         return (features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
     def embed_picture(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute features of one whole picture (H, W, 3) uint8, and (F,) bool: all of them are valid."""
+        """Compute features of one whole picture (H, W, 3) uint8, and an (F,) mask of the valid features, which is all
+        True."""
         crops = crop(rgb, np.ones(rgb.shape[:2], bool), self.size, margin=0.0)[None]
         feature = self._run(normalise(crops, self.spec))[0]
         unit = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
         return unit, np.ones(len(unit), bool)
 
     def _run(self, pictures: np.ndarray) -> np.ndarray:
-        """Compute features (R, F) of normalised pictures (R, H, W, 3)."""
+        """Compute features (R, F) of normalized pictures (R, H, W, 3)."""
         out = []
         for start in range(0, len(pictures), self.batch):
             part = pictures[start : start + self.batch]
@@ -116,7 +118,7 @@ def crop(
     margin: float = _MARGIN,
     background: float = _BACKGROUND,
 ) -> np.ndarray:
-    """Crop the square around a mask, (height, width, 3) float32 in [0, 1], padded with the view's mean."""
+    """Crop the square around a mask, (height, width, 3) float32 in [0, 1], padded with the mean colour of the view."""
     rows, columns = np.flatnonzero(pixels.any(1)), np.flatnonzero(pixels.any(0))
     centre = np.array([rows[0] + rows[-1] + 1, columns[0] + columns[-1] + 1]) / 2
     side = max(rows[-1] + 1 - rows[0], columns[-1] + 1 - columns[0]) * (1 + 2 * margin)
@@ -131,7 +133,7 @@ def crop(
     part = np.where(outside, background * part + (1 - background) * mean, part)
     at_row, at_column = row.start - low[0], column.start - low[1]
     square[at_row : at_row + part.shape[0], at_column : at_column + part.shape[1]] = part
-    from PIL import Image  # naming a recipe does without
+    from PIL import Image  # imported here, as the recipe key does not need it
 
     image = Image.fromarray(np.clip(square + 0.5, 0, 255).astype(np.uint8))
     image = image.resize((size[1], size[0]), Image.Resampling.BICUBIC)
@@ -139,5 +141,5 @@ def crop(
 
 
 def normalise(pictures: np.ndarray, spec: ModelSpec) -> np.ndarray:
-    """Scale pictures (..., 3) in [0, 1] as the model expects: ``(rgb - mean) / std``."""
+    """Convert pictures (..., 3) in [0, 1] to the range that the model expects: ``(rgb - mean) / std``."""
     return ((pictures - np.asarray(spec.mean, np.float32)) / np.asarray(spec.std, np.float32)).astype(np.float32)

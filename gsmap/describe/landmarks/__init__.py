@@ -1,1 +1,2 @@
-"""Landmarks: typed blobs of colour and density with a descriptor of their surroundings; no renders, no networks."""
+"""Landmarks: typed blobs of colour and density with a descriptor of their surroundings, without renders and
+networks."""

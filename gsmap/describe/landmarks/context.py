@@ -1,6 +1,5 @@
-"""Landmark descriptors: colour and occupancy in rings of an upright cylinder, or in spherical shells without
-gravity.
-"""
+"""Landmark descriptors: colour and occupancy in rings of an upright cylinder or, without gravity, in spherical
+shells."""
 
 from __future__ import annotations
 
@@ -16,11 +15,13 @@ METRICS = Path(__file__).with_name("metrics.npz")
 _LAB_CENTRE, _LAB_SPREAD = np.array([55.0, 3.0, 8.0]), np.array([20.0, 10.0, 14.0])
 
 
-# Bins of the surroundings, in metres under the layer's unit.
+# Bins of the surroundings, in metres (by the unit that the layer assumes).
 CELL_M = 0.07  # the surroundings are thinned to one point per cell of this size
 RADII_M = np.array([0.2, 0.45, 0.75, 1.1])  # outer radii of the cylinder's rings
-HEIGHTS_M = np.array([-1.1, -0.65, -0.35, -0.12, 0.12, 0.35, 0.65, 1.1])  # limits of its levels above the landmark
-SHELLS_M = np.array([0.12, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.95, 1.1])  # outer radii of the shells without a vertical
+# Limits of the cylinder's levels, relative to the landmark.
+HEIGHTS_M = np.array([-1.1, -0.65, -0.35, -0.12, 0.12, 0.35, 0.65, 1.1])
+# Outer radii of the shells used without a vertical.
+SHELLS_M = np.array([0.12, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.95, 1.1])
 NUM_RINGS = len(RADII_M) * (len(HEIGHTS_M) - 1)
 NUM_SHELLS = len(SHELLS_M)
 _OCCUPANCY_WEIGHT = 0.75  # of a bin's occupancy in the embedding
@@ -28,14 +29,14 @@ _COLOUR_WEIGHT = 0.7  # of a bin's colour in the embedding
 
 
 def cylinder_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray) -> np.ndarray:
-    """Compute contexts (M, NUM_RINGS, 4): per ring and height mean L, a, b (standardised) and occupancy.
+    """Compute contexts (M, NUM_RINGS, 4): the mean L, a, b (standardized) and the occupancy of each ring and height.
 
-    Rings have no direction, so that the context is invariant to rotation about gravity. A bin's
-    occupancy is the number of occupied cells relative to a surface cutting through it, at most 1.
+    Rings have no direction, so the context is invariant to rotation about gravity. The occupancy of a bin is its number
+    of occupied cells, relative to that of a surface that cuts through the bin, at most 1.
 
     Args:
-        positions: (M, 3) levelled frame (z up), metres.
-        points, lab: (N, 3) levelled cloud and its L*a*b*.
+        positions: (M, 3) positions of the landmarks in the levelled frame (z up), metres.
+        points, lab: (N, 3) points of the levelled cloud and their L*a*b*.
     """
     radius, height = RADII_M, HEIGHTS_M
     levels = len(height) - 1
@@ -49,11 +50,12 @@ def cylinder_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray)
 
 
 def shell_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray) -> np.ndarray:
-    """Compute contexts (M, NUM_SHELLS, 4) in spherical shells: invariant to rotation, for scenes of unknown vertical.
+    """Compute contexts (M, NUM_SHELLS, 4) in spherical shells, which are invariant to rotation, for scenes of unknown
+    vertical.
 
     Args:
-        positions: (M, 3) in any frame, metres.
-        points, lab: (N, 3) the cloud in that frame and its L*a*b*.
+        positions: (M, 3) positions of the landmarks in any frame, metres.
+        points, lab: (N, 3) points of the cloud in that frame and their L*a*b*.
     """
     radius = SHELLS_M
     inner = np.concatenate([[0], radius[:-1]])
@@ -70,7 +72,7 @@ def _context(
     heights_m: np.ndarray,
     expected_m2: np.ndarray,
 ) -> np.ndarray:
-    """Compute mean colour and occupancy (M, B, 4) of rings and heights, or of shells where there are no heights."""
+    """Compute mean colour and occupancy (M, B, 4) of rings and heights, or of shells if there are no heights."""
     from gsmap import _native
 
     thin, colour = downsample(points, lab, CELL_M)
@@ -89,12 +91,12 @@ def _context(
 
 
 def embed(context: np.ndarray, use_fitted_metric: bool = False) -> np.ndarray:
-    """Compute unit vectors (M, 4 * bins) of contexts (M, bins, 4): occupancy and relative colour.
+    """Compute unit vectors (M, 4 * bins) from contexts (M, bins, 4): occupancy and relative colour.
 
-    Exposure shifts and stretches L (gain and gamma in the logarithm of light), white balance shifts a and b, so each
-    bin's colour is taken relative to the mean of the whole surrounding and divided by its spread. The mean itself is
-    left out: it gains nothing under equal light, and costs most matches where white balances differ by a fifth. A bin
-    is weighted by the root of its occupancy.
+    Exposure shifts and stretches L (gain and gamma in the logarithm of light), and white balance shifts a and b.
+    Therefore the mean of the whole surrounding is subtracted from each bin's colour, which is then divided by the
+    spread. The mean itself is no feature: it gains nothing under equal light, and costs most matches where white
+    balances differ by a fifth. A bin is weighted by the square root of its occupancy.
     """
     occupancy, colour = context[..., 3:], np.clip(context[..., :3], -2.5, 2.5)
     total = np.maximum(occupancy.sum(1), 1e-6)
@@ -108,13 +110,13 @@ def embed(context: np.ndarray, use_fitted_metric: bool = False) -> np.ndarray:
 
 @cache
 def metric(dim: int) -> np.ndarray:
-    """Load the metric (dim, dim) under which embeddings of one landmark in two captures differ equally in all
-    directions.
+    """Load the metric (dim, dim) that makes the differences between embeddings of one landmark in two captures
+    isotropic.
 
-    The inverse root of their scatter, with a share of the identity (`tools/fit/descriptor.py`, which writes the file):
-    directions of large differences between true matches get small weights (Mikolajczyk and Matas 2007; Hua, Brown and
-    Winder 2007). `metric_digest` is part of the recipe of graphs that use it: a newly fitted metric needs no new
-    version.
+    The metric is the inverse square root of the scatter of these differences, with a share of the identity
+    (`tools/fit/descriptor.py` writes the file): directions of large differences between true matches get small weights
+    (Mikolajczyk and Matas 2007; Hua, Brown and Winder 2007). `metric_digest` is part of the recipe of graphs that use
+    it: a newly fitted metric needs no new version.
     """
     with np.load(METRICS) as stored:
         out: np.ndarray = stored[str(dim)].astype(np.float64)

@@ -1,7 +1,7 @@
-"""Landmark detection: typed blobs of colour and density of the surface, without rendering and without networks.
+"""Detect landmarks: typed blobs of colour and density of the surface, without rendering and without networks.
 
-The input is a *levelled* cloud: metres (by the given unit) and z against gravity. Landmarks are a function of that
-cloud alone, so that they do not depend on the frame and unit of the capture.
+The input is a *levelled* cloud: it is in metres (by the given unit), with z against gravity. Landmarks depend on that
+cloud alone, and not on the frame and unit of the capture.
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ from gsmap.geometry.cells import cell_means
 from gsmap.geometry.neighbours import spatial_order
 from gsmap.types.views import PointCloud
 
-CELL_M = 0.025  # grid of the finest octave, metres under the layer's unit; its blobs have a scale of 1.6 cells
-NUM_OCTAVES = 4  # number of scales, doubling; those finer than the capture's Gaussians are skipped
+CELL_M = 0.025  # cell of the finest octave, metres by the layer's unit; its blobs have a scale of 1.6 cells
+NUM_OCTAVES = 4  # number of scales, each twice the last; scales finer than the capture's Gaussians are skipped
 MAX_PER_OCTAVE = 1500  # default of the setting
-_MAX_SPACING_CELLS = 1.4  # an octave is skipped where points are typically farther from their 8th neighbour
-# Smallest contrast of the channels: 2 L*a*b* units in a and b, 1.3 times that in L, and surface in excess of a plane's.
+_MAX_SPACING_CELLS = 1.4  # an octave is skipped if points are typically farther from their 8th neighbour
+# Smallest contrast of the channels: 2 L*a*b* units in a and b, 1.3 times as much in L, and the excess over the surface
+# of a plane for density.
 _THRESHOLDS = np.array([1.3 * 2.0, 2.0, 2.0, 0.6])
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
-_SURROUND = 1.8  # scale of the surround relative to the blob's
-_MANY = 400_000  # points; larger clouds are thinned to the resolution of each grid
-_THIN_CELLS = 0.3  # cells within which points are merged: a fifth of a blob's scale
-_ORDER_ACROSS = 256  # cells of the order in which points are spread over grids
+_SURROUND = 1.8  # scale of the surround relative to the blob's scale
+_MANY = 400_000  # a cloud with more points is thinned to the resolution of each grid
+_THIN_CELLS = 0.3  # edge, in cells, of the cubes whose points are merged: a fifth of a blob's scale
+_ORDER_ACROSS = 256  # cells across in the order in which points are spread over grids
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
-_BLOCK_CELLS = 192  # grids larger than this are worked through in blocks: memory stays bounded
+_BLOCK_CELLS = 192  # grids larger than this are processed in blocks, which bounds memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +36,10 @@ class Blobs:
     """M blobs in the levelled frame, the strongest first.
 
     Args:
-        positions: (M, 3) metres.
-        types: (M,) int ``(channel * 2 + negative) * octaves + octave`` with channels L, a, b, density.
-        responses: (M,) multiples of the channel's threshold.
-        sigmas_m: (M,) blob scale.
+        positions: (M, 3) positions in metres.
+        types: (M,) integer type ``(channel * 2 + negative) * octaves + octave``, with the channels L, a, b, density.
+        responses: (M,) response in multiples of the channel's threshold.
+        sigmas_m: (M,) scale of the blob in metres.
     """
 
     positions: np.ndarray
@@ -51,7 +52,7 @@ class Blobs:
 
 
 class OctaveCache:
-    """Cache of one levelled cloud and its extrema by grid cell size, for layers that share both.
+    """Cache of one levelled cloud and of its extrema by grid cell size, for layers that use the same cloud.
 
     Layers whose units differ by a power of two use the same grids, bit by bit.
     """
@@ -61,13 +62,12 @@ class OctaveCache:
         self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
 
     def levelled(self, cloud: PointCloud, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return points, L*a*b* and areas of the cloud, rotated by ``level`` (3, 3) and in spatial order, which is
-        cache-friendly. Every call must pass the same cloud.
-        """
+        """Return points, L*a*b* and areas of the cloud, rotated by ``level`` (3, 3), in spatial order, which is
+        cache-friendly. Every call must pass the same cloud."""
         if self._levelled is None:
             points = cloud.points @ level.T
             order = spatial_order(points, _ORDER_ACROSS)
-            lab = cloud.lab.take(order, axis=0).astype(np.float64)  # as kernels take it, once
+            lab = cloud.lab.take(order, axis=0).astype(np.float64)  # converted once to the type that kernels need
             self._levelled = points.take(order, axis=0), lab, cloud.areas[order]
         return self._levelled
 
@@ -80,7 +80,7 @@ class OctaveCache:
         size_m: float,
         unit_m: float,
     ) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
-        """Compute `_extrema` of a grid of ``size_m``; ``unit_m`` is that of the points."""
+        """Compute `_extrema` of a grid with cells of ``size_m``; ``unit_m`` is metres per unit of the points."""
         key = size_m / unit_m, thresholds.tobytes()
         if key not in self._found:
             self._found[key] = list(_extrema(points, lab, areas, thresholds, size_m))
@@ -90,7 +90,8 @@ class OctaveCache:
 def thin_cloud(
     points: np.ndarray, lab: np.ndarray, areas: np.ndarray, size_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Thin a very large cloud to the means of grid cells finer than a grid of ``size_m`` resolves, keeping its area."""
+    """Thin a very large cloud to the means of grid cells that are finer than a grid of ``size_m`` resolves; the area is
+    kept."""
     if len(points) <= _MANY:
         return points, lab, areas
     return cell_means(points, lab, size_m * _THIN_CELLS, areas)
@@ -106,19 +107,20 @@ def find_blobs(
     median_area_m2: float | None = None,
     thinned_m: float = 0.0,
 ) -> Blobs:
-    """Detect extrema of colour and density against their surround, at 1.6 cells and one scale per octave.
+    """Detect extrema of colour and density relative to their surround, at 1.6 cells and one scale per octave.
 
-    Points are spread over the grid weighted by their area, so that neither the grid's origin nor the density of the
-    Gaussians matters. Colour at a scale is the normalised Gaussian convolution; the response
-    is its difference between scale s and 1.8 s. Density is the surface near a point relative to that of a plane
-    (``m sqrt(2 pi) s``): corners, clutter and thin objects stand out. A blob's position is the mean of the cells around
-    the extremum whose response exceeds 0.6 of the peak's, weighted by it. Octaves finer than the points
-    are skipped.
+    Points are spread over the grid with their areas as weights, so that neither the grid's origin nor the density of
+    the Gaussians matters. Colour at a scale is a normalized Gaussian convolution; its response is the difference
+    between the scales s and 1.8 s. Density is the surface near a point relative to that of a plane
+    (``m sqrt(2 pi) s``): corners, clutter and thin objects stand out. A blob's position is the mean, weighted by
+    response, of the cells around the extremum whose response exceeds 0.6 of the peak. Octaves finer than the points are
+    skipped.
 
     Args:
-        points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
-        octaves: of this cloud in its own unit, which is ``unit_m`` metres.
-        median_area_m2: of the points before thinning.
+        points, lab, areas: (N, 3) points of the levelled cloud in metres, (N, 3) L*a*b*, and (N,) areas in square
+            metres.
+        octaves: cache of this cloud in its own unit; ``unit_m`` is metres per that unit.
+        median_area_m2: median area of the points before thinning.
         thinned_m: cell size of the grid for which the points were thinned.
     """
     known = octaves or OctaveCache()
@@ -153,7 +155,8 @@ def _strongest(parts: list[Blobs], count: int | None = None) -> Blobs:
 def _extrema(
     points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray, size: float = 1.0
 ) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
-    """Yield (channel, negative, positions (n, 3), responses over threshold (n,)), positions in cells of a size."""
+    """Yield channel, sign (1 for negative), positions (n, 3) in cells of ``size``, and responses (n,) in multiples of
+    the threshold."""
     from gsmap import _native
 
     table = _native.landmark_extrema(

@@ -1,4 +1,4 @@
-"""Landmark layer: blobs of the surface with their descriptors."""
+"""Landmark layer: blobs of the surface and their descriptors."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Params:
 
 
 def settings(params: Params) -> dict[str, Any]:
-    """Return the parameters as plain values, and the digest of the fitted metric where it is used."""
+    """Return the parameters as plain values, with the digest of the fitted metric if it is used."""
     out: dict[str, Any] = plain(params)
     return out | _metric(params)
 
@@ -51,9 +51,9 @@ def _metric(params: Params) -> dict[str, str]:
 
 
 def descriptor_id(params: Params, *, upright: bool = True) -> str:
-    """Return the id that two comparable landmark layers share; contexts with and without a vertical do not compare.
+    """Return the id that comparable landmark layers share; contexts with and without a vertical are not comparable.
 
-    Layers with different numbers of landmarks compare.
+    Layers with different numbers of landmarks are comparable.
     """
     name = "landmarks" if upright else "landmarks_gravity_free"
     return RecipeKey("describe", name, {"landmarks": VERSION}, _metric(params)).recipe
@@ -69,21 +69,22 @@ def landmark_layer(
     """Compute the landmarks of a surface cloud.
 
     Args:
-        cloud: in the scene's frame and unit.
-        up: (3,) against gravity, scene frame, or None: contexts are then in shells, which are less distinctive.
-        unit_m: metres per scene unit to assume.
-        octaves: of this cloud, shared by its layers.
+        cloud: surface cloud in the scene's frame and unit.
+        up: (3,) direction against gravity in the scene's frame. With None, contexts are in shells, which are less
+            distinctive.
+        unit_m: assumed metres per unit of the scene.
+        octaves: cache of this cloud, shared by its layers.
 
     Returns:
-        Positions and extents in the scene's frame and unit; ``features`` are the blob's response and scale,
-        ``weights`` its response over the threshold.
+        The layer, with positions and extents in the scene's frame and unit. Its ``features`` are the blob's response
+        and scale, its ``weights`` the response in multiples of the threshold.
     """
     params = params or Params()
     descriptor = descriptor_id(params, upright=up is not None)
     bins = NUM_SHELLS if up is None else NUM_RINGS
     surroundings = shell_context if up is None else cylinder_context
     dim = 4 * bins
-    if not cloud.areas.any():  # nothing, or only coincident points
+    if not cloud.areas.any():  # no points, or only coincident points
         return NodeLayer.empty(descriptor, dim, unit_m)
     level = np.eye(3) if up is None else level_frame(up)
     octaves = octaves or OctaveCache()
@@ -110,10 +111,11 @@ def landmark_layer(
 
 
 def gravity_free(layer: NodeLayer, cloud: PointCloud, params: Params | None = None) -> NodeLayer:
-    """Recompute an upright scene's landmarks with shell contexts, comparable with scenes of unknown vertical.
+    """Recompute the landmarks of an upright scene with shell contexts, which are comparable with scenes of unknown
+    vertical.
 
     Args:
-        layer: from `landmark_layer`, with the same cloud and parameters.
+        layer: result of `landmark_layer` for the same cloud and parameters.
     """
     params = params or Params()
     descriptor = descriptor_id(params, upright=False)

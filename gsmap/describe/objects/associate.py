@@ -1,4 +1,4 @@
-"""Association of masks over views to the object nodes of one scene."""
+"""Associate the masks of several views to object nodes of one scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from gsmap.describe.cloud import downsample
 
 @dataclass(eq=False)
 class Node:
-    """An object under construction: points (n, 3), their box (2, 3), unit feature (F,), and the views that show it."""
+    """An object under construction: points (n, 3), their box (2, 3), a unit feature (F,), and the views that show
+    it."""
 
     points: np.ndarray
     box: np.ndarray
@@ -22,11 +23,11 @@ class Node:
 
 
 def associate(nodes: list[Node], region: Node, tau: float, cell: float) -> Node:
-    """Merge a region (a node seen once) into the most similar node, or start a new one; return the node.
+    """Merge a region (a node seen once) into the most similar node, or start a new node; return the node.
 
-    Resemblance is the cosine of the features plus the generalised IoU of the boxes (paper, tau_asso); regions of one
-    part of the segmenter are one node. Merging unites the points and thins them to one per cell of size ``cell``, and
-    averages the features over the regions seen so far.
+    Similarity is the cosine of the features plus the generalized IoU of the boxes (Graph-GSReg, tau_asso); regions of
+    the same part of the segmenter always form one node. Merging unites the points, thins them to one per cell of size
+    ``cell``, and averages the features over all merged regions.
     """
     best = _counterpart(nodes, region, tau)
     if best is None:
@@ -62,10 +63,10 @@ def _counterpart(nodes: list[Node], region: Node, tau: float) -> Node | None:
 
 
 def giou(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Compute the generalised IoU (M,) in (-1, 1] of axis-parallel boxes (M, 2, 3) with one box (2, 3).
+    """Compute the generalized IoU (M,) in (-1, 1] of axis-parallel boxes (M, 2, 3) with one box (2, 3).
 
-    Rezatofighi et al. 2019, in 3D: IoU minus the share of the hull that neither covers. Flat boxes are given a
-    thickness of a thousandth of the hull, so that two equal planes have IoU 1.
+    This is Rezatofighi et al. 2019 in 3D: IoU minus the share of the common hull that neither box covers. Flat boxes
+    get a thickness of a thousandth of the hull, so that two equal planes have an IoU of 1.
     """
     low, high = np.minimum(boxes[:, 0], box[0]), np.maximum(boxes[:, 1], box[1])
     pad = 0.5e-3 * (high - low).max(1, keepdims=True) + 1e-12
@@ -78,5 +79,5 @@ def giou(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def box_of(points: np.ndarray) -> np.ndarray:
-    """Compute the box (2, 3) of the points without the outermost 2 percent on each side."""
+    """Compute the box (2, 3) of the points, without the outermost 2 percent on each side."""
     return np.percentile(points, [2, 98] if len(points) > 20 else [0, 100], axis=0)

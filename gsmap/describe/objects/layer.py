@@ -22,15 +22,16 @@ from gsmap.types.progress import Progress, silent
 from gsmap.types.views import SceneContext
 
 VERSION = 3
-_NEAR_M = 0.1  # a view most of which is nearer than this looks out of the inside of an object, and is left out
-_MIN_POINTS = 12  # masks that show fewer Gaussians are dropped
-_MIN_SIMILARITY = 1.1  # cosine + GIoU above which a region joins a node (Graph-GSReg, tau_asso)
-_VOXEL_M = 0.03  # a node's points are thinned to one per cell of this size, metres under the layer's unit
-_MANY = 400_000  # points of the surface; of more, an even share is lifted
+_NEAR_M = 0.1  # a view that is mostly nearer than this is inside an object and left out
+_MIN_POINTS = 12  # masks with fewer Gaussians are dropped
+_MIN_SIMILARITY = 1.1  # a region joins a node if cosine + GIoU is larger (Graph-GSReg, tau_asso)
+_VOXEL_M = 0.03  # a node's points are thinned to one per cell of this size, metres by the layer's unit
+_MANY = 400_000  # points of the surface; of a larger surface an even sample is lifted
 # Settings that change the set of nodes, but not the meaning of a node and its embedding.
 _NOT_COMPARED = ("render_backend", "num_cameras", "longest_side_px", "depth_tolerance", "min_confidence", "min_views")
 
-# Settings without effect on the layer: the backend is in the key by itself, a model beyond its limits makes no layer.
+# Settings without effect on the layer: the backend is a separate part of the key, and a model beyond its limits gives
+# no layer.
 _NOT_NAMED = ("render_backend", "model_time_s", "model_memory_mb")
 
 
@@ -94,13 +95,13 @@ class Params:
 
 @dataclass(frozen=True)
 class MethodChoice:
-    """Parameters with every ``auto`` replaced by the chosen method.
+    """Parameters in which every ``auto`` is replaced by the chosen method.
 
     Args:
-        params: with names of methods and a backend.
-        versions: of the layer, the segmenter and the embedder.
-        kinds: of the models that the two methods need.
-        fallbacks: notes for the user on built-in methods.
+        params: parameters with names of methods and a backend.
+        versions: versions of the layer, the segmenter and the embedder.
+        kinds: kinds of the models that the two methods need.
+        fallbacks: the families for which ``auto`` chose the built-in method, for a note.
     """
 
     params: Params
@@ -109,7 +110,8 @@ class MethodChoice:
     fallbacks: tuple[str, ...]
 
     def settings(self, models: Mapping[str, ModelSpec]) -> dict[str, Any]:
-        """Return the plain settings that can change the layer: those of the chosen methods, and the models' digests."""
+        """Return the plain settings that can change the layer: the settings of the chosen methods, and the digests of
+        their models."""
         p = self.params
         out = {field.name: plain(getattr(p, field.name)) for field in fields(p) if field.name not in _NOT_NAMED}
         out["segmenters"] = {p.segmenter: plain(p.segmenters[p.segmenter])}
@@ -121,7 +123,7 @@ def choose_methods(params: Params, models: Mapping[str, ModelSpec]) -> MethodCho
     """Choose the methods for these parameters and models.
 
     Raises:
-        ConfigError: a method that does not exist.
+        ConfigError: a method does not exist.
     """
     segmenters, embedders = family("segmenter"), family("embedder")
     segmenter, embedder = _chosen(segmenters, params.segmenter, models), _chosen(embedders, params.embedder, models)
@@ -134,12 +136,14 @@ def choose_methods(params: Params, models: Mapping[str, ModelSpec]) -> MethodCho
         replace(params, segmenter=segmenter, embedder=embedder, render_backend=backend(params.render_backend)),
         {"objects": VERSION, **segmenters.version(segmenter), **embedders.version(embedder)},
         (*segmenters.get(segmenter).MODELS, *embedders.get(embedder).MODELS),
-        (f"built-in {' and '.join(fallbacks)}: no models were added for others",) if fallbacks else (),
+        (f"built-in {' and '.join(fallbacks)} used, because the map has no models for other methods",)
+        if fallbacks
+        else (),
     )
 
 
 def descriptor_id(params: Params, models: Mapping[str, ModelSpec]) -> str:
-    """Return the id that two comparable object layers share."""
+    """Return the id that comparable object layers share."""
     chosen = choose_methods(params, models)
     decides = {name: value for name, value in chosen.settings(models).items() if name not in _NOT_COMPARED}
     return RecipeKey("describe", "objects", chosen.versions, decides).recipe
@@ -152,20 +156,21 @@ def object_layer(
     params: Params | None = None,
     progress: Progress = silent,
 ) -> tuple[NodeLayer, list[str]]:
-    """Compute the object layer of a scene, and notes for the user.
+    """Compute the object layer of a scene; return it with notes for the user.
 
-    Sample cameras, render, segment, keep confident masks, lift each to the Gaussians whose centres project into it on
-    the visible surface, embed, associate over views. Contexts are counted when two layers are compared.
+    Cameras are sampled, and their views rendered and segmented. Each confident mask is lifted to the visible surface
+    Gaussians whose centres project into it, embedded, and associated over views. Contexts are computed when two layers
+    are compared.
 
     Args:
-        gaussians, cameras: the capture, scene frame and unit.
+        gaussians, cameras: the capture in the scene's frame and unit.
         context: input of the segmenter and embedder.
 
     Returns:
-        The layer, scene frame and unit; and notes.
+        The layer in the scene's frame and unit, and notes.
 
     Raises:
-        ConfigError: a method that does not exist or lacks its model.
+        ConfigError: a method does not exist or lacks its model.
     """
     descriptor = descriptor_id(params or Params(), context.models)
     chosen = choose_methods(params or Params(), context.models)
@@ -180,7 +185,9 @@ def object_layer(
     nodes: list[Node] = []
     blocked = 0
     if len(cloud) == 0 or cameras is None or len(cameras) == 0:
-        return NodeLayer.empty(descriptor, unit_m=unit_m), (["no cameras: no objects"] if len(cloud) else [])
+        return NodeLayer.empty(descriptor, unit_m=unit_m), (
+            ["the scene has no cameras, so objects are not computed"] if len(cloud) else []
+        )
     sampled = cameras.evenly(params.num_cameras)
     for i, view in enumerate(render_views(gaussians, sampled, params.longest_side_px, params.render_backend)):
         progress(i / len(sampled), f"objects, view {i + 1} of {len(sampled)}")
@@ -202,7 +209,9 @@ def object_layer(
     nodes = [n for n in nodes if len(n.views) >= enough]
     notes = list(chosen.fallbacks)
     if blocked:
-        notes.append(f"{blocked} of {len(sampled)} sampled cameras see nothing or are inside an object; left out")
+        notes.append(
+            f"{blocked} of {len(sampled)} sampled cameras see nothing or are inside an object; they are left out"
+        )
     return _layer(nodes, level, unit_m, descriptor), notes
 
 
@@ -225,7 +234,7 @@ def _layer(nodes: list[Node], level: np.ndarray, unit_m: float, descriptor: str)
 
 
 def _chosen(methods: Family, name: str, models: Mapping[str, ModelSpec]) -> str:
-    """Return the name of the chosen method."""
+    """Return the name of the chosen method; see the settings for ``auto``."""
     if name != "auto":
         methods.get(name)
         return name

@@ -1,7 +1,8 @@
-"""Segments of a surface: furniture, lamps, pictures; the remaining surface is the building.
+"""Segment a surface into objects such as furniture, lamps and pictures; the remaining surface is the building.
 
-Floor, ceiling and walls are removed (`structure`); an object on a wall is separated from it by depth or colour, and
-from objects before it by the neighbours of its rim; the remaining surface is split into connected components.
+Floor, ceiling and walls are removed (`structure`). An object on a wall is separated from the wall by depth or colour,
+and from objects in front of the wall by the neighbours of its rim. The remaining surface is split into connected
+components.
 """
 
 from __future__ import annotations
@@ -22,40 +23,40 @@ from gsmap.types.views import PointCloud
 VERSION = 1
 
 _NEIGHBOURS = 12
-_SAMPLE_M = 0.08  # edge of the cells of a segment's samples: finer than the cells of comparison
-_MAX_EXTENT_M = 10_000.0  # a scene so large, or so far from metric, has no furniture to segment
-_BAND_M = 0.25  # the colour of a wall is estimated for squares of this side,
-_AROUND_M = 1.5  # from all of the wall so far to either side at that height: pictures are narrower
-_LAYER_M = 0.02  # points whose distances from a wall differ by more are of different surfaces
-_SOLE_M = 0.14  # hanging objects do not reach so low: trims and door frames do
-_LINKED = 8  # of these, those that may be one thing
+_SAMPLE_M = 0.08  # edge of the cells of a segment's samples, finer than the cells in which captures are compared
+_MAX_EXTENT_M = 10_000.0  # a scene larger than this, or of a wrong unit, has no furniture to segment
+_BAND_M = 0.25  # the colour of a wall is estimated for squares of this size,
+_AROUND_M = 1.5  # from the wall up to this far to either side at the same height: pictures are narrower
+_LAYER_M = 0.02  # points whose distances from a wall differ by more are on different surfaces
+_SOLE_M = 0.14  # only trims and door frames reach lower than this; hanging objects do not
+_LINKED = 8  # of these, the neighbours that may be in the same segment
 
 
-_MAX_POINTS = 150_000  # the surface is thinned to about so many points
-_LINK = 2.2  # neighbours up to so many times their spacing apart may be of one segment,
-_LINK_MIN_M = 0.04  # up to this in any case,
+_MAX_POINTS = 150_000  # the surface is thinned to about this many points points
+_LINK = 2.2  # neighbours may be in one segment up to this many times their spacing apart,
+_LINK_MIN_M = 0.04  # always up to this distance,
 _LINK_MAX_M = 0.12  # and never farther than this
 _FLOOR_M = 0.03  # points lower than this are the floor
-_CEILING_M = 0.15  # points so near to the ceiling are the ceiling
-_WALL_M = 0.03  # points so near to a wall's plane are the wall, unless their colour differs
-_HANG_M = 0.12  # an object farther before a wall does not hang on it
-_WALL_LAB = 17.0  # a colour so far (L*a*b*) from that of the wall at its height is not the wall's
-_CORE = 0.65  # core points of a patch on a wall have this share of their neighbours on the wall in it
-_STANDS_FREE = 0.2  # share of a hanging patch's rim that may lead to objects before the wall
-_MIN_POINTS = 20  # segments of fewer surface points are dropped
-_MIN_AREA_M2 = 0.03  # hanging segments that are smaller are dropped
-_ASSIGN_M = 0.06  # Gaussians off the surface belong to the segment of the nearest surface within this distance
+_CEILING_M = 0.15  # points nearer to the ceiling than this are the ceiling
+_WALL_M = 0.03  # points nearer to a wall's plane than this are the wall, unless their colour differs
+_HANG_M = 0.12  # an object farther in front of a wall than this does not hang on it
+_WALL_LAB = 17.0  # a colour that differs more (L*a*b*) from the wall's colour at this height is not the wall's
+_CORE = 0.65  # a core point of a patch has this share of its neighbours on the wall in the patch
+_STANDS_FREE = 0.2  # largest share of a hanging patch's rim that leads to objects in front of the wall
+_MIN_POINTS = 20  # segments with fewer surface points are dropped
+_MIN_AREA_M2 = 0.03  # smaller hanging segments are dropped
+_ASSIGN_M = 0.06  # Gaussians off the surface join the segment of the nearest surface within this distance
 
 
 def find_segments(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None, unit_m: float) -> Segments:
-    """Segment a capture into physical objects, the largest first; none where up is unknown.
+    """Segment a capture into physical objects, the largest first; empty if the vertical is unknown.
 
-    Deterministic for Gaussians in the same order. Takes half a CPU second for 50,000.
+    The result is deterministic for Gaussians in the same order. It takes half a CPU second for 50,000 Gaussians.
 
     Args:
-        gaussians: any frame and unit.
-        cloud: their surface (`gsmap.describe.cloud.surface_cloud`).
-        up: (3,) against gravity, their frame.
+        gaussians: Gaussians in any frame and unit.
+        cloud: surface of the Gaussians (`gsmap.describe.cloud.surface_cloud`).
+        up: (3,) direction against gravity in the same frame.
         unit_m: metres per unit of the frame.
     """
     members = _members(gaussians, cloud, up, unit_m)
@@ -66,7 +67,7 @@ def find_segments(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None
     colours = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[rows, 0]), 0.0, 1.0))
     order = np.argsort(of, kind="stable")
     parts = np.split(order, np.searchsorted(of[order], np.arange(1, count))) if count else []
-    # One sample per cell: enough for the shape of a segment, whatever its detail.
+    # One sample per cell suffices for the shape of a segment.
     cells = np.floor(means * unit_m / _SAMPLE_M).astype(np.int64)
     labels, counts = cell_labels(np.column_stack([of, cell_labels(cells)[0], np.zeros(len(rows), np.int64)]))
     of_cell = np.empty(len(counts), np.int64)
@@ -102,7 +103,7 @@ def _members(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None, uni
     surface = _Surface(points, lab, areas, distances, neighbours, structure)
     segments = _numbered(surface.labels())
     out[cloud.index[rows]] = segments
-    # Remaining Gaussians, opaque or not: the segment (or the building) whose surface is nearest.
+    # Remaining Gaussians, opaque or not, join the segment (or the building) whose surface is nearest.
     others = are_finite(gaussians.means)
     others[cloud.index[rows]] = False
     rest = np.flatnonzero(others)
@@ -114,7 +115,7 @@ def _members(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None, uni
 
 
 def _thinned(cloud: PointCloud) -> np.ndarray:
-    """Select rows of the cloud, one per grid cell so that about `_MAX_POINTS` are left; all where it is small."""
+    """Select rows of the cloud, one per grid cell, so that about `_MAX_POINTS` are left; all rows of a small cloud."""
     if len(cloud) <= _MAX_POINTS:
         return np.arange(len(cloud))
     cell = float(np.sqrt(cloud.areas.sum() / _MAX_POINTS))
@@ -127,10 +128,10 @@ def _thinned(cloud: PointCloud) -> np.ndarray:
 def _normals(
     gaussians: Gaussians, index: np.ndarray, points: np.ndarray, neighbours: np.ndarray, level: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate normals (N, 3), level frame, and planarity (N,) of a surface.
+    """Estimate the normals (N, 3), in the level frame, and the planarity (N,) of a surface.
 
-    The principal axes of a neighbourhood mix both sides of a thin wall, so neighbours are weighted by their distance to
-    the plane of the flat Gaussian itself.
+    The principal axes of a neighbourhood would mix both sides of a thin wall, so neighbours are weighted by their
+    distance to the plane of the flat Gaussian itself.
     """
     scales = gaussians.scales[index]
     shortest = np.argmin(scales, axis=1)
@@ -151,7 +152,7 @@ def _normals(
 
 
 class _Surface:
-    """A surface with its building structure, to be segmented; points in metres, z up."""
+    """A surface with its building structure, ready to be segmented; points are in metres, z up."""
 
     def __init__(
         self,
@@ -176,7 +177,7 @@ class _Surface:
         self.near = near
 
     def labels(self) -> np.ndarray:
-        """Label (N,) the segment of each point, -1 for the building."""
+        """Return the (N,) segment of each point, -1 for the building."""
         heights, building = self.structure.heights_m, self.structure
         shell = heights < _FLOOR_M
         if building.has_ceiling:
@@ -185,7 +186,8 @@ class _Surface:
         by_wall = ~shell & (wall >= 0)
         distinct = by_wall & ((np.abs(off) > _WALL_M) | self._foreign_colour(wall, off, by_wall))
         hanging, patches = self._hanging(~shell & ~by_wall, distinct, wall)
-        # Points near a wall that are in no hanging patch are the wall, or the back of an object before it.
+        # Points near a wall that are in no hanging patch belong to the wall, or to the back of an object in front of
+        # it.
         free = ~shell & (~by_wall | (distinct & (patches < 0) & (np.abs(off) > _WALL_M)))
         ok = self.linked & free[self.a] & free[self.b]
         labels = np.where(free, components(self.count, self.a[ok], self.b[ok]), -1)
@@ -193,7 +195,7 @@ class _Surface:
         return np.where(hanging >= 0, hanging + self.count, labels)
 
     def _nearest_walls(self, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find the wall (N,) that each point lies close to, -1 for none, and its signed distance."""
+        """Return the (N,) wall near each point, -1 for none, and the signed distance of the point from it."""
         wall, off = np.full(self.count, -1), np.full(self.count, np.inf)
         for i, plane in enumerate(self.structure.walls):
             distance = self.points[:, :2] @ plane.normal - plane.offset_m
@@ -203,10 +205,10 @@ class _Surface:
         return wall, off
 
     def _foreign_colour(self, wall: np.ndarray, off: np.ndarray, by_wall: np.ndarray) -> np.ndarray:
-        """Find points (N,) of walls whose colour differs from most of the wall at their height."""
+        """Return an (N,) mask of points of walls whose colour differs from most of the wall at the same height."""
         foreign = np.zeros(self.count, bool)
         rows = np.flatnonzero(by_wall & (np.abs(off) < _WALL_M))
-        # A Gaussian's own colour is noisy: average neighbours at the same distance from the wall.
+        # The colour of a single Gaussian is noisy: average over neighbours at the same distance from the wall.
         beside = self.neighbours[rows]
         level = (np.abs(off[beside] - off[rows, None]) < _LAYER_M)[..., None]
         mean = np.zeros((self.count, 3))
@@ -226,8 +228,9 @@ class _Surface:
         return foreign
 
     def _hanging(self, free: np.ndarray, distinct: np.ndarray, wall: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Label (N,) patches on walls, -1 for none: those that hang, and all that belong to a wall."""
-        # Trims are thin: find patches by their core points, then add the rim back to each core.
+        """Return two (N,) labels of patches on walls, -1 for none: of the patches that hang and are kept, and of all
+        that hang."""
+        # Trims are thin, so find patches by their core points, then add the rim back to each core.
         same = self.near & (wall[self.a] == wall[self.b]) & (wall[self.a] >= 0)
         others = np.bincount(self.a[same], distinct[self.b[same]], minlength=self.count)
         core = distinct & (others > _CORE * np.bincount(self.a[same], minlength=self.count))
@@ -235,7 +238,8 @@ class _Surface:
         patch = np.where(core, components(self.count, self.a[ok], self.b[ok]), -1)
         rim = same & (patch[self.a] >= 0) & distinct[self.b] & ~core[self.b]
         patch[self.b[rim][::-1]] = patch[self.a[rim][::-1]]
-        # Neighbours of the rims: a picture's are the wall, those of a bookshelf's back are the bookshelf.
+        # Look at the neighbours of the rims: those of a picture are on the wall, those of a bookshelf's back on the
+        # bookshelf.
         rim = (patch[self.a] >= 0) & (patch[self.a] != patch[self.b]) & (self.length < 1.25 * _LINK_MAX_M)
         leaving = np.bincount(patch[self.a[rim]], minlength=self.count)
         to_free = np.bincount(patch[self.a[rim]], free[self.b[rim]], minlength=self.count)
@@ -250,7 +254,7 @@ class _Surface:
         return np.where((patch >= 0) & keep[patch], patch, -1), patch
 
     def _with_floating(self, labels: np.ndarray) -> np.ndarray:
-        """Assign unsupported segments to the segment below them: a shade to its lamp."""
+        """Assign unsupported segments to the segment below them, such as a shade to its lamp."""
         heights = self.structure.heights_m
         used, compact = np.unique(labels[labels >= 0], return_inverse=True)
         if not len(used):
@@ -269,7 +273,8 @@ class _Surface:
                 continue
             below = (low < low[i] - 0.05) & (high > low[i] - 1.4) & (np.arange(len(parts)) != i)
             below &= ((boxes[:, 0] - 0.03 < middle[i]) & (boxes[:, 1] + 0.03 > middle[i])).all(1)
-            below &= (high < low[i] + 0.3) | (high >= high[i] - 0.05)  # it lies on it, or within it
+            # The segment lies on the segment below, or within it.
+            below &= (high < low[i] + 0.3) | (high >= high[i] - 0.05)
             if below.any():
                 candidates = np.flatnonzero(below)
                 best = candidates[np.argmin(np.abs(np.minimum(high[candidates], high[i]) - low[i]))]
@@ -280,7 +285,7 @@ class _Surface:
 
 
 def _numbered(labels: np.ndarray) -> np.ndarray:
-    """Number labels by size from 0, the largest first; -1 for those of too few points."""
+    """Number labels by size from 0, the largest first; labels with too few points become -1."""
     used, compact, counts = np.unique(labels, return_inverse=True, return_counts=True)
     counts = np.where((used < 0) | (counts < _MIN_POINTS), 0, counts)
     rank = np.empty(len(used), np.int32)

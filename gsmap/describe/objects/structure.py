@@ -1,4 +1,4 @@
-"""Structure of a building: floor, ceiling and walls, separated from its contents by geometry alone."""
+"""Find the structure of a building (floor, ceiling and walls), separated from its contents by geometry alone."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_BIN_M = 0.02  # of a histogram of heights: finer than a floor is flat, coarser than a surface is noisy
-_STEP_M = 0.1  # of a histogram along a wall
-_CEILING_M = 1.9  # a horizontal plane lower than this above the floor is a table
-_PATCH_M2 = 0.3  # smaller upright patches are no evidence of a wall
-_REACH_M = 0.3  # a wall ends nearer to the ceiling than this
-_HIDDEN_M = 2.5  # gap that furniture may hide of a wall: a plane that continues behind it is the same wall
-_FLAT_M = 0.02  # neighbours on one plane lie no farther off it
-_PARALLEL = 0.96  # cosine of neighbours' normals on one plane
+_BIN_M = 0.02  # bin of a histogram of heights, above the noise of a surface and below the unevenness of a floor
+_STEP_M = 0.1  # bin of a histogram along a wall
+_CEILING_M = 1.9  # a horizontal plane less than this above the floor is a table
+_PATCH_M2 = 0.3  # smaller upright patches are no evidence for a wall
+_REACH_M = 0.3  # a wall must reach to within this distance of the ceiling
+_HIDDEN_M = 2.5  # largest gap in a wall that furniture may hide; a plane that continues behind it is the same wall
+_FLAT_M = 0.02  # largest distance from the plane of neighbours on one plane
+_PARALLEL = 0.96  # smallest cosine between the normals of neighbours on one plane
 
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A stretch of a vertical plane, level frame.
+    """A stretch of a vertical plane, in the level frame.
 
     Args:
         normal: (2,) horizontal unit normal, of arbitrary sign.
-        offset_m: of the plane along the normal.
-        span_m: (low, high) along `along`.
+        offset_m: offset of the plane along the normal.
+        span_m: (low, high) extent along `along`.
     """
 
     normal: np.ndarray
@@ -36,7 +36,7 @@ class Wall:
         return np.array([-self.normal[1], self.normal[0]])
 
     def inside(self, points: np.ndarray, margin_m: float = _STEP_M) -> np.ndarray:
-        """Return (N,) bool: points before or behind the stretch."""
+        """Return an (N,) mask of points in front of or behind the stretch."""
         along = points[:, :2] @ self.along
         return np.asarray((along > self.span_m[0] - margin_m) & (along < self.span_m[1] + margin_m))
 
@@ -46,8 +46,8 @@ class Structure:
     """Floor, ceiling and walls of a building.
 
     Args:
-        heights_m: (N,) of the points above the floor.
-        ceiling_m: height of the ceiling, or of the highest points where there is none.
+        heights_m: (N,) heights of the points above the floor.
+        ceiling_m: height of the ceiling, or of the highest points if there is no ceiling.
         has_ceiling: True if a ceiling was found.
         walls: stretches of planes that reach up to the ceiling.
     """
@@ -59,8 +59,8 @@ class Structure:
 
 
 def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Label (count,) the connected components of nodes joined by edges a-b."""
-    from scipy.sparse import coo_matrix  # naming a recipe does without
+    """Return the (count,) connected component of each node; edges join nodes ``a`` and ``b``."""
+    from scipy.sparse import coo_matrix  # imported here, as the recipe key does not need it
     from scipy.sparse.csgraph import connected_components
 
     joined = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(count, count))
@@ -73,15 +73,15 @@ def find_structure(
 ) -> Structure:
     """Find floor, ceiling and walls of a place.
 
-    The floor is the lowest large horizontal plane (fitted, for the vertical is known to a fraction of a degree only),
-    the ceiling the highest. A wall is an upright patch, grown over neighbours on one plane, that reaches up to the
-    ceiling; its plane is followed along as far as it goes on.
+    The floor is the lowest large horizontal plane, the ceiling the highest. The floor is fitted, because the vertical
+    is off by a fraction of a degree. A wall is an upright patch, grown over neighbours on one plane, that reaches up to
+    the ceiling; it extends as far as points on its plane continue.
 
     Args:
-        points: (N, 3) metres, z up.
-        normals: (N, 3) of the surface, sign arbitrary.
-        planarity: (N,) in [0, 1], how flat the neighbourhood is.
-        areas: (N,) square metres that each stands for.
+        points: (N, 3) points in metres, z up.
+        normals: (N, 3) normals of the surface, sign arbitrary.
+        planarity: (N,) flatness of the neighbourhood in [0, 1].
+        areas: (N,) area of surface that each point represents, in square metres.
         neighbours: (N, K) rows of the nearest points, each point itself first.
     """
     heights, ceiling, has_ceiling = _heights(points, np.abs(normals[:, 2]) > 0.95, areas)
@@ -113,7 +113,7 @@ def find_structure(
 
 
 def _heights(points: np.ndarray, flat: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, float, bool]:
-    """Compute heights above the fitted floor (N,), the ceiling's, and whether there is one."""
+    """Compute heights above the fitted floor (N,), the height of the ceiling, and whether there is a ceiling."""
     z = points[:, 2]
     low = float(z.min())
     if not flat.any():
@@ -141,7 +141,7 @@ def _is_of(wall: Wall, points: np.ndarray) -> bool:
 
 
 def _wall(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, rows: np.ndarray) -> Wall | None:
-    """Fit the plane of a patch to all that lies on it, and its extent; None where it is a pillar."""
+    """Fit a plane to all points of a patch, and its extent; return None if the patch is a pillar."""
     patch = points[rows, :2]
     middle = patch.mean(0)
     normal = np.linalg.eigh((patch - middle).T @ (patch - middle))[1][:, 0]
@@ -166,7 +166,7 @@ def _wall(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, rows: np.n
     facing = np.abs(normals[:, :2] @ normal) > 0.8
     off = points[:, :2] @ normal - offset
     on = facing & (np.abs(off) < 2 * _FLAT_M)
-    # The mode of the distances: the wall without the objects on it.
+    # The mode of the distances is the wall without the objects on it.
     bins, edges = np.histogram(off[on], bins=40, range=(-2 * _FLAT_M, 2 * _FLAT_M), weights=areas[on])
     peak = int(np.argmax(np.convolve(bins, np.ones(5), "same")))
     offset += 0.5 * (edges[peak] + edges[peak + 1])

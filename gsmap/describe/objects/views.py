@@ -1,4 +1,4 @@
-"""Rendered views of a capture from its sampled cameras."""
+"""Render views of a capture from a sample of its cameras."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from gsmap.render import ChunkIndex, render
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.views import View
 
-_MIN_SEEN = 0.2  # a view of which a smaller share shows anything is empty
+_MIN_SEEN = 0.2  # a view with a smaller share of covered pixels counts as empty
 
 
 def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, backend: str = "auto") -> Iterator[View]:
-    """Yield a view per camera, each at its own aspect ratio.
+    """Yield a view for each camera, at the camera's own aspect ratio.
 
     Args:
-        gaussians, cameras: of one frame.
-        backend: as for `gsmap.render.render`.
+        gaussians, cameras: Gaussians and cameras in one frame.
+        backend: see `gsmap.render.render`.
     """
     small = cameras.resized(longest_side_px)
     index = ChunkIndex.build(gaussians)  # a camera sees a room or two of a large capture
@@ -30,10 +30,10 @@ def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, b
 
 
 def is_blocked(view: View, nearest: float) -> bool:
-    """Return True if the camera is inside an object: most of its view is nearer than ``nearest``, or empty.
+    """Return whether the camera is inside an object: its view is mostly nearer than ``nearest``, or empty.
 
     Args:
-        nearest: scene units.
+        nearest: distance in scene units.
     """
     seen = view.alpha > 0.5
     return bool(seen.mean() < _MIN_SEEN or (view.depth[seen] < nearest).mean() > 0.5)

@@ -1,1 +1,1 @@
-"""ONNX models from users: validation before a map accepts one, and text encoders."""
+"""ONNX models that users supply: validation before a map accepts a model, and text encoders."""

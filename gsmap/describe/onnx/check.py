@@ -1,4 +1,4 @@
-"""Validation of a model before a map accepts it."""
+"""Validate a model before a map accepts it."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ PRESETS = {  # mean and standard deviation of rgb in [0, 1]
 
 
 def kinds() -> dict[str, list[Any]]:
-    """List every kind of model that a segmenter, embedder or extractor names, with these methods; and those of text.
+    """List all kinds of models that segmenters, embedders and extractors name, each with these methods; and the kinds
+    for text.
 
     Raises:
-        ConfigError: a method that names models and has no ``probe`` for them.
+        ConfigError: a method names models but has no ``probe`` for them.
     """
     found: dict[str, list[Any]] = {}
     for methods in (family("segmenter"), family("embedder"), family("extractor")):
@@ -33,7 +34,7 @@ def kinds() -> dict[str, list[Any]]:
             method = methods.get(name)
             if method.MODELS and not hasattr(method, "probe"):
                 raise ConfigError(
-                    f"{methods.name} {name!r} lacks probe: see the contract in gsmap.methods.{methods.name}",
+                    f"{methods.name} {name!r} has no function probe: see the contract in gsmap.methods.{methods.name}",
                     code="invalid_method",
                 )
             for kind in method.MODELS:
@@ -45,7 +46,7 @@ def parse_preset(preset: str) -> tuple[tuple[float, float, float], tuple[float, 
     """Parse mean and standard deviation from a preset's name or ``mean=r,g,b;std=r,g,b``.
 
     Raises:
-        ConfigError: neither, or a standard deviation that is not positive.
+        ConfigError: the text is neither, or a standard deviation is not positive.
     """
     if preset in PRESETS:
         return PRESETS[preset]
@@ -65,7 +66,7 @@ def parse_preset(preset: str) -> tuple[tuple[float, float, float], tuple[float, 
 def check_model(
     kind: str, path: str | os.PathLike[str], preset: str = "clip", limits: ModelLimits | None = None
 ) -> ModelSpec:
-    """Validate an ONNX file of a kind: complete in itself, and usable by the methods that need it.
+    """Validate an ONNX file as a model of a kind: it must be complete, and usable by the methods that need it.
 
     Args:
         kind: one of `kinds`.
@@ -73,10 +74,10 @@ def check_model(
         limits: time and memory limits of the model, now and wherever this spec is used.
 
     Raises:
-        ConfigError: an unknown kind or preset.
-        NotFoundError: no such file.
-        InputError: not an ONNX model, weights in other files, one that takes too long or too much memory, or one
-            that a method's ``probe`` refuses.
+        ConfigError: the kind or preset is unknown.
+        NotFoundError: the file does not exist.
+        InputError: the file is not an ONNX model, has weights in other files, takes too long or too much memory, or is
+            rejected by a method's ``probe``.
     """
     known = kinds()
     if kind not in known:
@@ -84,7 +85,7 @@ def check_model(
     mean, std = parse_preset(preset)
     path = Path(path)
     if not path.is_file():
-        raise NotFoundError(f"no model file at {path}", code="file_not_found")
+        raise NotFoundError(f"the model file {path} does not exist", code="file_not_found")
     if kind == text.TOKENIZER:
         return text.check_tokenizer(path)
     refuse_external_data(path)

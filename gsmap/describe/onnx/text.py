@@ -1,6 +1,5 @@
-"""Text embedding by the text tower (``clip-text``, ONNX) and tokenizer (``clip-tokenizer``, ``tokenizer.json``) of the
-pack of the image encoder ``clip``.
-"""
+"""Text embedding with the model pack of the image encoder ``clip``: its text tower (``clip-text``, ONNX) and its
+tokenizer (``clip-tokenizer``, ``tokenizer.json``)."""
 
 from __future__ import annotations
 
@@ -19,8 +18,8 @@ TEXT, TOKENIZER = "clip-text", "clip-tokenizer"
 KINDS = (TEXT, TOKENIZER)
 
 _MAX_CHARACTERS = 1000
-_MAX_BYTES = 64 << 20  # of a tokenizer: those that are published have two to twenty
-_CONTEXT = 77  # tokens that CLIP was trained on; for towers that leave it free
+_MAX_BYTES = 64 << 20  # of a tokenizer; published tokenizers have 2 to 20 MB
+_CONTEXT = 77  # number of tokens with which CLIP was trained, for towers that accept any number
 _OUTPUTS = ("text_embeds", "text_embedding", "embedding", "embeddings", "sentence_embedding", "pooler_output")
 _IMAGE_DIMS = 4
 
@@ -29,8 +28,8 @@ def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
     """Compute the unit vector (F,) float32 of a text.
 
     Raises:
-        ConfigError: the map lacks the tower or its tokenizer.
-        InputError: words that are too long, or a tower that does not run on them.
+        ConfigError: the map lacks the text tower or its tokenizer.
+        InputError: the text is too long, or the tower does not run on it.
         MissingDependencyError: the package tokenizers is not installed.
     """
     missing = [kind for kind in KINDS if kind not in models]
@@ -38,7 +37,7 @@ def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
         files = {TEXT: "TEXT.onnx", TOKENIZER: "tokenizer.json"}
         verbs = " and ".join(f"gsmap models add MAP {kind} {files[kind]}" for kind in missing)
         raise ConfigError(
-            f"a text query needs the text tower of the map's image encoder, which the map lacks: {verbs}; or query by "
+            f"a text query needs the text tower of the map's image encoder. Add it: {verbs}; or query by "
             "--picture FILE, --like SCENE:NODE or --at X,Y,Z",
             code="model_required",
         )
@@ -60,15 +59,15 @@ def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
 
 
 def probe_text(spec: ModelSpec) -> None:
-    """Refuse a model that is not a text tower; it is run once.
+    """Reject a model that is not a text tower, by running it once.
 
     Raises:
-        InputError: its inputs and outputs do not fit, or it does not run.
+        InputError: the model's inputs and outputs do not fit, or it does not run.
     """
     if any(len(tensor.shape) == _IMAGE_DIMS for tensor in spec.inputs):
-        raise misfit(spec, "it also takes images: export the text tower by itself")
+        raise misfit(spec, "the model also takes images: export the text tower alone")
     if not spec.outputs:
-        raise misfit(spec, "it has no outputs")
+        raise misfit(spec, "the model has no outputs")
     length = _ids_of(spec).shape[1] or _CONTEXT
     ids = np.zeros((1, length), np.int64)
     _run(spec, ids, np.ones_like(ids))
@@ -78,7 +77,7 @@ def check_tokenizer(path: Path) -> ModelSpec:
     """Validate a ``tokenizer.json``, which is stored beside the models.
 
     Raises:
-        InputError: it is not.
+        InputError: the file is not a tokenizer.
         MissingDependencyError: the package tokenizers is not installed.
     """
     if path.stat().st_size > _MAX_BYTES:
@@ -91,19 +90,22 @@ def check_tokenizer(path: Path) -> ModelSpec:
 
 
 def _tokens(text: str, spec: ModelSpec, length: int, *, pad: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Tokenize a text: (1, L) ids, and (1, L) mask.
+    """Tokenize a text: return (1, L) ids, and a (1, L) mask.
 
     Args:
-        length: tokens at most.
-        pad: pad to that length with the tokenizer's padding token, or with the end token, as CLIP does.
+        length: largest number of tokens.
+        pad: pad to ``length`` with the tokenizer's padding token or, as CLIP does, with the end token.
     """
     path = Path(spec.path)
     if not path.is_file():
         raise NotFoundError(
-            f"the tokenizer is missing: {path}; add it again with gsmap models add", code="model_missing"
+            f"the tokenizer file {path} is missing; add it again with gsmap models add", code="model_missing"
         )
     if hashlib.sha256(path.read_bytes()).hexdigest() != spec.sha256:
-        raise InputError(f"the tokenizer has changed since it was added: {path}; add it again", code="model_changed")
+        raise InputError(
+            f"the tokenizer file {path} has changed since it was added; add it again",
+            code="model_changed",
+        )
     tokenizer = _tokenizer(path)
     own = tokenizer.padding
     tokenizer.no_padding()
@@ -124,22 +126,20 @@ def _tokenizer(path: Path) -> Any:
         raise MissingDependencyError("text queries need the package tokenizers: pip install 'gsmap[text]'") from error
     try:
         return Tokenizer.from_file(str(path))
-    except Exception as error:  # it raises plain exceptions, whatever is wrong
-        raise InputError(
-            f"{path} is not a tokenizer.json that can be read: {error}", code="invalid_tokenizer"
-        ) from error
+    except Exception as error:  # the package raises plain exceptions for all problems
+        raise InputError(f"{path} is not a readable tokenizer.json: {error}", code="invalid_tokenizer") from error
 
 
 def _ids_of(spec: ModelSpec) -> Tensor:
     """Return the input that takes the tokens."""
     takes = [t for t in spec.inputs if len(t.shape) == 2 and not any(w in t.name for w in ("mask", "type", "position"))]
     if len(takes) != 1:
-        raise misfit(spec, "a text tower takes tokens of shape (N, L), and perhaps a mask of that shape")
+        raise misfit(spec, "a text tower takes tokens of shape (N, L), and optionally a mask of the same shape")
     return takes[0]
 
 
 def _run(spec: ModelSpec, ids: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Run the tower on the tokens of one text, (F,)."""
+    """Run the tower on the tokens of one text; return a vector (F,)."""
     feed = {}
     for tensor in spec.inputs:
         value = ids
@@ -156,5 +156,5 @@ def _run(spec: ModelSpec, ids: np.ndarray, mask: np.ndarray) -> np.ndarray:
     output = (named or flat or [spec.outputs[0].name])[0]
     found = np.asarray(run(spec, open_session(spec), [output], feed)[0], np.float32)
     if found.ndim != 2 or not found.shape[1]:
-        raise misfit(spec, f"its output {output} has shape {list(found.shape)}: one vector per text is needed")
+        raise misfit(spec, f"the output {output} has shape {list(found.shape)}, but one vector per text is needed")
     return found[0]

@@ -1,8 +1,8 @@
-"""Segmenter without a network: parts of the surface, seen through the renders.
+"""Segmenter without a network: parts of the surface, as seen in renders.
 
 The surface is cut into parts once, in 3D (Felzenszwalb and Huttenlocher 2004, "Efficient graph-based image
-segmentation", on a neighbour graph of the Gaussians with colour and normal differences as weights); a view's mask of a
-part are the pixels that one of its Gaussians dominates. So the masks of one part agree over all views.
+segmentation", on a neighbour graph of the Gaussians with colour and normal differences as weights). The mask of a part
+in a view consists of the pixels that Gaussians of the part dominate, so the masks of one part agree over all views.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from gsmap.types.views import Mask, PointCloud, SceneContext, View
 
 VERSION = 1
 MODELS: tuple[str, ...] = ()
-_NUM_SAMPLES = 20000  # points that the surface is thinned to before it is cut, about
-_MIN_SHARE = 0.001  # parts of a smaller share of the samples join their most similar neighbour
-_MIN_AREA = 0.002  # masks of a smaller share of the image are dropped
-_LIGHTNESS_WEIGHT = 0.5  # of L* against a* and b*: shading separates surfaces less than hue
+_NUM_SAMPLES = 20000  # the surface is thinned to about this many points before it is cut
+_MIN_SHARE = 0.001  # parts with a smaller share of the samples join their most similar neighbour
+_MIN_AREA = 0.002  # masks with a smaller share of the image are dropped
+_LIGHTNESS_WEIGHT = 0.5  # of L* relative to a* and b*: shading separates surfaces less than hue
 _LAB_SCALE = 5.0  # L*a*b* difference that counts as an edge of weight 1
-_TURN_WEIGHT = 3.0  # of an edge between normals at a right angle
+_TURN_WEIGHT = 3.0  # weight of an edge between perpendicular normals
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class BuiltinSegmenter:
             self.part_of_gaussian[cloud.index] = cut_surface(cloud, params)
 
     def segment(self, view: View) -> list[Mask]:
-        """Return one mask per connected blob of pixels that a part's Gaussians dominate."""
-        from scipy import ndimage  # naming a recipe does without
+        """Return one mask for each connected blob of pixels that the Gaussians of a part dominate."""
+        from scipy import ndimage  # imported here, as the recipe key does not need it
 
         parts = self.part_of_gaussian[view.dominant_id]
         parts[view.alpha < 0.5] = -1
@@ -61,7 +61,7 @@ class BuiltinSegmenter:
             if place is None:
                 continue
             window = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in place)
-            # Closing by a pixel bridges the single foreign Gaussians that speckle a part.
+            # Closing by a pixel bridges single Gaussians of other parts within a part.
             pixels = ndimage.binary_closing(np.pad(parts[window] == part, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
             labels, count = ndimage.label(pixels)
             sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
@@ -73,8 +73,8 @@ class BuiltinSegmenter:
 
 
 def cut_surface(cloud: PointCloud, params: Params) -> np.ndarray:
-    """Segment the cloud into parts (N,) int, numbered from 0."""
-    # A cell so large that the surface covers about _NUM_SAMPLES of them.
+    """Segment the cloud into parts; return the (N,) part of each point, numbered from 0."""
+    # The cell size is such that the surface covers about _NUM_SAMPLES cells.
     cell = float(np.sqrt(cloud.areas.sum() / _NUM_SAMPLES)) or 1e-9
     points, lab = downsample(cloud.points, cloud.lab, cell)
     if len(points) < 16:
@@ -86,7 +86,7 @@ def cut_surface(cloud: PointCloud, params: Params) -> np.ndarray:
     once = (a < b) | ~(neighbours[b] == a[:, None]).any(1)
     near = distance[:, 1:].ravel() < 3 * cell
     a, b = a[once & near], b[once & near]
-    lab = lab[neighbours].mean(1)  # a Gaussian's own colour is noisy
+    lab = lab[neighbours].mean(1)  # the colour of a single Gaussian is noisy
     difference = (lab[a] - lab[b]) * [_LIGHTNESS_WEIGHT, 1.0, 1.0]
     turn = 1 - np.abs((normals[a] * normals[b]).sum(1))
     weight = np.linalg.norm(difference, axis=1) / _LAB_SCALE + _TURN_WEIGHT * turn
@@ -97,10 +97,10 @@ def cut_surface(cloud: PointCloud, params: Params) -> np.ndarray:
 def felzenszwalb(
     count: int, a: np.ndarray, b: np.ndarray, weight: np.ndarray, scale: float, min_size: int
 ) -> np.ndarray:
-    """Segment a graph (Felzenszwalb and Huttenlocher 2004): component (count,) int of each node.
+    """Segment a graph (Felzenszwalb and Huttenlocher 2004); return the (count,) component of each node.
 
-    Edges in order of weight join components whose inner difference allows it; components smaller than ``min_size`` are
-    then joined along their lightest edges.
+    Edges, in order of weight, join components whose internal differences allow it. Then components smaller than
+    ``min_size`` are joined along their lightest edges.
     """
     order = np.argsort(weight, kind="stable")
     ends = [np.ascontiguousarray(end[order], np.int64) for end in (a, b)]

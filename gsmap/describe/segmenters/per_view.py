@@ -1,7 +1,7 @@
-"""Built-in segmenter without association over views, as a network would segment each view.
+"""Built-in segmenter that segments each view independently, as a network would.
 
-The built-in segmenter numbers the parts of the surface, so that its masks need no association. Here the part numbers
-are dropped, and masks are associated by appearance and position, as in Graph-GSReg (``tau_asso``).
+The segmenter ``builtin`` numbers the parts of the surface, so its masks need no association over views. Here the part
+numbers are dropped, and masks are associated by appearance and position, as in Graph-GSReg (``tau_asso``).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MODELS: tuple[str, ...] = ()
 
 @dataclass(frozen=True)
 class Params:
-    """No settings: parts are cut as the built-in segmenter cuts them by default."""
+    """Settings of the segmenter: none; parts are cut with the defaults of the segmenter ``builtin``."""
 
 
 def make(context: SceneContext, params: Params) -> PerViewSegmenter:
@@ -32,5 +32,5 @@ class PerViewSegmenter:
     parts: builtin.BuiltinSegmenter
 
     def segment(self, view: View) -> list[Mask]:
-        """Return the built-in segmenter's masks of a view, without their parts."""
+        """Return the masks of the segmenter ``builtin`` in a view, without their part numbers."""
         return [replace(mask, part=None) for mask in self.parts.segment(view)]

@@ -1,10 +1,11 @@
-"""Segment Anything from its published ONNX exports, prompted by a grid of points.
+"""Segmenter that runs Segment Anything from its published ONNX exports, prompted by a grid of points.
 
-Contract (segment-anything, ``scripts/export_onnx_model.py``; MobileSAM and others export the same): the encoder takes
-a picture whose longer side is 1024 and gives ``image_embeddings``; the decoder takes those with ``point_coords`` (1,
-P, 2) in the 1024 frame, ``point_labels`` (1, P), ``mask_input``, ``has_mask_input``, ``orig_im_size`` and gives
-``masks`` (1, M, H, W) logits in the picture's size and ``iou_predictions`` (1, M). Where the export leaves its batch
-free, many prompts go through the decoder at once. Cuts and box suppression are those of its automatic mask generator.
+Contract (segment-anything, ``scripts/export_onnx_model.py``; MobileSAM and others export the same): the encoder takes a
+picture whose longer side is 1024 and returns ``image_embeddings``; the decoder takes these with ``point_coords``
+(1, P, 2) in the 1024 frame, ``point_labels`` (1, P), ``mask_input``, ``has_mask_input``, ``orig_im_size``, and returns
+``masks`` (1, M, H, W), logits at the picture's size, and ``iou_predictions`` (1, M). If the export accepts any batch
+size, the decoder processes many prompts at once. Thresholds and box suppression are as in SAM's automatic mask
+generator.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from gsmap.types.views import Mask, SceneContext, View
 VERSION = 1
 MODELS = ("sam-encoder", "sam-decoder")
 SAM_SIDE_PX = 1024
-# What the published SAM decoder export takes (segment-anything, scripts/export_onnx_model.py).
+# Inputs of the published SAM decoder export (segment-anything, scripts/export_onnx_model.py).
 DECODER_INPUTS = ("image_embeddings", "point_coords", "point_labels", "mask_input", "has_mask_input", "orig_im_size")
-_BATCH = 64  # prompts per run of the decoder, where it takes several
-_MIN_STABILITY = 0.9  # IoU between the mask cut one logit above and one below zero
-_MAX_BOX_IOU = 0.7  # of two masks whose boxes overlap more, the one of lower predicted IoU is dropped
+_BATCH = 64  # prompts per run of a decoder that accepts several
+_MIN_STABILITY = 0.9  # IoU between the masks cut one logit above and one logit below zero
+_MAX_BOX_IOU = 0.7  # of two masks whose boxes overlap more, the mask with the lower predicted IoU is dropped
 _MIN_AREA, _MAX_AREA = 0.002, 0.9  # fractions of the view
 _PIXEL_MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _PIXEL_STD = np.array([58.395, 57.12, 57.375], np.float32)
@@ -52,10 +53,10 @@ def make(context: SceneContext, params: Params) -> SamSegmenter:
 
 
 def probe(spec: ModelSpec) -> None:
-    """Refuse a model that is not a SAM encoder or decoder, by its inputs and outputs.
+    """Reject a model that is not a SAM encoder or decoder, by its inputs and outputs.
 
     Raises:
-        InputError: what does not fit.
+        InputError: the inputs or outputs do not fit; the message says which.
     """
     problem = _encoder_problem(spec) if spec.kind == "sam-encoder" else _decoder_problem(spec)
     if problem:
@@ -67,7 +68,7 @@ def _encoder_problem(spec: ModelSpec) -> str:
         return "a SAM encoder takes one image, (1, 3, 1024, 1024) or (H, W, 3)"
     if any(side not in (1, 3, SAM_SIDE_PX, None) for side in spec.inputs[0].shape):
         return f"a SAM encoder takes images of {SAM_SIDE_PX} x {SAM_SIDE_PX} pixels"
-    return "" if any(len(t.shape) == 4 for t in spec.outputs) else "a SAM encoder gives embeddings (1, C, h, w)"
+    return "" if any(len(t.shape) == 4 for t in spec.outputs) else "a SAM encoder returns embeddings (1, C, h, w)"
 
 
 def _decoder_problem(spec: ModelSpec) -> str:
@@ -75,11 +76,11 @@ def _decoder_problem(spec: ModelSpec) -> str:
     if missing:
         return f"the published SAM decoder export also takes {', '.join(missing)}"
     absent = [name for name in ("masks", "iou_predictions") if name not in {t.name for t in spec.outputs}]
-    return f"it does not give {', '.join(absent)}" if absent else ""
+    return f"the model has no output {', '.join(absent)}" if absent else ""
 
 
 class SamSegmenter:
-    """Masks of everything SAM finds."""
+    """A segmenter that returns the masks of everything that SAM finds."""
 
     def __init__(self, params: Params, encoder: ModelSpec, decoder: ModelSpec) -> None:
         self.params = params
@@ -90,7 +91,7 @@ class SamSegmenter:
         self.types = {t.name: np.float64 if t.dtype == "double" else np.float32 for t in decoder.inputs}
 
     def segment(self, view: View) -> list[Mask]:
-        """Segment a view by a grid of prompts, without unstable, too small, too large or duplicate masks."""
+        """Segment a view by a grid of prompts, and drop unstable, too small, too large or duplicate masks."""
         height, width = view.rgb.shape[:2]
         embeddings = self._encode(view.rgb)
         side = (np.arange(self.params.points_per_side) + 0.5) / self.params.points_per_side
@@ -118,11 +119,11 @@ class SamSegmenter:
         height, width = rgb.shape[:2]
         scale = SAM_SIDE_PX / max(height, width)
         size = (round(width * scale), round(height * scale))
-        from PIL import Image  # naming a recipe does without
+        from PIL import Image  # imported here, as the recipe key does not need it
 
         large = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BILINEAR), np.float32)
         tensor = self.encoder_spec.inputs[0]
-        if len(tensor.shape) == 3:  # exports that normalise and pad inside
+        if len(tensor.shape) == 3:  # exports that normalize and pad inside the network
             picture = large
         else:
             normal = (large - _PIXEL_MEAN) / _PIXEL_STD
@@ -137,10 +138,10 @@ class SamSegmenter:
     def _decode(
         self, embeddings: np.ndarray, points: np.ndarray, height: int, width: int
     ) -> Iterator[tuple[np.ndarray, float]]:
-        """Yield (logits (H, W), predicted IoU) of each mask of each prompt."""
+        """Yield the logits (H, W) and the predicted IoU of each mask of each prompt."""
         count = len(points)
         scale = SAM_SIDE_PX / max(height, width)
-        # A prompt without a box carries a padding point labelled -1 (the export's contract).
+        # A prompt without a box needs a padding point labelled -1 (by the contract of the export).
         coords = np.zeros((count, 2, 2))
         coords[:, 0] = points * scale
         labels = np.tile([1.0, -1.0], (count, 1))
@@ -154,7 +155,7 @@ class SamSegmenter:
         }
         feed = {name: value.astype(self.types[name]) for name, value in feed.items()}
         masks, scores = run(self.decoder_spec, self.decoder, ["masks", "iou_predictions"], feed)
-        # Of four masks the first answers prompts of several points; the generator uses the other three.
+        # Of four masks the first is for prompts of several points; the generator uses the remaining three.
         first = 1 if masks.shape[1] == 4 else 0
         for prompt in range(masks.shape[0]):
             for m in range(first, masks.shape[1]):
@@ -162,7 +163,7 @@ class SamSegmenter:
 
 
 def suppress(boxes: np.ndarray, scores: np.ndarray, max_iou: float) -> list[int]:
-    """Apply non-maximum suppression: rows of the boxes (M, 4) ``x0 y0 x1 y1`` to keep, the best first."""
+    """Apply non-maximum suppression to boxes (M, 4) ``x0 y0 x1 y1``; return the rows to keep, the best first."""
     areas = (boxes[:, 2:] - boxes[:, :2]).prod(1)
     left = np.argsort(-scores, kind="stable")
     keep = []
