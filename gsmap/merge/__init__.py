@@ -1,7 +1,7 @@
-"""Merging of several scenes of one place into one set of Gaussians.
+"""Merge several scenes of one place into one set of Gaussians.
 
-``merge(scenes, method)`` is pure: scenes in the map frame in, Gaussians out. Built-in methods live in
-`mergers`, other packages add theirs by entry point; all keep the contract in `gsmap.methods.merger`.
+``merge(scenes, method)`` is a pure function from scenes in the map frame to Gaussians. Built-in methods are in
+`mergers`, and other packages add methods by entry points; all keep the contract in `gsmap.methods.merger`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
 VERSION = 1
-"""Version of the steps around a merger: the selection of its inputs, and of the tile's part of its result."""
+"""Version of the steps around a merger: how its inputs are selected, and which part of its result a tile gets."""
 
 __all__ = [
     "VERSION",
@@ -64,15 +64,15 @@ class Params:
 
 
 def methods() -> list[str]:
-    """Return the names of the merging methods that load."""
+    """Return the names of the merging methods that can be loaded."""
     return list(family("merger").usable())
 
 
 def merger(method: str) -> Merger:
-    """Return a merger by name.
+    """Return the merger with a name.
 
     Raises:
-        ConfigError: unknown name, or the merger breaks the contract.
+        ConfigError: the name is unknown, or the merger breaks the contract.
     """
     found: Merger = family("merger").get(method)
     return found
@@ -84,10 +84,10 @@ def default_params(method: str) -> Any:
 
 
 def checked_params(method: str, params: Any) -> Any:
-    """Return the params, or the method's defaults for None.
+    """Return the params after a check; for None return the method's defaults.
 
     Raises:
-        ConfigError: unknown method, params of another method.
+        ConfigError: the method is unknown, or the params are of another method.
     """
     wanted = merger(method).Params
     if params is None:
@@ -119,10 +119,10 @@ def uses_dates(method: str, params: Any = None) -> bool:
 
 
 def with_steps(method: str, params: Any, steps: int) -> Any:
-    """Return the params with a number of optimization steps.
+    """Return the params with the given number of optimization steps.
 
     Raises:
-        ConfigError: the method has no steps, or the number is negative.
+        ConfigError: the method does not optimize, or the number is negative.
     """
     params, name = checked_params(method, params), merger(method).STEPS
     if name is None:
@@ -140,14 +140,15 @@ PREFERENCES = ("newest", "best", "both")
 
 
 def with_prefer(method: str, params: Any, prefer: str) -> Any:
-    """Return the params with the preferred scene where scenes disagree: the newest, the best observed, or both.
+    """Return the params with the given preference where scenes disagree: the newest scene, the best observed one, or
+    both.
 
     Raises:
-        ConfigError: unknown preference, or the method does not use dates.
+        ConfigError: the preference is unknown, or the method does not use dates.
     """
     params = checked_params(method, params)
     if prefer not in PREFERENCES:
-        raise ConfigError(f"prefer is one of {', '.join(PREFERENCES)}, got {prefer!r}", code="invalid_choice")
+        raise ConfigError(f"--prefer must be one of {', '.join(PREFERENCES)}, got {prefer!r}", code="invalid_choice")
     if hasattr(params, "prefer"):
         return replace(params, prefer=prefer)
     takes = [other for other in methods() if hasattr(merger(other).Params(), "prefer")]
@@ -168,7 +169,7 @@ def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
         ConfigError: unknown method, params of another method.
     """
     how, params = merger(method), checked_params(method, params)
-    # A merger that uses dates compares scenes by renders.
+    # A merger that uses dates compares scenes by renders, so the version of the comparison is part of its recipe.
     renders = how.RENDERS or how.uses_dates(params)
     versions = {"merge": VERSION} | ({"compare": compare.VERSION} if renders else {})
     backend, settings = render.backend() if renders else "", plain(params)
@@ -187,22 +188,25 @@ def merge(
     """Merge scenes in one frame.
 
     Args:
-        scenes: scenes in the map frame; of a tile, all their Gaussians within the merger's ``reading_m`` of the bounds
-            (`gsmap.merge.tile.merge_tile` reads just these).
+        scenes: scenes in the map frame. For a tile, they need all Gaussians within the merger's ``reading_m`` of the
+            bounds (`gsmap.merge.tile.merge_tile` reads just these).
         method: one of `methods()`.
         params: the method's ``Params``; None takes the defaults.
-        bounds: (2, 3) lowest and highest corner of a tile; the result holds the Gaussians with means in it, and tiles
-            fit together whatever their order. None merges everything.
+        bounds: (2, 3) lowest and highest corner of a tile. The result holds the Gaussians with means in the tile; tiles
+            fit together, whatever their order. None merges everything.
         budget_s: limit on the wall-clock seconds of an optimizing method; the result is `truncated` if it was reached.
         progress: called with the fraction done in [0, 1] and the current step.
 
     Raises:
-        ConfigError: unknown method, params of another method, a budget that is not positive.
-        InputError: no scenes, or empty bounds.
+        ConfigError: the method is unknown, the params are of another method, or the budget is not positive.
+        InputError: there are no scenes, or the bounds are empty.
     """
     params = checked_params(method, params)
     if budget_s is not None and not budget_s > 0:
-        raise ConfigError(f"a merge budget must be a positive number of seconds, got {budget_s}", code="invalid_budget")
+        raise ConfigError(
+            f"the merge budget must be a positive number of seconds, got {budget_s}",
+            code="invalid_budget",
+        )
     if not scenes:
         raise InputError("nothing to merge: no scenes given", code="nothing_to_merge")
     if bounds is not None:

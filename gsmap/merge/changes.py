@@ -1,4 +1,4 @@
-"""Resolution of changes between scenes of different dates: outdated Gaussians and view pixels are removed."""
+"""Resolve changes between scenes of different dates: remove outdated Gaussians and mask outdated pixels of views."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PosedScene
 
 Prefer = Literal["newest", "best", "both"]
-"""Preferred scene where scenes disagree: the ``newest``, the ``best`` observed one, or none, so that ``both`` show."""
+"""Preferred scene where scenes disagree: the ``newest``, the ``best`` observed one, or no preference, so that ``both``
+appear."""
 
 LOOKING_M = 10.0
 """Distance around a tile, in metres, within which Gaussians and cameras are read for comparison and reference views."""
 
 MIN_CAMERAS = 12
-"""Least number of cameras of each scene that are read for these, the nearest ones, wherever they stand."""
+"""Smallest number of cameras of each scene that are read for these purposes: the nearest ones, at any distance."""
 
-_SHOWS = 0.15  # blending weight of disputed Gaussians in a disputed pixel
-_NEAR_M = 0.25  # distance from a change within which fragments of it are searched
+_SHOWS = 0.15  # smallest blending weight of disputed Gaussians in a disputed pixel
+_NEAR_M = 0.25  # fragments of a change are searched within this distance of it
 _NEGLIGIBLE_GAIN = 0.02
-_INTRUDES = 0.15  # difference of colour in [0, 1] that a misfit causes in a view
+_INTRUDES = 0.15  # smallest difference of colour in [0, 1] that a misfit causes in a view
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +39,14 @@ class ResolvedScenes:
     """Scenes without outdated Gaussians.
 
     Args:
-        scenes: in the given order, without outdated Gaussians, and in the newest scene's exposure.
+        scenes: the scenes in the given order, without outdated Gaussians, and in the exposure of the newest scene.
         num_removed: number of removed Gaussians of each scene.
-        changed: per scene (N,) bool, Gaussians that replace removed ones of another scene; as no older scene shows
-            their place, they stay as they are.
-        behind: per scene (N,) bool, Gaussians beside a change that are occluded in newer scenes: they are not
-            disproved, but do not show the present place either.
-        replacements: per scene, the present Gaussians at the places of its removed ones; empty without any.
-        removed: per scene, its removed Gaussians.
+        changed: per scene, an (N,) mask of Gaussians that replace removed Gaussians of another scene. No older scene
+            shows their place, so mergers do not change them.
+        behind: per scene, an (N,) mask of Gaussians beside a change that are occluded in newer scenes. Nothing
+            disproves them, but they may not show the present place.
+        replacements: per scene, the present Gaussians at the places of the scene's removed Gaussians; may be empty.
+        removed: per scene, the removed Gaussians.
     """
 
     scenes: list[PosedScene]
@@ -57,7 +58,7 @@ class ResolvedScenes:
     _flagged: dict[int, tuple[Gaussians, int]] = field(default_factory=dict)
 
     def outdated_pixels(self, scene: int, camera: Cameras, longest_side_px: int = 240) -> np.ndarray:
-        """Return (H, W) bool, pixels of a scene's view from one camera that show outdated or miss present content."""
+        """Return an (H, W) mask of pixels in one view of a scene that show outdated content or miss present content."""
         flagged, count = self._flagged_of(scene)
         width, height = (int(v) for v in camera.sizes_px[0])
         small = camera.resized(longest_side_px)
@@ -72,7 +73,7 @@ class ResolvedScenes:
         return out
 
     def _flagged_of(self, scene: int) -> tuple[Gaussians, int]:
-        """Return a scene's disputed Gaussians in white, the rest in black, and the number of disputed ones.
+        """Return a scene's Gaussians, disputed ones in white and the rest in black, and the number of disputed ones.
 
         The result is cached for one scene, as views are processed scene by scene.
         """
@@ -84,11 +85,11 @@ class ResolvedScenes:
         return self._flagged[scene]
 
     def is_disputed(self, scene: int) -> bool:
-        """Return whether any view of a scene may show outdated or miss present content."""
+        """Return whether any view of a scene may show outdated content or miss present content."""
         return len(self.removed[scene]) + len(self.replacements[scene]) > 0
 
     def notes(self) -> list[str]:
-        """Return notes on removed Gaussians."""
+        """Return a note for each scene with removed Gaussians."""
         return [
             f"{n} outdated Gaussians of scene {s.scene_id[:12]} are removed where the place changed"
             for s, n in zip(self.scenes, self.num_removed, strict=True)
@@ -105,18 +106,18 @@ def resolve_changes(
 ) -> ResolvedScenes:
     """Remove Gaussians that scenes of other dates disprove.
 
-    From the newest scene back, each older one is compared once with the combined views of all newer ones, so that N
-    scenes cost N comparisons. A Gaussian is removed if it lies in free space of these, or on a surface of another
-    colour after exposure balancing; with ``best`` only if they also observed the place better, and otherwise the newer
-    scene's Gaussians are removed. Gaussians unobserved by newer scenes stay. Scenes without dates, or of one date,
-    remove nothing.
+    From the newest scene back, each older scene is compared once with the combined views of all newer scenes, so N
+    scenes cost N comparisons. A Gaussian of the older scene is removed if it lies in free space of the newer scenes, or
+    on a surface of another colour after exposure balancing. With ``best`` this holds only if the newer scenes also
+    observed the place better; otherwise the Gaussians of the newer scene are removed. Gaussians that no newer scene
+    observed stay. Scenes without dates, or of one date, remove nothing.
 
     Args:
         scenes: scenes in the map frame.
         prefer: preferred scene where scenes disagree.
         max_views: largest number of views of each scene that are compared.
-        one_exposure: bring all scenes to the newest one's exposure. Not for a piece of a map, whose neighbours would
-            show the same scene in another exposure.
+        one_exposure: bring all scenes to the exposure of the newest scene. Do not use it for a piece of a map:
+            neighbouring pieces would show the same scene in another exposure.
     """
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
     changed, behind = ([np.zeros(len(s.gaussians), dtype=bool) for s in scenes] for _ in range(2))
@@ -152,8 +153,8 @@ def resolve_changes(
                 first += len(rows)
             replacements[i] = Gaussians.concatenate([replacements[i], joined.gaussians[verdict.replacing]])
             if group is groups[-1]:
-                continue  # nothing is compared with the oldest
-            # Only Gaussians unobserved by newer scenes are added, so that `newer` stays as large as the place.
+                continue  # no scene is older than the oldest
+            # Only Gaussians that no newer scene observed are added, so that `newer` does not outgrow the place.
             shows = keeps[i] & views.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
             added.append(
                 _NewerScene(i, _in_one_exposure(compare.mask_outdated(views, found, keeps[i]), exposures[i]), shows)
@@ -171,7 +172,7 @@ def resolve_changes(
 
 @dataclass(frozen=True, eq=False)
 class _NewerScene:
-    """A newer scene: its index, its views, and (N,) bool, its Gaussians that are compared with older scenes."""
+    """A newer scene: its index, its views, and an (N,) mask of its Gaussians that are compared with older scenes."""
 
     scene: int
     views: CaptureViews
@@ -180,7 +181,8 @@ class _NewerScene:
 
 @dataclass(frozen=True, eq=False)
 class _Disagreement:
-    """Masks of (N,) removed Gaussians of the older scene, (M,) replacing and (M,) removed ones of the newer."""
+    """Masks of two compared scenes: (N,) removed Gaussians of the older scene; (M,) replacing and (M,) removed
+    Gaussians of the newer scene."""
 
     removed: np.ndarray
     replacing: np.ndarray
@@ -200,7 +202,7 @@ def _find_disagreement(older: CaptureViews, newer: CaptureViews, found: Comparis
 
 
 def _revealed(newer: CaptureViews, found: Comparison) -> np.ndarray:
-    """Return (M,) bool, Gaussians of the newer scene that an object of the older one occluded."""
+    """Return an (M,) mask of Gaussians of the newer scene that an object of the older scene occluded."""
     count = len(newer.gaussians)
     shown, bared = np.zeros(count), np.zeros(count)
     for picture in found.newer_views:
@@ -213,7 +215,7 @@ def _revealed(newer: CaptureViews, found: Comparison) -> np.ndarray:
 
 
 def _beside(older: np.ndarray, newer: CaptureViews, verdict: _Disagreement) -> np.ndarray:
-    """Return (N,) bool, Gaussians of the older scene (N, 3) near removed or new ones."""
+    """Return an (N,) mask that is True for Gaussians of the older scene near removed or replacing Gaussians."""
     disputed = np.concatenate([older[verdict.removed], newer.gaussians.means[verdict.replacing]])
     if not len(disputed):
         return np.zeros(len(older), dtype=bool)
@@ -222,10 +224,10 @@ def _beside(older: np.ndarray, newer: CaptureViews, verdict: _Disagreement) -> n
 
 
 def _find_misfits(older: Gaussians, candidates: np.ndarray, newer: CaptureViews) -> np.ndarray:
-    """Return (N,) bool, candidate Gaussians of the older scene that would alter views of the newer one.
+    """Return an (N,) mask of candidate Gaussians of the older scene that would alter views of the newer scene.
 
-    They are in the newer scene's exposure. Removes what evidence on single Gaussians leaves beside a change: fragments,
-    and Gaussians smaller than a pixel.
+    The Gaussians must be in the exposure of the newer scene. This finds the outdated Gaussians beside a change that the
+    evidence on single Gaussians misses: fragments, and Gaussians smaller than a pixel.
     """
     out = np.zeros(len(older), dtype=bool)
     rows = np.flatnonzero(candidates)
@@ -251,7 +253,7 @@ def _find_misfits(older: Gaussians, candidates: np.ndarray, newer: CaptureViews)
 
 
 def _exposure(found: Comparison) -> compare.Balance | None:
-    """Return the balance from the older scene's to the newest exposure; None if it is negligible."""
+    """Return the balance from the exposure of the older scene to that of the newest scene; None if it is negligible."""
     greys = np.tile(np.array([[0.1], [0.5], [0.9]]), 3)
     off = np.log(np.maximum(found.balance.applied(greys), 1e-3) / greys)
     return found.balance if np.abs(off).max() > _NEGLIGIBLE_GAIN else None
@@ -264,7 +266,7 @@ def _exposed(gaussians: Gaussians, exposure: compare.Balance | None) -> Gaussian
 def _remaining(scene: PosedScene, stays: np.ndarray, exposure: compare.Balance | None) -> PosedScene:
     if stays.all() and exposure is None:
         return scene
-    # Earlier renders of its views show the removed Gaussians.
+    # Earlier renders of the scene's views show the removed Gaussians.
     return replace(scene, reference_views=None, gaussians=_exposed(scene.gaussians[stays], exposure))
 
 
@@ -273,7 +275,7 @@ def _in_one_exposure(views: CaptureViews, exposure: compare.Balance | None) -> C
 
 
 def _in_grey(gaussians: Gaussians, value: float) -> Gaussians:
-    """Return the Gaussians in one grey, in [0, 1], independent of the viewing direction."""
+    """Return the Gaussians with one grey value in [0, 1], independent of the viewing direction."""
     return replace(gaussians, sh=sh0_of_rgb(np.full((len(gaussians), 1, 3), value, np.float32)))
 
 
@@ -282,7 +284,7 @@ def _empty(scene: PosedScene) -> Gaussians:
 
 
 def _by_date(scenes: Sequence[PosedScene]) -> list[list[int]]:
-    """Group the indices of dated scenes by date, newest first; empty for a single date."""
+    """Group the indices of dated scenes by date, newest first; return nothing if all have one date."""
     times = {i: _time(scene.captured_at) for i, scene in enumerate(scenes)}
     dated = {i: time for i, time in times.items() if time is not None}
     groups = [[i for i, then in dated.items() if then == time] for time in sorted(set(dated.values()), reverse=True)]
@@ -290,7 +292,7 @@ def _by_date(scenes: Sequence[PosedScene]) -> list[list[int]]:
 
 
 def newest_first(scenes: Sequence[PosedScene]) -> list[int]:
-    """Return the indices of all scenes, newest first, undated ones last in their order."""
+    """Return the indices of all scenes, newest first; undated scenes come last, in their given order."""
     times = [_time(scene.captured_at) for scene in scenes]
     return sorted(range(len(scenes)), key=lambda i: (-t.timestamp() if (t := times[i]) else np.inf, i))
 

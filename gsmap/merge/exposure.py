@@ -1,4 +1,4 @@
-"""Exposure balancing: scenes of different exposure and white balance are brought to one."""
+"""Balance exposure: bring scenes of different exposure and white balance to a common one."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from gsmap.merge.overlap import boxes_overlap, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PosedScene, ReferencePhoto
 
-_MAX_VIEWS, _LONGEST_SIDE_PX = 6, 160  # of a pair: views of one scene that see most of the other, and their size
-_MIN_PIXELS = 500  # that show one surface in both scenes, for a gain to be estimated
-_MAX_DEPTH_RATIO = 0.05  # relative difference in depth of one surface
-_MIN_ALPHA = 0.95  # of a pixel that shows a surface
-_MIN_COLOUR, _MAX_COLOUR = 0.05, 0.95  # colours outside are black or saturated
+# For each pair: number of views of one scene that see most of the other, and their size.
+_MAX_VIEWS, _LONGEST_SIDE_PX = 6, 160
+_MIN_PIXELS = 500  # smallest number of pixels that show one surface in both scenes for a gain to be estimated
+_MAX_DEPTH_RATIO = 0.05  # largest relative difference in depth between pixels of one surface
+_MIN_ALPHA = 0.95  # smallest alpha of a pixel that shows a surface
+_MIN_COLOUR, _MAX_COLOUR = 0.05, 0.95  # colours outside this range are black or saturated
 _NEGLIGIBLE_LOG_GAIN = 0.01
 _MAX_GAIN = 4.0
 
 
 def balance_exposure(scenes: Sequence[PosedScene]) -> tuple[list[PosedScene], np.ndarray]:
-    """Balance scenes by one gain per scene and colour channel; return them and the applied log-gains (S, 3).
+    """Balance scenes by one gain per scene and colour channel; return the scenes and the applied log-gains (S, 3).
 
-    Gains are the least-squares solution to the median log-ratios of colour on common surfaces of scene pairs; their
-    mean over connected scenes is zero, which preserves the overall brightness.
+    The log-gains are the least-squares fit to the median log-ratios of colour on surfaces that pairs of scenes share.
+    Their mean over connected scenes is zero, which preserves the overall brightness.
     """
     log_gains = _solve(len(scenes), _ratios(scenes))
     if np.abs(log_gains).max(initial=0) < _NEGLIGIBLE_LOG_GAIN:
@@ -44,21 +45,21 @@ def balance_exposure(scenes: Sequence[PosedScene]) -> tuple[list[PosedScene], np
 
 
 def _with_gain(photo: ReferencePhoto, gain: np.ndarray) -> ReferencePhoto:
-    """Apply a gain to the surroundings that a photo's colours are balanced to."""
+    """Apply a gain to the scene colours to which a photo's colours are balanced."""
     around = photo.around
     return photo if around is None else replace(photo, around=lambda: apply_gain(around(), gain))
 
 
 def apply_gain(gaussians: Gaussians, gain: np.ndarray) -> Gaussians:
-    """Multiply the colours of Gaussians by ``gain`` (3,), exactly, for every viewing direction."""
+    """Multiply the colours of Gaussians by ``gain`` (3,), exactly and for every viewing direction."""
     sh = gaussians.sh * gain.astype(np.float32)
-    # Colour is SH + 0.5: the offset must grow too.
+    # Colour is SH + 0.5, so the offset must be scaled as well.
     sh[:, 0] += ((gain - 1) * 0.5 / SH_C0).astype(np.float32)
     return replace(gaussians, sh=sh)
 
 
 def apply_balance(gaussians: Gaussians, balance: Balance) -> Gaussians:
-    """Bring Gaussians to the exposure of another capture by a balance of gain, gamma and white balance.
+    """Convert Gaussians to the exposure of another capture by a balance of gain, gamma and white balance.
 
     Mean colours follow the balance, and direction-dependent terms are multiplied by its local slope.
     """
@@ -72,7 +73,8 @@ def apply_balance(gaussians: Gaussians, balance: Balance) -> Gaussians:
 
 
 def _ratios(scenes: Sequence[PosedScene]) -> list[tuple[int, int, np.ndarray, float]]:
-    """Return (i, j, median log(colour_i / colour_j) (3,), pixels) of every pair of scenes with a common surface."""
+    """For every pair of scenes with a common surface return (i, j, median log(colour_i / colour_j) (3,), number of
+    pixels)."""
     found = []
     for i, scene in enumerate(scenes):
         for j, other in enumerate(scenes):
@@ -87,14 +89,14 @@ def _ratios(scenes: Sequence[PosedScene]) -> list[tuple[int, int, np.ndarray, fl
 
 
 def _looking_at(cameras: Cameras, gaussians: Gaussians) -> Cameras:
-    """Select the few cameras with most of the Gaussians in view."""
+    """Select the few cameras that have most of the Gaussians in view."""
     share = share_in_view(cameras, gaussians.means)
     best = np.argsort(-share, kind="stable")[:_MAX_VIEWS]
     return cameras[best[share[best] > 0]].resized(_LONGEST_SIDE_PX)
 
 
 def _same_surface(scene: PosedScene, other: PosedScene, camera: Cameras) -> np.ndarray:
-    """Return (K, 3) log-ratios of colour at pixels of a common surface that are neither black nor saturated."""
+    """Return the (K, 3) log-ratios of colour at pixels of a common surface that are neither black nor saturated."""
     a, b = render(scene.gaussians, camera), render(other.gaussians, camera)
     same = np.abs(a.depth[0] - b.depth[0]) < _MAX_DEPTH_RATIO * np.minimum(a.depth[0], b.depth[0])
     same &= (a.alpha[0] > _MIN_ALPHA) & (b.alpha[0] > _MIN_ALPHA)
@@ -113,5 +115,5 @@ def _solve(count: int, ratios: list[tuple[int, int, np.ndarray, float]]) -> np.n
         right[i] -= weight * ratio
         right[j] += weight * ratio
     largest = np.log(_MAX_GAIN)
-    # The pseudo-inverse gives every group of connected scenes a mean of zero.
+    # The pseudo-inverse gives every group of connected scenes a mean log-gain of zero.
     return np.clip(np.linalg.pinv(normal, hermitian=True) @ right, -largest, largest)

@@ -1,4 +1,4 @@
-"""Spatial tests and concatenation of scenes in the map frame."""
+"""Test spatial overlap of scenes in the map frame, and concatenate scenes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def clamp_inside(points: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
 
 
 def concatenate_scenes(scenes: Sequence[PosedScene]) -> tuple[Gaussians, np.ndarray]:
-    """Concatenate the Gaussians of scenes, and return the scene index (N,) int32 of each."""
+    """Concatenate the Gaussians of scenes, and return the (N,) int32 scene index of each Gaussian."""
     origin = np.repeat(np.arange(len(scenes), dtype=np.int32), [len(s.gaussians) for s in scenes])
     return Gaussians.concatenate([s.gaussians for s in scenes]), origin
 
@@ -36,7 +36,7 @@ def boxes_overlap(a: PosedScene, b: PosedScene) -> bool:
 
 
 def share_in_view(cameras: Cameras, points: np.ndarray, sample: int = 2000) -> np.ndarray:
-    """Return (C,) the fraction of points (N, 3), sampled evenly, in the frustum of each camera."""
+    """Return the (C,) fraction of points (N, 3), sampled evenly, in the frustum of each camera."""
     points = points[:: max(1, len(points) // sample)].astype(np.float64)
     share = np.zeros(len(cameras))
     if len(points):

@@ -1,7 +1,8 @@
 """Kept photos as reference views of merging.
 
 A photo is sharper than a render, but has its own exposure, and may show people, moved objects or another season than
-the scene that it was localized in. So it is balanced to the colours of that scene, and counts only where both agree.
+the scene in which it was localized. So the photo is balanced to the colours of that scene, and counts only where both
+agree.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from gsmap.compare.neighbourhoods import dilate
 from gsmap.render import render
 from gsmap.types import Cameras, PosedScene, ReferencePhoto
 
-_MAX_SIGMA_PX = 3.0  # pose uncertainty of a photo that is used, at a longest side of 480 pixels
-_MIN_ALPHA = 0.9  # of the scene, in pixels that are compared
-_MIN_AGREEMENT = 0.4  # fraction of these pixels that must show the same
-_MARGIN_PX = 2  # around pixels that differ, which is ignored, too
-_MAX_SPREAD = 0.03  # standard deviation, of colours in [0, 1], about the line from photo to scene
-_MIN_SLOPE = 0.5  # of that line: a photo of another place follows nothing
+_MAX_SIGMA_PX = 3.0  # largest pose uncertainty of a photo that is used, at a longest side of 480 pixels
+_MIN_ALPHA = 0.9  # smallest alpha of the scene in pixels that are compared
+_MIN_AGREEMENT = 0.4  # smallest fraction of these pixels that must agree
+_MARGIN_PX = 2  # margin around pixels that differ, which is ignored as well
+_MAX_SPREAD = 0.03  # largest standard deviation, of colours in [0, 1], about the line from photo to scene
+_MIN_SLOPE = 0.5  # smallest slope of that line: colours of a photo of another place are unrelated
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +29,9 @@ class PhotoReference:
     """A photo as a reference view.
 
     Args:
-        camera: one camera, map frame.
-        image: (H, W, 3) uint8 in the colours of the scene.
-        counts: (H, W) bool, pixels that agree with the scene.
+        camera: one camera in the map frame.
+        image: (H, W, 3) uint8 image, balanced to the colours of the scene.
+        counts: (H, W) mask of pixels that agree with the scene.
         depth: (H, W) float32 depth of the scene, 0 without a surface.
     """
 
@@ -41,7 +42,8 @@ class PhotoReference:
 
 
 def make_photo_reference(photo: ReferencePhoto, scene: PosedScene, longest_side_px: int) -> PhotoReference | None:
-    """Balance a photo to its scene and mask pixels that disagree; None for another place or an uncertain pose."""
+    """Balance a photo to its scene and mask pixels that disagree; return None if it shows another place or its pose is
+    uncertain."""
     longest = int(photo.camera.sizes_px.max())
     camera = photo.camera.resized(min(longest_side_px, longest))
     seen = render(scene.gaussians if photo.around is None else photo.around(), camera, dominant_id=False)
@@ -70,7 +72,7 @@ def make_photo_reference(photo: ReferencePhoto, scene: PosedScene, longest_side_
 
 
 def _resized(picture: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Resize an image to a camera's size, (H, W, 3) float32 in [0, 1]."""
+    """Resize an image to the size of a camera; return (H, W, 3) float32 in [0, 1]."""
     from PIL import Image
 
     width, height = (int(side) for side in camera.sizes_px[0])

@@ -1,7 +1,7 @@
-"""Cache of reference views: renders of a scene's own views, shared by all tiles that they show.
+"""Cache of reference views: renders of a scene's own views, shared by all tiles that appear in them.
 
-A view is rendered in the scene's own frame, from the Gaussians around its camera rather than around a tile, so that it
-does not depend on the tile, nor on which tiles are made together.
+A view is rendered in the scene's own frame, from the Gaussians around its camera rather than around a tile. So it does
+not depend on the tile, or on which tiles are computed together.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, Sim3
 
 _CAN_BE_HELD = 256 << 20
-"""Bytes of reference views that a process keeps in memory without a folder for them."""
+"""Size in bytes of the reference views that a process without a cache folder keeps in memory."""
 
 _CELL = 0.25
-"""Edge of the cells by which cameras are grouped, so that their surroundings are read once; relative to the radius of
-these."""
+"""Edge of the cells by which cameras are grouped, so that the surroundings of a cell are read once; relative to the
+radius of\nthe surroundings."""
 
 
-_KINDS = (np.float64, np.uint64, np.int32, np.float32, np.float32)  # of the arrays of a view
+_KINDS = (np.float64, np.uint64, np.int32, np.float32, np.float32)  # types of the arrays of a view
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceView:
-    """Visibility data of one view of a scene, scene frame and unit.
+    """Visibility data of one view of a scene, in the scene's frame and unit.
 
     Args:
         box: (2, 3) lowest and highest corner of the visible surface.
-        keys: (K,) uint64, sorted: keys of the visible Gaussians by `keys_of`.
-        pixels: (K,) int32 number of pixels that each of them dominates.
-        largest: (K,) float32 largest blending weight of each of them.
-        depth: (H, W) float32 expected z of the surface, 0 without one.
+        keys: (K,) uint64 sorted keys of the visible Gaussians, from `keys_of`.
+        pixels: (K,) int32 number of pixels that each visible Gaussian dominates.
+        largest: (K,) float32 largest blending weight of each visible Gaussian.
+        depth: (H, W) float32 expected z of the surface, 0 without a surface.
     """
 
     box: np.ndarray
@@ -77,7 +77,7 @@ class ReferenceView:
         Raises:
             OSError, ValueError: the file is missing, or truncated.
         """
-        # Bare arrays in sequence: a tile reads hundreds, and headers would take longer.
+        # Raw arrays in sequence: a tile reads hundreds of views, and parsing headers would take longer.
         content = path.read_bytes()
         shown, height, width = np.frombuffer(content, "<i8", 3).tolist()
         parts, at = [], 24
@@ -91,26 +91,26 @@ class ReferenceView:
 
 @dataclass(frozen=True)
 class ReferenceViewCache:
-    """Store of the reference views of one run while tiles are made.
+    """Cache of the reference views of one run while tiles are computed.
 
     Args:
-        folder: folder of files shared by processes, unique to the run; if its parent does not exist, a few views are
-            kept in memory instead.
-        max_bytes: largest size of the files, of which the oldest are deleted first.
+        folder: folder of files that the processes of one run share; if its parent does not exist, a few views are kept
+            in memory instead.
+        max_bytes: largest total size of the files; the oldest files are deleted first.
     """
 
     folder: str = field(default_factory=lambda: f"/nowhere/{secrets.token_hex(16)}")
     max_bytes: int = 4 << 30
 
     def get(self, name: str, make: Callable[[], ReferenceView]) -> ReferenceView:
-        """Return the view of a name, made if it is not kept."""
+        """Return the view with a name; call ``make`` if the view is not in the cache."""
         folder = Path(self.folder)
         if not folder.parent.is_dir():
             return self._held(name, make)
         with suppress(OSError, ValueError):
             return ReferenceView.read(folder / name)
         made = make()
-        with suppress(OSError):  # with a full disk it is made again for the next tile
+        with suppress(OSError):  # with a full disk the view is computed again for the next tile
             folder.mkdir(exist_ok=True)
             made.write(folder / name)
             self._make_room(made.num_bytes)
@@ -119,13 +119,14 @@ class ReferenceViewCache:
     def _held(self, name: str, make: Callable[[], ReferenceView]) -> ReferenceView:
         at = (self.folder, name)
         found = make() if at not in _HELD else _HELD.pop(at)
-        _HELD[at] = found  # the newest last
+        _HELD[at] = found  # the newest view is last
         while len(_HELD) > 1 and sum(view.num_bytes for view in _HELD.values()) > _CAN_BE_HELD:
             _HELD.popitem(last=False)
         return found
 
     def _make_room(self, num_bytes: int) -> None:
-        """Delete the oldest files if all take too much; tested once per sixteenth of the limit."""
+        """Delete the oldest files if all files together are too large; the size is tested once per sixteenth of the
+        limit."""
         _WRITTEN[self.folder] += num_bytes
         if _WRITTEN[self.folder] < self.max_bytes / 16:
             return
@@ -142,7 +143,7 @@ class ReferenceViewCache:
 
 
 _HELD: OrderedDict[tuple[str, str], ReferenceView] = OrderedDict()
-_WRITTEN: Counter[str] = Counter()  # bytes by folder since its size was last tested
+_WRITTEN: Counter[str] = Counter()  # bytes written to each folder since its size was last tested
 
 
 T = TypeVar("T")
@@ -150,11 +151,11 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class RegionCache(Generic[T]):
-    """Data of the surroundings of cameras, made once per cell of cameras; the last one is cached.
+    """Data of the surroundings of cameras, computed once per cell of cameras; the data of the last cell are cached.
 
     Args:
-        make: makes the data of a box (2, 3), or more.
-        around: half the edge of the box around a camera, at least, in the unit of the box.
+        make: function that returns the data of at least a box (2, 3).
+        around: smallest distance from a camera to each side of its box, in the unit of the box.
     """
 
     make: Callable[[np.ndarray], T]
@@ -169,7 +170,7 @@ class RegionCache(Generic[T]):
         """Return the data of the surroundings of a camera centre (3,)."""
         cell = self.cell(centre)
         if self._last is None or self._last[0] != cell:
-            self._last = None  # freed first, so that two are never in memory
+            self._last = None  # freed first, so that data of two cells are never in memory
             low = np.array(cell) * _CELL * self.around
             self._last = cell, self.make(np.array([low - self.around, low + (1 + _CELL) * self.around]))
         return self._last[1]
@@ -181,9 +182,9 @@ class SceneReferenceViews:
 
     Args:
         scene_id: id of the scene.
-        load: loads the Gaussians with means in a box (2, 3) of the scene frame, or more.
-        cameras: all cameras of the scene, its frame.
-        around: least distance, in the scene's unit, from a camera along each axis within which Gaussians are rendered.
+        load: function that loads at least the Gaussians with means in a box (2, 3) of the scene frame.
+        cameras: all cameras of the scene, in the scene's frame.
+        around: Gaussians within at least this distance along each axis from a camera are rendered, in the scene's unit.
         longest_side_px: longest side of the views.
         store: cache of the views.
     """
@@ -205,7 +206,7 @@ class SceneReferenceViews:
         return self.store.get(text_digest(" ".join(map(str, about)))[:32], lambda: self._seen(camera))
 
     def cell(self, camera: int) -> tuple[int, ...]:
-        """Return the cell of a camera; cameras of one cell are best processed in sequence."""
+        """Return the cell of a camera; it is best to process the cameras of one cell in sequence."""
         return self._nearby.cell(self.cameras.centers[camera])
 
     def _seen(self, camera: int) -> ReferenceView:
@@ -229,10 +230,10 @@ class SceneReferenceViews:
 
 @dataclass(frozen=True, eq=False)
 class PlacedReferenceViews:
-    """The reference views of a placed scene, for the piece of it that a tile reads.
+    """The reference views of a placed scene, for the piece of the scene that a tile reads.
 
     Args:
-        views: of the scene.
+        views: reference views of the scene.
         S_map_scene: pose of the scene.
         rows: (C,) index in the scene of each placed camera.
         keys: (N,) uint64 keys of the placed Gaussians.
@@ -246,7 +247,7 @@ class PlacedReferenceViews:
     order: np.ndarray
 
     def of(self, camera: int) -> ReferenceView:
-        """Return the view of a placed camera, in the scene frame."""
+        """Return the view of a placed camera, in the frame of the scene."""
         return self.views.of(int(self.rows[camera]))
 
     def cell(self, camera: int) -> tuple[int, ...]:
@@ -254,12 +255,12 @@ class PlacedReferenceViews:
         return self.views.cell(int(self.rows[camera]))
 
     def depth(self, view: ReferenceView) -> np.ndarray:
-        """Return the depth (H, W) of a view in the map's unit."""
+        """Return the depth image (H, W) of a view, in the map's unit."""
         found: np.ndarray = view.depth * np.float32(self.S_map_scene.scale)
         return found
 
     def touches(self, view: ReferenceView, bounds: np.ndarray | None, margin: float) -> bool:
-        """Return whether the surface of a view may reach into map bounds (2, 3) grown by a margin."""
+        """Return whether the surface in a view may reach into the map bounds (2, 3), enlarged by a margin."""
         if bounds is None:
             return True
         if not np.isfinite(view.box).all():
@@ -268,10 +269,10 @@ class PlacedReferenceViews:
         return bool((low <= bounds[1] + margin).all() and (high >= bounds[0] - margin).all())
 
     def count(self, view: ReferenceView, pixels: np.ndarray, largest: np.ndarray) -> None:
-        """Add the pixels and largest weights of the placed Gaussians in a view to (N,) arrays."""
+        """Add the pixels and the largest weights of the placed Gaussians in a view to the (N,) arrays."""
         if not len(view.keys):
             return
-        # Sorted queries: random access takes several times as long.
+        # The queries are sorted, because random access takes several times as long.
         at = np.minimum(np.searchsorted(view.keys, self.keys[self.order]), len(view.keys) - 1)
         known = view.keys[at] == self.keys[self.order]
         rows, at = self.order[known], at[known]
@@ -280,7 +281,8 @@ class PlacedReferenceViews:
 
 
 def keys_of(means: np.ndarray) -> np.ndarray:
-    """Return (N,) uint64 keys of the Gaussians of one scene, independent of the piece that is read: hashed means."""
+    """Return (N,) uint64 keys of the Gaussians of one scene: hashes of their means, which do not depend on the piece
+    that is read."""
     bits = np.ascontiguousarray(means, dtype=np.float32).view(np.uint32).astype(np.uint64)
     mixed: np.ndarray = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
     for axis in (1, 2):
@@ -289,7 +291,7 @@ def keys_of(means: np.ndarray) -> np.ndarray:
 
 
 def _box_of(view: Cameras, depth: np.ndarray) -> np.ndarray:
-    """Return the (2, 3) box around the surface of a depth map; empty (low above high) without one."""
+    """Return the (2, 3) box around the surface of a depth image; empty (low above high) without a surface."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     shown = depth > 0
     if not shown.any():
@@ -301,7 +303,7 @@ def _box_of(view: Cameras, depth: np.ndarray) -> np.ndarray:
 
 
 def surface_axes(camera: Cameras, depth: np.ndarray) -> list[np.ndarray]:
-    """Return x, y and z, each (H, W) float32, of the points of a depth map in the frame of the camera's pose."""
+    """Return x, y and z, each (H, W) float32, of the points of a depth image in the frame of the camera's pose."""
     height, width = depth.shape
     fx, fy, cx, cy = camera.intrinsics_px[0]
     x = (np.arange(width) + 0.5 - cx) / fx

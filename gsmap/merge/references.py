@@ -17,14 +17,15 @@ from gsmap.render import Rendering, render
 from gsmap.types import Cameras, Gaussians, PosedScene
 from gsmap.types.progress import Progress
 
-WEIGHT_UNIT = 0.1  # of `References.visible_pixels`, for Gaussians that dominate no pixel: always less than one pixel
+# Factor in `References.visible_pixels` for Gaussians that dominate no pixel: they count less than one pixel.
+WEIGHT_UNIT = 0.1
 
 
 MAX_VIEWS, PHOTO_WEIGHT = 360, 4.0  # defaults of `render_references`
-_MIN_TILE_FRACTION = 0.02  # of a view that must show the tile
-_FULL_TILE_FRACTION = 0.25  # from which on a view is used once in every pass; with less, in proportion
-_MARGIN_PX = 6  # around what counts of a view, for the windows of SSIM
-_MAX_PHOTOS = 120  # of a tile; those in which most of it lies
+_MIN_TILE_FRACTION = 0.02  # smallest share of a view that must show the tile
+_FULL_TILE_FRACTION = 0.25  # with at least this share a view is used once in every pass, otherwise in proportion
+_MARGIN_PX = 6  # margin around the valid pixels of a view, for the windows of SSIM
+_MAX_PHOTOS = 120  # of a tile: the photos that show most of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +33,14 @@ class References:
     """V reference views.
 
     Args:
-        cameras: V cameras, map frame, cropped to the valid pixels.
+        cameras: V cameras in the map frame, cropped to the valid pixels.
         images: V images (H, W, 3) uint8.
         weights: V maps (H, W) uint8, 255 for fully valid pixels, 0 where the scene is empty and outside the tile.
         scene: (V,) scene of each view.
-        view_weights: (V,) uses of each view in one pass over all; at most 1 for rendered views.
-        visible_pixels: per scene (N,) float32 number of pixels of its own views that each Gaussian dominates; without
-            any, `WEIGHT_UNIT` times its largest weight in any pixel; 1 for all without views.
+        view_weights: (V,) number of uses of each view in one pass over all views; at most 1 for rendered views.
+        visible_pixels: per scene, the (N,) float32 number of pixels of the scene's own views that each Gaussian
+            dominates. A Gaussian that dominates none has `WEIGHT_UNIT` times its largest weight in any pixel; without
+            views all have 1.
         num_photos: number of views that are photos.
     """
 
@@ -67,19 +69,20 @@ def render_references(
 ) -> References:
     """Render each scene from its own cameras, and keep the views that show enough of the tile.
 
-    Pixels are weighted by the scene's own opacity. For a tile, pixels are valid whose surface lies inside it or within
-    half the halo, so that the border is constrained from both sides, and only Gaussians within the halo are rendered,
-    as farther ones are absent when the tile is fitted.
+    Pixels are weighted by the scene's own opacity. For a tile, a pixel is valid if its surface lies inside the tile or
+    within half the halo, so that the border is constrained from both sides. Only Gaussians within the halo are
+    rendered, because farther Gaussians are absent when the tile is fitted.
 
     Args:
-        scenes: in the map frame.
-        bounds: (2, 3) box of the tile; None for all.
+        scenes: scenes in the map frame.
+        bounds: (2, 3) box of the tile; None for everything.
         halo_m: width of the tile's surroundings.
         longest_side_px: longest side of the views.
-        settled: outdated pixels of each scene's views (`gsmap.merge.changes`); None for none.
+        settled: resolved changes, which give the outdated pixels of views (`gsmap.merge.changes`); None without
+            changes.
         progress: called with the fraction done in [0, 1] and the current step.
         max_views: largest number of rendered views.
-        photo_weight: uses of a photo in every pass, relative to a rendered view; 0 ignores photos.
+        photo_weight: number of uses of a photo in every pass, relative to a rendered view; 0 ignores photos.
     """
     near = [inside(scene.gaussians.means, bounds, halo_m) for scene in scenes]
     pieces = [scene.gaussians if n.all() else scene.gaussians[n] for scene, n in zip(scenes, near, strict=True)]
@@ -171,7 +174,7 @@ def _photos(
     pieces: Sequence[Gaussians],
     longest_side_px: int,
 ) -> Iterator[tuple[int, photos.PhotoReference]]:
-    """Yield photos that show the tile and agree with their scene, with the index of that scene."""
+    """Yield photos that show the tile and agree with their scene, each with the index of the scene."""
     candidates = [
         (i, photo, share)
         for i, (scene, piece) in enumerate(zip(scenes, pieces, strict=True))
@@ -187,16 +190,16 @@ def _photos(
             yield i, one
 
 
-_SAMPLE = 600  # points by which views are selected, if there are too many
+_SAMPLE = 600  # number of points by which views are selected if there are too many views
 
 
 def _best_views(
     todo: list[tuple[int, int, Cameras]], scenes: Sequence[PosedScene], pieces: Sequence[Gaussians], count: int
 ) -> list[tuple[int, int, Cameras]]:
-    """Select at most ``count`` views greedily by coverage, in their order.
+    """Select at most ``count`` views greedily by coverage, and return them in their original order.
 
-    A view adds to each visible point its resolution in pixels per metre, less for every selected view of the point, and
-    less for older scenes.
+    The gain of a view is the sum over visible points of its resolution in pixels per metre; it is lower for points with
+    more selected views, and for older scenes.
     """
     if len(todo) <= count:
         return todo
@@ -207,7 +210,7 @@ def _best_views(
     for row, (i, _, camera) in enumerate(todo):
         pixels, depth = project(points, camera.T_camera_frame[0], camera.intrinsics_px[0])
         seen = in_image(pixels, depth, camera.sizes_px[0], near=0.1)
-        # Nearer than a metre, resolution does not count more.
+        # The gain of resolution is limited to that at a distance of a metre.
         sharpness[row, seen] = 1 / np.maximum(depth[seen], 1.0) / (1 + 0.1 * age[i])
     often = np.zeros(len(points), dtype=np.float32)
     chosen = []
@@ -222,7 +225,8 @@ def _best_views(
 def _count(
     seen: Rendering, disputed: np.ndarray | None, pixels: np.ndarray, sure: np.ndarray, largest: np.ndarray
 ) -> None:
-    """Count dominated pixels, all and undisputed: Gaussians visible only at disputed pixels count for nothing."""
+    """Count dominated pixels, both all and undisputed ones: Gaussians that are visible only at disputed pixels count
+    nothing."""
     dominant = seen.dominant_id[0]
     pixels += np.bincount(dominant[dominant >= 0], minlength=len(pixels))
     undisputed = dominant >= 0 if disputed is None else (dominant >= 0) & ~disputed
@@ -248,10 +252,10 @@ def _cropped(camera: Cameras, window: tuple[slice, slice]) -> Cameras:
 
 
 def _visible_pixels(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:
-    """Compute `References.visible_pixels` of one scene.
+    """Compute `References.visible_pixels` for one scene.
 
-    Unobserved Gaussians count 0 in a whole scene; in a piece of one, further views may observe them, so they count
-    half a pixel.
+    Unobserved Gaussians count 0 in a whole scene. In a piece of a scene further views may observe them, so there they
+    count half a pixel.
     """
     if not largest.any():
         return np.ones(len(pixels), dtype=np.float32)
@@ -260,19 +264,19 @@ def _visible_pixels(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.
 
 
 def view_schedule(view_weights: np.ndarray, steps: int, seed: int) -> np.ndarray:
-    """Return (steps,) the view of each step, in proportion to the weights and spread evenly over time."""
+    """Return the (steps,) view of each step; views occur in proportion to their weights, spread evenly over time."""
     rng = np.random.default_rng(seed)
     times, views = [], []
     for view, rate in enumerate(view_weights / view_weights.sum()):
         count = int(np.ceil(steps * rate)) + 1
-        # Every view is used once per 1/rate steps, at a random phase each time.
+        # Every view is used once in each interval of 1/rate steps, at a random phase.
         times.append((np.arange(count) + rng.random(count)) / rate)
         views.append(np.full(count, view))
     return np.concatenate(views)[np.argsort(np.concatenate(times), kind="stable")][:steps]
 
 
 def inside_pixels(camera: Cameras, depth: np.ndarray, bounds: np.ndarray | None, band_m: float) -> np.ndarray:
-    """Return (H, W) bool, pixels of a depth map whose surface lies in the bounds grown by a band."""
+    """Return an (H, W) mask of pixels of a depth image whose surface lies in the bounds enlarged by a band."""
     if bounds is None:
         return np.ones(depth.shape, dtype=bool)
     found: np.ndarray = depth > 0

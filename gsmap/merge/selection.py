@@ -1,4 +1,4 @@
-"""Selection of Gaussians of overlapping scenes: one owner scene per cell."""
+"""Select Gaussians of overlapping scenes: each cell belongs to one owner scene."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from gsmap.types import Gaussians
 def select_owners(
     gaussians: Gaussians, origin: np.ndarray, visible_pixels: np.ndarray, cell_m: float, cover_m: float
 ) -> np.ndarray:
-    """Return (N,) bool, Gaussians that stay when every grid cell belongs to the scene that shows most of it.
+    """Return an (N,) mask of Gaussians that remain if every grid cell belongs to the scene that shows most of it.
 
-    Two scenes of one surface overlaid blur it and absorb light twice: the ghosts of a plain union. A Gaussian of
-    another scene than its cell's owner stays only where the owner has none near, as it did not observe the place.
+    If two scenes of one surface are overlaid, they blur the surface and absorb light twice, as in a plain union. A
+    Gaussian of a scene that does not own its cell stays only if the owner has no Gaussian nearby, that is, did not
+    observe the place.
 
     Args:
         gaussians: N Gaussians of all scenes.
         origin: (N,) scene of each Gaussian.
-        visible_pixels: (N,) pixels that each Gaussian dominates in its own scene's views.
+        visible_pixels: (N,) number of pixels that each Gaussian dominates in the views of its own scene.
         cell_m: edge of a cell.
-        cover_m: distance within which a Gaussian of the owner replaces another scene's.
+        cover_m: a Gaussian of the owner replaces Gaussians of other scenes within this distance.
     """
     from scipy.spatial import cKDTree
 
@@ -46,7 +47,8 @@ def select_owners(
 
 
 def near_other_scene(means: np.ndarray, origin: np.ndarray, chosen: np.ndarray, distance_m: float) -> np.ndarray:
-    """Return (N,) bool, Gaussians not chosen that lie within a distance of a chosen one of another scene."""
+    """Return an (N,) mask of Gaussians that are not chosen but lie within a distance of a chosen Gaussian of another
+    scene."""
     from scipy.spatial import cKDTree
 
     near = np.zeros(len(means), dtype=bool)

@@ -1,4 +1,4 @@
-"""Merging of one tile from scenes that are read in pieces."""
+"""Merge one tile from scenes that are read in pieces."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class LazyScene:
     Args:
         scene_id: id of the scene.
         S_map_scene: pose of the scene.
-        load: loads the Gaussians with means in a box (2, 3) of the scene frame, or more; all for None.
-        cameras: its cameras, scene frame.
+        load: function that loads at least the Gaussians with means in a box (2, 3) of the scene frame; all for None.
+        cameras: cameras of the scene, in the scene's frame.
         captured_at: ISO 8601 time with zone, or None.
-        store: cache of its reference views, shared with further tiles.
+        store: cache of the scene's reference views, shared with further tiles.
         without: digest of the Gaussians that ``load`` leaves out; empty for none.
-        load_within: as ``load``, but without Gaussians outside of the box, where that is cheaper.
-        photos: kept photos of the scene, scene frame and unit.
+        load_within: as ``load``, but it may omit Gaussians outside of the box if that is cheaper.
+        photos: kept photos of the scene, in the scene's frame and unit.
     """
 
     scene_id: str
@@ -52,7 +52,7 @@ class LazyScene:
     photos: tuple[ReferencePhoto, ...] = ()
 
     def centroid(self) -> np.ndarray | None:
-        """Return (3,) the mean of all its means, map frame; None if it is empty."""
+        """(3,) mean of all means of the scene in the map frame; None if the scene is empty."""
         means = self.load(None).means
         return self.S_map_scene.apply(means.mean(0, dtype=np.float64)) if len(means) else None
 
@@ -68,7 +68,7 @@ def merge_tile(
 ) -> MergeResult:
     """Read the surroundings of a tile, transform them to the map frame and merge them; see `gsmap.merge.merge`.
 
-    Memory is bounded by the Gaussians within the merger's ``reading_m`` of the tile, and around one camera of one
+    Memory is bounded by the Gaussians within the merger's ``reading_m`` of the tile and those around one camera of one
     scene. ``origin`` of the result indexes ``scenes``.
     """
     if not scenes:
@@ -84,7 +84,7 @@ def merge_tile(
 
 
 def _undated(placed: Sequence[PosedScene]) -> list[str]:
-    """Return a note if overlapping scenes lack dates."""
+    """Return a note if overlapping scenes have no date."""
     if all(scene.captured_at is not None for scene in placed):
         return []
     meeting = [scene for scene in placed if any(scene is not other and boxes_overlap(scene, other) for other in placed)]
@@ -92,8 +92,8 @@ def _undated(placed: Sequence[PosedScene]) -> list[str]:
     if not count:
         return []
     return [
-        f"{count} of {len(meeting)} captures have no date, so their order is unknown; "
-        "set it by gsmap edit MAP SCENE --captured-at DATE"
+        f"{count} of {len(meeting)} overlapping captures have no date, so their order is unknown; "
+        "set dates with gsmap edit MAP SCENE --captured-at DATE"
     ]
 
 
@@ -124,7 +124,7 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pos
         cameras = cameras[found]
         if inside(cameras.centers, near).all() and reading.looking_m > 0:
             rows = found
-        if rows is None or reading.reading_m > reading.reach_m:  # views are rendered from these Gaussians
+        if rows is None or reading.reading_m > reading.reach_m:  # views are rendered from these additional Gaussians
             box = np.array([np.minimum(box[0], around[0]), np.maximum(box[1], around[1])])
     read = (scene.load_within or scene.load)(_box_in(S.inverse(), box))
     inner = inside(S.apply(read.means).astype(np.float32), box)
@@ -154,9 +154,10 @@ def _reference_views(
 
 
 def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarray:
-    """Grow a box to contain at least the nearest few cameras.
+    """Enlarge a box so that it contains at least the nearest few cameras.
 
-    A box is convex, so nothing outside occludes the tile from a camera inside, and the piece in the box suffices.
+    A box is convex, so nothing outside of it occludes the tile from a camera inside it; the piece of the scene in the
+    box suffices.
     """
     distance = np.linalg.norm(np.maximum(np.maximum(box[0] - centers, centers - box[1]), 0), axis=1)
     nearest = centers[np.argsort(distance, kind="stable")[:count]]
@@ -166,7 +167,7 @@ def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarra
 
 
 def _box_in(S_b_a: Sim3, box: np.ndarray) -> np.ndarray:
-    """Return the axis-aligned box (2, 3) in frame b around a box of frame a, padded against rounding."""
+    """Return the axis-aligned box (2, 3) in frame b around a box of frame a, enlarged against rounding errors."""
     moved = moved_box(box, S_b_a)
     pad = 1e-5 * (1 + np.abs(moved).max())
     return np.array([moved[0] - pad, moved[1] + pad])

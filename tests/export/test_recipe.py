@@ -168,10 +168,10 @@ def test_format_packed_provenance_and_budget_are_part_of_what_a_tile_is(row):
 def test_notes_recipe_and_key_are_in_the_manifest_and_in_the_answer(row):
     result = row.export(Params("tto"))
     entry = row.entries()[0]
-    assert entry["notes"] == ["nothing to optimize: no camera observes the tile"] == list(result.tiles[0].notes)
+    assert entry["notes"] == ["no camera observes the tile, so it is not optimized"] == list(result.tiles[0].notes)
     assert entry["key"] == result.tiles[0].key
     assert entry["recipe"] == recipe_key("tto").to_json() == result.tiles[0].recipe
-    assert result.notes == (f"{len(result.tiles)} tiles: nothing to optimize: no camera observes the tile",)
+    assert result.notes == (f"{len(result.tiles)} tiles: no camera observes the tile, so it is not optimized",)
     again = row.export(Params("tto"))
     assert again.notes == ()
     assert again.tiles[0].notes == result.tiles[0].notes

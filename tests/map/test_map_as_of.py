@@ -97,7 +97,7 @@ def test_whom_to_believe_is_part_of_how_a_tile_is_made(site: Map, tmp_path: Path
     assert export() == 1
     with raises(ConfigError, code="option_not_applicable", match="--prefer"):
         export(merge="distance", prefer="newest")
-    with raises(ConfigError, code="invalid_choice", match="prefer is one of newest, best, both, got 'oldest'"):
+    with raises(ConfigError, code="invalid_choice", match="--prefer must be one of newest, best, both, got 'oldest'"):
         export(prefer="oldest")
 
 

@@ -1,4 +1,5 @@
-"""Merging by distance, as in GaussReg: each scene keeps the Gaussians nearest to its own centroid."""
+"""Merge by distance, as in GaussReg: each scene keeps the Gaussians that are nearer to its own centroid than to any
+other."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ RENDERS = False
 
 @dataclass(frozen=True)
 class Params:
-    """Settings of distance-based selection: none."""
+    """Settings of merging by distance: none."""
 
 
 def reach_m(params: Params) -> float:
@@ -48,11 +49,13 @@ def merge(
     budget_s: float | None,
     progress: Progress,
 ) -> MergeResult:
-    """Keep the Gaussians nearest to their own scene's centroid.
+    """Keep the Gaussians that are nearest to the centroid of their own scene.
 
-    For two scenes this is a bisecting plane: keep i of A iff ``|mu_i - c_A| < |mu_i - c_B|``, and j of B the other way.
+    For two scenes A and B the border is the bisecting plane: a Gaussian i of A is kept iff
+    ``|mu_i - c_A| < |mu_i - c_B|``, a Gaussian of B in the opposite case.
 
-    A centroid is the unweighted mean of all means of the whole capture (GaussReg, fusion code); ties keep nothing.
+    A centroid is the unweighted mean of all means of the whole capture (GaussReg, fusion code). In a tie neither is
+    kept.
     """
     gaussians, origin = concatenate_scenes(scenes)
     squared = np.full((len(gaussians), len(scenes)), np.inf)

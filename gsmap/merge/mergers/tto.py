@@ -1,10 +1,11 @@
-"""Test-time optimization: the merged map is fitted to renders of each scene from that scene's own cameras.
+"""Merge by test-time optimization: the merged map is fitted to renders of each scene from that scene's own cameras.
 
-The merging of Graph-GSReg (voxelize the union, then minimize the difference to renders of the original scenes) with
-measured improvements: each cell starts from the scene that shows most of it, invisible Gaussians are removed, similar
-ones are merged above a number, the newest scene is preferred where the place changed, and exposures can be balanced.
-With `owner_cells` off, both preferred, an `ssim_weight`, `huber_delta` and `min_weight` of 0 and a `kept_fraction` of 1
-it is the published method: an L1 fit of all voxels of the union.
+The method is the merging of Graph-GSReg (voxelize the union, then minimize the difference to renders of the original
+scenes) with measured improvements. Each cell starts from the scene that shows most of it. Invisible Gaussians are
+removed, and the most similar Gaussians are merged until few enough are left. The newest scene is preferred where the
+place changed, and exposures can be balanced. With `owner_cells` off, `prefer` of ``both``, an `ssim_weight`,
+`huber_delta` and `min_weight` of 0 and a `kept_fraction` of 1 it is the published method: an L1 fit of all voxels of
+the union.
 """
 
 from __future__ import annotations
@@ -31,20 +32,22 @@ from gsmap.types import Gaussians, MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
 VERSION = 8
-"""Raised whenever the result for the same scenes changes, also by the modules of `gsmap.merge` that it calls."""
+"""Version, raised whenever the result for the same scenes changes, also through modules of `gsmap.merge` that it
+calls."""
 STEPS: str | None = "steps"
 RENDERS = True
 
-_BESIDE_M = 0.025  # distance from new Gaussians within which no other scene's Gaussians stay
-# First steps of Adam, positions relative to the Gaussians' median size: as long as pays in few passes.
+_BESIDE_M = 0.025  # Gaussians of other scenes within this distance of new Gaussians are removed
+# Initial steps of Adam, for positions relative to the median size of the Gaussians: the longest that pay off in few
+# passes.
 _FIRST = LearningRates(means=0.07, quats=8e-3, log_scales=4e-2, logit_opacities=0.25, sh_base=4e-2, sh_rest=5e-3)
-_LAST = 0.1  # last step relative to the first, reached exponentially
+_LAST = 0.1  # last step relative to the first; the decay is exponential
 _OWNER_CELL_M = 0.5  # edge of the owner cells
-_COVER_M = 0.1  # an owner's Gaussian this near replaces another scene's
-_SEED = 0  # of the order of views
-_MIN_PASS_STEPS = 20  # of a pass over all views, for a tile that few pixels show
-_SURE_FRACTION = 0.5  # of the steps, taken whatever they gain: the first, long ones may lose
-_MIN_GAIN = 0.002  # relative decrease of the loss by a pass, below which the fit stops
+_COVER_M = 0.1  # a Gaussian of the owner within this distance replaces one of another scene
+_SEED = 0  # random seed of the order of views
+_MIN_PASS_STEPS = 20  # smallest number of steps of a pass over all views, for a tile that few pixels show
+_SURE_FRACTION = 0.5  # share of the steps that are always taken, because long initial steps may raise the loss
+_MIN_GAIN = 0.002  # if a pass decreases the loss by a smaller fraction, the fit stops
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ class Params:
                 raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}", code="out_of_range")
         for name in ("kept_fraction", "ssim_weight"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}", code="out_of_range")
+                raise ConfigError(f"{name} must lie in [0, 1], got {getattr(self, name)}", code="out_of_range")
         if not 0 <= self.momentum < 1:
             raise ConfigError(f"momentum must be in [0, 1), got {self.momentum}", code="out_of_range")
 
@@ -149,7 +152,8 @@ def merge(
     budget_s: float | None,
     progress: Progress,
 ) -> MergeResult:
-    """Remove outdated Gaussians, balance exposures, render reference views, select Gaussians, and fit them."""
+    """Remove outdated Gaussians, balance exposures, render reference views, select Gaussians, and fit these to the
+    views."""
     deadline = None if budget_s is None else time.monotonic() + budget_s
     notes: list[str] = []
     settled = resolve_changes(scenes, params.prefer, one_exposure=bounds is None)
@@ -169,20 +173,20 @@ def merge(
         max_views=params.max_views,
         photo_weight=params.photo_weight,
     )
-    # A single scene has no overlaps, and reproduces its own views already.
+    # A single scene has no overlaps and already reproduces its own views.
     alone = sum(bool(inside(scene.gaussians.means, bounds, params.halo_m).any()) for scene in scenes) < 2
     start, origin, new = _start(
         scenes, wanted, settled, replace(params, kept_fraction=1.0) if alone else params, bounds
     )
     if len(wanted) == 0 or not inside(start.means, bounds).any():
-        notes.append("nothing to optimize: no camera observes the tile")
+        notes.append("no camera observes the tile, so it is not optimized")
         return MergeResult(start, origin, notes=tuple(notes))
     if alone and not wanted.num_photos:
         mine = inside(start.means, bounds)
         return MergeResult(start[mine], origin[mine], notes=tuple(notes))
-    # The inner half of the halo is fitted, then dropped: were it frozen, Gaussians at the border would compensate for
-    # neighbours that the next tile refines.
-    # New Gaussians stay: no other scene shows their place.
+    # The inner half of the halo is fitted and then dropped. If it were frozen, Gaussians at the border would compensate
+    # for errors of neighbours that the next tile refines. New Gaussians stay unchanged, because no other scene shows
+    # their place.
     frozen = ~inside(start.means, bounds, params.halo_m / 2) | new
     if wanted.num_photos:
         many = wanted.num_photos > 1
@@ -190,7 +194,7 @@ def merge(
     fitted, steps, truncated = with_enough_memory(
         lambda backend: _fit(start, frozen, wanted, params, deadline, progress, backend)
     )
-    # A Gaussian stays in its initial tile: one that crosses the border would be lost or duplicated.
+    # A Gaussian must stay in its initial tile; if it crossed the border it would be lost or duplicated.
     mine = inside(start.means, bounds)
     fitted = replace(fitted[mine], means=clamp_inside(fitted.means[mine], bounds))
     return MergeResult(fitted, origin[mine], steps=steps, truncated=truncated, notes=tuple(notes))
@@ -203,18 +207,19 @@ def _start(
     params: Params,
     bounds: np.ndarray | None,
 ) -> tuple[Gaussians, np.ndarray, np.ndarray]:
-    """Voxelize the scenes within the halo, select one scene per cell, and reduce the tile to its number of Gaussians.
+    """Voxelize the scenes within the halo, select one scene per cell, and reduce the tile to its allowed number of
+    Gaussians.
 
-    New Gaussians, where the place changed, stay as they are.
+    New Gaussians, where the place changed, are not altered.
 
     Returns:
-        The initial Gaussians, (N,) the scene of each, and (N,) bool, new ones.
+        The initial Gaussians, the (N,) scene of each Gaussian, and an (N,) mask of new Gaussians.
     """
     gaussians, origin = concatenate_scenes(scenes)
     near = inside(gaussians.means, bounds, params.halo_m)
     new = np.concatenate(settled.changed)[near]
     labels = voxel_labels(gaussians.means[near], params.voxel_m)
-    # A new Gaussian shares its voxel with none.
+    # A new Gaussian shares its voxel with no other Gaussian.
     labels[new] = labels.max(initial=-1) + 1 + np.arange(int(new.sum()))
     labels = np.unique(labels, return_inverse=True)[1]
     merged, heaviest = merge_groups(gaussians[near], labels)
@@ -222,7 +227,7 @@ def _start(
     origin, new = origin[near][heaviest], new[heaviest]
     stays = np.ones(len(merged), dtype=bool)
     if params.owner_cells:
-        # Gaussians occluded in newer scenes do not vote.
+        # Gaussians that are occluded in newer scenes do not count in the selection of an owner.
         behind = np.concatenate(settled.behind)[near][heaviest]
         votes = np.where(behind, np.minimum(visible, WEIGHT_UNIT), visible)
         stays &= select_owners(merged, origin, votes, _OWNER_CELL_M, _COVER_M)
@@ -234,10 +239,10 @@ def _start(
     many = stays & mine & ~new
     if params.kept_fraction == 1 or many.sum() <= count:
         return merged[stays], origin[stays], new[stays]
-    from gsmap.geometry.decimate import decimate  # with scipy, which naming a recipe does without
+    from gsmap.geometry.decimate import decimate  # imports scipy, which the recipe key does not need
 
     fewer, into = decimate(merged[many], count, visible[many])
-    # A Gaussian merged of two scenes counts for the more visible one.
+    # A Gaussian that was merged from two scenes belongs to the scene in which it is more visible.
     order = np.argsort(visible[many], kind="stable")
     of = np.empty(len(fewer), dtype=origin.dtype)
     of[into[order]] = origin[many][order]
@@ -255,7 +260,7 @@ def _fit(
     progress: Progress,
     backend: str,
 ) -> tuple[Gaussians, int, bool]:
-    """Fit the initial Gaussians to the reference views; return them, the steps taken, and whether time ran out."""
+    """Fit the initial Gaussians to the reference views; return them, the number of steps, and whether time ran out."""
     one_pass = max(_MIN_PASS_STEPS, round(wanted.view_weights.sum()))
     steps = params.steps if params.steps is not None else round(params.max_passes * one_pass)
     options = FitOptions(ssim_weight=params.ssim_weight, huber_delta=params.huber_delta, betas=(params.momentum, 0.999))
@@ -264,7 +269,7 @@ def _fit(
     pictures = [fitter.load(image[None]) for image in wanted.images]
     weights = [fitter.load(weight[None]) for weight in wanted.weights]
     size_m = float(np.exp(np.median(start.log_scales.max(1))))
-    losses: list[Any] = []  # lazy values of the fitter, converted on use
+    losses: list[Any] = []  # lazy values of the fitter, converted when used
     for step, view in enumerate(view_schedule(wanted.view_weights, steps, _SEED)):
         if deadline is not None and time.monotonic() > deadline:
             return fitter.gaussians(), step, True
@@ -278,7 +283,7 @@ def _fit(
 
 
 def _rates(progress: float, size_m: float) -> LearningRates:
-    """Learning rates at a fraction of the optimization, for Gaussians of a median size."""
+    """Return the learning rates at a fraction of the optimization, for Gaussians of a median size."""
     first = vars(_FIRST) | {"means": _FIRST.means * size_m}
     return LearningRates(**{name: rate * _LAST**progress for name, rate in first.items()})
 
@@ -288,7 +293,7 @@ def _mean(losses: list[Any]) -> float:
 
 
 def _has_converged(losses: list[Any], one_pass: int) -> bool:
-    """Return whether the last pass over all views hardly improved on the one before."""
+    """Return whether the last pass over all views hardly improved on the previous pass."""
     if len(losses) % one_pass or len(losses) < 2 * one_pass:
         return False
     before, now = _mean(losses[-2 * one_pass : -one_pass]), _mean(losses[-one_pass:])

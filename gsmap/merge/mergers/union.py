@@ -1,4 +1,4 @@
-"""Merging by concatenation, as in PhotoReg: every Gaussian of every scene, including ghosts."""
+"""Merge by concatenation, as in PhotoReg: keep every Gaussian of every scene, including ghosts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Merging by voxelization: Gaussians with means in one voxel become one Gaussian with the same moments."""
+"""Merge by voxelization: Gaussians with means in one voxel become one Gaussian with the same moments."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ class Params:
 
 
 def reach_m(params: Params) -> float:
-    # A voxel may cross the border: both tiles read all of it, and the merged mean decides its tile.
+    # A voxel may cross the border of a tile: both tiles read all of it, and the merged mean decides to which tile it
+    # belongs.
     return params.voxel_m
 
 
@@ -61,7 +62,7 @@ def merge(
     budget_s: float | None,
     progress: Progress,
 ) -> MergeResult:
-    """Merge to one Gaussian per voxel of the map's grid; see `gsmap.geometry.voxels.merge_groups`."""
+    """Merge scenes to one Gaussian per voxel of the map's grid; see `gsmap.geometry.voxels.merge_groups`."""
     settled = resolve_changes(scenes, params.prefer, one_exposure=bounds is None)
     gaussians, origin = concatenate_scenes(settled.scenes)
     merged, heaviest = merge_groups(gaussians, voxel_labels(gaussians.means, params.voxel_m))
