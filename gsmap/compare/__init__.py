@@ -19,7 +19,7 @@ from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, Change
 from gsmap.compare.neighbourhoods import dilate, local_ranges
 
 VERSION = 4
-"""Raised whenever the comparison of the same two captures changes."""
+"""Version, raised whenever the comparison of the same two captures gives another result."""
 
 __all__ = [
     "AGREE",

@@ -1,4 +1,4 @@
-"""Renders of a capture from its own cameras, with how well each surface and Gaussian was observed."""
+"""Render a capture from its own cameras, and measure how well they observed each surface and Gaussian."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PosedScene
 
 LONGEST_SIDE_PX, MAX_VIEWS = 240, 48  # default size and number of the views of a capture
-MIN_ALPHA = 0.9  # of a pixel that shows a surface
-MIN_WEIGHT = 0.1  # blending weight in some own view, for a Gaussian to be part of a surface
-NEAREST_M = 0.2  # nearer Gaussians are not judged by a view
-MIN_TOLERANCE_M, MAX_TOLERANCE_M = 0.03, 0.1  # of depths of one surface; the captures' agreement decides in between
-MIN_VIEWS = 2  # that must agree before anything is concluded
-CELL_M = 0.12  # Gaussians this near vote together
+MIN_ALPHA = 0.9  # smallest alpha of a pixel that shows a surface
+MIN_WEIGHT = 0.1  # a surface Gaussian has at least this blending weight in some own view
+NEAREST_M = 0.2  # a view does not judge nearer Gaussians
+MIN_TOLERANCE_M, MAX_TOLERANCE_M = 0.03, 0.1  # limits of the tolerance of depths of one surface
+MIN_VIEWS = 2  # number of views that must agree on a conclusion
+CELL_M = 0.12  # Gaussians nearer to each other than this vote together
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A render of a capture in reduced size.
+    """A downscaled render of a capture.
 
     Args:
-        camera: one camera, the frame of the comparison.
+        camera: one camera, in the frame of the comparison.
         colour: (H, W, 3) float32, in [0, 1].
         depth: (H, W) float32 camera-space z, metres.
-        near, far: (H, W) float32 lowest and highest depth over 3 x 3 pixels: at an edge a depth mixes foreground and
-            background, and proves nothing between the two.
-        opaque: (H, W) bool, pixels that show a surface.
-        solid: (H, W) bool, opaque pixels with eight opaque neighbours.
+        near, far: (H, W) float32 lowest and highest depth over 3 x 3 pixels. At an edge the depth of a pixel mixes
+            foreground and background, so it is no evidence between ``near`` and ``far``.
+        opaque: (H, W) mask of pixels that show a surface.
+        solid: (H, W) mask of opaque pixels with eight opaque neighbours.
         dominant_id: (H, W) int32 Gaussian with the largest blending weight, -1 for none.
     """
 
@@ -53,7 +53,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedPoints:
-    """Points in a view: their rows ``index``, pixels and depths ``z``."""
+    """Points projected into a view: their rows ``index``, pixels and depths ``z``."""
 
     index: np.ndarray
     row: np.ndarray
@@ -67,12 +67,12 @@ class CaptureViews:
 
     Args:
         scene: the capture.
-        views: V renders of it.
-        surface: (N,) bool, Gaussians that are visible in the views, the rest being floaters or unobserved; all of a
-            capture without views.
-        times_seen: (N,) int32 views in which a Gaussian lies on the visible surface.
-        sharpness: (N,) float32 sum over these of (pixels per metre)^2: more and nearer views observe it better.
-        sure: per view (H, W) bool, solid pixels of a surface that enough of the capture's views observed.
+        views: V renders of the capture.
+        surface: (N,) mask of Gaussians that are visible in the views; the rest are floaters or unobserved. Without
+            views it is True for all.
+        times_seen: (N,) int32 number of views in which a Gaussian lies on the visible surface.
+        sharpness: (N,) float32 sum over these views of (pixels per metre)^2; it is larger for more and nearer views.
+        sure: per view, an (H, W) mask of solid pixels whose surface enough views of the capture observed.
         placed: per view, the projections of the capture's own Gaussians.
     """
 
@@ -92,7 +92,7 @@ class CaptureViews:
 def render_views(
     scene: PosedScene, *, longest_side_px: int = LONGEST_SIDE_PX, max_views: int = MAX_VIEWS
 ) -> CaptureViews:
-    """Render a capture from its own cameras; one without cameras has no views, and is no evidence on others."""
+    """Render a capture from its own cameras; without cameras it has no views and is no evidence on other captures."""
     count = len(scene.gaussians)
     largest = np.zeros(count, dtype=np.float32)
     views = []
@@ -114,7 +114,7 @@ def render_views(
 
 
 def max_per_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
-    """Return (N,) the largest count in each point's cell."""
+    """Return the (N,) largest count in each point's cell."""
     if not len(points):
         return counts
     cell = voxel_labels(points, cell_m)
@@ -125,7 +125,8 @@ def max_per_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.nd
 
 
 def select_cameras(scene: PosedScene, longest_side_px: int, max_views: int) -> list[Cameras]:
-    """Select at most ``max_views`` cameras of a capture, evenly along its path; none if they were synthesized."""
+    """Select at most ``max_views`` cameras of a capture, evenly along its path; none if the cameras were
+    synthesized."""
     if scene.cameras is None or scene.cameras.synthesised or not len(scene.cameras) or not len(scene.gaussians):
         return []
     small = scene.cameras.evenly(max_views).resized(longest_side_px)
@@ -133,7 +134,7 @@ def select_cameras(scene: PosedScene, longest_side_px: int, max_views: int) -> l
 
 
 def project_points(points: np.ndarray, view: View, nearest_m: float) -> ProjectedPoints:
-    """Project points (N, 3) into a view; points outside, or nearer than ``nearest_m``, are dropped."""
+    """Project points (N, 3) into a view; drop points outside of it or nearer than ``nearest_m``."""
     camera = view.camera
     width, height = (int(v) for v in camera.sizes_px[0])
     return ProjectedPoints(
@@ -160,7 +161,7 @@ def make_view(
     dominant_id: np.ndarray,
     camera: Cameras,
 ) -> View:
-    """Make a view of a render, with depth ranges and opacity masks."""
+    """Convert a render to a view, with depth ranges and opacity masks."""
     opaque = alpha > MIN_ALPHA
     near, far = depth_extremes(depth, opaque)
     solid = opaque & erode(opaque)

@@ -1,4 +1,4 @@
-"""Views of several captures combined as if of one capture, selected by coverage."""
+"""Combine views of several captures as if they were of one capture; the views are selected by coverage."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from gsmap.compare.capture_views import MAX_TOLERANCE_M, MAX_VIEWS, NEAREST_M, C
 from gsmap.compare.comparison import AGREE, OTHER_BEHIND, UNSURE, Comparison
 from gsmap.types import Gaussians, PosedScene
 
-_SAMPLE = 1500  # points of a capture by which views of the other captures are selected
-_ENOUGH = 8  # views of a point: more add little
-_VIEWS = 2  # times as many views as of one capture: several captures together show more
+_SAMPLE = 1500  # number of points of a capture by which views of the other captures are selected
+_ENOUGH = 8  # number of views of a point beyond which further views add little
+_VIEWS = 2  # factor on the number of views of one capture, because several captures show more
 
 
 def combine_views(
     parts: Sequence[tuple[CaptureViews, np.ndarray]], of: PosedScene, max_views: int = MAX_VIEWS
 ) -> CaptureViews:
-    """Combine the views of several captures into those of one, selecting the views that show the place of ``of``.
+    """Combine the views of several captures into those of one capture, and select the views that show the place of
+    ``of``.
 
     Args:
-        parts: captures from the newest to the oldest, each with a mask (N,) of the Gaussians that are valid still; the
-            result holds these, one capture after another.
-        of: the capture to be compared with the result.
-        max_views: of one capture; the result has at most twice as many.
+        parts: captures from the newest to the oldest, each with a mask (N,) of the Gaussians that are still valid. The
+            result contains these Gaussians, one capture after another.
+        of: the capture with which the result will be compared.
+        max_views: largest number of views of one capture; the result has at most twice as many.
     """
     chosen = _select_views([capture for capture, _ in parts], of, max_views)
     views, sure, placed, first = [], [], [], 0
@@ -51,12 +52,13 @@ def combine_views(
 
 
 def mask_outdated(capture: CaptureViews, comparison: Comparison, stays: np.ndarray) -> CaptureViews:
-    """Mask the views of the older capture of a comparison where a newer capture disagrees.
+    """Mask the views of the older capture of a comparison where the newer capture disagrees.
 
-    Its colours are balanced to the newer's, so that earlier captures are compared with one exposure.
+    Colours of the views are balanced to the newer capture, so that earlier captures are compared with a single
+    exposure.
 
     Args:
-        stays: (N,) bool, its Gaussians that are valid still.
+        stays: (N,) mask of the older capture's Gaussians that are still valid.
     """
     sure, views = [], []
     for own, picture in zip(capture.sure, comparison.older_views, strict=True):
@@ -72,7 +74,7 @@ def mask_outdated(capture: CaptureViews, comparison: Comparison, stays: np.ndarr
 
 
 def _select_views(captures: Sequence[CaptureViews], of: PosedScene, max_views: int) -> list[list[int]]:
-    """Select views of each capture greedily by coverage, at most twice ``max_views`` in all."""
+    """Select views of each capture greedily by coverage, at most twice ``max_views`` in total."""
     chosen: list[list[int]] = [[] for _ in captures]
     points = of.gaussians.means[:: max(1, len(of.gaussians) // _SAMPLE)]
     names = [(c, v) for c, capture in enumerate(captures) for v in range(len(capture.views))]
@@ -84,7 +86,7 @@ def _select_views(captures: Sequence[CaptureViews], of: PosedScene, max_views: i
         at = project_points(points, view, NEAREST_M)
         # Points behind a surface are occluded.
         seen = at.z < view.far[at.row, at.column] + MAX_TOLERANCE_M
-        # Among views of equal coverage, the newest.
+        # Of views with equal coverage, the newest is taken.
         sees[i, at.index[seen]] = 1 + 0.2 * (len(captures) - c) / len(captures)
     wanting = np.full(len(points), _ENOUGH, dtype=np.float32)
     for _ in range(min(_VIEWS * max_views, len(names))):

@@ -1,4 +1,4 @@
-"""Comparison of two captures by renders of both from the cameras of both."""
+"""Compare two captures by renders of both from the cameras of both."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ from gsmap.render import render
 from gsmap.types import Gaussians
 
 UNSURE, AGREE, COLOUR, OTHER_IN_FRONT, OTHER_BEHIND = 0, 1, 2, 3, 4
-"""Outcomes of a pixel of one capture's own view. ``UNSURE``: one capture shows nothing there, an edge, or a poorly
-observed surface. ``AGREE``: one surface, one colour. ``COLOUR``: one surface in two colours. ``OTHER_IN_FRONT``: the
-other capture has a surface in this one's free space. ``OTHER_BEHIND``: this capture has a surface in front of the
-other's, which proves nothing: the other's cameras may never have observed the place from here."""
+"""Outcomes of a pixel of one capture's own view. ``UNSURE``: one capture shows no surface, an edge, or a poorly
+observed surface. ``AGREE``: one surface in one colour. ``COLOUR``: one surface in two colours. ``OTHER_IN_FRONT``: the
+other capture has a surface in free space of this capture. ``OTHER_BEHIND``: this capture has a surface in front of the
+other capture's surface. That is no evidence of change, because the other cameras may never have observed the place from
+here."""
 
 
-_TOLERANCE_SIGMAS = 3.5  # robust standard deviations of the depths that agree
+_TOLERANCE_SIGMAS = 3.5  # tolerance in robust standard deviations of agreeing depths
 _TOLERANCE_PER_DEPTH = 0.01  # further tolerance in metres per metre of depth
 
 
@@ -42,8 +43,8 @@ class ComparedView:
         own: the capture's own view.
         other: the surfaces of the other capture from the same camera.
         outcome: (H, W) uint8, one of the five outcomes.
-        one: (H, W) bool, both captures show one surface, well observed or not.
-        covered: (H, W) bool, the other capture has a surface in front, perhaps at an edge.
+        one: (H, W) mask of pixels where both captures show the same surface, well observed or not.
+        covered: (H, W) mask of pixels where the other capture has a surface in front, perhaps at an edge.
         chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour, newer minus older.
     """
 
@@ -61,10 +62,10 @@ class Comparison:
     """Result of comparing two captures.
 
     Args:
-        older, newer: evidence on each capture's Gaussians, from the views of the other.
+        older, newer: evidence on the Gaussians of each capture, from the views of the other capture.
         older_views, newer_views: each capture's own views, with renders of the other capture.
-        balance: from the older capture's colours to the newer's.
-        tolerance_m: (base, slope): depths differ if by more than ``base + slope * depth``.
+        balance: map from colours of the older capture to colours of the newer capture.
+        tolerance_m: (base, slope); two depths differ if their difference exceeds ``base + slope * depth``.
     """
 
     older: ChangeEvidence
@@ -78,10 +79,10 @@ class Comparison:
 def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
     """Compare two captures in one metric frame.
 
-    Each capture is rendered once from the other's cameras, its surfaces only: from positions without own cameras,
-    floaters would hide them.
+    The surfaces of each capture are rendered once from the cameras of the other capture. Floaters are left out, because
+    they would hide surfaces from positions where the capture has no cameras.
     """
-    from gsmap.compare.segments import (  # with scipy, which naming a recipe does without
+    from gsmap.compare.segments import (  # imports scipy, which the recipe key does not need
         SegmentedCapture,
         find_remnants,
         label_shells,
@@ -145,7 +146,7 @@ def _seen_by(view: View, gaussians: Gaussians, rows: np.ndarray) -> View:
 
 
 def _tolerance(pairs: list[tuple[View, np.ndarray, View]]) -> tuple[float, float]:
-    """Return the depth tolerance, base and slope, from the scatter of the surfaces that agree."""
+    """Return the depth tolerance, base and slope, from the scatter of surfaces that agree."""
     found = []
     for own, sure, other in pairs:
         both = (sure & other.solid)[::2, ::2]
@@ -159,7 +160,7 @@ def _tolerance(pairs: list[tuple[View, np.ndarray, View]]) -> tuple[float, float
 
 
 def _line(crossed: list[list[tuple[View, np.ndarray, View]]], tolerance: tuple[float, float]) -> Balance:
-    """Fit the balance from the older capture's colours to the newer's, by all pixels on one surface."""
+    """Fit the colour balance from the older to the newer capture, from all pixels that show one surface."""
     older, newer = [], []
     for pairs, own_is_newer in zip(crossed, (False, True), strict=True):
         for own, sure, other in pairs:
@@ -184,7 +185,7 @@ def _outcomes(
     sign: int,
     tolerance: tuple[float, float],
 ) -> ComparedView:
-    """Classify the pixels of a view; ``line`` takes the older capture's colours to the newer's."""
+    """Classify the pixels of a view; ``line`` converts the older capture's colours to the newer capture's."""
     base, share = tolerance
     gap = base + share * own.depth
     one = own.solid & other.solid & _one_surface(own, other, tolerance)
@@ -195,7 +196,7 @@ def _outcomes(
     outcome = np.full(own.depth.shape, UNSURE, dtype=np.uint8)
     outcome[one & sure] = AGREE
     outcome[one & sure & colours_differ(line, chroma, lightness)] = COLOUR
-    # Beyond the extremes of both neighbourhoods: an edge that is a pixel off proves nothing.
+    # Compare with the extremes of both neighbourhoods, because an edge that is shifted by a pixel is no evidence.
     outcome[both & (other.far < own.near - gap)] = OTHER_IN_FRONT
     outcome[both & (other.near > own.far + gap)] = OTHER_BEHIND
     return ComparedView(own, other, outcome, one, covered, chroma, lightness)
@@ -204,7 +205,8 @@ def _outcomes(
 def _count(
     tally: EvidenceCounts, at: ProjectedPoints, picture: ComparedView, sure: np.ndarray, tolerance: tuple[float, float]
 ) -> None:
-    """Count where the Gaussians of one capture lie in a view of the other, and add the colours of its surface."""
+    """Count where the Gaussians of one capture lie in a view of the other capture, and add the colours of that view's
+    surface."""
     view, (base, share) = picture.own, tolerance
     count_looks(
         at.index,
@@ -240,7 +242,7 @@ def _count(
 def _count_colour(
     tally: EvidenceCounts, at: ProjectedPoints, picture: ComparedView, tolerance: tuple[float, float]
 ) -> None:
-    """Add the colour differences in a capture's own view to its Gaussians."""
+    """Add the colour differences in a capture's own view to the capture's Gaussians."""
     base, share = tolerance
     add_colours(
         at.index,

@@ -1,4 +1,4 @@
-"""Single-linkage clusters of points."""
+"""Cluster points by single linkage."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from gsmap._native import clusters
 
 
 def components(points: np.ndarray, reach_m: float, kind: np.ndarray | None = None) -> np.ndarray:
-    """Return (N,) int64 cluster labels of points (N, 3); points within reach of each other share one.
+    """Return the (N,) int64 cluster labels of points (N, 3); points within reach of each other are in one cluster.
 
     Labels count from 0 in the order of the clusters' first points.
 

@@ -8,7 +8,7 @@ from gsmap._native import depth_ranges
 
 
 def depth_extremes(depth: np.ndarray, opaque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (H, W) the lowest and highest opaque depth over 3 x 3 pixels; inf and -inf without opaque pixels."""
+    """Return the (H, W) lowest and highest opaque depth over 3 x 3 pixels; inf and -inf without opaque pixels."""
     found: tuple[np.ndarray, np.ndarray] = depth_ranges(depth=np.ascontiguousarray(depth), opaque=opaque)
     return found
 
@@ -37,7 +37,7 @@ def over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
 
 
 def local_ranges(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (H, W, K) the lowest and highest value of each channel over 3 x 3 pixels."""
+    """Return the (H, W, K) lowest and highest value of each channel over 3 x 3 pixels."""
     channels = [picture[..., c] for c in range(picture.shape[-1])]
     low, high = (np.stack([over_3x3(c, pick) for c in channels], axis=-1) for pick in (np.minimum, np.maximum))
     return low, high

@@ -1,7 +1,8 @@
-"""Additive log-odds model: the probability of a hypothesis from several pieces of evidence.
+"""Compute the probability of a hypothesis from several pieces of evidence by an additive log-odds model.
 
-Each piece of evidence adds log-odds by a piecewise linear curve, and the sum passes through a logistic function. Curves
-are fitted on synthetic places by tools, and stored beside the module that uses them.
+A piecewise linear curve gives the log-odds that each piece of evidence adds; a logistic function converts the sum to a
+probability. The tools in ``tools/fit`` fit the curves on synthetic places; curves are stored beside the module that
+uses them.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Curve:
-    """Piecewise linear log-odds of one piece of evidence.
+    """Piecewise linear log-odds curve of one piece of evidence.
 
     Args:
         knots: values of the evidence, increasing.
-        worth: log-odds at each knot; linear between, constant beyond.
-        missing: log-odds of missing evidence.
+        worth: log-odds at each knot; linear between knots, constant beyond the outermost.
+        missing: log-odds if the evidence is missing.
     """
 
     knots: tuple[float, ...]
@@ -29,7 +30,7 @@ class Curve:
     missing: float
 
     def at(self, value: float) -> float:
-        """Return the log-odds of a value; NaN is missing evidence."""
+        """Return the log-odds of a value; NaN stands for missing evidence."""
         return self.missing if np.isnan(value) else float(np.interp(value, self.knots, self.worth))
 
 
@@ -38,9 +39,9 @@ class Odds:
     """Fitted log-odds model.
 
     Args:
-        curves: by the name of the evidence.
+        curves: curves by the name of the evidence.
         base: log-odds without evidence, at a prior of one half.
-        least: lowest probability, and one minus the highest: more extreme ones were too rare to be calibrated.
+        least: lowest probability, and one minus the highest; more extreme probabilities could not be calibrated.
     """
 
     curves: dict[str, Curve]
@@ -61,11 +62,12 @@ class Odds:
         return cls(curves, stored["base"], stored["least"])
 
     def worth(self, evidence: Mapping[str, float]) -> dict[str, float]:
-        """Return the log-odds that each piece of evidence adds, by its name."""
+        """Return the log-odds that each piece of evidence adds, by the name of the piece."""
         return {name: self.curves[name].at(value) for name, value in evidence.items()}
 
     def shortfalls(self, evidence: Mapping[str, float]) -> list[str]:
-        """Return the names of the present evidence, farthest below its best log-odds first."""
+        """Return the names of the present pieces of evidence, sorted by the log-odds that each lacks to its best value,
+        most first."""
         lacks = {}
         for name, value in evidence.items():
             if not np.isnan(value):
@@ -73,7 +75,7 @@ class Odds:
         return sorted(lacks, key=lambda name: -lacks[name])
 
     def probability(self, evidence: Mapping[str, float], prior: float) -> float:
-        """Return the probability in (0, 1).
+        """Return the probability of the hypothesis, in (0, 1).
 
         Args:
             prior: probability without evidence.
@@ -82,10 +84,10 @@ class Odds:
         return float(np.clip(1 / (1 + np.exp(-odds)), self.least, 1 - self.least))
 
     def log_odds(self, evidence: Mapping[str, float], *, at_best: bool = False) -> float:
-        """Return the log-odds at a prior of one half.
+        """Return the log-odds of the hypothesis at a prior of one half.
 
         Args:
-            at_best: unnamed evidence counts at its best value; by default it counts nothing.
+            at_best: missing pieces of evidence count at their best value; by default they add nothing.
         """
         rest = sum(max(curve.worth) for name, curve in self.curves.items() if name not in evidence) if at_best else 0.0
         return self.base + sum(self.worth(evidence).values()) + rest

@@ -1,9 +1,9 @@
-"""Propagation of change evidence over segments: connected groups of Gaussians that are one physical object.
+"""Propagate evidence of change over segments: connected groups of Gaussians that are one physical object.
 
-Evidence of single Gaussians and their neighbours errs both ways. Thin objects, edges and lighting make a few Gaussians
-of an unchanged object look changed; and if an object is replaced by a similar one, most of its Gaussians lie on the new
-surface in nearly its colour. So a change needs roots, Gaussians that changed beyond doubt, and from a segment much of
-which changed the change spreads to Gaussians that differ slightly.
+Evidence on single Gaussians and their neighbours has two kinds of errors. Thin objects, edges and lighting make a few
+Gaussians of an unchanged object look changed. And if a similar object replaces an object, most of its Gaussians lie on
+the new surface in nearly the new colour. So a change needs *roots*: Gaussians that changed beyond doubt. If much of a
+segment changed, the change spreads to Gaussians of the segment that differ only slightly.
 """
 
 from __future__ import annotations
@@ -19,32 +19,37 @@ from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.neighbours import nearest_of, neighbours_of
 
 _CELL_M = 0.05  # edge of the surface cells in which planes are detected
-_FEWEST = 5  # points of a hull
+_FEWEST = 5  # smallest number of points of a hull
 _VOTERS = 5  # nearest judged neighbours that vote
-_CHANGE_LINK_M = 0.1  # changed Gaussians this near on one shell plane, or off all planes, are one change
-MIN_ROOTS, MIN_ROOT_FRACTION = 8, 0.2  # Gaussians beyond doubt, and their fraction, that prove a change
-_ISOLATED_COLOUR = 4.0  # times the least difference of colour, that counts beside a change without neighbours
-_ADJACENT_M = 0.35  # largest distance from a proven change at which such a Gaussian joins it
-_SEGMENT_LINK_M = 0.08  # Gaussians this near are of one segment
-_MIN_CHANGED_FRACTION = 0.2  # of a segment, from which on the change spreads over it
-_WEAK_COLOUR = 0.2  # times the least difference of colour, that counts there
-_NEIGHBOUR_M = 0.15  # within which most neighbours on the segment must have changed
-_NEAR_SHELL_M = 0.1  # what is this near to the shell may be a frame or skirting board of it
-MAX_OUTSIDE_HULL_M = 0.05  # such a part joins a segment's change only this far outside of the hull of that
-_MIN_REMNANT_FRACTION = 0.5  # of a segment that must have changed for the rest to be tested
-_MIN_REMNANT_SCORE = 0.7  # mean score from which on the rest changed, too
-_MAX_COLOUR_DISTANCE = 0.05  # in [0, 1], to the colours that changed on the segment, for a score of 1
-_NEW_WEIGHT = 0.5  # score for the fraction that is new of the other capture's segment
+# Changed Gaussians nearer to each other than this, on one shell plane or off all planes, are one change.
+_CHANGE_LINK_M = 0.1
+# Smallest number of roots that prove a change, and smallest fraction of its Gaussians.
+MIN_ROOTS, MIN_ROOT_FRACTION = 8, 0.2
+# Difference at which a Gaussian without changed neighbours counts, relative to the smallest that counts.
+_ISOLATED_COLOUR = 4.0
+_ADJACENT_M = 0.35  # largest distance from a proven change at which such a Gaussian joins the change
+_SEGMENT_LINK_M = 0.08  # Gaussians nearer to each other than this are in one segment
+_MIN_CHANGED_FRACTION = 0.2  # a change spreads over a segment if at least this fraction of it changed
+_WEAK_COLOUR = 0.2  # difference that counts in such a segment, relative to the smallest that counts elsewhere
+_NEIGHBOUR_M = 0.15  # most neighbours on the segment within this distance must have changed
+_NEAR_SHELL_M = 0.1  # Gaussians nearer to the shell than this may be a frame or skirting board
+# Such Gaussians join a segment's change up to this distance outside of the hull of the change.
+MAX_OUTSIDE_HULL_M = 0.05
+_MIN_REMNANT_FRACTION = 0.5  # smallest changed fraction of a segment whose rest is tested
+_MIN_REMNANT_SCORE = 0.7  # the rest changed as well if its mean score is at least this
+_MAX_COLOUR_DISTANCE = 0.05  # largest distance in [0, 1] to changed colours of the segment that gives a score of 1
+_NEW_WEIGHT = 0.5  # score per new fraction of the other capture's segment
 
 
 def label_shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
-    """Return, for each capture, (N,) the floor, ceiling or wall of each Gaussian, -1 for none; numbered jointly.
+    """For each capture return the (N,) floor, ceiling or wall of each Gaussian, -1 for none; the numbers are common to
+    all captures.
 
-    Gaussians off surfaces take the label of the nearest on a surface. z is up: frames that are not upright have no
-    shell.
+    Gaussians off surfaces get the label of the nearest Gaussian on a surface. z must be up: in frames that are not
+    upright no shell is found.
 
     Args:
-        captures: of each, points (N, 3) and a mask (N,) of those on surfaces.
+        captures: for each capture, points (N, 3) and a mask (N,) of the points on surfaces.
     """
     surface = np.concatenate([points[shows] for points, shows in captures]).astype(np.float64)
     label, counts = cell_labels(np.floor(surface / _CELL_M))
@@ -63,7 +68,8 @@ def label_shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarr
 
 
 def label_segments(points: np.ndarray, shell: np.ndarray) -> np.ndarray:
-    """Return (N,) int64 labels of connected segments off floors, ceilings and walls, from 0; -1 on these."""
+    """Return the (N,) int64 labels, from 0, of connected segments off floors, ceilings and walls; -1 on floors,
+    ceilings and walls."""
     out = np.full(len(points), -1, dtype=np.int64)
     loose = np.flatnonzero(shell < 0)
     out[loose] = components(points[loose], _SEGMENT_LINK_M)
@@ -71,7 +77,8 @@ def label_segments(points: np.ndarray, shell: np.ndarray) -> np.ndarray:
 
 
 def adjoins_shell(points: np.ndarray, shell: np.ndarray) -> np.ndarray:
-    """Return (N,) bool, points adjacent to the shell without being part of it, such as frames of doors and windows."""
+    """Return an (N,) mask of points adjacent to the shell without being part of it, such as frames of doors and
+    windows."""
     return (shell < 0) & ~is_clear(points, points[shell >= 0], _NEAR_SHELL_M)
 
 
@@ -80,15 +87,15 @@ class ChangeLabels:
     """Labels of the N Gaussians of a capture before changes are propagated over segments.
 
     Args:
-        points: (N, 3).
+        points: (N, 3) positions.
         shell: (N,) see `label_shells`.
         segment: (N,) see `label_segments`.
-        changed: (N,) bool, gone or repainted by their own evidence.
-        sure: (N,) bool, changed beyond doubt.
-        judged: (N,) bool, observed by the other capture.
-        hidden: (N,) bool, occluded in the other capture.
-        differs: (N,) difference of colour, relative to the least that counts.
-        framed: (N,) bool, see `adjoins_shell`.
+        changed: (N,) mask of Gaussians that are gone or repainted by their own evidence.
+        sure: (N,) mask of Gaussians that changed beyond doubt.
+        judged: (N,) mask of Gaussians that the other capture observed.
+        hidden: (N,) mask of Gaussians that are occluded in the other capture.
+        differs: (N,) difference of colour, relative to the smallest that counts.
+        framed: (N,) mask, see `adjoins_shell`.
     """
 
     points: np.ndarray
@@ -103,10 +110,10 @@ class ChangeLabels:
 
 
 def find_rooted(labels: ChangeLabels) -> np.ndarray:
-    """Return (N,) bool, members of connected changes, on one shell plane or off all, with enough roots beyond doubt.
+    """Return an (N,) mask of members of connected changes (on one shell plane, or off all planes) with enough roots.
 
-    Light that a new colour reflects onto the next wall has no roots, nor have misaligned edges. Isolated Gaussians that
-    changed beyond doubt join a change near by.
+    Light that a new colour reflects onto the next wall has no roots, and misaligned edges have none either. Isolated
+    Gaussians that changed beyond doubt join a nearby change.
     """
     rows = np.flatnonzero(labels.changed)
     label = components(labels.points[rows], _CHANGE_LINK_M, labels.shell[rows])
@@ -124,10 +131,11 @@ def find_rooted(labels: ChangeLabels) -> np.ndarray:
 
 
 def spread_changes(labels: ChangeLabels) -> np.ndarray:
-    """Return (N,) bool, the changed Gaussians and those that the change spreads to.
+    """Return an (N,) mask of the changed Gaussians and of the Gaussians to which the change spreads.
 
-    On segments much of which changed, the change spreads to connected Gaussians that differ slightly, and to those most
-    of whose neighbours on the segment changed; but not to frames of doors and windows outside of the changed hull.
+    If much of a segment changed, the change spreads to connected Gaussians that differ slightly, and to Gaussians for
+    which most neighbours on the segment changed. It does not spread to frames of doors and windows outside of the
+    changed hull.
     """
     segment, loose = labels.segment, np.flatnonzero(labels.segment >= 0)
     count = int(segment.max(initial=-1)) + 1
@@ -163,10 +171,10 @@ class SegmentedCapture:
     """A capture of a pair, after `spread_changes`.
 
     Args:
-        points, colours: (N, 3), colours in [0, 1].
+        points, colours: (N, 3) positions, and (N, 3) colours in [0, 1].
         segment: (N,) see `label_segments`.
-        changed: (N,) bool.
-        framed: (N,) bool, see `adjoins_shell`.
+        changed: (N,) mask of changed Gaussians.
+        framed: (N,) mask, see `adjoins_shell`.
     """
 
     points: np.ndarray
@@ -176,7 +184,7 @@ class SegmentedCapture:
     framed: np.ndarray
 
     def share(self) -> np.ndarray:
-        """Return (N,) the fraction of each Gaussian's segment that changed; 0 without a segment."""
+        """Return the (N,) changed fraction of each Gaussian's segment; 0 without a segment."""
         out, loose = np.zeros(len(self.points)), np.flatnonzero(self.segment >= 0)
         of = self.segment[loose]
         out[loose] = (np.bincount(of, self.changed[loose]) / np.maximum(np.bincount(of), 1))[of]
@@ -184,11 +192,11 @@ class SegmentedCapture:
 
 
 def find_remnants(sides: tuple[SegmentedCapture, SegmentedCapture]) -> list[np.ndarray]:
-    """Return, for each of two captures, (N,) bool, unchanged remnants that belong to a mostly changed segment.
+    """For each of two captures return an (N,) mask of unchanged remnants that belong to a mostly changed segment.
 
-    A sofa that was shifted by half its length shows its own colour where old and new place overlap. As touching objects
-    form one segment, the remnant may also be an object beside that stayed: colours, and the other capture's surface in
-    its place, decide.
+    For example, a sofa that was shifted by half its length shows its own colour where its old and new places overlap.
+    Touching objects form one segment, so a remnant may also be an adjacent object that stayed. Colours, and the other
+    capture's surface at the place, decide.
     """
     shares = [side.share() for side in sides]
     found = []
@@ -202,7 +210,7 @@ def find_remnants(sides: tuple[SegmentedCapture, SegmentedCapture]) -> list[np.n
         nearest = nearest_of(other.points, one.points[left])[1]
         stays = np.zeros(len(left), dtype=bool)
         for k in np.unique(segment[left[one.framed[left]]]):
-            # The remnant of a shifted object lies between what changed in both captures.
+            # The remnant of a shifted object lies between the changed parts in both captures.
             beside = np.unique(other.segment[nearest[segment[left] == k]])
             theirs = other.points[other.changed & np.isin(other.segment, beside[beside >= 0])]
             changed = np.concatenate([one.points[one.changed & (segment == k)], theirs])
@@ -220,7 +228,8 @@ def find_remnants(sides: tuple[SegmentedCapture, SegmentedCapture]) -> list[np.n
 
 
 def in_hull(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return (N,) bool, points (N, 3) in the convex hull of others (M, 3) or `MAX_OUTSIDE_HULL_M` beyond its planes."""
+    """Return an (N,) mask of points (N, 3) inside the convex hull of others (M, 3), or at most `MAX_OUTSIDE_HULL_M`
+    outside."""
     if len(others) < _FEWEST or not len(points):
         return np.zeros(len(points), dtype=bool)
     planes = ConvexHull(others.astype(np.float64), qhull_options="QJ").equations
@@ -229,7 +238,7 @@ def in_hull(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def is_clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarray:
-    """Return (N,) bool, points (N, 3) without any of the others (M, 3) within reach."""
+    """Return an (N,) mask of points (N, 3) that have none of the others (M, 3) within reach."""
     if not len(points) or not len(others):
         return np.ones(len(points), dtype=bool)
     return np.isinf(nearest_of(others, points, reach_m)[0])
@@ -238,9 +247,9 @@ def is_clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarr
 def _with_changed_majority(
     labels: ChangeLabels, judged: np.ndarray, others: np.ndarray, changed: np.ndarray, reach_m: float
 ) -> np.ndarray:
-    """Return the rows of others most of whose judged neighbours changed. All masks are (N,).
+    """Return the rows in the mask ``others`` for which most judged neighbours changed. All masks are (N,).
 
-    Such as the occluded inside of a replaced object, or the rest of a painted wall.
+    These are, for example, the occluded inside of a replaced object, or the rest of a painted wall.
     """
     voters, rows = np.flatnonzero(judged), np.flatnonzero(others)
     if not len(voters) or not len(rows):

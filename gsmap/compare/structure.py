@@ -1,4 +1,4 @@
-"""Detection of the building shell: floors, ceilings and walls, as planes of surface cells."""
+"""Detect the building shell: floors, ceilings and walls, as planes of surface cells."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from gsmap.compare.components import components
 from gsmap.geometry.neighbours import nearest_of
 
 _BIN_M = 0.03
-_THICK_M = 0.045  # of a plane with its skirting boards, picture frames and noise
-_LEVEL_M2, _WALL_M2 = 4.0, 0.5  # least areas; a smaller plane is a table or a cupboard
-_REACH_M = 0.16  # cells of one plane are linked over such gaps
-_WALL_M = 1.8  # least height of a wall
-_TO_CEILING_M = 0.2  # largest gap between a wall and the ceiling, where there is one
-_THROUGH_M = 0.15  # from one face of a wall between rooms to the other
-_PIECE_M2 = 0.1  # least visible piece of a wall behind furniture
-_BESIDE_M = 0.3  # cells this near to a wall, in its plane, are part of it
+_THICK_M = 0.045  # thickness of a plane with its skirting boards, picture frames and noise
+_LEVEL_M2, _WALL_M2 = 4.0, 0.5  # smallest areas; a smaller plane is a table or a cupboard
+_REACH_M = 0.16  # cells of one plane are linked over gaps up to this width
+_WALL_M = 1.8  # smallest height of a wall
+_TO_CEILING_M = 0.2  # largest gap between a wall and the ceiling, if there is a ceiling
+_THROUGH_M = 0.15  # largest thickness of a wall between rooms
+_PIECE_M2 = 0.1  # smallest visible piece of a wall behind furniture
+_BESIDE_M = 0.3  # cells in the plane of a wall within this distance are part of the wall
 _MOST_PLANES = 24
-_NORMAL_OF = 12  # neighbours
+_NORMAL_OF = 12  # number of neighbours to which a normal is fitted
 
 
 def normals_of(points: np.ndarray) -> np.ndarray:
-    """Estimate (M, 3) unit normals of surface cells; signs are arbitrary."""
+    """Estimate (M, 3) unit normals of surface cells; their signs are arbitrary."""
     if len(points) < 4:
         return np.tile([0.0, 0.0, 1.0], (len(points), 1))
     normals: np.ndarray = PointTree(np.ascontiguousarray(points, np.float64)).normals(_NORMAL_OF)
@@ -30,10 +30,10 @@ def normals_of(points: np.ndarray) -> np.ndarray:
 
 
 def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray:
-    """Return (M,) int the plane of each cell, counted from 0, level planes first; -1 off all planes.
+    """Return the (M,) plane of each cell as a number from 0, level planes first; -1 for cells off all planes.
 
     Args:
-        points, normals: (M, 3) of a surface in cells of ``cell_m``, z up.
+        points, normals: (M, 3) points and normals of surface cells of size ``cell_m``, z up.
     """
     label = np.full(len(points), -1, dtype=np.int64)
     if len(points) < 50:
@@ -54,7 +54,8 @@ def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray
         faces: list[float] = []
         for offset in _peaks(points[upright[along]] @ way, _WALL_M2 / cell_m**2):
             on = (np.abs(points @ way - offset) < _THICK_M) & (np.abs(normals @ way) > 0.8) & (label < 0)
-            # A wall's other face need not be seen up to the ceiling: nothing else of that height is so thin.
+            # The other face of a wall need not be seen up to the ceiling, because no other object of that height is so
+            # thin.
             thin = any(abs(offset - face) < _THROUGH_M for face in faces)
             rows = _wall(points, np.flatnonzero(on), np.inf if thin else ceiling, cell_m)
             if len(rows):
@@ -67,7 +68,8 @@ def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray
 
 
 def _wall(points: np.ndarray, rows: np.ndarray, ceiling: float, cell_m: float) -> np.ndarray:
-    """Return the cells of an upright plane that are wall: large pieces up to the ceiling, and pieces beside."""
+    """Return the cells of an upright plane that belong to a wall: large pieces up to the ceiling, and pieces beside
+    them."""
     pieces = _pieces(points, rows, _PIECE_M2 / cell_m**2)
     tall = [p for p in pieces if np.ptp(points[p, 2]) > _WALL_M or points[p, 2].max() > ceiling - _TO_CEILING_M]
     if not tall:
@@ -82,7 +84,7 @@ def _wall(points: np.ndarray, rows: np.ndarray, ceiling: float, cell_m: float) -
 
 
 def _peaks(values: np.ndarray, fewest: float) -> list[float]:
-    """Return the peaks of the density of values on a line, densest first, each suppressing its neighbourhood."""
+    """Return the peaks of the density of values on a line, densest first; each peak suppresses its neighbourhood."""
     if not len(values):
         return []
     low = values.min() - _BIN_M
@@ -100,7 +102,7 @@ def _peaks(values: np.ndarray, fewest: float) -> list[float]:
 
 
 def _directions(normals: np.ndarray) -> list[float]:
-    """Return the yaws (radians, modulo half a turn) of many upright normals, most frequent first."""
+    """Return the yaws (radians, modulo half a turn) shared by many upright normals, most frequent first."""
     if not len(normals):
         return []
     yaw = np.degrees(np.arctan2(normals[:, 1], normals[:, 0])) % 180
