@@ -1,7 +1,7 @@
-"""Change detection between two captures of one place.
+"""Detect changes between two captures of one place.
 
-``compare(older, newer)`` is pure: two captures in one metric frame in, a report out. Different lighting, exposure and
-coverage are no changes of objects.
+``compare(older, newer)`` is a pure function from two captures in one metric frame to a report. Differences of lighting,
+exposure and coverage do not count as changes of objects.
 """
 
 from __future__ import annotations

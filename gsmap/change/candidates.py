@@ -1,4 +1,4 @@
-"""Detection of changes from the labelled surface cells of two captures."""
+"""Detect changes from the labelled surface cells of two captures."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ from gsmap.change.segments import (
 from gsmap.change.surface_cells import SurfaceCells
 from gsmap.compare import CaptureViews
 
-_IN_PLACE_M = 0.1  # distance of cells of two captures at one place
-_IN_PLACE = 0.3  # fraction of the smaller of two segments at one place
-_SPLIT = (0.15, 0.85)  # fraction of a segment at the place of another, for it to be two objects side by side
+_IN_PLACE_M = 0.1  # largest distance between cells of two captures at the same place
+_IN_PLACE = 0.3  # smallest fraction of the smaller segment that is at the place of the larger one
+# A segment is two adjacent objects if a fraction in this range is at the place of another segment.
+_SPLIT = (0.15, 0.85)
 _FEWEST_OF_PART = 60
 
 
@@ -42,7 +43,7 @@ def find_changes(
     """Detect all changes between two captures, without their confidence.
 
     Args:
-        unlike: spread of the lighting difference, see `gsmap.change.segments.lighting_spread`.
+        unlike: spread of the lighting difference; see `gsmap.change.segments.lighting_spread`.
     """
     tints = [p for p in find_colour_changes(both, cells, params) if is_recoloured(p, unlike)]
     clear = [np.zeros(len(side), dtype=bool) for side in both]
@@ -77,7 +78,7 @@ def find_changes(
 def _split(
     segments: list[ChangedSegment], others: list[ChangedSegment], both: tuple[SurfaceCells, SurfaceCells], which: int
 ) -> list[ChangedSegment]:
-    """Split segments of which a part is replaced by a segment of the other capture."""
+    """Split each segment of which only a part is replaced by a segment of the other capture."""
     out = []
     for segment in segments:
         points = both[which].points[segment.cells]

@@ -1,6 +1,6 @@
-"""Probability of a detected change, from its evidence.
+"""Compute the probability of a detected change from its evidence.
 
-Weights are fitted by ``tools/fit/change.py`` on synthetic places that changed, and on places that were captured again
+``tools/fit/change.py`` fits the weights on synthetic places that changed, and on places that were captured again
 unchanged, by night or with another exposure.
 """
 
@@ -11,26 +11,26 @@ from typing import Literal
 
 import numpy as np
 
-_MANY = 200  # cells; more prove nothing more
-_OFTEN = 6  # views of each cell; more prove nothing more
+_MANY = 200  # number of cells beyond which further cells add no evidence
+_OFTEN = 6  # number of views of each cell beyond which further views add no evidence
 
 BASES = {"looked through": -4.99, "painted": -4.03}
 WEIGHTS = {
     "looked through": {"cells": 0.38, "views": 4.2, "on": -1.27, "slender": -5.3},
     "painted": {"cells": 0.85, "colour": 0.39},
 }
-"""Log-odds without evidence, and the weight of each of the `pieces`, at a prior of one half."""
+"""Log-odds without evidence, and the weight of each feature in `pieces`, at a prior of one half."""
 
 
 def pieces(evidence: Mapping[str, float]) -> tuple[Literal["looked through", "painted"], dict[str, float]]:
     """Compute the features of the log-odds of a change.
 
     Args:
-        evidence: of `gsmap.types.change.Change`.
+        evidence: evidence of a `gsmap.types.change.Change`.
 
     Returns:
-        ``looked through`` if a part lies in free space of the other capture, ``painted`` if only colours differ; and
-        the features by name.
+        ``looked through`` if a part of the change lies in free space of the other capture, or ``painted`` if only
+        colours differ; and the features by name.
     """
     if evidence["looked_through"] > 0:
         return "looked through", {
@@ -46,7 +46,7 @@ def pieces(evidence: Mapping[str, float]) -> tuple[Literal["looked through", "pa
 
 
 def confidence(evidence: Mapping[str, float]) -> float:
-    """Return the probability in (0, 1) of a change, at a prior of one half."""
+    """Return the probability, in (0, 1), that a change is real, at a prior of one half."""
     way, numbers = pieces(evidence)
     odds = BASES[way] + sum(WEIGHTS[way][name] * value for name, value in numbers.items())
     return float(1 / (1 + np.exp(-odds)))

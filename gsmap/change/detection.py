@@ -1,4 +1,4 @@
-"""Pipeline of change detection: from two captures to a report of changes."""
+"""Detect changes: the steps from two captures to a report of changes."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
 VERSION = 2
-"""Raised whenever the report on the same two captures changes."""
+"""Version, raised whenever the report on the same two captures changes."""
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
-    """Return the recipe of a report, without its inputs, the two captures."""
+    """Return the recipe of a report, without its inputs (the two captures)."""
     version = {"change": VERSION, "compare": comparison.VERSION}
     return RecipeKey("change", "evidence", version, plain(params or Params()), render.backend())
 
@@ -42,13 +42,14 @@ def compare(
 ) -> ChangeReport:
     """Detect the changes from an older capture of a place to a newer one.
 
-    Only surfaces that both captures observed are judged: what is occluded or unobserved in one of them is not reported.
+    Only surfaces that both captures observed are judged; content that is occluded or unobserved in one of them is not
+    reported.
 
     Args:
-        older, newer: both in one metric frame.
+        older, newer: the captures, both in one metric frame.
         params: see `Params`.
         progress: called with the fraction done in [0, 1] and the current step.
-        up: (3,) the frame's vertical, about which objects turn and across which they move; None for z.
+        up: (3,) vertical of the frame, about which objects rotate and perpendicular to which they move; None for z.
 
     Returns:
         The report, in the frame of the captures.
@@ -89,7 +90,7 @@ def _notes(older: PosedScene, newer: PosedScene, seen: float) -> tuple[str, ...]
         if scene.cameras is None or not len(scene.cameras):
             notes.append(f"the {when} capture has no cameras, so free space is unknown and few changes can be detected")
     if seen < _LITTLE and not notes:
-        notes.append(f"the newer capture observed only {100 * seen:.0f} % of the older one's surface")
+        notes.append(f"the newer capture observed only {100 * seen:.0f} % of the older capture's surface")
     return tuple(notes)
 
 
@@ -97,7 +98,7 @@ _LITTLE = 0.2
 
 
 def _upright(up: np.ndarray | None) -> Sim3 | None:
-    """Return the rotation of a vertical to z; None where it is z already."""
+    """Return the rotation from a vertical to z; None if the vertical is z already."""
     if up is None:
         return None
     up = np.asarray(up, dtype=np.float64).reshape(-1)
@@ -120,7 +121,7 @@ def _rotated(scene: PosedScene, S: Sim3) -> PosedScene:
 
 
 def _transformed(change: Change, S: Sim3) -> Change:
-    """Transform a change to another frame; its box becomes the one around the rotated box."""
+    """Transform a change to another frame; its new box encloses the transformed box."""
     moved = change.S_after_before
     return replace(
         change,

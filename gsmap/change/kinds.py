@@ -1,4 +1,4 @@
-"""Classification of changes by kind."""
+"""Classify changes by kind."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from gsmap.change.surface_cells import SurfaceCells
 from gsmap.types import Sim3
 from gsmap.types.change import ChangeKind
 
-_RING_M = 0.15  # width of the surroundings on the same plane that a change of colour is compared with
+_RING_M = 0.15  # width of the surroundings, on the same plane, with which a change of colour is compared
 _PLANE_M = 0.04
-_STANDS_OUT = 0.45  # contrast of an edge, relative to the other capture, below which it is none
-_FEWEST = 6  # cells of a ring
-_FLAT_M2 = 1.5  # on a wall, a larger change of colour is paint and no picture
-_FEWEST_MOVED, _REPAINTED = 8, 0.03  # cells, and their fraction, in free space, below which an object was repainted
-_GONE = 0.5  # fraction of the changed cells in free space, from which an object disappeared or appeared as a whole
-_ONE_PLACE = 0.4  # fraction of the larger footprint that both cover, if one object replaced the other
+_STANDS_OUT = 0.45  # an edge with less contrast, relative to the other capture, counts as no edge
+_FEWEST = 6  # smallest number of cells in a ring
+_FLAT_M2 = 1.5  # on a wall, a larger change of colour is paint, not a picture
+_FEWEST_MOVED, _REPAINTED = 8, 0.03  # with fewer cells, or a smaller fraction, in free space an object was repainted
+_GONE = 0.5  # an object disappeared or appeared as a whole if this fraction of its changed cells is in free space
+_ONE_PLACE = 0.4  # one object replaced another if both cover at least this fraction of the larger footprint
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,8 @@ def classify_colour_change(paint: ColourChange, sides: tuple[SurfaceCells, Surfa
 
 
 def _edge(side: SurfaceCells, inside: np.ndarray, other: SurfaceCells, other_inside: np.ndarray) -> float | None:
-    """Return the contrast of colours inside to those around, on the same plane; None without surroundings."""
+    """Return the contrast between colours inside a change and around it on the same plane; None without
+    surroundings."""
     if not len(inside):
         return None
     changed = np.zeros(len(side), dtype=bool)
@@ -70,12 +71,12 @@ def _edge(side: SurfaceCells, inside: np.ndarray, other: SurfaceCells, other_ins
     outside, row = outside[flat], row[flat]
     if len(outside) < _FEWEST:
         return None
-    # Cells at the border are mixtures: those one cell farther in and out are compared.
+    # Cells at the border mix both colours, so cells one step farther in and out are compared.
     return float(np.median(np.linalg.norm(side.colours[outside] - _deeper(side, inside, row), axis=1)))
 
 
 def _deeper(side: SurfaceCells, inside: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Return mean colours of the inside cells around the given rows."""
+    """Return the mean colours of the inside cells around the given rows."""
     points = side.points[inside]
     _, near = cKDTree(points).query(points[row], k=min(6, len(points)))
     near = near.reshape(len(row), -1)
@@ -105,7 +106,7 @@ def classify_in_place(
         return "recoloured"
     if older is None or newer is None:
         return "appeared" if older is None else "disappeared"
-    # The background of a removed object is lit differently without it, and is no object in its place.
+    # The background of a removed object is lit differently without the object, but it is no new object.
     gone = [len(t.moved) / max(len(t.changed), 1) for t in (older, newer)]
     if max(gone) >= _GONE and min(gone) < _REPAINTED:
         return "appeared" if moved[1] > moved[0] else "disappeared"
@@ -118,7 +119,7 @@ def classify_in_place(
 
 
 def _is_slight(a: tuple[SurfaceCells, ChangedSegment], b: tuple[SurfaceCells, ChangedSegment]) -> bool:
-    """Return whether a segment is much smaller or flatter than another."""
+    """Return whether a segment is much smaller or flatter than another segment."""
     (side_a, segment_a), (side_b, segment_b) = a, b
     flat = np.ptp(side_a.points[segment_a.cells, 2]) < 0.3 * np.ptp(side_b.points[segment_b.cells, 2])
     return bool(flat or len(segment_a.cells) < 0.35 * len(segment_b.cells))

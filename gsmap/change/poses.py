@@ -1,4 +1,4 @@
-"""Upright pose estimation for moved objects: Hough voting followed by coloured ICP."""
+"""Estimate upright poses of moved objects: Hough voting followed by coloured ICP."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ _LIGHT = 0.5  # weight of lightness relative to hue, as lighting differs from pl
 
 
 def tints(colours: np.ndarray) -> np.ndarray:
-    """Return (N, 3) lightness and two hue coordinates of colours (N, 3) in [0, 1], for Euclidean comparison."""
+    """Return the (N, 3) lightness and two hue coordinates of colours (N, 3) in [0, 1], for Euclidean comparison."""
     lightness, green = colours.mean(1), colours[:, 1]
     return np.stack([_LIGHT * lightness, 0.8 * (colours[:, 0] - green), 0.8 * (colours[:, 2] - green)], axis=1)
 
 
 def features(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
-    """Return (N, 6) positions and tints, both in metres."""
+    """Return the (N, 6) positions and tints of points, both in metres."""
     return np.concatenate([points, tints(colours) * _TINT_M], axis=1)
 
 
-_VOTERS, _VOTED = 150, 900  # cells of the object, and of the other capture, that vote
-_LEVEL_M, _TINT = 0.06, 0.1  # largest differences in height and tint of a pair of cells that votes
+_VOTERS, _VOTED = 150, 900  # number of cells of the object, and of the other capture, that vote
+_LEVEL_M, _TINT = 0.06, 0.1  # largest differences in height and in tint between the cells of a voting pair
 _SINK_M = 0.04
 _FEWEST_PAIRS = 10
 _BIN_M = 0.1
-_PEAKS = 2  # of each yaw
-_LOW_M = 0.25  # above which an object may stand at another height afterwards
+_PEAKS = 2  # number of peaks that are kept for each yaw
+_LOW_M = 0.25  # an object higher above the ground than this may be at another height afterwards
 
 
 def rotation_about_up(yaw: float) -> np.ndarray:
@@ -42,14 +42,15 @@ def rotation_about_up(yaw: float) -> np.ndarray:
 def vote_poses(
     points: np.ndarray, colours: np.ndarray, onto: np.ndarray, onto_colours: np.ndarray, yaws: int
 ) -> list[tuple[float, Sim3]]:
-    """Return poses that align many cells with cells of their colour and height, and their votes; most votes first.
+    """Return the poses that align many cells with cells of similar colour and height, each with its votes, most votes
+    first.
 
-    Every pair of similar cells votes, at every yaw, for the translation between them (a generalised Hough transform,
-    Ballard 1981); cells with many similar ones weigh less.
+    Every pair of similar cells votes, at every yaw, for the translation between both cells (a generalized Hough
+    transform, Ballard 1981); a cell that is similar to many cells has less weight.
 
     Args:
-        points, colours: (N, 3) of the object.
-        onto, onto_colours: (M, 3) of all candidate cells of the other capture.
+        points, colours: (N, 3) positions and colours of the object's cells.
+        onto, onto_colours: (M, 3) positions and colours of all candidate cells of the other capture.
         yaws: number of yaws, evenly spaced.
     """
     mine, theirs = _few(len(points), _VOTERS), _few(len(onto), _VOTED)
@@ -80,13 +81,13 @@ def _few(count: int, most: int) -> np.ndarray:
 
 
 def refine_pose(moving: np.ndarray, target: FeatureTree, start: Sim3, radii_m: Sequence[float]) -> Sim3:
-    """Refine a pose by point-to-point ICP over yaw and translation; neighbours are near in position and colour.
+    """Refine a pose by point-to-point ICP over yaw and translation; correspondences are near in position and colour.
 
     Objects on a floor do not sink or rise: vertical corrections are limited.
 
     Args:
         moving: (N, 6) `features` of the object.
-        target: tree of the other capture's features.
+        target: search tree of the other capture's features.
         start: initial upright pose.
         radii_m: search radius of each step.
     """

@@ -1,4 +1,4 @@
-"""Detection of moved objects: changed segments of the older capture that fit changed segments of the newer one."""
+"""Detect moved objects: changed segments of the older capture that match changed segments of the newer capture."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from gsmap.compare.capture_views import project_points
 from gsmap.compare.components import components
 from gsmap.types import Sim3
 
-_YAW_STARTS = 24  # turns about the vertical from which a moved segment is looked for
-_MAX_OFFSET_M = 0.05  # of a moved segment from the surface where it stands
-_MAX_RIVAL_SCORE = 0.875  # relative to the best; a better rival makes a move ambiguous, unless by symmetry
-_ALIKE = 0.12  # largest difference of tints of one object
+_YAW_STARTS = 24  # number of initial rotations about the vertical in the search for a moved segment
+_MAX_OFFSET_M = 0.05  # largest distance of a moved segment from the surface at its new place
+# Relative to the best score; a better rival makes a move ambiguous, unless the object is symmetric.
+_MAX_RIVAL_SCORE = 0.875
+_ALIKE = 0.12  # largest difference between the tints of one object
 _DARKER = 0.12  # largest difference in lightness of an object between two places
-_FEWEST = 30  # cells of an object that can be recognized
+_FEWEST = 30  # smallest number of cells of an object that can be recognized
 _COARSE, _FINE, _JUDGED = 80, 300, 250  # cells used for coarse and fine alignment, and for scoring
-_TRIED, _KEPT = 10, 3  # poses that are refined coarsely, and of these finely
+_TRIED, _KEPT = 10, 3  # number of poses that are refined coarsely, and then finely
 _AS_GOOD = 0.92  # relative score of an equally good pose
-_LEAST_M = 0.08  # shorter displacements without rotation are no move
-_LEAST_LEFT = 0.14  # least fraction of both segments in free space, for a move
+_LEAST_M = 0.08  # a shorter displacement without rotation is no move
+_LEAST_LEFT = 0.14  # smallest fraction of both segments in free space for a move
 _APART_M = 0.15  # largest displacement of the centre of a symmetric object
-_BESIDE_M = 0.5  # beyond a moved segment, within which more of it is searched
-_TAKES_M = 0.1  # cells this near to a moved segment are part of it
-_ABOUT_M = 0.3  # around the former place of a segment
-_PIECES_M = 0.4  # pieces this near to each other with one motion are of one object
+_BESIDE_M = 0.5  # further cells of a moved segment are searched up to this distance
+_TAKES_M = 0.1  # cells within this distance of a moved segment are part of it
+_ABOUT_M = 0.3  # radius around the former place of a segment
+_PIECES_M = 0.4  # pieces with the same motion within this distance of each other are one object
 _ROUNDS = 2
-_NUDGES = (-0.5, -0.25, 0.0, 0.25, 0.5)  # radians, for objects that were turned in place
+_NUDGES = (-0.5, -0.25, 0.0, 0.25, 0.5)  # in radians, for objects that were rotated in place
 _PANEL_M = 0.15, 1.0  # thinner and higher segments are doors, which open and shut
 
 
@@ -46,9 +47,9 @@ class Relocation:
     """The motion of an object between two captures.
 
     Args:
-        older, newer: its segments in the captures.
-        S_after_before: from its former to its new place.
-        score: fraction of its cells that fit, in both directions, in [0, 1].
+        older, newer: segments of the object in both captures.
+        S_after_before: motion from the former to the new place.
+        score: fraction in [0, 1] of the object's cells that fit; the smaller of both directions.
         runner_up: score of the best distinct pose.
         symmetry: rotation about the vertical that fits equally well.
     """
@@ -63,7 +64,7 @@ class Relocation:
 
 @dataclass(eq=False)
 class _Capture:
-    """A capture with its segments that have not been matched yet."""
+    """A capture, with its segments that have not been matched yet."""
 
     side: SurfaceCells
     cells: CellLabels
@@ -94,7 +95,7 @@ def find_relocations(
     views: tuple[CaptureViews, CaptureViews],
     params: Params,
 ) -> tuple[list[Relocation], list[ChangedSegment], list[ChangedSegment]]:
-    """Return the relocations between two captures, and the remaining segments of both."""
+    """Return the relocations between two captures, and the remaining segments of the older and the newer capture."""
     a = _Capture.of(sides[0], cells[0], views[0], older)
     b = _Capture.of(sides[1], cells[1], views[1], newer)
     moves: list[Relocation] = []
@@ -118,7 +119,8 @@ def find_relocations(
 def _moves_from(
     here: _Capture, there: _Capture, back: bool, tried_before: set[bytes], params: Params
 ) -> list[Relocation]:
-    """Return relocations of segments that are not in ``tried_before``; ``back`` if their capture is the newer."""
+    """Return the relocations of segments that are not in ``tried_before``; with ``back`` their capture is the newer
+    one."""
     found = []
     for seed in _seeds(here):
         name = bytes([back]) + seed.cells.tobytes()
@@ -130,16 +132,16 @@ def _moves_from(
 
 
 def _is_stationary(move: Relocation) -> bool:
-    """Return whether too little of an object lies in free space for a move.
+    """Return whether too little of an object lies in free space for it to have moved.
 
-    Objects of one shape and colour that replace each other appear to be rotated.
+    If objects of the same shape and colour replace each other, they appear to be rotated.
     """
     moved = len(move.older.moved) + len(move.newer.moved)
     return moved < _LEAST_LEFT * (len(move.older.cells) + len(move.newer.cells))
 
 
 def _overlap(move: Relocation, other: Relocation, a: _Capture, b: _Capture) -> bool:
-    """Return true if an earlier relocation moves the same object, or moves another object to the same place."""
+    """Return whether an earlier relocation moves the same object, or moves another object to the same place."""
     same = not _differ(move.S_after_before, other.S_after_before, a.points(move.older))
     for capture, mine, theirs in ((a, move.older, other.older), (b, move.newer, other.newer)):
         if len(np.intersect1d(mine.cells, theirs.cells)) > 0.3 * min(len(mine.cells), len(theirs.cells)):
@@ -151,7 +153,7 @@ def _overlap(move: Relocation, other: Relocation, a: _Capture, b: _Capture) -> b
 
 
 def _merge_pieces(moves: list[Relocation], a: _Capture) -> list[Relocation]:
-    """Merge the relocations of neighbouring pieces with one motion."""
+    """Merge the relocations of neighbouring pieces that have the same motion."""
     kept: list[Relocation] = []
     for move in sorted(moves, key=lambda m: -len(m.older.cells) - len(m.newer.cells)):
         points = a.points(move.older)
@@ -167,7 +169,7 @@ def _merge_pieces(moves: list[Relocation], a: _Capture) -> list[Relocation]:
 
 
 def _completed(move: Relocation, a: _Capture, b: _Capture) -> Relocation:
-    """Extend a relocation by adjacent cells that fit its motion, whether or not they changed."""
+    """Extend a relocation by adjacent cells that fit its motion, whether they changed or not."""
     S = move.S_after_before
     older = _with_more(move.older, a, b, S)
     newer = _with_more(move.newer, b, a, S.inverse())
@@ -186,7 +188,7 @@ def _with_more(segment: ChangedSegment, here: _Capture, there: _Capture, pose: S
     rows = rows[similar]
     if not len(rows):
         return segment
-    # Cells far from all fitting ones belong to another object.
+    # Cells far from all fitting cells belong to another object.
     fits = np.isfinite(cKDTree(side.points[rows]).query(points, distance_upper_bound=_TAKES_M)[0])
     segment, _ = split_segment(segment, segment.cells[fits])
     # Keep only cells connected to the segment.
@@ -205,7 +207,7 @@ def _with_more(segment: ChangedSegment, here: _Capture, there: _Capture, pose: S
 
 
 def _without(segments: list[ChangedSegment], gone: ChangedSegment) -> list[ChangedSegment]:
-    """Remove the cells of one segment from all."""
+    """Remove the cells of one segment from all segments."""
     left = []
     for segment in segments:
         _, rest = split_segment(segment, gone.cells)
@@ -215,7 +217,8 @@ def _without(segments: list[ChangedSegment], gone: ChangedSegment) -> list[Chang
 
 
 def _seeds(capture: _Capture) -> list[ChangedSegment]:
-    """Return the segments that may have moved: those partly in free space, and of some only that part."""
+    """Return the segments that may have moved, which are partly in free space; for some also their part in free space
+    alone."""
     seeds = []
     for segment in capture.segments:
         if len(segment.moved) < 8 or len(segment.cells) < _FEWEST or _is_panel(capture.points(segment)):
@@ -228,7 +231,7 @@ def _seeds(capture: _Capture) -> list[ChangedSegment]:
 
 
 def _is_panel(points: np.ndarray) -> bool:
-    """Return whether a segment is high and thin like a door."""
+    """Return whether a segment is high and thin, like a door."""
     xy = points[:, :2] - points[:, :2].mean(0)
     thin = xy @ np.linalg.eigh(xy.T @ xy)[1][:, 0]
     return bool(np.ptp(np.quantile(thin, (0.05, 0.95))) < _PANEL_M[0] and np.ptp(points[:, 2]) > _PANEL_M[1])
@@ -249,7 +252,7 @@ def _moved(seed: ChangedSegment, here: _Capture, there: _Capture, back: bool, pa
         _YAW_STARTS,
     )
     starts = [pose for _, pose in tried[:_TRIED]]
-    # For small displacements, most votes are for the unchanged pose.
+    # For small displacements most votes are for the unchanged pose, so nearby poses are tried as well.
     middle = points.mean(0)
     starts += [Sim3(rotation_about_up(yaw), middle - rotation_about_up(yaw) @ middle) for yaw in _NUDGES]
     hopes = []
@@ -296,7 +299,7 @@ def _moved(seed: ChangedSegment, here: _Capture, there: _Capture, back: bool, pa
 
 
 def _targets(there: _Capture, points: np.ndarray) -> np.ndarray:
-    """Return the candidate cells for a segment: changed cells, and cells at its former place."""
+    """Return the candidate cells for a segment: changed cells, and cells around its former place."""
     changed = np.concatenate([t.cells for t in there.segments])
     side = there.side
     low, high = points.min(0) - _ABOUT_M, points.max(0) + _ABOUT_M
@@ -306,19 +309,20 @@ def _targets(there: _Capture, points: np.ndarray) -> np.ndarray:
 
 
 def _near(moving: np.ndarray, tree: FeatureTree, pose: Sim3) -> float:
-    """Return the mean closeness, in [0, 1], of cells to cells of their colour."""
+    """Return the mean closeness, in [0, 1], of transformed cells to cells of similar colour."""
     moved = np.concatenate([pose.apply(moving[:, :3]), moving[:, 3:]], axis=1)
     return float((1 - np.minimum(tree.distances(moved, 0.1), 0.1) / 0.1).mean())
 
 
 def _differ(a: Sim3, b: Sim3, points: np.ndarray) -> bool:
-    """Return whether two poses place points differently."""
+    """Return whether two poses move points to different places."""
     few = points[:: max(1, len(points) // 50)]
     return bool(np.linalg.norm(a.apply(few) - b.apply(few), axis=1).mean() > 0.15)
 
 
 def _covered(capture: _Capture, points: np.ndarray, pose: Sim3, whole: float = 0.5) -> ChangedSegment | None:
-    """Return the union of a capture's segments at transformed points; whole segments from a covered fraction on."""
+    """Return the union of a capture's segments at transformed points; a segment is taken completely if the points cover
+    at least the fraction ``whole`` of it."""
     tree = cKDTree(pose.apply(points))
     taken = []
     for segment in capture.segments:
@@ -331,7 +335,7 @@ def _covered(capture: _Capture, points: np.ndarray, pose: Sim3, whole: float = 0
 
 
 def _score(mine: ChangedSegment, theirs: ChangedSegment, here: _Capture, there: _Capture, pose: Sim3) -> float:
-    """Return the fraction of observable cells that fit, the smaller of both directions."""
+    """Return the fraction of observable cells that fit; the smaller of both directions."""
     out = _agreement(mine, here, there, pose)
     return min(out, _agreement(theirs, there, here, pose.inverse())) if out > 0 else 0.0
 
@@ -351,7 +355,8 @@ def _agreement(segment: ChangedSegment, here: _Capture, there: _Capture, pose: S
 def _fits(
     rows: np.ndarray, moved: np.ndarray, side: SurfaceCells, other: SurfaceCells
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return masks of the moved cells (N, 3) on the other capture's surface, and of those also of its colour."""
+    """Return a mask of the moved cells (N, 3) that lie on the other capture's surface, and a mask of those that also
+    have its colour."""
     distance, near = other.tree.query(moved, k=4, distance_upper_bound=1.5 * _MAX_OFFSET_M)
     on = np.isfinite(distance[:, 0])
     theirs = other.tints[np.minimum(near, len(other) - 1)]
@@ -363,7 +368,7 @@ def _fits(
 
 
 def _in_free_space(points: np.ndarray, views: CaptureViews) -> np.ndarray:
-    """Return (N,) bool, points in free space of a capture's own views."""
+    """Return an (N,) mask of points in free space of a capture's own views."""
     count = np.zeros(len(points), dtype=np.int64)
     for view, sure in zip(views.views[::2], views.sure[::2], strict=True):
         at = project_points(points, view, 0.2)
@@ -375,7 +380,7 @@ def _in_free_space(points: np.ndarray, views: CaptureViews) -> np.ndarray:
 def _symmetry(
     mine: ChangedSegment, theirs: ChangedSegment, here: _Capture, there: _Capture, pose: Sim3, score: float
 ) -> Literal["none", "half", "any"]:
-    """Return the rotational symmetry about the vertical by which the object fits equally well."""
+    """Return the rotational symmetry about the vertical under which the object fits equally well."""
     points = here.points(mine)
     fine = _features(here.side, mine.cells)[:: max(1, len(points) // _FINE)]
     middle = 0.5 * (np.quantile(points, 0.02, axis=0) + np.quantile(points, 0.98, axis=0))

@@ -1,4 +1,4 @@
-"""Assembly of reported changes: boxes, voxels, members, confidence and evidence."""
+"""Assemble reported changes: boxes, voxels, members, confidence and evidence."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.types.change import Change
 
 _GAIN = 0.08  # logarithm of an exposure gain that counts as different lighting
-_BY_M = 0.15  # a change is a piece of a larger one of its kind if half of it is this near
+_BY_M = 0.15  # a change is a piece of a larger change of its kind if half of it is within this distance
 _SLIVER_M = 0.07  # changes thinner than this in two directions are edges that two trainings place differently
 
 
 def make_change(
     one: DetectedChange, both: tuple[SurfaceCells, SurfaceCells], cells: tuple[CellLabels, CellLabels], params: Params
 ) -> Change:
-    """Make the entry of the report of a detected change."""
+    """Convert a detected change to an entry of the report."""
     rows, seen = [], []
     for k in (0, 1):
         segment = one.segments[k]
@@ -66,7 +66,7 @@ def make_change(
 
 
 def merge_pieces(changes: Sequence[Change], params: Params) -> list[Change]:
-    """Merge changes into larger ones of their kind near by; moved objects have their pieces already."""
+    """Merge changes into nearby larger changes of the same kind; the pieces of moved objects are already merged."""
     out: list[Change] = []
     for change in sorted(changes, key=lambda c: (-len(c.voxels), c.box.tolist())):
         if change.kind != "moved" and len(change.voxels):
@@ -83,7 +83,7 @@ def merge_pieces(changes: Sequence[Change], params: Params) -> list[Change]:
 
 
 def _joined(whole: Change, piece: Change, params: Params) -> Change:
-    """Merge a piece into a change, whose confidence stays."""
+    """Merge a piece into a change; the confidence of the change stays."""
     every = np.concatenate([whole.voxels, piece.voxels])
     _, first = np.unique(np.floor(every / params.voxel_m), axis=0, return_index=True)
     return replace(
@@ -96,16 +96,16 @@ def _joined(whole: Change, piece: Change, params: Params) -> Change:
 
 
 def _confidence(one: DetectedChange, evidence: dict[str, float]) -> float:
-    """Return the confidence in [0, 1]; of a moved object it includes the fit at its new place."""
+    """Return the confidence in [0, 1]; for a moved object it includes the fit at the new place."""
     sure = confidence(evidence)
     return sure * float(np.clip(evidence["fit"] / 0.8, 0, 1)) if one.kind == "moved" else sure
 
 
 def detect_lighting_change(both: tuple[SurfaceCells, SurfaceCells], line: Balance, spread: float) -> Change | None:
-    """Detect a change of lighting or exposure of the whole place; None without one.
+    """Detect a change of lighting or exposure of the whole place; return None without one.
 
     Args:
-        spread: spread of the lighting difference, see `gsmap.change.segments.lighting_spread`.
+        spread: spread of the lighting difference; see `gsmap.change.segments.lighting_spread`.
     """
     gains = np.abs(np.log(line.gains()))
     sure = float(1 - np.exp(-max(gains.max() / _GAIN, spread / LIT_OTHERWISE)))

@@ -1,4 +1,4 @@
-"""Changed segments and changes of colour from the surface cells of two captures."""
+"""Find changed segments and changes of colour from the surface cells of two captures."""
 
 from __future__ import annotations
 
@@ -13,30 +13,32 @@ from gsmap.compare.components import components, groups
 from gsmap.compare.structure import planes
 from gsmap.geometry.cells import cell_labels
 
-_MIN_LOOKED_THROUGH = 0.5  # fraction of the views of a neighbourhood, for it to count as gone
-_CLUSTER_LINK_M = 0.1  # changed cells this near belong to one segment
-_MIN_PAINT = 1.9  # strength of a change of colour that is reported, times the least difference of colour
-_MAX_LEAK = 0.2  # fraction of it that goes on around its edges; that of light and shadow is larger
-_SMOOTH_M = 0.08  # radius of the neighbourhood that evidence is summed over
-_FEWEST_LOOKS = 3  # views through a neighbourhood, or pixels that compared its colour
-_FAINT = 0.6  # least strength of a cell of a change of colour
-_WHOLE = 0.33  # changed fraction of the judged cells of a segment, from which all of it counts as changed
-_BOX_M = 0.1  # except for cells farther than this outside the box of its changed cells
+_MIN_LOOKED_THROUGH = 0.5  # a neighbourhood is gone if at least this fraction of its views see it in free space
+_CLUSTER_LINK_M = 0.1  # changed cells within this distance of each other belong to one segment
+_MIN_PAINT = 1.9  # smallest strength of a reported change of colour, relative to the smallest that counts
+_MAX_LEAK = 0.2  # largest fraction of it that continues beyond its edges; for light and shadow more continues
+_SMOOTH_M = 0.08  # radius of the neighbourhood over which evidence is summed
+_FEWEST_LOOKS = 3  # smallest number of views of a neighbourhood, or of pixels that compare its colour
+_FAINT = 0.6  # smallest strength of a cell in a change of colour
+_WHOLE = 0.33  # a segment counts as changed completely if at least this fraction of its judged cells changed
+_BOX_M = 0.1  # except for cells farther outside of the box of its changed cells than this
 _SAME_M = 0.15  # and for unchanged cells farther than this from changed ones
-_LINK_M = 0.08  # largest distance of neighbouring cells of one segment
+_LINK_M = 0.08  # largest distance between neighbouring cells of one segment
 _RING_M = (0.04, 0.12)  # distances from a change of colour at which its surroundings begin and end
 _MOST = 0.35
-_MUCH, _MANY = 0.25, 100  # fraction of a segment, and cells, that no shadow recolours
+_MUCH, _MANY = 0.25, 100  # a shadow recolours less than this fraction of a segment and fewer than this many cells
 _PLACE_M = 0.5
-_DARK = 0.8  # fraction of lightness in a change that may be a shadow, a lamp, or a window at night
-_COHERENT = 0.4  # least agreement of a change with itself; less may be a texture that two trainings show differently
-_BEHIND_M = 0.2  # distance of a change of colour on a wall to the object that appeared or disappeared in front
-_BEHIND = 0.5  # fraction of it that must be this near
-_SPLINTER, _SPLINTER_M = 60, 0.15  # smaller segments this near to a larger one are fragments of it
+_DARK = 0.8  # with a larger fraction of lightness a change may be a shadow, a lamp, or a window at night
+_COHERENT = 0.4  # a less coherent change may be a texture that two trainings show differently
+# Largest distance from a change of colour on a wall to the object that appeared or disappeared in front of it.
+_BEHIND_M = 0.2
+_BEHIND = 0.5  # smallest fraction of the change within that distance
+# Segments with fewer cells within this distance of a larger segment are fragments of it.
+_SPLINTER, _SPLINTER_M = 60, 0.15
 
 
 LIT_OTHERWISE = 0.028
-"""Value of `lighting_spread` from which on the whole place is lit differently."""
+"""With a larger `lighting_spread` the whole place is lit differently."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +48,10 @@ class CellLabels:
     Args:
         plane: (M,) plane of the building shell, -1 for none; numbered jointly in both captures.
         segment: (M,) connected segment off the shell, -1 on the shell.
-        moved: (M,) bool, in free space of the other capture.
-        painted: (M,) bool, on the other capture's surface, in another colour.
-        judged: (M,) bool, observed by the other capture.
-        strength: (M,) difference of colour relative to the least that counts.
+        moved: (M,) mask of cells in free space of the other capture.
+        painted: (M,) mask of cells on the other capture's surface, in another colour.
+        judged: (M,) mask of cells that the other capture observed.
+        strength: (M,) difference of colour, relative to the smallest that counts.
         offset_m: (M,) distance of the other capture's surface behind this one.
     """
 
@@ -78,7 +80,7 @@ def _judge(side: SurfaceCells, plane: np.ndarray) -> CellLabels:
     strength = side.around(side.strength * side.pixels, _SMOOTH_M) / np.maximum(pixels, 1)
     offset = side.around(side.offset_m * side.pixels, _SMOOTH_M) / np.maximum(pixels, 1)
     painted = ~moved & (pixels >= _FEWEST_LOOKS) & (strength >= _FAINT)
-    plane = np.where(moved, -1, plane)  # free space is no wall
+    plane = np.where(moved, -1, plane)  # cells in free space are not part of a wall
     segment = np.full(len(side), -1, dtype=np.int64)
     segment[plane < 0] = components(side.points[plane < 0], _LINK_M)
     judged = (side.through + side.on > 0) | (side.pixels > 0)
@@ -93,9 +95,9 @@ class ChangedSegment:
     """A changed segment of one capture.
 
     Args:
-        cells: (K,) all of its cells.
-        moved, painted: cells in free space of the other capture, or in another colour there.
-        behind: cells of the shell behind it that changed their colour because of it.
+        cells: (K,) all cells of the segment.
+        moved, painted: cells in free space of the other capture, and cells that have another colour there.
+        behind: cells of the shell behind the segment whose colour changed because of it.
     """
 
     cells: np.ndarray
@@ -113,13 +115,13 @@ class ColourChange:
     """A change of colour on one surface, as both captures show it.
 
     Args:
-        cells: of each capture.
-        strength: mean strength relative to the least that counts.
+        cells: cells of each capture.
+        strength: mean strength, relative to the smallest that counts.
         leak: fraction of the change that continues around it.
-        coherence: 1 where all cells changed equally, 0 where each changed differently.
+        coherence: 1 if all cells changed equally, 0 if each changed differently.
         darkening: fraction of the change that is lightness, not hue.
-        is_shell: on a wall, floor or ceiling.
-        share: fraction of the segment it is on, the smaller of both captures; 0 on the shell.
+        is_shell: the change is on a wall, floor or ceiling.
+        share: fraction of its segment that the change covers, the smaller of both captures; 0 on the shell.
         area_m2: area of the surface.
     """
 
@@ -134,15 +136,17 @@ class ColourChange:
 
 
 def find_segments(side: SurfaceCells, cells: CellLabels, painted: np.ndarray, params: Params) -> list[ChangedSegment]:
-    """Return the changed segments of one capture, largest first; ``painted`` (M,) bool are clearly recoloured cells."""
+    """Return the changed segments of one capture, largest first; ``painted`` (M,) is a mask of clearly recoloured
+    cells."""
     fewest = max(2, round(params.min_area_m2 / CELL_M**2))
     changed = (cells.moved | painted) & (cells.segment >= 0)
-    count = max(int(cells.segment.max(initial=-1)) + 1, 1)  # at least one, for -1 to index: all may be shell
+    # At least one, so that -1 is a valid index if all cells are shell.
+    count = max(int(cells.segment.max(initial=-1)) + 1, 1)
     total = np.bincount(cells.segment[cells.judged & (cells.segment >= 0)], minlength=count)
     share = np.bincount(cells.segment[changed], minlength=count) / np.maximum(total, 1)
     whole = (share >= _WHOLE)[cells.segment] & (cells.segment >= 0)
-    # Of segments that changed in part, the part is cut out; wholly changed ones stay together, within their own box.
-    # Segments of too few cells join changed cells near by.
+    # The changed part of a partly changed segment is cut out; a completely changed segment stays together, within the
+    # box of its changed cells. Segments with too few cells join nearby changed cells.
     size = np.bincount(cells.segment[cells.segment >= 0], minlength=count)
     kind = np.where(whole & (size >= fewest)[cells.segment], cells.segment, -1)
     for segment in np.unique(kind[kind >= 0]):
@@ -162,7 +166,7 @@ def find_segments(side: SurfaceCells, cells: CellLabels, painted: np.ndarray, pa
 def find_colour_changes(
     sides: tuple[SurfaceCells, SurfaceCells], cells: tuple[CellLabels, CellLabels], params: Params
 ) -> list[ColourChange]:
-    """Cluster the recoloured cells of both captures, on one plane or off all planes."""
+    """Cluster the recoloured cells of both captures; cells of one cluster are on the same plane, or off all planes."""
     rows = [np.flatnonzero(c.painted) for c in cells]
     points = np.concatenate([side.points[r] for side, r in zip(sides, rows, strict=True)])
     plane = np.concatenate([c.plane[r] for c, r in zip(cells, rows, strict=True)])
@@ -197,10 +201,11 @@ def find_colour_changes(
 
 
 def is_recoloured(paint: ColourChange, spread: float) -> bool:
-    """Return whether a change of colour is paint, not lighting or texture that two trainings show differently.
+    """Return whether a change of colour is paint, rather than lighting or a texture that two trainings show
+    differently.
 
     Args:
-        spread: of the lighting difference, see `lighting_spread`.
+        spread: spread of the lighting difference; see `lighting_spread`.
     """
     if not paint.is_shell and paint.share >= _MUCH and sum(map(len, paint.cells)) >= _MANY:
         less = 0.6 if paint.share >= _MOST and paint.coherence >= _COHERENT else 0.75
@@ -218,7 +223,8 @@ def is_recoloured(paint: ColourChange, spread: float) -> bool:
 def lighting_spread(sides: tuple[SurfaceCells, SurfaceCells]) -> float:
     """Measure the difference in lighting of two captures of a place.
 
-    The robust spread, over cubes of half a metre, of the colour differences that remain after exposure balancing.
+    The result is the robust spread, over cubes of half a metre, of the colour differences that remain after exposure
+    balancing.
     """
     spreads = []
     for side in sides:
@@ -232,7 +238,7 @@ def lighting_spread(sides: tuple[SurfaceCells, SurfaceCells]) -> float:
 
 
 def _share(cells: CellLabels, rows: np.ndarray) -> float:
-    """Return the fraction that cells make up of the segment that most of them belong to."""
+    """Return the fraction of a segment that some cells make up, for the segment to which most of them belong."""
     if not len(rows):
         return 0.0
     segment = int(np.bincount(cells.segment[rows]).argmax())
@@ -256,7 +262,8 @@ def _leak(side: SurfaceCells, cells: CellLabels, inside: np.ndarray, plane: int)
 def segment_in_front(
     segments: list[ChangedSegment], sides: tuple[SurfaceCells, SurfaceCells], paint: ColourChange, which: list[int]
 ) -> int | None:
-    """Return the index of the segment that appeared or disappeared in front of a change of colour on a wall, or None.
+    """Return the index of the segment that appeared or disappeared in front of a change of colour on a wall; None
+    without one.
 
     Args:
         which: capture of each segment, 0 for the older and 1 for the newer.
@@ -280,7 +287,7 @@ def with_background(segment: ChangedSegment, cells: np.ndarray) -> ChangedSegmen
 
 
 def absorb_fragments(segments: list[ChangedSegment], side: SurfaceCells) -> list[ChangedSegment]:
-    """Merge small segments into larger ones near by; the result is sorted by size, largest first."""
+    """Merge small segments into nearby larger segments; the result is sorted by size, largest first."""
     left = sorted(segments, key=lambda t: (-len(t.cells), int(t.cells[0])))
     kept: list[ChangedSegment] = []
     for segment in left:
@@ -313,7 +320,7 @@ def union_of(a: ChangedSegment, b: ChangedSegment) -> ChangedSegment:
 
 
 def split_segment(segment: ChangedSegment, rows: np.ndarray) -> tuple[ChangedSegment, ChangedSegment]:
-    """Split a segment into the part of some of its cells, and the rest."""
+    """Split a segment into the part with the cells ``rows`` and the rest."""
     inside = np.isin(segment.cells, rows)
     both = []
     for cells in (segment.cells[inside], segment.cells[~inside]):

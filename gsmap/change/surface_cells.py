@@ -1,4 +1,4 @@
-"""Surface cells of two captures with their evidence of change from the views of both."""
+"""Collect the surface cells of two captures, with evidence of change from the views of both."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from gsmap.geometry.sh import rgb_of_sh0
 
 CELL_M = 0.05  # surfaces are judged by cells of this size
 _MIN_CHROMA, _MIN_LIGHTNESS = 0.05, 0.15  # smallest differences, of colours in [0, 1], that may be a change
-_COLOUR_SIGMAS = 3.0  # robust standard deviations that exposure and noise may leave
-_CLIP_M = 0.15  # larger offsets are other surfaces, not noise
-_STEEPEST = 0.2  # least cosine of the viewing angle at which an offset is measured
+_COLOUR_SIGMAS = 3.0  # largest difference due to exposure and noise, in robust standard deviations
+_CLIP_M = 0.15  # larger offsets come from another surface, not from noise
+_STEEPEST = 0.2  # smallest cosine of the viewing angle at which an offset is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +29,15 @@ class SurfaceCells:
     """The surface of one capture in M cells, with evidence from the views of both captures.
 
     Args:
-        rows: (R,) Gaussians of the capture on surfaces, and ``label`` (R,) the cell of each.
-        points, colours: (M, 3) means.
-        through, on: (M,) views of the other capture with a Gaussian in free space or on the surface, summed over the
-            cell's Gaussians.
-        offset_m: (M,) mean distance of the other capture's surface behind this one, along its normal.
+        rows: (R,) Gaussians of the capture on surfaces; ``label`` (R,) is the cell of each.
+        points, colours: (M, 3) mean positions and colours of the cells.
+        through, on: (M,) number of views of the other capture in which a Gaussian is in free space or on the surface,
+            summed over the Gaussians of the cell.
+        offset_m: (M,) mean distance, along the normal, of the other capture's surface behind this one.
         colour: (M, 3) mean difference of colour, two of chroma and one of lightness, newer minus older.
-        strength: (M,) the same relative to the least difference that counts, texture off by a pixel ignored.
-        pixels: (M,) pixels that show the cell in both captures.
+        strength: (M,) size of the difference relative to the smallest that counts; texture that is shifted by a pixel
+            is ignored.
+        pixels: (M,) number of pixels that show the cell in both captures.
     """
 
     rows: np.ndarray
@@ -64,11 +65,11 @@ class SurfaceCells:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """(M, 3) unit normals; signs are arbitrary."""
+        """(M, 3) unit normals; their signs are arbitrary."""
         return normals_of(self.points)
 
     def around(self, values: np.ndarray, radius_m: float) -> np.ndarray:
-        """Return (M, ...) sums of values over the cells within a radius of each."""
+        """Return the (M, ...) sums of values over the cells within a radius of each cell."""
         return self._neighbours(radius_m) @ values
 
     def _neighbours(self, radius_m: float) -> Any:
@@ -85,7 +86,7 @@ class SurfaceCells:
 
 @dataclass(eq=False)
 class _Sums:
-    """Sums over pixels by their dominant Gaussian."""
+    """Sums of pixel values by the dominant Gaussian of each pixel."""
 
     offset: np.ndarray
     colour: np.ndarray
@@ -103,7 +104,7 @@ def compare_surfaces(
     """Accumulate the evidence on the surface cells of both captures."""
     sums = _Sums.zeros(len(older.gaussians)), _Sums.zeros(len(newer.gaussians))
     limits = _limits(comparison.balance)
-    # Every second view of each capture, as neighbouring views of a walk show the same.
+    # Use every second view of each capture, because neighbouring views along a path show the same content.
     for picture in comparison.newer_views[::2]:
         _add(sums, (picture.other, picture.own), picture, comparison, limits)
     for picture in comparison.older_views[1::2]:
@@ -118,7 +119,7 @@ def compare_surfaces(
 
 
 def _limits(line: Balance) -> tuple[float, float]:
-    """Return the least differences of chroma and lightness that count."""
+    """Return the smallest differences of chroma and lightness that count."""
     return (
         max(_MIN_CHROMA, _COLOUR_SIGMAS * line.chroma_spread),
         max(_MIN_LIGHTNESS, _COLOUR_SIGMAS * line.lightness_spread),
@@ -150,15 +151,17 @@ def _add(
 
 
 def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
-    """Return differences of colour (H, W, 3), two of chroma and one of lightness, and their strength (H, W).
+    """Return differences of colour (H, W, 3), two of chroma and one of lightness, and the strength (H, W) of the
+    differences.
 
-    The strength is relative to the limits, after subtracting what a shift by a pixel explains.
+    The strength is relative to the limits, after subtracting the difference that a shift by a pixel explains.
     """
     log_a = log_colours(a) * line.slope.astype(np.float32) + line.offset.astype(np.float32)
     log_b = log_colours(b)
     bright = np.minimum(np.exp(np.maximum(log_a.max(-1), log_b.max(-1))), 1)
     plain = _opponent(log_b - log_a, bright)
-    # Texture that is off by a pixel, or blurred in one capture, stays within the other's range around the pixel.
+    # Texture that is shifted by a pixel, or blurred in one capture, stays within the other capture's range around the
+    # pixel.
     strengths = []
     for x, y in ((log_a, log_b), (log_b, log_a)):
         beyond = _opponent(beyond_ranges(x, y), bright)
@@ -167,14 +170,14 @@ def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, fl
 
 
 def _opponent(ratio: np.ndarray, bright: np.ndarray) -> np.ndarray:
-    """Return red and blue relative to green, and the mean, as in `gsmap.compare.Balance.differences`."""
+    """Return red and blue relative to green, and the mean of all three, as in `gsmap.compare.Balance.differences`."""
     green = ratio[..., 1]
     parts = [ratio[..., 0] - green, ratio[..., 2] - green, ratio.mean(-1)]
     return np.stack(parts, axis=-1) * bright[..., None]
 
 
 def _along_normal(view: Any) -> np.ndarray:
-    """Return (H, W) metres along the surface normal per metre of depth."""
+    """Return the (H, W) metres along the surface normal per metre of depth."""
     fx, fy, cx, cy = view.camera.intrinsics_px[0]
     height, width = view.depth.shape
     x = np.broadcast_to((np.arange(width) + 0.5 - cx) / fx, (height, width))
