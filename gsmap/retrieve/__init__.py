@@ -1,4 +1,4 @@
-"""Retrieval: find the pairs of scenes, among many, that may overlap."""
+"""Retrieval: among many scenes find the pairs that may overlap."""
 
 from gsmap.retrieve.index import new_segment
 from gsmap.retrieve.lookup import VERSION, look_up

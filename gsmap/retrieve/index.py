@@ -19,7 +19,7 @@ def positions_of(rows: np.ndarray) -> np.ndarray:
 
 
 def new_segment(scenes: Sequence[SceneNodes]) -> InMemory:
-    """Build a segment of scenes that are not indexed yet."""
+    """Build an index segment of scenes that are not indexed yet."""
     keys = np.concatenate([v.index_nodes.keys for v in scenes]) if scenes else np.zeros(0, np.int64)
     rows = [_pack(v.index_nodes, place) for place, v in enumerate(scenes)]
     return in_lists([v.member for v in scenes], keys, np.concatenate(rows) if rows else np.zeros((0, WIDTH), np.uint8))

@@ -1,4 +1,4 @@
-"""Look up candidates of a scene in an inverted index: tf-idf votes of nodes, then geometric verification."""
+"""Look up the candidates of a scene in an inverted index: nodes vote with tf-idf weights, then geometry verifies."""
 
 from __future__ import annotations
 
@@ -18,35 +18,36 @@ from gsmap.types.segments import Segment, lists_of, places_of
 
 VERSION = 5
 
-_BLOCK_ROWS = 250_000  # of an index that are in memory at a time: 15 MB
-_SAME_NODE_M = 0.05  # two nodes nearer than this may be one
-VOTES_PER_NODE = 200  # most similar nodes that each node votes for
-_MIN_SIMILARITY = 0.6  # nodes whose vectors have a smaller cosine do not match
-_EQUAL_SIMILARITY = 0.02  # a match is common where other scenes have nodes whose cosine is at most this much smaller
-_FLIPPED_SIGNS = 2  # of the axes that name a node's list, so many are searched on both sides
-_MAX_MATCHES = 24  # highest weighted matches of two scenes by which they are aligned
-MAX_VERIFIED = 300  # most voted for scenes that are verified geometrically
-PEERS = 30  # nearest aligned candidates, at most a third of all, by which a score is normalized
-# Largest difference of the distance and of the rise of two nodes between two scenes, and largest residual of an aligned
-# match; working metres.
+_BLOCK_ROWS = 250_000  # of an index that are in memory at the same time: 15 MB
+_SAME_NODE_M = 0.05  # two nodes nearer to each other than this may be the same
+VOTES_PER_NODE = 200  # number of most similar nodes for which each node votes
+_MIN_SIMILARITY = 0.6  # smallest cosine between the vectors of matching nodes
+_EQUAL_SIMILARITY = 0.02  # another scene has a match about as good if its cosine is at most this much smaller
+_FLIPPED_SIGNS = 2  # number of axes, of those that name a node's list, that are searched on both sides
+_MAX_MATCHES = 24  # number of matches of highest weight by which two scenes are aligned
+MAX_VERIFIED = 300  # number of scenes, those with most votes, that are verified geometrically
+PEERS = 30  # number of nearest aligned candidates (at most a third of all) that normalize a score
+# Tolerance, in working metres, of the distance and of the height difference of two nodes in two scenes, and of the
+# residual of an aligned match.
 _TOLERANCE_M = 0.2
-_MIN_DISTANCE_M = 0.5  # nodes nearer to each other are not counted as independent inliers; working metres
-_SCALE_SLACK = 0.25  # share of a distance that it may differ by where the metre of one of the scenes is guessed
-_LEAST_SPREAD = 0.05  # of the best score: smaller differences are chance
+_MIN_DISTANCE_M = 0.5  # nodes nearer to each other, in working metres, are not independent inliers
+_SCALE_SLACK = 0.25  # relative tolerance of a distance if the metre of one of the scenes is estimated
+_LEAST_SPREAD = 0.05  # of the best score: smaller differences are due to chance
 
 
 def look_up(queries: Sequence[SceneNodes], segments: Sequence[Segment], params: Params) -> list[list[Candidate]]:
-    """Return the candidates of each query scene, best first, equals by id.
+    """Return the candidates of each query scene, best first; equal candidates are sorted by id.
 
-    A node's match has the weight of a tf-idf score: the squared logarithm of the share of scenes that have a match as
-    good. The scenes with most votes are aligned with the query by their highest weighted matches, and the tf-idf score
-    of an aligned scene sums the inliers. Aliased rooms align at the same place and share the inliers of their
-    decoration; so the final score is the tf-idf score less the mean of those of the nearest aligned candidates, in
-    their standard deviations, and at least 0.
+    The weight of a node's match is that of a tf-idf score: the squared logarithm of the share of scenes that have a
+    match about as good. The scenes with most votes are aligned with the query by their matches of highest weight, and
+    the tf-idf score of an aligned scene sums over its inliers. Aliased rooms align at the same place, and their
+    decoration gives the same inliers. So the final score is normalized by the tf-idf scores of the nearest aligned
+    candidates: their mean is subtracted, the difference divided by their standard deviation, and negative values set to
+    0.
 
     Args:
         queries: the query scenes; a scene is no candidate of itself.
-        segments: all parts of the index.
+        segments: all segments of the index.
     """
     members = _IndexedScenes(segments)
     found = [_NodeMatches(query, members, params) for query in queries]
@@ -58,7 +59,7 @@ def look_up(queries: Sequence[SceneNodes], segments: Sequence[Segment], params: 
 
 
 class _IndexedScenes:
-    """The indexed scenes of all segments, each once, sorted by id."""
+    """The indexed scenes of all segments, each scene once, sorted by id."""
 
     def __init__(self, segments: Sequence[Segment]) -> None:
         first: dict[str, tuple[int, int, IndexedScene]] = {}
@@ -73,19 +74,19 @@ class _IndexedScenes:
             self.places[number][place] = self.place_of[scene]
 
     def are_few(self, params: Params) -> bool:
-        """Return whether every scene is paired with every other."""
+        """Return whether there are so few scenes that each is paired with every other scene."""
         return len(self.members) - 1 <= params.top_k
 
 
 class _NodeMatches:
-    """Matches of one query's nodes, collected block by block.
+    """Matches of the nodes of one query, collected block by block.
 
     Args:
         query: the query scene.
-        own: its place among the members; -1 if it is not indexed.
-        probes: (M, 2 ** _FLIPPED_SIGNS) int64 inverted lists that each of its nodes searches.
-        nearest: (M, VOTES_PER_NODE) int32 squared distances of the nearest matches, as a heap, the largest first.
-        seen: where all scenes are paired, the places of those with nodes in the same lists, however dissimilar.
+        own: place of the query scene among the members; -1 if it is not indexed.
+        probes: (M, 2 ** _FLIPPED_SIGNS) int64 inverted lists that each node of the query searches.
+        nearest: (M, VOTES_PER_NODE) int32 squared distances of the nearest matches, as a heap with the largest first.
+        seen: if all scenes are paired, the places of the scenes with nodes in the same lists, similar or not.
     """
 
     def __init__(self, query: SceneNodes, members: _IndexedScenes, params: Params) -> None:
@@ -102,10 +103,10 @@ class _Block:
     """Consecutive inverted lists of a segment.
 
     Args:
-        keys: (W,) int64 of the lists, rising.
-        starts: (W + 1,) int64 where each begins in the rows.
-        rows: (M, B) uint8.
-        num_members: of the segment.
+        keys: (W,) int64 keys of the lists, ascending.
+        starts: (W + 1,) int64 first row of each list, and the end.
+        rows: (M, B) uint8 encoded nodes.
+        num_members: number of scenes in the segment.
     """
 
     keys: np.ndarray
@@ -115,7 +116,7 @@ class _Block:
 
 
 def _blocks(found: Sequence[_NodeMatches], segment: Segment) -> Iterator[_Block]:
-    """Yield the inverted lists of a segment that any query searches, and those between them, block by block."""
+    """Yield, block by block, the inverted lists of a segment that any query searches, and the lists between them."""
     keys, starts = lists_of(segment)
     searched = np.unique(np.concatenate([matches.probes.ravel() for matches in found] or [np.zeros(0, np.int64)]))
     rows_searched = np.flatnonzero(np.isin(keys, searched, assume_unique=True))
@@ -128,13 +129,13 @@ def _blocks(found: Sequence[_NodeMatches], segment: Segment) -> Iterator[_Block]
 
 
 def _search(found: _NodeMatches, block: _Block, place_of: np.ndarray) -> None:
-    """Compare a query's nodes with those of the inverted lists that they search.
+    """Compare a query's nodes with the nodes in the inverted lists that they search.
 
-    Squared distances of codes are integers, and all matches as near as the last of a node's nearest are kept, so the
+    Squared distances of codes are integers, and all matches that tie with the last of a node's nearest are kept, so the
     result does not depend on the order.
 
     Args:
-        place_of: place among the members of each scene of the segment; -1 for scenes that are not members.
+        place_of: for each scene of the segment, its place among the members; -1 for scenes that are not members.
     """
     at = np.minimum(np.searchsorted(block.keys, found.probes), len(block.keys) - 1)
     node, column = np.nonzero(block.keys[at] == found.probes)
@@ -148,7 +149,7 @@ def _search(found: _NodeMatches, block: _Block, place_of: np.ndarray) -> None:
         )
     except ValueError as error:
         raise CorruptError(
-            f"rows of an index name scenes that it does not hold ({error})", code="index_damaged"
+            f"rows of the index refer to scenes that it does not contain ({error})", code="index_damaged"
         ) from error
     found.parts.append((matched, squared, place, positions_of(block.rows[row])))
     if found.seen is not None:
@@ -162,10 +163,10 @@ def _rank(found: _NodeMatches, members: _IndexedScenes, params: Params) -> list[
         return []
     query = found.query
     node, squared, place, candidate_points = (np.concatenate(part) for part in zip(*found.parts, strict=True))
-    near = squared <= found.nearest[node, 0]  # the remaining ones were near when they were found
+    near = squared <= found.nearest[node, 0]  # drop matches that were near when found but no longer are
     node, squared, place, candidate_points = node[near], squared[near], place[near], candidate_points[near]
-    # Nearest first. Squared distances are integers below 2 ** 23; equals are sorted by scene, and within a scene by its
-    # lists, so the order of arrival has no effect. A node votes by its best match in each scene.
+    # Sort the nearest first. Squared distances are integers below 2 ** 23. Equal ones are sorted by scene, and within a
+    # scene by list, so the order of arrival has no effect. A node votes by its best match in each scene.
     order = np.argsort((node << 44) | (squared << 20) | place, kind="stable")
     node, place, squared, candidate_points = node[order], place[order], squared[order], candidate_points[order]
     best = np.unique(node * len(members.members) + place, return_index=True)[1]
@@ -187,11 +188,12 @@ def _rank(found: _NodeMatches, members: _IndexedScenes, params: Params) -> list[
 
 
 def _tf_idf_weights(node: np.ndarray, squared: np.ndarray, num_scenes: int) -> np.ndarray:
-    """Return the (K,) tf-idf weights of matches; those of a node are consecutive, nearest first, one per scene."""
+    """Return the (K,) tf-idf weights of matches; matches of a node must be consecutive, nearest first, one per
+    scene."""
     if not len(node):
         return np.zeros(0)
     cosine = codes.similarity(squared.astype(np.float64))
-    # Number of scenes with a match about as good: one search in the matches of all nodes, end to end.
+    # Count the scenes with a match about as good by one search in the concatenated matches of all nodes.
     step = 4.0 * node
     similar = np.searchsorted(step - cosine, step - cosine + _EQUAL_SIMILARITY, side="right")
     first = np.searchsorted(node, node)
@@ -207,11 +209,11 @@ class _CandidateMatches:
     Args:
         row: (K,) candidate of each match, ascending.
         node: (K,) query node of each match.
-        weight: (K,) tf-idf weight; 0 for all but a node's best match in that candidate.
+        weight: (K,) tf-idf weight; 0 except for a node's best match in a candidate.
         query_points, candidate_points: (K, 3) float64 positions of the matched nodes.
         num_nodes: M.
-        coarse: (C,) metres per working metre, of the coarser scene of the pair.
-        metric, upright: (C,) bool: both scenes are.
+        coarse: (C,) metres per working metre of the coarser scene of the pair.
+        metric, upright: (C,) masks, True if both scenes are metric, and if both are upright.
     """
 
     row: np.ndarray
@@ -254,14 +256,16 @@ class _CandidateMatches:
 
 
 def _scores(candidates: _CandidateMatches) -> np.ndarray:
-    """Return the (C,) scores: tf-idf scores of the inliers, normalized by those of the nearest aligned candidates."""
+    """Return the (C,) scores: the tf-idf scores of the inliers, normalized by the scores of the nearest aligned
+    candidates."""
     count = len(candidates.coarse)
     if not count:
         return np.zeros(0)
     inliers, centres = _align(candidates)
     rarity = np.log((count + 1) / (inliers.sum(0) + 0.5)) ** 2
     tf_idf = np.round(inliers @ rarity, 6)
-    # Inliers of many candidates are decoration; where a room can be aligned in two ways, the remaining nodes decide.
+    # Nodes that are inliers of many candidates belong to common decoration; if a room can be aligned in two ways, the
+    # remaining nodes decide.
     other, other_centres = _align(replace(candidates, weight=candidates.weight * rarity[candidates.node]))
     other_tf_idf = np.round(other @ rarity, 6)
     centres[other_tf_idf > tf_idf] = other_centres[other_tf_idf > tf_idf]
@@ -278,10 +282,10 @@ def _scores(candidates: _CandidateMatches) -> np.ndarray:
 
 
 def _align(candidates: _CandidateMatches) -> tuple[np.ndarray, np.ndarray]:
-    """Align each candidate with the query by its highest weighted matches.
+    """Align each candidate with the query by its matches of highest weight.
 
     Returns:
-        (C, M) bool inliers among the query's nodes, and the (C, 3) aligned centres of the candidates.
+        A (C, M) mask of inliers among the query's nodes, and the (C, 3) aligned centres of the candidates.
     """
     rows, fits = _select_matches(candidates)
     for reach in (1.5, 1.0):
@@ -296,7 +300,8 @@ def _align(candidates: _CandidateMatches) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _select_matches(candidates: _CandidateMatches) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matches compatible with the best pair of each candidate, and the (C,) mask of those with a pair."""
+    """Return the matches that are compatible with the best pair of each candidate, and a (C,) mask of candidates that
+    have such a pair."""
     num, count = len(candidates.coarse), _MAX_MATCHES
     at = np.full((num, count), -1)
     order = np.lexsort((candidates.node, -np.round(candidates.weight, 9), candidates.row))
@@ -320,9 +325,9 @@ def _select_matches(candidates: _CandidateMatches) -> tuple[np.ndarray, np.ndarr
 
 
 def _fit_alignments(candidates: _CandidateMatches, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (C, 3, 3) and (C, 3) alignment of each candidate's nodes with the query's by some matches.
+    """Fit the alignment of each candidate's nodes with the query's nodes to some matches; return (C, 3, 3) and (C, 3).
 
-    Rotations are about the vertical where gravity is known in both scenes; a bounded scale is fitted where a metre is
+    Rotations are about the vertical if gravity is known in both scenes; a bounded scale is fitted if a metre is
     estimated.
     """
     row, num = candidates.row[rows], len(candidates.coarse)
@@ -346,19 +351,19 @@ def _fit_alignments(candidates: _CandidateMatches, rows: np.ndarray) -> tuple[np
 
 
 def _best_pair_inliers(agree: np.ndarray, apart: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (C, M) mask of matches compatible with the pair of matches that has the largest compatible weight,
-    and the (C,) mask of candidates with such a pair.
+    """Return a (C, M) mask of the matches compatible with the pair of matches that has the largest compatible weight,
+    and a (C,) mask of candidates that have such a pair.
 
     Args:
-        agree: (C, M, M) bool compatibility of two matches.
-        apart: (C, M, M) the same of two matches far enough apart.
-        weights: (C, M) of the matches; 0 where there is none.
+        agree: (C, M, M) mask of compatible pairs of matches.
+        apart: (C, M, M) mask of compatible pairs of matches that are far enough apart.
+        weights: (C, M) weights of the matches; 0 where there is none.
     """
     plain = agree.astype(np.float32)
     scaled = np.round(weights * (1 << 10) / max(float(weights.max()), 1e-9)).astype(np.float32)  # exact sums
     both = (plain * scaled[:, None]) @ plain + scaled[:, :, None] + scaled[:, None]
     both[~apart] = 0.0
-    best = both.reshape(len(both), -1).argmax(1)  # the first of equals
+    best = both.reshape(len(both), -1).argmax(1)  # the first of equal pairs
     i, j = np.divmod(best, weights.shape[1])
     each = np.arange(len(both))
     fits = both[each, i, j] > 0

@@ -1,4 +1,4 @@
-"""Find pairs of scenes with poses whose content may touch."""
+"""Find pairs of scenes whose content, by their poses, may touch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from gsmap.retrieve.pair_schedule import Pair
 from gsmap.retrieve.params import Params
 
-REACH_SIGMAS = 3.0  # standard deviations of their distance within which two scenes may touch
+REACH_SIGMAS = 3.0  # two scenes may touch if their gap is within this many standard deviations of their distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,10 +18,11 @@ class ScenePosition:
     """Position and extent of a scene in its component.
 
     Args:
-        component: of the pose graph; components share no frame, so only scenes of one component can be neighbours.
-        centre: (3,) of the scene's content, in the component's frame.
-        radius: of its content, map units.
-        sigma: standard deviation of its position, map units.
+        component: number of the component; components have different frames, so only scenes of one component can be
+            neighbours.
+        centre: (3,) centre of the scene's content, in the component's frame.
+        radius: radius of the scene's content, in map units.
+        sigma: standard deviation of the scene's position, in map units.
     """
 
     component: int
@@ -31,13 +32,13 @@ class ScenePosition:
 
 
 def neighbours(positions: Mapping[str, ScenePosition], params: Params) -> list[Pair]:
-    """Pair each scene with the nearest scenes of its component that its content may touch.
+    """Pair each scene with the nearest scenes of its component whose content may touch its own.
 
-    Each scene searches trees of the scenes of about its own extent and of larger ones, so that a few large scenes do
-    not widen the search of all.
+    Each scene searches among scenes of about its own extent and among larger scenes, so that a few large scenes do not
+    widen the search of all scenes.
 
     Returns:
-        Pairs (lower, higher) by id, each once, nearest first, equals by id.
+        Pairs (lower id, higher id), each once, nearest first; equally near pairs are sorted by id.
     """
     from scipy.spatial import cKDTree
 
@@ -51,7 +52,7 @@ def neighbours(positions: Mapping[str, ScenePosition], params: Params) -> list[P
         centres = np.array([positions[ids[row]].centre for row in rows], dtype=np.float64)
         sigmas = np.array([positions[ids[row]].sigma for row in rows])
         radii = np.array([positions[ids[row]].radius for row in rows])
-        # hypot(a, b) <= a + b, so this reach misses none.
+        # hypot(a, b) <= a + b, so this reach misses no pair.
         reach = radii + REACH_SIGMAS * sigmas
         octave = np.floor(np.log2(np.maximum(reach, 1e-12))).astype(int)
         near = [np.zeros((2, 0), dtype=np.int64)]
@@ -72,6 +73,6 @@ def neighbours(positions: Mapping[str, ScenePosition], params: Params) -> list[P
         ends = np.sort(np.stack([rows[row], rows[other]]), axis=0)[:, nearest]
         found.append(np.column_stack([*ends, distance[nearest]]))
     every = np.concatenate(found)
-    every = np.unique(every, axis=0)  # pairs found from both sides
+    every = np.unique(every, axis=0)  # removes pairs that were found from both scenes
     ordered = every[np.lexsort((every[:, 1], every[:, 0], every[:, 2]))]
     return [(ids[a], ids[b]) for a, b in ordered[:, :2].astype(np.int64).tolist()]

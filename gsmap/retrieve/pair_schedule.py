@@ -10,21 +10,21 @@ Pair = tuple[str, str]
 
 
 def directed(a: str, b: str) -> Pair:
-    """Return a pair as (lower, higher) by id."""
+    """Return a pair as (lower id, higher id)."""
     return (a, b) if a < b else (b, a)
 
 
 class PairSchedule:
-    """Rounds of pairs to register; the accepted edges of a round decide which pairs the next ones need.
+    """Rounds of pairs to register; the accepted edges of a round determine which pairs the next rounds need.
 
-    A pair is redundant where both of its scenes have `Params.max_edges_per_scene` undisputed edges and are connected
-    already, by an edge or over a third scene. So a scene in a component of its own is tried with all its candidates,
-    and a candidate that the graph reaches by a long path only is tried, too, which closes a loop.
+    A pair is redundant if both of its scenes have `Params.max_edges_per_scene` undisputed edges and an edge or a common
+    neighbour connects them already. So a scene without edges is tried with all its candidates. A candidate to which the
+    graph has only a long path is tried as well, which closes a loop.
 
     Args:
         lists: candidate pairs of each query scene, best first.
         tried: pairs that were registered before.
-        edges: undisputed edges.
+        edges: undisputed edges that exist already.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class PairSchedule:
         return well_connected and (b in near_a or not near_a.isdisjoint(near_b))
 
     def next(self) -> list[Pair]:
-        """Return the pairs (lower, higher) of the next round, those of the highest ranks first; empty at the end."""
+        """Return the pairs (lower id, higher id) of the next round, highest ranks first; empty at the end."""
         ranked: dict[Pair, int] = {}
         for k, pairs in enumerate(self._lists):
             count = 0

@@ -1,4 +1,4 @@
-"""Find candidate pairs of scene graphs in memory, by a temporary index."""
+"""Find candidate pairs of scene graphs in memory, with a temporary index."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def candidate_pairs(
     positions: Mapping[str, ScenePosition] | None = None,
     params: Params | None = None,
 ) -> list[Pair]:
-    """Return pairs of scene ids that may overlap: the best candidates of each scene and its neighbours by pose.
+    """Return pairs of scene ids that may overlap: each scene with its best candidates and with its neighbours by pose.
 
     Args:
-        graphs: of all scenes, in any order.
-        new: ids of the query scenes; default all.
-        positions: of scenes with poses, by scene id.
+        graphs: graphs of all scenes, in any order.
+        new: ids of the query scenes; all by default.
+        positions: positions of the scenes with poses, by scene id.
 
     Returns:
-        Pairs (lower, higher) by scene id, each once, best first, equals by id. A scene's id is the digest of its
-        content, so the same scenes give the same pairs in any order of input.
+        Pairs (lower id, higher id), each once, best first; equally good pairs are sorted by id. A scene's id is the
+        digest of its content, so the same scenes give the same pairs in any order of input.
     """
     params = params or Params()
     scenes = [select_nodes(graph, "", params.nodes_per_scene) for graph in sorted(graphs, key=lambda g: g.scene_id)]

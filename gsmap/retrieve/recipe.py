@@ -14,6 +14,6 @@ def index_recipe(params: Params) -> str:
 
 
 def recipe_key(params: Params) -> RecipeKey:
-    """Return the recipe of a lookup; the caller adds its input, the key of the scene's graph."""
+    """Return the recipe of a lookup; the caller adds the key of the scene's graph as input."""
     settings = {"top_k": params.top_k, "nodes_per_scene": params.nodes_per_scene}
     return RecipeKey("retrieve", "lookup", {"retrieve": VERSION, "index": INDEX_VERSION}, settings)

@@ -13,10 +13,11 @@ from gsmap.types import NodeLayer, SceneGraph
 from gsmap.types.retrieval import IndexedScene
 
 INDEX_VERSION = 2
-"""Version of the nodes in an index; an index of another version is rebuilt."""
+"""Version of the nodes in an index; an index of an older version is rebuilt."""
 
 WIDTH = NUM_DIMS + 6 + 4
-"""Bytes of a node in an index: its code, its position as three float16, and its scene's place in the index."""
+"""Bytes of a node in an index: its code, its position as three float16 numbers, and the place of its scene in the
+index."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +26,8 @@ class Nodes:
 
     Args:
         keys: (M,) int64 inverted list of each node, ascending.
-        codes: (M, NUM_DIMS) int8.
-        positions: (M, 3) float16 metres about their mean, level where the scene is upright.
+        codes: (M, NUM_DIMS) int8 codes.
+        positions: (M, 3) float16 positions in metres relative to their mean, levelled if gravity is known.
     """
 
     keys: np.ndarray
@@ -39,7 +40,7 @@ class Nodes:
 
 @dataclass(frozen=True, eq=False)
 class SceneNodes:
-    """Nodes of a scene to be indexed, and those of the scene as a query.
+    """Nodes of a scene to be indexed, and nodes with which the scene queries the index.
 
     Args:
         index_nodes: nodes that queries find.
@@ -53,11 +54,11 @@ class SceneNodes:
 
 
 def select_nodes(graph: SceneGraph, key: str, nodes_per_scene: int) -> SceneNodes:
-    """Select the strongest nodes of each layer of a scene graph, stored under a key.
+    """Select the strongest nodes of each layer of a scene graph that is stored under a key.
 
-    Layers for estimated units are skipped where a layer of metric size has nodes (``landmarks``, ``landmarks@K``). An
-    empty layer counts as missing: the corners and patterns of a large, coarse capture may all be larger than landmarks
-    of metric size.
+    Layers for estimated units are skipped if a layer of metric size (``landmarks``, ``landmarks@K``) has nodes. An
+    empty layer counts as missing: all corners and patterns of a large, coarse capture may be larger than landmarks of
+    metric size.
     """
     upright = graph.up is not None
     metric = {name.split("@")[0] for name, layer in graph.layers.items() if ":" not in name and len(layer)}
@@ -68,7 +69,7 @@ def select_nodes(graph: SceneGraph, key: str, nodes_per_scene: int) -> SceneNode
         if not len(layer) or (":" in name and name.split(":")[0] in metric):
             continue
         other_frame = name.startswith("landmarks_gravity_free")
-        unit_m = 1.0 if "landmarks" in metric else layer.unit_m  # the scene's unit, where that may be the metre
+        unit_m = 1.0 if "landmarks" in metric else layer.unit_m  # use the scene's own unit if that may be the metre
         nodes = _select_strongest(layer, nodes_per_scene, unit_m * level)
         index_nodes.append(_with_keys(nodes, layer.descriptor_id, second=other_frame))
         query_nodes.append(_with_keys(nodes, layer.descriptor_id, second=False))
@@ -97,7 +98,7 @@ def _with_keys(nodes: _SelectedNodes, descriptor_id: str, *, second: bool) -> No
 
 
 def _join_groups(*groups: list[Nodes]) -> list[Nodes]:
-    """Join each group, sorted by key, with positions about the mean of the first group."""
+    """Join the parts of each group, sorted by key, with positions relative to the mean of the first group."""
     first = [nodes.positions for nodes in groups[0]]
     centre = np.concatenate(first).mean(0) if first else np.zeros(3)
     return [_join(group, centre) for group in groups]
