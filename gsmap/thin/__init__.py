@@ -1,4 +1,4 @@
-"""Thinning of superseded scenes: observed fraction, visible Gaussians and fidelity."""
+"""Thin superseded scenes: measure the observed fraction, find visible Gaussians and measure fidelity."""
 
 from __future__ import annotations
 
@@ -43,20 +43,21 @@ class Params:
     def __post_init__(self) -> None:
         for name in ("min_seen_again", "min_weight"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}", code="out_of_range")
+                raise ConfigError(f"{name} must lie in [0, 1], got {getattr(self, name)}", code="out_of_range")
         for name in ("max_views", "longest_side_px"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}", code="out_of_range")
 
 
 def observed_fraction(older: PosedScene, newer: Sequence[CaptureViews]) -> float:
-    """Return the fraction of a scene's surface that newer scenes of the same frame observed, changed or not.
+    """Return the fraction of a scene's surface that newer scenes in the same frame observed, changed or not.
 
-    Occluded surfaces are not observed; Gaussians slightly behind an observed surface in one cell are part of it.
+    Occluded surfaces are not observed; a Gaussian slightly behind an observed surface in the same cell is part of that
+    surface.
 
     Args:
-        older: in metres, with its cameras.
-        newer: see `gsmap.compare.render_views`.
+        older: the scene in metres, with its cameras.
+        newer: views of the newer scenes, from `gsmap.compare.render_views`.
     """
     mine = render_views(older)
     surface = mine.surface & (mine.times_seen > 0)
@@ -70,7 +71,8 @@ def observed_fraction(older: PosedScene, newer: Sequence[CaptureViews]) -> float
 
 
 def find_visible(scene: PosedScene, params: Params) -> np.ndarray:
-    """Return (N,) bool, Gaussians visible in some own view of a scene; all if cameras are missing or synthesized."""
+    """Return an (N,) mask of Gaussians that are visible in an own view of the scene; all if cameras are missing or
+    synthesized."""
     if scene.cameras is None or not len(scene.cameras) or scene.cameras.synthesised:
         return np.ones(len(scene.gaussians), dtype=bool)
     largest = np.zeros(len(scene.gaussians), dtype=np.float32)
@@ -83,9 +85,10 @@ def find_visible(scene: PosedScene, params: Params) -> np.ndarray:
 
 
 def measure_fidelity_db(scene: PosedScene, kept: Gaussians, params: Params) -> float:
-    """Measure the PSNR in dB, colours in [0, 1], of the kept Gaussians against all, over the scene's own views.
+    """Measure the PSNR in dB of renders of the kept Gaussians against renders of all, over the scene's own views;
+    colours in [0, 1].
 
-    Infinite for equal views, NaN without cameras.
+    The result is infinite for equal views and NaN without cameras.
     """
     if scene.cameras is None or not len(scene.cameras):
         return float("nan")
