@@ -1,4 +1,4 @@
-"""Streams of Gaussians (`gsmap.types.GaussianSource`) with memory bounded by a chunk instead of a scene."""
+"""Streams of Gaussians (`gsmap.types.GaussianSource`), whose memory is bounded by a chunk instead of a scene."""
 
 from gsmap.stream.blocks import blocks, bounds, load_all, shift_origin
 from gsmap.stream.infinities import clamp_column, clamp_infinities, count_clamped

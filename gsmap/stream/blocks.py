@@ -1,4 +1,4 @@
-"""Read a Gaussian source whole, in blocks of other sizes, or about another origin."""
+"""Read a Gaussian source completely, in blocks of another size, or relative to another origin."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmap.types.source import origin_of_source
 
 
 def load_all(source: GaussianSource) -> Gaussians:
-    """Load all Gaussians of a source, using no more than a chunk of further memory."""
+    """Load all Gaussians of a source; the additional memory is at most one chunk."""
     n, k = source.num_gaussians, (source.sh_degree + 1) ** 2
     shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, k, 3)}
     out = {name: np.empty(shapes[name], np.float32) for name in FIELDS}
@@ -29,7 +29,7 @@ def load_all(source: GaussianSource) -> Gaussians:
 
 
 def blocks(source: GaussianSource, rows: int) -> Iterator[Gaussians]:
-    """Yield all Gaussians of a source in order, ``rows`` at a time; fewer at the end."""
+    """Yield all Gaussians of a source in order, in blocks of ``rows``; the last block may be smaller."""
     held: list[Gaussians] = []
     count = 0
     for chunk in source.chunks():
@@ -47,7 +47,7 @@ def blocks(source: GaussianSource, rows: int) -> Iterator[Gaussians]:
 
 
 def shift_origin(source: GaussianSource, origin: np.ndarray) -> GaussianSource:
-    """Return the Gaussians of a source about another origin (3,)."""
+    """Return a source of the same Gaussians with means relative to another origin (3,)."""
     return source.about(origin) if isinstance(source, Gaussians) else _ShiftedSource(source, origin)
 
 
@@ -81,6 +81,6 @@ class _ShiftedSource:
 
 
 def bounds(source: GaussianSource) -> np.ndarray:
-    """Compute the (2, 3) float32 bounds of the means of a source that is not empty."""
+    """Compute the (2, 3) float32 bounds of the means of a non-empty source."""
     corners = [box_around(means) for means in source.columns("means") if len(means)]
     return box_around(np.concatenate(corners))

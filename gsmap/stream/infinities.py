@@ -1,4 +1,4 @@
-"""Infinities that are valid values: an opacity of exactly 0 or 1, and a Gaussian without thickness."""
+"""Replace infinities that are valid values: an opacity of exactly 0 or 1, or a Gaussian without thickness."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 
 from gsmap.types import Gaussians
 
-MAX_LOGIT = np.float32(25 * np.log(2))  # its opacity is 1 in float32
-MIN_LOG_SCALE = np.float32(np.log(2e-9))  # of the unit
+MAX_LOGIT = np.float32(25 * np.log(2))  # a logit whose opacity is 1 in float32
+MIN_LOG_SCALE = np.float32(np.log(2e-9))  # of a scale of 2e-9 units
 
 
 def clamp_infinities(gaussians: Gaussians) -> Gaussians:
     """Replace infinite logits, and log-scales of minus infinity, by finite values that render the same.
 
-    Scales of plus infinity and other infinities are damage and stay (`gsmap.ingest.validate`).
+    Other infinities, such as scales of plus infinity, are damage and are left for `gsmap.ingest.validate`.
     """
     logits = clamp_column("logit_opacities", gaussians.logit_opacities)
     log_scales = clamp_column("log_scales", gaussians.log_scales)
@@ -25,7 +25,7 @@ def clamp_infinities(gaussians: Gaussians) -> Gaussians:
 
 
 def clamp_column(name: str, column: np.ndarray) -> np.ndarray:
-    """Clamp one field of Gaussians as `clamp_infinities` does; returns the array itself if nothing changes."""
+    """Clamp one field of Gaussians as `clamp_infinities` does; return the array itself if nothing changes."""
     if name not in ("logit_opacities", "log_scales") or not np.isinf(column).any():
         return column
     column = column.copy()
@@ -38,6 +38,6 @@ def clamp_column(name: str, column: np.ndarray) -> np.ndarray:
 
 
 def count_clamped(gaussians: Gaussians) -> tuple[int, int]:
-    """Count the opacities and the scales that have the values of `clamp_infinities`."""
+    """Count the opacities and the scales whose values may come from `clamp_infinities`."""
     logits, log_scales = gaussians.logit_opacities, gaussians.log_scales
     return int((np.abs(logits) == MAX_LOGIT).sum()), int((log_scales == MIN_LOG_SCALE).sum())

@@ -1,8 +1,8 @@
-"""External sort of Gaussians along a Morton curve: a sample sort with buckets on disk.
+"""Sort Gaussians externally along a Morton curve: a sample sort with buckets on disk.
 
-A sample of the codes gives the cuts of the curve, so that every bucket fits in memory; one pass writes each Gaussian to
-the file of its bucket, and each bucket is sorted when it is read. Every step is stable, so that the result equals that
-of sorting all at once.
+A sample of the codes determines cuts of the curve such that every bucket fits in memory. One pass writes each Gaussian
+to the file of its bucket, and each bucket is sorted when it is read. Every step is stable, so the result equals that of
+sorting everything at once.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.gaussians import CHUNK_ROWS
 
 BUCKET_BYTES = 128 << 20
-"""Bytes sorted in memory at once; the sort needs about three times as much memory."""
+"""Number of bytes that are sorted in memory at once; the sort needs about three times as much memory."""
 
 _SAMPLES = 1 << 20
-_MAX_BUCKETS = 256  # files that are open at once
+_MAX_BUCKETS = 256  # number of files that are open at the same time
 
 
 @contextlib.contextmanager
@@ -33,9 +33,10 @@ def sorted_along_morton_curve(
     """Sort the Gaussians of a source along the Morton curve of its box, as `gsmap.geometry.morton.morton_order` does.
 
     Args:
-        source: with finite means.
-        box: (2, 3) bounds of its means (`gsmap.stream.bounds`).
-        scratch: a folder that does not exist, on a disk with space for all Gaussians; deleted when the block ends.
+        source: a source with finite means.
+        box: (2, 3) bounds of these means (`gsmap.stream.bounds`).
+        scratch: path of a folder that does not exist yet, on a disk with space for all Gaussians; the folder is deleted
+            when the ``with`` block ends.
         bucket_bytes: a source of at most this size is sorted in memory, without a folder.
     """
     row_bytes = 4 * _width(source.sh_degree)
@@ -55,7 +56,7 @@ def sorted_along_morton_curve(
 
 @dataclass(frozen=True, eq=False)
 class _Buckets:
-    """Gaussians in bucket files, sorted as each is read."""
+    """Gaussians in bucket files; each bucket is sorted when it is read."""
 
     folder: Path
     counts: np.ndarray
@@ -84,7 +85,7 @@ class _Buckets:
 
 
 def _cuts(source: GaussianSource, box: np.ndarray, rows: int) -> np.ndarray:
-    """Compute codes that cut the curve into parts of about ``rows`` Gaussians."""
+    """Compute the codes that cut the curve into parts of about ``rows`` Gaussians each."""
     step = -(-source.num_gaussians // _SAMPLES)
     sampled, at = [], 0
     for means in source.columns("means"):
@@ -96,7 +97,7 @@ def _cuts(source: GaussianSource, box: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _distribute(source: GaussianSource, box: np.ndarray, cuts: np.ndarray, folder: Path) -> np.ndarray:
-    """Write every Gaussian to the file of its bucket; returns the counts."""
+    """Write every Gaussian to the file of its bucket; return the number of Gaussians in each bucket."""
     counts = np.zeros(len(cuts) + 1, np.int64)
     with contextlib.ExitStack() as opened:
         files = [opened.enter_context(open(_file(folder, i), "xb")) for i in range(len(counts))]
@@ -116,12 +117,12 @@ def _file(folder: Path, bucket: int) -> Path:
 
 
 def _width(sh_degree: int) -> int:
-    """Return the number of values per Gaussian."""
+    """Return the number of values of a Gaussian."""
     return 3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2
 
 
 def _table(gaussians: Gaussians) -> np.ndarray:
-    """Convert Gaussians to (n, width) float32."""
+    """Convert Gaussians to an array (n, width) float32."""
     g = gaussians
     return np.concatenate(
         [g.means, g.quats, g.log_scales, g.logit_opacities[:, None], g.sh.reshape(len(g), -1)], axis=1
