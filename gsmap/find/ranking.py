@@ -1,4 +1,4 @@
-"""Rank objects for a query by similarity of segments or by cosine similarity of embeddings."""
+"""Rank objects for a query, by similarity of segments or by cosine similarity of embeddings."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ def rank_by_similarity(
     objects: Sequence[Sequence[SegmentDescriptor]],
     model: SimilarityModel | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the probabilities that objects are of one kind with the query object.
+    """Return the probability, for each object, that it is of the same kind as the query object.
 
-    Captures see objects from one side or in part, so the best match of any observation of the query with any
-    observation of an object counts.
+    Captures may show only one side or a part of an object, so the best match of any observation of the query with any
+    observation of the object counts.
 
     Args:
         query: observations of the query object.
         objects: observations of each object.
 
     Returns:
-        (N,) probabilities at a prior of 0.5, and (N,) observation of each object that matched best; 0 and -1 for
-        objects without observations.
+        The (N,) probabilities at a prior of 0.5, and the (N,) index of each object's observation that matched best; 0
+        and -1 for objects without observations.
     """
     model = model or SimilarityModel.load()
     owner = np.repeat(np.arange(len(objects)), [len(observations) for observations in objects])
@@ -40,7 +40,7 @@ def rank_by_similarity(
 
 
 def cosine_similarities(query: np.ndarray, valid: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
-    """Return (M,) cosines of a vector (F,) with vectors (M, F), over its valid entries (F,) bool."""
+    """Return the (M,) cosines between a vector (F,) and vectors (M, F), over the entries in the mask ``valid`` (F,)."""
     a, b = np.where(valid, query, 0.0).astype(np.float64), np.where(valid, embeddings, 0.0).astype(np.float64)
     norms = np.linalg.norm(a) * np.linalg.norm(b, axis=1)
     out: np.ndarray = np.where(norms > 0, b @ a / np.where(norms > 0, norms, 1.0), -1.0)
@@ -48,7 +48,8 @@ def cosine_similarities(query: np.ndarray, valid: np.ndarray, embeddings: np.nda
 
 
 def best_per_owner(scores: np.ndarray, owner: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best score of each owner (-inf without any) and its row (-1); of equal scores the first."""
+    """Return the best score of each owner and the row of that score; -inf and -1 without any. Of equal scores the first
+    counts."""
     order = np.lexsort((np.arange(len(scores)), -scores, owner))
     owners, first = np.unique(owner[order], return_index=True)
     best, row = np.full(count, -np.inf), np.full(count, -1, np.int64)

@@ -1,7 +1,7 @@
-"""Estimate the similarity of two segments from size, shape, colour and height above the floor.
+"""Estimate the similarity of two segments from their size, shape, colour and height above the floor.
 
-No embedding takes part, so the result does not depend on the embedder. Ten differences of two segments each contribute
-log-odds by a decreasing piecewise linear curve (an additive model, as `gsmap.register.probability`).
+Embeddings are not used, so the result does not depend on the embedder. Each of ten differences between two segments
+adds log-odds by a decreasing piecewise linear curve (an additive model, as in `gsmap.register.probability`).
 ``tools/fit/find.py`` fits the curves on synthetic places; they are stored beside this file.
 """
 
@@ -22,7 +22,7 @@ _FILE = "similarity.json"
 _MIN_SIZE_M = 0.04  # half a cell of a segment's samples
 _HEIGHT_BINS_M = np.linspace(0.0, 2.4, 13)
 _LOG_DISTANCE_BINS = np.log(np.geomspace(0.1, 3.2, 11))
-_MAX_PAIRS = 4000  # of samples whose distances are measured: more change no bin by a percent
+_MAX_PAIRS = 4000  # of samples whose distances are measured; with more, no bin changes by a percent
 _NUM_HUES, _GREY_CHROMA = 12, 8.0
 _NUM_TINTS, _MAX_CHROMA = 12, 60.0
 
@@ -38,7 +38,7 @@ DIFFERENCES = (
     "contrast",
     "stands",
 )
-"""Differences of two segments, each 0 for equal ones; also keys of the model file."""
+"""Differences between two segments, each 0 for equal segments; the names are also keys of the model file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +46,14 @@ class SegmentDescriptor:
     """Geometry and colour of a segment.
 
     Args:
-        log_sizes: (3,) natural logarithms of its height, and of its length and width along the floor, metres.
-        height_histogram: (13,) over heights above its foot.
-        distance_histogram: (11,) over log distances of pairs of samples, metres (D2, Osada et al. 2002).
-        hue_histogram: (13,) over hues, and grey.
-        tint_histogram: (144,) over a* and b*, from -60 to 60.
+        log_sizes: (3,) natural logarithms of the height, and of the length and width along the floor, in metres.
+        height_histogram: (13,) histogram over heights above the lowest point.
+        distance_histogram: (11,) histogram over log distances of pairs of samples, in metres (D2, Osada et al. 2002).
+        hue_histogram: (13,) histogram over hues, and grey.
+        tint_histogram: (144,) histogram over a* and b*, from -60 to 60.
         lightness: mean CIE L*.
-        colour_range: (3,) from the 10th to the 90th percentile of L*, a* and b*.
-        elevation_m: height of its foot above the floor of the capture.
+        colour_range: (3,) difference between the 90th and the 10th percentile of L*, a* and b*.
+        elevation_m: height of the lowest point above the floor of the capture.
     """
 
     log_sizes: np.ndarray
@@ -70,7 +70,7 @@ def describe_segments(segments: Segments, up: np.ndarray) -> list[SegmentDescrip
     """Describe the segments of a capture.
 
     Args:
-        up: (3,) against gravity, in the frame of the segments.
+        up: (3,) direction against gravity, in the frame of the segments.
     """
     points = segments.samples @ level_frame(up).T * segments.unit_m
     ends = np.cumsum(segments.sample_counts)
@@ -82,7 +82,8 @@ def describe_segments(segments: Segments, up: np.ndarray) -> list[SegmentDescrip
 
 
 def describe_samples(points: np.ndarray, lab: np.ndarray, floor_m: float) -> SegmentDescriptor:
-    """Describe a segment by samples (K, 3), metres, z up, with CIE Lab colours (K, 3); the floor is at ``floor_m``."""
+    """Describe a segment by samples (K, 3) in metres, z up, with CIE Lab colours (K, 3); ``floor_m`` is the height of
+    the floor."""
     lab = lab.astype(np.float64)
     foot = float(np.percentile(points[:, 2], 2))
     height = points[:, 2] - foot
@@ -105,7 +106,7 @@ def describe_samples(points: np.ndarray, lab: np.ndarray, floor_m: float) -> Seg
 
 
 def differences(a: SegmentDescriptor, others: Sequence[SegmentDescriptor]) -> np.ndarray:
-    """Return (N, 10) `DIFFERENCES` of a segment from each of the others."""
+    """Return the (N, 10) `DIFFERENCES` between a segment and each of N others."""
     if not others:
         return np.zeros((0, len(DIFFERENCES)))
 
@@ -127,19 +128,19 @@ def differences(a: SegmentDescriptor, others: Sequence[SegmentDescriptor]) -> np
 
 
 def _histogram_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the earth mover's distances between histograms, in bins."""
+    """Return the earth mover's distances between histograms, in units of bins."""
     out: np.ndarray = np.abs(np.cumsum(a) - np.cumsum(b, axis=1)).sum(1)
     return out
 
 
 def _pair_distances(points: np.ndarray) -> np.ndarray:
-    """Return distances of pairs of points, of all pairs or of evenly spaced ones."""
+    """Return the distances of all pairs of points, or of evenly spaced pairs if there are too many."""
     count = len(points)
     if count < 2:
         return np.zeros(1)
     total = count * (count - 1) // 2
     chosen = np.arange(total) if total <= _MAX_PAIRS else np.linspace(0, total - 1, _MAX_PAIRS).astype(np.int64)
-    # Row and column of the k-th pair (i < j), counted row by row.
+    # Compute row i and column j of the k-th pair (i < j), counted row by row.
     i = (count - 2 - np.floor(np.sqrt(4.0 * count * (count - 1) - 8.0 * chosen - 7) / 2 - 0.5)).astype(np.int64)
     j = chosen + i + 1 - total + (count - i) * (count - i - 1) // 2
     out: np.ndarray = np.linalg.norm(points[i] - points[j], axis=1)
@@ -156,7 +157,7 @@ def _histogram(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def _hue_histogram(lab: np.ndarray) -> np.ndarray:
-    """Return (13,) shares of 12 hues and of grey."""
+    """Return the (13,) shares of 12 hues and of grey."""
     chroma = np.hypot(lab[:, 1], lab[:, 2])
     coloured = chroma / (chroma + _GREY_CHROMA)
     at = np.arctan2(lab[:, 2], lab[:, 1]) / (2 * np.pi) * _NUM_HUES % _NUM_HUES
@@ -168,7 +169,7 @@ def _hue_histogram(lab: np.ndarray) -> np.ndarray:
 
 
 def _tint_histogram(lab: np.ndarray) -> np.ndarray:
-    """Return (144,) shares of 12 x 12 tints, interpolated and blurred."""
+    """Return the (144,) shares of 12 x 12 tints, interpolated and blurred."""
     out = np.zeros((_NUM_TINTS, _NUM_TINTS))
     at = np.clip((lab[:, 1:] + _MAX_CHROMA) / (2 * _MAX_CHROMA) * _NUM_TINTS - 0.5, 0, _NUM_TINTS - 1 - 1e-9)
     low, share = at.astype(int), at - np.floor(at)
@@ -188,8 +189,8 @@ class SimilarityModel:
     """Log-odds of each difference.
 
     Args:
-        knots: of each of `DIFFERENCES`, rising from 0.
-        worth: log-odds at each knot, falling from 0; linear between knots, constant beyond.
+        knots: knots for each of `DIFFERENCES`, ascending from 0.
+        worth: log-odds at each knot, descending from 0; linear between knots, constant beyond the last.
         base: log-odds of two segments without any difference.
     """
 
@@ -203,7 +204,7 @@ class SimilarityModel:
         return _load()
 
     def log_odds(self, differing: np.ndarray) -> np.ndarray:
-        """Return (N,) log-odds of `differences` (N, 10) that two segments are of one kind."""
+        """Return the (N,) log-odds, from `differences` (N, 10), that two segments are of the same kind."""
         columns = zip(differing.T, self.knots, self.worth, strict=True)
         return self.base + sum((np.interp(*column) for column in columns), np.zeros(len(differing)))
 
