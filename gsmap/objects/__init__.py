@@ -1,4 +1,5 @@
-"""Objects of the map: segments of scenes fused over time, looked up in every scene, and related to each other."""
+"""Objects of the map: segments of scenes are associated over time, observed in every scene, and related to each
+other."""
 
 from gsmap.objects.changed_segments import find_changed_segment
 from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse

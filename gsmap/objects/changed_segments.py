@@ -1,14 +1,15 @@
-"""Assignment of changes to segments."""
+"""Assign changes to segments."""
 
 from __future__ import annotations
 
 import numpy as np
 
-CHANGED = 0.4  # least fraction of a segment that changed as a whole; less is a part of it, or an adjacent object
+CHANGED = 0.4  # smallest fraction of a segment that changed as a whole; with less, a part or an adjacent object changed
 
 
 def find_changed_segment(members: np.ndarray, rows: np.ndarray) -> int:
-    """Return the segment that most of the given Gaussians belong to, and that mostly consists of them; -1 for none."""
+    """Return the segment to which most of the given Gaussians belong, if these are also most of the segment; -1 for
+    none."""
     if not len(rows) or rows.max() >= len(members):
         return -1
     mine = members[rows]

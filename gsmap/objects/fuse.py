@@ -1,4 +1,4 @@
-"""Association of segments over scenes: segments that fill the same cells in the same colour are one object."""
+"""Associate segments of several scenes: segments that fill the same cells in the same colour are one object."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from gsmap.geometry.cells import cell_labels, group_means
 
-_CELL_M = 0.12  # edge of the cells that segments are compared by
-_MIN_OVERLAP_OF_LARGER = 0.2  # fraction of the larger segment's cells that two segments of one object share
-_MAX_LAB = 15.0  # median difference of their colours, after exposure balancing
-_MIN_IOU = 0.4  # from which on the colours may differ: the object was painted
-_AHEAD = 3  # later scenes at the place of a segment that it is compared with, so that cost is linear in scenes
+_CELL_M = 0.12  # edge of the cells by which segments are compared
+_MIN_OVERLAP_OF_LARGER = 0.2  # two segments of one object share at least this fraction of the larger segment's cells
+_MAX_LAB = 15.0  # largest median difference of their colours, after exposure balancing
+_MIN_IOU = 0.4  # with at least this IoU the colours may differ, because the object was painted
+_AHEAD = 3  # number of later scenes with which a segment is compared, so that the cost is linear in scenes
 
 
 SegmentId = tuple[int, int]
-"""Indices (scene, segment)."""
+"""Indices (scene, segment) of a segment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +25,9 @@ class PlacedSegments:
     """The segments of one scene in the map frame.
 
     Args:
-        points: (K, 3) float64 metres, sample points of segments.
-        segments: (K,) int the segment of each point.
-        lab: (K, 3) colours of the points, L*a*b*.
+        points: (K, 3) float64 sample points of the segments, in metres.
+        segments: (K,) int segment of each point.
+        lab: (K, 3) colours of the points, in L*a*b*.
         count: M, number of segments.
     """
 
@@ -43,19 +43,20 @@ def fuse(
     parted: Sequence[tuple[SegmentId, int]] = (),
     min_overlap: float = 0.45,
 ) -> list[tuple[SegmentId, ...]]:
-    """Group segments into objects, at most one segment of each scene; each segment is in one group.
+    """Group segments into objects, with at most one segment of each scene per object; each segment is in one group.
 
-    Two segments are joined if each is the other's best match by shared cells and they agree in size and colour; the
-    best matches are joined first. Scenes far apart in the given order are not compared directly.
+    Two segments are joined if, by shared cells, each is the best match of the other and both agree in size and colour;
+    the best matches are joined first. Scenes far apart in the given order are not compared directly.
 
     Args:
-        captures: in order of time, one frame.
+        captures: segments of the scenes in order of time, in one frame.
         moved: pairs of segments of one moved object; these are joined first.
-        parted: segments, each with the index of a scene that does not show it in place.
-        min_overlap: fraction in [0, 1] of the smaller segment's cells that lie in the larger one's.
+        parted: pairs of a segment and the index of a scene that does not show the segment in place.
+        min_overlap: smallest fraction in [0, 1] of the smaller segment's cells that lie in the cells of the larger
+            segment.
 
     Returns:
-        Groups sorted by their first segment; segments within by scene.
+        Groups sorted by their first segment; the segments of a group are sorted by scene.
     """
     first, cells, lab = _cells(captures)
     home = np.searchsorted(first, np.arange(first[-1]), "right") - 1
@@ -75,7 +76,8 @@ def fuse(
 
 
 def _cells(captures: Sequence[PlacedSegments]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (C + 1,) the first node of each scene, unique sorted rows (cell, node), and their mean colours."""
+    """Return the (C + 1,) first node of each scene, the unique sorted rows (cell, node), and the mean colours of these
+    rows."""
     first = np.concatenate([[0], np.cumsum([capture.count for capture in captures])]).astype(np.int64)
     points = np.concatenate([capture.points for capture in captures]).reshape(-1, 3)
     lab = np.concatenate([capture.lab for capture in captures]).reshape(-1, 3)
@@ -88,9 +90,10 @@ def _cells(captures: Sequence[PlacedSegments]) -> tuple[np.ndarray, np.ndarray, 
 def _overlaps(
     cells: np.ndarray, lab: np.ndarray, home: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return pairs of nodes of different scenes that share cells, their number, and the median colour difference."""
+    """Return pairs of nodes of different scenes that share cells, the number of shared cells, and the median colour
+    difference."""
     parts, offs = [], []
-    for ahead in range(1, 2 * _AHEAD + 1):  # nodes are sorted by scene; two of one scene may share a cell
+    for ahead in range(1, 2 * _AHEAD + 1):  # nodes are sorted by scene; two nodes of one scene may share a cell
         same = np.flatnonzero(cells[:-ahead, 0] == cells[ahead:, 0])
         same = same[home[cells[same, 1]] != home[cells[same + ahead, 1]]]
         parts.append(np.column_stack([cells[same, 1], cells[same + ahead, 1]]))
@@ -108,7 +111,7 @@ def _overlaps(
 
 
 def _mutual(a: np.ndarray, b: np.ndarray, score: np.ndarray, home: np.ndarray) -> np.ndarray:
-    """Return the rows of mutually best pairs."""
+    """Return the rows of pairs in which each node is the best match of the other."""
     best: dict[tuple[int, int], int] = {}
     for row in np.argsort(score, kind="stable"):
         best[int(a[row]), int(home[b[row]])] = int(row)
@@ -124,10 +127,10 @@ def _mutual(a: np.ndarray, b: np.ndarray, score: np.ndarray, home: np.ndarray) -
 def _join_groups(
     edges: Sequence[tuple[int, int]], home: np.ndarray, parted: set[tuple[int, int]], moved: int
 ) -> list[list[int]]:
-    """Join nodes to groups by edges in order, the first ``moved`` edges being of moved objects.
+    """Join nodes to groups by edges in order; the first ``moved`` edges belong to moved objects.
 
-    An edge is skipped that would give a group two nodes of one scene, or, unless it is of a moved object, a node of a
-    scene that does not show another node of the group.
+    An edge is skipped if it would give a group two nodes of one scene. Unless it belongs to a moved object, it is also
+    skipped if it would add a node of a scene that does not show another node of the group.
     """
     group = {n: [n] for n in range(len(home))}
     for i, (p, q) in enumerate(edges):

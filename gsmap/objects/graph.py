@@ -1,4 +1,4 @@
-"""Export of the map's objects, relations and rooms as a graph."""
+"""Export the objects, relations and rooms of a map as a graph."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def object_graph(
 ) -> Any:
     """Build a `networkx.MultiDiGraph` of objects, relations and rooms, with attributes that GraphML supports.
 
-    Nodes: ``kind`` (object), ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
-    ``seen``, ``looks``, ``half_life_days`` (absent if unknown), ``there`` (seen in the newest observation), ``name``
-    and ``label`` (absent if none was given). Edges: ``kind`` (on, in, next to). Rooms are nodes, too: ``kind`` (room),
+    Nodes: ``kind`` (object), ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``, ``seen``,
+    ``looks``, ``half_life_days`` (absent if unknown), ``there`` (seen in the newest observation), ``name`` and
+    ``label`` (absent if none was given). Edges: ``kind`` (on, in, next to). Rooms are nodes, too: ``kind`` (room),
     ``component``, ``x y z`` (middle of the floor), ``area_m2``; an object has an edge ``in room`` to its room, and
     rooms have an edge ``door`` in each direction.
 
     Args:
-        dates: as for `estimate_persistence`.
-        metres: per unit of the map; by component, or for all.
-        rooms: the map's.
+        dates: see `estimate_persistence`.
+        metres: metres per unit of the map, for each component or for all.
+        rooms: rooms of the map.
     """
     import networkx as nx
 

@@ -1,4 +1,4 @@
-"""Construction of the objects of the map from the segments of its scenes."""
+"""Construct the objects of the map from the segments of its scenes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
 VERSION = 1
-"""Raised whenever the objects of the same scenes change, also by other modules of `gsmap.objects`."""
+"""Version, raised whenever the objects of the same scenes change, also through other modules of `gsmap.objects`."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class SegmentedScene:
     """A scene with a pose and segments.
 
     Args:
-        scene: its id.
-        S_map_scene: its pose.
-        segments: of its scene graph.
+        scene: id of the scene.
+        S_map_scene: pose of the scene.
+        segments: segments of its scene graph.
     """
 
     scene: str
@@ -75,20 +75,21 @@ def make_objects(
     params: Params | None = None,
     progress: Progress = silent,
 ) -> list[MapObject]:
-    """Make the objects of one component of the map, the largest first.
+    """Construct the objects of one component of the map, the largest first.
 
-    A scene is rendered at most once, and only if an object of other scenes lies in the frustum of its cameras: its cost
-    is that of its own segments and of the objects at its place.
+    A scene is rendered at most once, and only if an object of other scenes lies in the frustum of its cameras. So the
+    cost of a scene depends only on its own segments and on the objects at its place.
 
     Args:
         captures: scenes of the component, oldest first.
-        render: renders the views of a scene; called at most once for each.
-        metres: per unit of the map.
+        render: function that renders the views of a scene; it is called at most once for each scene.
+        metres: metres per unit of the map.
         moved: pairs of segments, by index, of one moved object.
-        parted: segments, each with the index of a scene that does not show it in place.
-        find_earlier: state and observed fraction, from an earlier run, of a segment of another scene in a scene, by
-            index; None if it has to be observed now.
-        in_frustum: whether some camera of a scene has any of the points in its frustum, scene frame and unit.
+        parted: pairs of a segment and the index of a scene that does not show the segment in place.
+        find_earlier: function that returns, from an earlier run, the state and observed fraction of a segment of
+            another scene in a scene (by index); None if it has to be observed now.
+        in_frustum: function that returns whether a camera of a scene has any of the points (scene frame and unit) in
+            its frustum.
         params: see `Params`.
         progress: called with the fraction done in [0, 1] and the current step.
     """
@@ -111,8 +112,8 @@ def make_objects(
         for group, at in kept
     ]
     for c, capture in enumerate(captures):
-        progress(c / max(len(captures), 1), f"looking up {len(kept)} objects in scene {c + 1} of {len(captures)}")
-        # Scene that provides the expected place of each object: the nearest in time.
+        progress(c / max(len(captures), 1), f"observing {len(kept)} objects in scene {c + 1} of {len(captures)}")
+        # The scene nearest in time provides the expected place of each object.
         of = [min((o for o in at if o != c), key=lambda o: (abs(o - c), o), default=c) for _, at in kept]
         points = [places[o][0] for (_, places), o in zip(kept, of, strict=True)]
         S_scene_map, unit = capture.S_map_scene.inverse(), metres * capture.S_map_scene.scale
@@ -131,7 +132,8 @@ def make_objects(
         if to_observe:
             seen = render(capture)
             own = [places[o][1] for (_, places), o in zip(kept, of, strict=True)]
-            # Exposure by objects that the scene certainly shows, or by all that have a surface in place.
+            # Estimate exposure from objects that the scene certainly shows or, without any, from all objects with a
+            # surface in place.
             sure = [i for i, mine in enumerate(sightings) if c in mine] or to_observe
             observations = {
                 i: observe_points(seen, S_scene_map.apply(points[i]), unit) for i in dict.fromkeys([*sure, *to_observe])
@@ -161,7 +163,7 @@ def make_objects(
 
 
 def _placed(capture: SegmentedScene, metres: float) -> PlacedSegments:
-    """Return sample points of every segment, in metres of the map."""
+    """Return the sample points of every segment, in metres of the map."""
     segments = capture.segments
     points = capture.S_map_scene.apply(segments.samples) * metres
     return PlacedSegments(
@@ -170,7 +172,7 @@ def _placed(capture: SegmentedScene, metres: float) -> PlacedSegments:
 
 
 def _distinct(objects: list[MapObject]) -> list[MapObject]:
-    """Make ids unique where two are the same by chance."""
+    """Make ids unique if two objects have the same id by chance."""
     taken: set[str] = set()
     out = []
     for obj in objects:

@@ -1,4 +1,4 @@
-"""Estimation of how long objects stay in place."""
+"""Estimate how long objects stay in place."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Persistence:
     """Persistence of an object over its observations.
 
     Args:
-        seen, looks: numbers of observations that show it, and of all.
-        half_life_days: days after which half of such objects are gone; None for too few dated observations.
+        seen, looks: number of observations that show the object, and of all observations.
+        half_life_days: number of days after which half of such objects are gone; None with too few dated observations.
     """
 
     seen: int
@@ -29,7 +29,7 @@ class Persistence:
 
     @property
     def share(self) -> float:
-        """Fraction of the observations that show it."""
+        """Fraction of the observations that show the object."""
         return self.seen / self.looks if self.looks else 0.0
 
 
@@ -37,10 +37,9 @@ def estimate_persistence(obj: MapObject, dates: Mapping[str, str | None]) -> Per
     """Estimate the persistence of an object.
 
     Objects depart at a constant rate (an exponential survival prior, as in Rosen, Mason and Leonard 2016, "Towards
-    lifelong feature-based mapping in semi-static environments"). Between two observations an object survives, or
-    departs half way between; the rate is the posterior mean under Jeffreys' prior, ``(departures + 1/2) / (time at
-    risk)``, and the half-life ``ln 2`` over the rate. An object without departures has the half-life that its observed
-    time permits.
+    lifelong feature-based mapping in semi-static environments"). Between two observations an object either survives or
+    departs half-way. The rate is the posterior mean under Jeffreys' prior, ``(departures + 1/2) / (time at risk)``, and
+    the half-life is ``ln 2`` divided by the rate. Without departures the half-life is limited by the observed time.
 
     Args:
         obj: the object.

@@ -1,4 +1,4 @@
-"""Spatial relations between objects: on, in and next to."""
+"""Derive spatial relations between objects: on, in and next to."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from gsmap.types import MapObject
 
-_ON_M = 0.12  # largest gap between an object and the one it stands on: boxes are of Gaussians' centres
-_OVER = 0.5  # fraction of its footprint over that object
-_INSIDE = 0.8  # fraction of an object's box inside the one it is in
+_ON_M = 0.12  # largest gap between an object and the object below, as boxes enclose only the centres of Gaussians
+_OVER = 0.5  # smallest fraction of its footprint over the object below
+_INSIDE = 0.8  # smallest fraction of an object's box inside the object that contains it
 _NEXT_M = 0.3  # largest distance in plan of objects next to each other
 
 RelationKind = Literal["on", "in", "next to"]
@@ -20,7 +20,7 @@ RelationKind = Literal["on", "in", "next to"]
 
 @dataclass(frozen=True)
 class Relation:
-    """``source`` is ``kind`` ``target``, by the objects' ids; ``next to`` holds both ways and is given once."""
+    """The relation ``source kind target`` between the ids of two objects; ``next to`` is symmetric and given once."""
 
     source: str
     kind: RelationKind
@@ -28,11 +28,11 @@ class Relation:
 
 
 def relations(objects: Sequence[MapObject], metres: float | Mapping[int, float] = 1.0) -> list[Relation]:
-    """Derive ``on``, ``in`` and ``next to`` between simultaneous objects, by their boxes (z up).
+    """Derive ``on``, ``in`` and ``next to`` between objects that exist at the same time, from their boxes (z up).
 
     Args:
-        objects: of any component; relations hold within a component, between objects both present or both gone.
-        metres: per unit of the map; by component, or for all.
+        objects: objects of any components; relations hold within a component, between two present or two gone objects.
+        metres: metres per unit of the map, for each component or for all.
     """
     out = []
     of = metres if isinstance(metres, Mapping) else dict.fromkeys((obj.component for obj in objects), metres)

@@ -1,8 +1,9 @@
-"""Room segmentation: the floor plan of a place, cut at walls, lintels of doors and narrow passages.
+"""Segment rooms: the floor plan of a place is cut at walls, lintels of doors and narrow passages.
 
-Between the height of doors and the ceiling there are only walls and lintels, so a connected floor at that height is
-one room, whatever its furniture. Where doors reach the ceiling, or lintels are unobserved, a passage narrower than
-`_DOOR_M` separates two rooms (as in Bormann et al. 2016, "Room segmentation: survey, implementation, and analysis").
+Between the height of doors and the ceiling there are only walls and lintels, so a connected area of the plan at that
+height is one room, whatever its furniture. If doors reach the ceiling, or lintels are unobserved, a passage narrower
+than `_DOOR_M` separates two rooms (as in Bormann et al. 2016, "Room segmentation: survey, implementation, and
+analysis").
 """
 
 from __future__ import annotations
@@ -15,27 +16,27 @@ from scipy import ndimage
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.types import Gaussians, Room
 
-_BIN_M = 0.05  # of heights
+_BIN_M = 0.05  # bin of a histogram of heights
 _CELL_M = 0.1  # edge of the cells of the floor plan
-_MAX_GAUSSIANS = 150_000  # of a capture, evenly; its neighbours fill the gaps
-_MIN_OPACITY = 0.5  # of a surface
-_ABOVE_DOORS_M = 2.12  # above the floor, from which on nothing but walls and lintels stands
-_BELOW_CEILING_M = 0.1  # up to which walls are detected
-_DEFAULT_CEILING_M = 2.4  # above the floor, where no ceiling was seen
-_MIN_WALL_FILL = 0.5  # fraction of the height in between that a wall fills
-_MIN_WALL_M = 0.8  # length of a wall
-_DOOR_M = 1.2  # width of a passage that separates two rooms
-_STOREY_M = 1.5  # difference in height between cameras of two storeys
-_MIN_DOOR_M = 0.5  # width of an opening that joins two rooms
+_MAX_GAUSSIANS = 150_000  # of a capture, sampled evenly; neighbouring captures fill the gaps
+_MIN_OPACITY = 0.5  # smallest opacity of a surface
+_ABOVE_DOORS_M = 2.12  # height above the floor from which on there are only walls and lintels
+_BELOW_CEILING_M = 0.1  # walls are detected up to this distance from the ceiling
+_DEFAULT_CEILING_M = 2.4  # height of the ceiling above the floor if no ceiling was seen
+_MIN_WALL_FILL = 0.5  # smallest fraction of the height in between that a wall fills
+_MIN_WALL_M = 0.8  # smallest length of a wall
+_DOOR_M = 1.2  # a narrower passage separates two rooms
+_STOREY_M = 1.5  # smallest difference in height between cameras of two storeys
+_MIN_DOOR_M = 0.5  # smallest width of an opening that joins two rooms
 
 
 def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, min_area_m2: float = 1.5) -> list[Room]:
     """Segment the rooms of a place, the largest first.
 
     Args:
-        captures: Gaussians of its scenes in one level frame, metres, z up.
-        eyes: (C, 3) camera centres, by which storeys are separated; may be empty.
-        min_area_m2: least floor area of a room.
+        captures: Gaussians of the place's scenes in one level frame, in metres, z up.
+        eyes: (C, 3) camera centres, which separate storeys; may be empty.
+        min_area_m2: smallest floor area of a room.
     """
     parts = [_surface(gaussians) for gaussians in captures]
     points = np.concatenate([np.zeros((0, 3)), *(p for p, _ in parts)])
@@ -57,9 +58,10 @@ def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, min_area_m2: flo
 
 
 def _surface(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Sample points (P, 3) on the Gaussians, half a cell apart, and a mask of those on level surfaces.
+    """Sample points (P, 3) on the Gaussians, half a cell apart; return them with a mask of the points on level
+    surfaces.
 
-    Blank walls consist of few wide Gaussians, whose means alone would leave holes.
+    A blank wall consists of few wide Gaussians, whose means alone would leave holes.
     """
     opaque = gaussians.logit_opacities > np.log(_MIN_OPACITY / (1 - _MIN_OPACITY))
     rows = np.flatnonzero(opaque)
@@ -85,7 +87,8 @@ def _surface(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _storeys(eyes: np.ndarray, points: np.ndarray) -> list[float]:
-    """Return the median camera height of each storey, the lowest first; without cameras, that of all points."""
+    """Return the median camera height of each storey, lowest first; without cameras, the median height of all
+    points."""
     if not len(eyes):
         return [float(np.median(points[:, 2]))]
     heights = np.sort(eyes[:, 2])
@@ -94,7 +97,7 @@ def _storeys(eyes: np.ndarray, points: np.ndarray) -> list[float]:
 
 
 def _floor_and_ceiling(heights: np.ndarray, eye: float) -> tuple[float, float]:
-    """Estimate the heights of floor and ceiling by the level surfaces below and above the cameras."""
+    """Estimate the heights of floor and ceiling from the level surfaces below and above the cameras."""
     floor = _mode(heights[(heights > eye - 2.0) & (heights < eye - 0.6)], eye - 1.5)
     above = heights[(heights > floor + _ABOVE_DOORS_M) & (heights < floor + 4.0)]
     below = np.count_nonzero(np.abs(heights - floor) < _BIN_M)
@@ -124,7 +127,7 @@ def _segment_storey(
     """Segment the rooms of one storey, numbered from ``first``.
 
     Args:
-        flat: (P,) bool, points on level surfaces.
+        flat: (P,) mask of points on level surfaces.
         scene_of: (P,) index of the scene of each point.
     """
     cell = _CELL_M
@@ -147,7 +150,7 @@ def _segment_storey(
     inside = ndimage.binary_fill_holes(ndimage.binary_closing(inside | blocked, np.ones((3, 3)), iterations=2))
     labels = _label_rooms(inside & ~wall, min_area_m2)
     grown = _extend_to_walls(labels, wall & inside)
-    # A door that is open in one scene is a door, though it is shut in another.
+    # A door that is open in one scene is a door, even if it is shut in another scene.
     open_floors = []
     trodden = flat & (np.abs(points[:, 2] - floor) < _BIN_M)
     for capture in np.unique(scene_of):
@@ -168,7 +171,7 @@ def _segment_storey(
 
 
 def _remove_short(wall: np.ndarray, cells: float) -> np.ndarray:
-    """Remove pieces of wall shorter than a number of cells, such as lamps and ducts."""
+    """Remove pieces of wall that are shorter than a number of cells, such as lamps and ducts."""
     labels, _ = ndimage.label(wall, np.ones((3, 3)))
     spans = ndimage.find_objects(labels)
     long = [max(s.stop - s.start for s in span) >= cells for span in spans]
@@ -177,10 +180,10 @@ def _remove_short(wall: np.ndarray, cells: float) -> np.ndarray:
 
 
 def _label_rooms(free: np.ndarray, min_area_m2: float) -> np.ndarray:
-    """Return labels (X, Y) of the rooms of a free floor, from 1; 0 for none.
+    """Return the labels (X, Y) of the rooms of a free floor, from 1; 0 for no room.
 
-    Each core of floor wider than a door is a room with the cells nearest to it on foot; a piece of floor without a core
-    is one room.
+    Each core of floor that is wider than a door forms a room, together with the cells that are nearest to it by walking
+    distance. A piece of floor without a core is one room.
     """
     distance = ndimage.distance_transform_edt(free) * _CELL_M
     pieces, count = ndimage.label(free)
@@ -207,7 +210,7 @@ def _label_rooms(free: np.ndarray, min_area_m2: float) -> np.ndarray:
 
 
 def _flood(labels: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Flood the free cells by labels, each cell from the nearest label in steps."""
+    """Extend labels over the free cells; each cell gets the label that is nearest in steps."""
     cross = ndimage.generate_binary_structure(2, 1)
     while True:
         spread = ndimage.grey_dilation(labels, footprint=cross)
@@ -218,16 +221,16 @@ def _flood(labels: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def _extend_to_walls(labels: np.ndarray, wall: np.ndarray) -> np.ndarray:
-    """Extend labels to adjacent wall cells, half of which lie in front of the wall."""
+    """Extend labels to adjacent wall cells, because half of these lie in front of the wall."""
     spread = ndimage.grey_dilation(labels, size=(3, 3))
     return np.where((labels == 0) & wall, spread, labels)
 
 
 def _connected_rooms(labels: np.ndarray, number: int, open_floor: np.ndarray) -> list[int]:
-    """Return the numbers of rooms connected to a room by open floor at least as wide as a door.
+    """Return the numbers of the rooms that open floor, at least as wide as a door, connects to a room.
 
     Args:
-        labels: (X, Y) of rooms, without their walls.
+        labels: (X, Y) labels of rooms, without their walls.
     """
     reach = np.ones((9, 9), bool)  # through a wall of up to 60 cm
     mine = ndimage.binary_dilation(labels == number, reach)
@@ -240,7 +243,7 @@ def _connected_rooms(labels: np.ndarray, number: int, open_floor: np.ndarray) ->
         both = np.intersect1d(passages[labels == number], passages[labels == other])
         for passage in both[both > 0]:
             rows, columns = np.nonzero((passages == passage) & (labels != number) & (labels != other))
-            cut = not len(rows)  # one piece of floor, cut at its narrowest
+            cut = not len(rows)  # one piece of floor that was cut at its narrowest place
             if cut or max(np.ptp(rows), np.ptp(columns)) + 1 >= _MIN_DOOR_M / _CELL_M:
                 out.append(other)
                 break

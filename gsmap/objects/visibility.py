@@ -1,4 +1,4 @@
-"""Visibility of objects in a scene: observation of points in renders from the scene's own cameras."""
+"""Observe objects in a scene: test their points in renders from the scene's own cameras."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, ObservationState
 
-MAX_VIEWS, LONGEST_SIDE_PX = 32, 128  # default number of a capture's views that are rendered, and their size
-_TOLERANCE_M, _TOLERANCE_PER_DEPTH = 0.1, 0.02  # between a point and the surface that it is on; metres, and per metre
-_MIN_OBSERVED = 0.5  # fraction of an object's points below which it is unobserved
-_MIN_PRESENT = 0.5  # fraction of the observed points on a surface of its colour, for it to be seen
-_MIN_SAME_SHAPE = 0.9  # or on a surface of any colour: an object that was painted
+MAX_VIEWS, LONGEST_SIDE_PX = 32, 128  # default number and size of the views that are rendered of a capture
+# Tolerance between a point and its surface; metres, and per metre of depth.
+_TOLERANCE_M, _TOLERANCE_PER_DEPTH = 0.1, 0.02
+_MIN_OBSERVED = 0.5  # an object is unobserved if a smaller fraction of its points is observed
+_MIN_PRESENT = 0.5  # an object is seen if this fraction of its observed points is on a surface of its colour,
+_MIN_SAME_SHAPE = 0.9  # or if this fraction is on a surface of any colour (it was painted)
 _PATCH_M = 0.25  # edge of the cells over which colours are averaged
-_MAX_LAB = 14.0  # difference of mean colours, L*a*b* units, of one surface
+_MAX_LAB = 14.0  # largest difference between mean colours of one surface, in L*a*b* units
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedViews:
-    """Renders of a scene from its own cameras, scene frame and unit.
+    """Renders of a scene from its own cameras, in the scene's frame and unit.
 
     Args:
         cameras: one camera of each render.
@@ -41,9 +42,9 @@ class PointObservations:
     """Observation of K points by the views of a scene.
 
     Args:
-        through: (K,) bool, in free space of some view.
-        on: (K,) bool, on the surface of some view.
-        colours: (K, 3) mean colour of that surface, L*a*b*; NaN without one.
+        through: (K,) mask of points in free space of at least one view.
+        on: (K,) mask of points on the surface of at least one view.
+        colours: (K, 3) mean colour of that surface, L*a*b*; NaN without a surface.
     """
 
     through: np.ndarray
@@ -57,7 +58,7 @@ def render_views(
     max_views: int = MAX_VIEWS,
     longest_side_px: int = LONGEST_SIDE_PX,
 ) -> RenderedViews:
-    """Render a scene from its own cameras; no views if cameras are missing or synthesized."""
+    """Render a scene from its own cameras; the result has no views if cameras are missing or synthesized."""
     if cameras is None or not len(cameras) or cameras.synthesised:
         return RenderedViews((), (), ())
     small = cameras.evenly(max_views).resized(longest_side_px)
@@ -71,7 +72,8 @@ def render_views(
 
 
 def is_in_view(cameras: Cameras | None, points: np.ndarray, max_views: int = MAX_VIEWS) -> bool:
-    """Return whether any of a scene's selected cameras has one of the points (K, 3) in its frustum, occluded or not."""
+    """Return whether any of a scene's selected cameras has one of the points (K, 3) in its frustum, even if
+    occluded."""
     if cameras is None or cameras.synthesised:
         return False
     some = cameras.evenly(max_views)
@@ -83,7 +85,7 @@ def is_in_view(cameras: Cameras | None, points: np.ndarray, max_views: int = MAX
 
 
 def observe_points(views: RenderedViews, points: np.ndarray, unit_m: float) -> PointObservations:
-    """Observe points (K, 3) in the views of a scene, its frame and unit; ``unit_m`` is metres per unit."""
+    """Observe points (K, 3) in the views of a scene, in the scene's frame and unit; ``unit_m`` is metres per unit."""
     through, times = np.zeros(len(points), bool), np.zeros(len(points))
     colours = np.zeros((len(points), 3))
     for view, depth, colour in zip(views.cameras, views.depths, views.colours, strict=True):
@@ -103,17 +105,17 @@ def observe_points(views: RenderedViews, points: np.ndarray, unit_m: float) -> P
 def classify_observation(
     seen: PointObservations, points: np.ndarray, colours: np.ndarray, shift: np.ndarray
 ) -> tuple[ObservationState, float]:
-    """Classify the observation of an object of other scenes.
+    """Classify the observation of an object of other scenes in a scene.
 
     Args:
         seen: observation of the object's points.
-        points: (K, 3) of the object, metres.
+        points: (K, 3) points of the object, metres.
         colours: (K, 3) colours of these points in the other scene, L*a*b*.
-        shift: (3,) difference in exposure of the scene's colours to those.
+        shift: (3,) exposure difference of the scene's colours relative to ``colours``.
 
     Returns:
-        The state, ``unseen`` if too few of the points were observed, ``seen`` if most of the observed points are on a
-        surface of the object's colour, ``absent`` if not; and the fraction of observed points.
+        The state and the fraction of observed points. The state is ``unseen`` if too few points were observed, ``seen``
+        if most of the observed points are on a surface of the object's colour, and otherwise ``absent``.
     """
     observed = seen.through | seen.on
     share = float(observed.mean()) if len(observed) else 0.0
