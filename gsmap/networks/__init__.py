@@ -1,4 +1,4 @@
-"""ONNX networks from users, run in processes of their own within limits. Only this room imports onnxruntime."""
+"""ONNX networks supplied by users, each run in a separate process within limits. Only this room imports onnxruntime."""
 
 from gsmap.networks.file import refuse_external_data
 from gsmap.networks.process import ModelProcess

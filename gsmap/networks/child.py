@@ -1,7 +1,7 @@
-"""Script of the process that runs one ONNX model, within limits on memory, files and its parent's life.
+"""Script of the process that runs one ONNX model, with limits on memory and files; it ends with its parent.
 
-It imports nothing of gsmap, and exchanges messages with `gsmap.networks.process` over one socket: headers in JSON,
-arrays in shared memory, and arrays that do not fit there after their header. Nothing received is executed.
+It imports nothing from gsmap, and exchanges messages with `gsmap.networks.process` over one socket. Headers are JSON;
+arrays are in shared memory or, if they do not fit there, follow their header. Received data are never executed.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Channel:
     """One end of the socket between the model process and its parent.
 
     Args:
-        link: to the other end.
-        shared: the file of the shared memory.
+        link: socket to the other end.
+        shared: file of the shared memory.
     """
 
     def __init__(self, link: socket.socket, shared: int) -> None:
@@ -39,7 +39,7 @@ class Channel:
         self._size = 0
 
     def reserve(self, size: int) -> None:
-        """Grow the shared memory to at least this size; only for the end whose files are not limited."""
+        """Enlarge the shared memory to at least this size; only the end whose files are not limited may call it."""
         if size > self._size:
             os.ftruncate(self.shared, size)
 
@@ -62,16 +62,16 @@ class Channel:
                 self.link.sendall(array.reshape(-1).view(np.uint8).data)
 
     def receive(self, max_bytes: int, deadline: float | None = None) -> tuple[dict[str, Any], list[np.ndarray]]:
-        """Read one message; its arrays are good until the next one is sent.
+        """Read one message; its arrays are valid until the next message is sent.
 
         Raises:
-            EOFError: the other end is gone.
-            TimeoutError: `time.monotonic` has come to the deadline.
-            ValueError: no message, or arrays of more bytes than ``max_bytes``.
+            EOFError: the other process has ended.
+            TimeoutError: `time.monotonic` has reached the deadline.
+            ValueError: the data are no message, or the arrays have more bytes than ``max_bytes``.
         """
         (length,) = struct.unpack("<I", self._exactly(bytearray(4), deadline))
         if length > _MAX_HEADER_BYTES:
-            raise ValueError(f"a header of {length} bytes")
+            raise ValueError(f"a message has a header of {length} bytes")
         header = json.loads(self._exactly(bytearray(length), deadline))
         self._map()
         arrays = []
@@ -82,10 +82,10 @@ class Channel:
                 size *= side
             max_bytes -= size
             if dtype.hasobject or min(shape, default=0) < 0 or max_bytes < 0:
-                raise ValueError(f"an array of {dtype} {shape}")
+                raise ValueError(f"a message has an invalid or too large array: {dtype} {shape}")
             if place is not None and size:
                 if place < 0 or place + size > self._size:
-                    raise ValueError(f"an array at byte {place}")
+                    raise ValueError(f"a message has an array at byte {place}, outside the shared memory")
                 arrays.append(self._array(dtype, shape, place))
                 continue
             arrays.append(np.empty(shape, dtype))
@@ -94,7 +94,7 @@ class Channel:
         return header, arrays
 
     def _map(self) -> None:
-        """Map the shared memory in its current size."""
+        """Map the shared memory at its current size."""
         size = os.fstat(self.shared).st_size
         if size != self._size:
             self._memory, self._size = mmap.mmap(self.shared, size), size
@@ -103,29 +103,29 @@ class Channel:
         return np.ndarray(shape, dtype, self._memory, place)
 
     def _exactly(self, buffer: Any, deadline: float | None) -> Any:
-        """Fill the buffer."""
+        """Read until the buffer is full."""
         view = memoryview(buffer)
         while len(view):
             self.link.settimeout(None if deadline is None else max(deadline - time.monotonic(), 1e-3))
             got = self.link.recv_into(view)
             if not got:
-                raise EOFError("the other end is gone")
+                raise EOFError("the other process has ended")
             view = view[got:]
         return buffer
 
 
 def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
-    """Load the model, send its inputs and outputs, then run it for every request."""
+    """Load the model, send the names of its inputs and outputs, then run it for every request."""
     channel = Channel(socket.socket(fileno=link), shared)
     _end_with_parent()
-    # Of all processes this one goes first when the machine runs out of memory.
+    # If the machine runs out of memory, the system ends this process first.
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
         file.write("1000")
     try:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
-        options.log_severity_level = 4  # errors are raised as well
+        options.log_severity_level = 4  # no log messages, because errors are raised as well
         _limit(memory_bytes)
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         ends = session.get_inputs(), session.get_outputs()
@@ -150,18 +150,18 @@ def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
 
 
 def _limit(memory_bytes: int) -> None:
-    """Limit this process: so much memory beyond the mapped libraries, no file made longer, no core dump."""
+    """Limit this process: memory beyond the mapped libraries, no growing of files, no core dump."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
-    with contextlib.suppress(OSError, ValueError):  # not Linux, where nothing limits the memory of a process
+    with contextlib.suppress(OSError, ValueError):  # only Linux can limit the memory of a process
         with open("/proc/self/statm") as file:
             mapped = int(file.read().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (mapped + memory_bytes, mapped + memory_bytes))
 
 
 def _end_with_parent() -> None:
-    """End this process with its parent: the parent's end of the pipe closes however it ends, SIGKILL included."""
-    if sys.platform.startswith("linux"):  # by the kernel's hand, whatever keeps the threads here
+    """End this process with its parent: the parent's end of the pipe closes in any case, even by SIGKILL."""
+    if sys.platform.startswith("linux"):  # the kernel does it, whatever the threads are doing
         fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
         fcntl.fcntl(0, fcntl.F_SETFL, fcntl.fcntl(0, fcntl.F_GETFL) | os.O_ASYNC)
 

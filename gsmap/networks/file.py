@@ -1,4 +1,4 @@
-"""Check that an ONNX file holds all its weights."""
+"""Check that an ONNX file contains all its weights."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmap.errors import InputError
 
-# Fields that lead to tensors, by message (onnx.proto3); a tensor's field 13 names a file outside the model.
+# Fields that lead to tensors, by message type (onnx.proto3); field 13 of a tensor names a file outside the model.
 _CHILDREN = {
     "model": {7: "graph", 25: "function"},
     "graph": {1: "node", 5: "tensor", 15: "sparse"},
@@ -20,18 +20,18 @@ _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
 
 
 def refuse_external_data(path: Path) -> None:
-    """Refuse a model that refers to other files.
+    """Reject a model that refers to other files.
 
     Raises:
-        InputError: weights are in other files, or the file is not a protobuf message.
+        InputError: the model has weights in other files, or the file is not a protobuf message.
     """
     try:
         outside = _has_external(memoryview(path.read_bytes()), "model", 0)
     except (ValueError, IndexError):
-        raise InputError(f"{path} is not an ONNX model: it does not parse", code="not_a_model") from None
+        raise InputError(f"{path} is not an ONNX model: it cannot be parsed", code="not_a_model") from None
     if outside:
         raise InputError(
-            f"{path} keeps weights in other files; save it as one file (onnx.save without external data)",
+            f"{path} has weights in other files; save it as a single file (onnx.save without external data)",
             code="model_has_external_data",
         )
 
@@ -51,7 +51,7 @@ def _has_external(data: memoryview, message: str, depth: int) -> bool:
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """Yield (field number, value) of a protobuf message: numbers for varints, views for everything with a length."""
+    """Yield (field number, value) of a protobuf message: integers for varints, views for fields with a length."""
     at = 0
     while at < len(data):
         key, at = _varint(data, at)

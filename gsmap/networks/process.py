@@ -1,4 +1,4 @@
-"""Models in processes of their own, which end on a time limit, when unused, and with this process."""
+"""ONNX models in separate processes, which end at a time limit, when unused, and with this process."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from gsmap.networks import child
 from gsmap.types.model import ModelLimits, Tensor
 
 _MIB = 1 << 20
-_MAX_S, _MAX_BYTES = 1e6, 1 << 50  # largest timeout and limit that the system accepts
-_PER_ARRAY_BYTES = 64  # of shared memory, so that each can be aligned
+_MAX_S, _MAX_BYTES = 1e6, 1 << 50  # largest timeout and memory limit that the system accepts
+_PER_ARRAY_BYTES = 64  # additional shared memory per array, for alignment
 
 
 class ModelProcess:
-    """An ONNX model, loaded in a process of its own.
+    """An ONNX model that is loaded in a separate process.
 
     Args:
-        path: of the file.
-        limits: seconds for loading it and for every run, and memory beside the libraries.
+        path: path of the file.
+        limits: time in seconds for loading and for each run, and memory in addition to the libraries.
 
     Attributes:
-        inputs, outputs: as the file declares them.
+        inputs, outputs: inputs and outputs that the file declares.
 
     Raises:
-        InputError: not a model that onnxruntime runs within the limits.
+        InputError: onnxruntime cannot run the model within the limits.
     """
 
     inputs: tuple[Tensor, ...]
@@ -53,12 +53,12 @@ class ModelProcess:
         command = [sys.executable, "-P", child.__file__, str(child_link.fileno()), str(shared)]
         self._process = subprocess.Popen(
             [*command, path, str(self._memory_bytes)],
-            stdin=subprocess.PIPE,  # nothing is written to it: it closes when this process ends
+            stdin=subprocess.PIPE,  # unused, but it closes when this process ends, which ends the child
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             pass_fds=(child_link.fileno(), shared),
-            start_new_session=True,  # Ctrl-C is for this process, which ends that one
-            env={**os.environ, "MALLOC_ARENA_MAX": "4"},  # each thread's own arena would count as memory
+            start_new_session=True,  # Ctrl-C must reach only this process, which then ends the child
+            env={**os.environ, "MALLOC_ARENA_MAX": "4"},  # the arenas of many threads would count as memory
         )
         child_link.close()
         self._channel = child.Channel(link, shared)
@@ -66,7 +66,7 @@ class ModelProcess:
         answer, _ = self._exchange("loading it", None, {})
         if "error" in answer:
             self.close()
-            raise InputError(f"{path} is not an ONNX model that can be run: {answer['error']}", code="not_a_model")
+            raise InputError(f"{path} is not a runnable ONNX model: {answer['error']}", code="not_a_model")
         self.inputs, self.outputs = (_tensors(answer[end]) for end in ("inputs", "outputs"))
 
     @property
@@ -78,14 +78,14 @@ class ModelProcess:
         return self.close.alive and self._process.poll() is None
 
     def run(self, outputs: list[str] | None, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        """Run the model on these inputs.
+        """Run the model on the given inputs.
 
         Args:
-            outputs: names; None for all.
+            outputs: names of the outputs to return; None for all.
 
         Raises:
-            InputError: it went beyond a limit, and its process was ended.
-            RuntimeError: an error of onnxruntime.
+            InputError: the run exceeded a limit, and its process was ended.
+            RuntimeError: onnxruntime raised an error.
         """
         given = ", ".join(f"{name} {list(value.shape)}" for name, value in feed.items())
         with self._lock:
@@ -99,9 +99,7 @@ class ModelProcess:
     def _exchange(
         self, what: str, outputs: list[str] | None, feed: Mapping[str, np.ndarray]
     ) -> tuple[dict[str, Any], list[np.ndarray]]:
-        """Send inputs and receive outputs, or the declaration after loading; the process is ended after the time
-        limit.
-        """
+        """Send inputs and receive outputs (or the declaration after loading); end the process at the time limit."""
         deadline = time.monotonic() + self._time_s
         try:
             if feed:
@@ -113,15 +111,15 @@ class ModelProcess:
         except TimeoutError as error:
             self.close()
             raise InputError(
-                f"model {self.path}: {what} took more than {self.limits.time_s:g} s and was ended: give it more with "
-                "--set describe.object.model_time_s=SECONDS, or take another model",
+                f"model {self.path}: {what} took more than {self.limits.time_s:g} s and was ended: allow more with "
+                "--set describe.object.model_time_s=SECONDS, or use another model",
                 code="model_timeout",
             ) from error
         except (EOFError, OSError, ValueError, LookupError, TypeError) as error:
             self.close()
             code = self._process.returncode
             raise self._too_large(what, signal.Signals(-code).name if code < 0 else f"code {code}") from error
-        except BaseException:  # Ctrl-C: the answer of a run that goes on would be taken for the next one
+        except BaseException:  # Ctrl-C: otherwise the answer of this run would be taken for that of the next
             self.close()
             raise
         if answer.get("lacks_memory"):
@@ -131,8 +129,8 @@ class ModelProcess:
 
     def _too_large(self, what: str, ended: str) -> InputError:
         return InputError(
-            f"model {self.path}: {what} ended its process ({ended}), most likely for lack of memory: give it more than "
-            f"{self.limits.memory_mb} MB with --set describe.object.model_memory_mb=MB, or take another model",
+            f"model {self.path}: {what} ended its process ({ended}), most likely for lack of memory: allow more than "
+            f"{self.limits.memory_mb} MB with --set describe.object.model_memory_mb=MB, or use another model",
             code="model_out_of_memory",
         )
 
@@ -149,7 +147,7 @@ def _tensors(listed: list[Any]) -> tuple[Tensor, ...]:
 
 
 def _shared_memory() -> int:
-    """Open an unnamed file, in memory where the system can."""
+    """Open an unnamed file, in memory if the system supports it."""
     if hasattr(os, "memfd_create"):
         return os.memfd_create("gsmap-model")
     with tempfile.TemporaryFile() as file:

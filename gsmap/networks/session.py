@@ -1,4 +1,4 @@
-"""Sessions of ONNX models, each in a process of its own (`gsmap.networks`)."""
+"""Open sessions of ONNX models, each in a separate process (`gsmap.networks`)."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from gsmap.errors import InputError, NotFoundError
 from gsmap.networks.process import ModelProcess
 from gsmap.types.model import ModelLimits, ModelSpec, Tensor
 
-_KEPT = 4  # processes: an encoder, a decoder, features, and one that takes the place of another
+_KEPT = 4  # number of processes: an encoder, a decoder, an extractor, and one to spare
 _processes: dict[tuple[str, str, ModelLimits], ModelProcess] = {}
 _lock = threading.Lock()
 
 
 def open_session(spec: ModelSpec) -> ModelProcess:
-    """Open a checked model, ready to `run` within its limits.
+    """Open a checked model, which is then ready to `run` within its limits.
 
     Raises:
-        NotFoundError: the file is gone.
-        InputError: its bytes are not those that were checked, or it does not load within its limits.
+        NotFoundError: the file does not exist any more.
+        InputError: the file has changed since it was checked, or does not load within its limits.
     """
     path = Path(spec.path)
     if not path.is_file():
         raise NotFoundError(
-            f"model {spec.kind} is missing: {path}; add it again with `gsmap models add`", code="model_missing"
+            f"the file of model {spec.kind} is missing: {path}; add it again with `gsmap models add`",
+            code="model_missing",
         )
     if hashlib.sha256(path.read_bytes()).hexdigest() != spec.sha256:
         raise InputError(
@@ -36,10 +37,10 @@ def open_session(spec: ModelSpec) -> ModelProcess:
 
 
 def run(spec: ModelSpec, session: ModelProcess, outputs: list[str] | None, feed: dict[str, Any]) -> list[Any]:
-    """Compute the session's outputs.
+    """Compute the outputs of a session.
 
     Raises:
-        InputError: onnxruntime refuses these inputs, or the run exceeds a limit.
+        InputError: onnxruntime rejects the inputs, or the run exceeds a limit.
     """
     try:
         return list(session.run(outputs, feed))
@@ -52,7 +53,7 @@ def run(spec: ModelSpec, session: ModelProcess, outputs: list[str] | None, feed:
 
 
 def declared(path: Path, sha256: str, limits: ModelLimits) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Return the inputs and outputs of the model in a file whose bytes have this digest.
+    """Return the inputs and outputs that a model declares; ``sha256`` is the digest of its file.
 
     Raises:
         InputError: not a model that onnxruntime runs within the limits.
@@ -62,7 +63,7 @@ def declared(path: Path, sha256: str, limits: ModelLimits) -> tuple[tuple[Tensor
 
 
 def misfit(spec: ModelSpec, problem: str) -> InputError:
-    """Return the error for a model whose inputs and outputs are not those of its kind."""
+    """Return the error for a model whose inputs and outputs do not fit its kind."""
     have = ", ".join(f"{t.name} {list(t.shape)}" for t in spec.inputs)
     return InputError(
         f"{spec.path} is not a {spec.kind} model: {problem}; its inputs are {have or 'none'}", code="model_misfit"
@@ -70,7 +71,7 @@ def misfit(spec: ModelSpec, problem: str) -> InputError:
 
 
 def _process(path: str, sha256: str, limits: ModelLimits) -> ModelProcess:
-    """Return the process of a model; the least recently used one is dropped, and ends once unused."""
+    """Return the process of a model; the least recently used process is dropped, and ends once it is unused."""
     key = path, sha256, limits
     with _lock:
         found = _processes.pop(key, None)
