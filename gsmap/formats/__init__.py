@@ -1,4 +1,4 @@
-"""Files of Gaussians: one module per format, found by suffix.
+"""Read and write files of Gaussians. Each format is one module, selected by the suffix of the file.
 
 The contract of a format is in `gsmap.methods.format`; another package adds one by an entry point in the group
 ``gsmap.formats``, named by its suffix. Modules are imported on first use.
@@ -29,7 +29,7 @@ _Part = TypeVar("_Part")
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str | None:
-    """Return the longest known suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None.
+    """Return the longest known suffix of a path, so ``.compressed.ply`` before ``.ply``; None without one.
 
     One without a dot (``tileset.json``) is a whole name: that of a file whose folder is the scene.
     """
@@ -39,7 +39,7 @@ def suffix_of(path: str | os.PathLike[str]) -> str | None:
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the Gaussians of a file of any known format; infinities that are values are clamped (`gsmap.stream`).
+    """Read the Gaussians of a file of any known format; clamp infinite values that have a meaning (`gsmap.stream`).
 
     Positions that float32 cannot hold, such as map coordinates, are about an origin (`Gaussians.origin`).
 
@@ -56,7 +56,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def stream(path: str | os.PathLike[str]) -> GaussianSource:
-    """Open a file of Gaussians of any known format; its chunks are read one at a time if the format permits it.
+    """Open a file of Gaussians of any known format; read it in chunks if the format permits.
 
     Raises:
         NotFoundError, InputError: As `read`; reading chunks may raise them, too.
@@ -71,7 +71,7 @@ def stream(path: str | os.PathLike[str]) -> GaussianSource:
 
 @dataclass(frozen=True, eq=False)
 class _FileSource:
-    """Source of Gaussians from an opened file; errors of the operating system name the file."""
+    """A source of Gaussians in an open file; its errors from the operating system name the file."""
 
     path: Path
     source: GaussianSource
@@ -106,7 +106,7 @@ class _FileSource:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Return the metadata of the file; an empty `FileInfo` if its format has none."""
+    """Return the metadata of a file; an empty `FileInfo` if the format has no metadata."""
     path = Path(path)
     module = _load(_suffix(path, "read"))
     with _explained(path, "read"):
@@ -114,7 +114,7 @@ def info(path: str | os.PathLike[str]) -> FileInfo:
 
 
 def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: object) -> None:
-    """Write Gaussians in the format of the path's suffix; the file appears whole or not at all.
+    """Write Gaussians in the format of the path's suffix; after an error, no partial file remains.
 
     Links, pipes and devices: see `gsmap.durable.write_output`; only a format of one file is written to a pipe.
 
@@ -136,7 +136,7 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
             path.parent.mkdir(parents=True, exist_ok=True)
         if is_stream(path):
             raise InputError(
-                f"cannot write {path}: {suffix} consists of several files, and this is a pipe or a device",
+                f"cannot write {path}: it is a pipe or a device, but {suffix} consists of several files",
                 code="not_writable",
             )
     with _explained(path, "write"):
@@ -147,7 +147,7 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
 
 
 def read_cameras(path: str | os.PathLike[str]) -> Cameras:
-    """Cameras of a ``cameras.json``, ``transforms.json`` or COLMAP folder; see `gsmap.formats.cameras.read`."""
+    """Read a ``cameras.json``, a ``transforms.json`` or a COLMAP folder; see `gsmap.formats.cameras.read`."""
     from gsmap.formats import cameras
 
     with _explained(Path(path), "read"), np.errstate(all="ignore"):
@@ -160,13 +160,13 @@ def known(verb: str) -> list[str]:
 
 
 def can_write(suffix: str) -> bool:
-    """Return whether files of this suffix can be written; unlike `known`, import that format alone."""
+    """Return true if files of this suffix can be written; import only this format, where `known` imports all."""
     return _can(suffix, "write")
 
 
 @lru_cache(maxsize=4)
 def _suffixes(places: tuple[str, ...]) -> tuple[str, ...]:
-    """All suffixes; ``places`` (`sys.path`) are looked through for other packages' once, as that takes milliseconds."""
+    """Return all suffixes; cache them by ``places`` (`sys.path`), as searching for plug-ins takes milliseconds."""
     return family("format").names()
 
 
@@ -175,7 +175,7 @@ def _load(suffix: str) -> Any:
 
 
 def _can(suffix: str, verb: str) -> bool:
-    """Return true if a format reads or writes; a plug-in that cannot be loaded does neither."""
+    """Return true if the format of a suffix can read or write (``verb``); false if its plug-in cannot be loaded."""
     try:
         return hasattr(_load(suffix), verb)
     except ConfigError:
@@ -183,7 +183,7 @@ def _can(suffix: str, verb: str) -> bool:
 
 
 def _suffix(path: Path, verb: str) -> str:
-    """Return the suffix of a path, or raise an error if it cannot be read or written."""
+    """Return the suffix of a path; raise an error if no format can read or write that suffix."""
     suffix = suffix_of(path)
     if suffix is None:
         what = f"has the unknown suffix {path.suffix!r}" if path.suffix else "has no suffix"
@@ -197,7 +197,7 @@ def _suffix(path: Path, verb: str) -> str:
 
 
 def _layout(path: Path, suffix: str) -> str:
-    """Return the suffix of the actual content: some programs name a ``.compressed.ply`` file ``.ply``."""
+    """Return the suffix that fits the content of the file: some programs name a ``.compressed.ply`` file ``.ply``."""
     if suffix != ".ply":
         return suffix
     from gsmap.formats import ply

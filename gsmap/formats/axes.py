@@ -1,4 +1,4 @@
-"""Axis conventions of files, and rotation of Gaussians from one convention to another.
+"""Axis conventions of files, and conversion of Gaussians from one convention to another.
 
 A convention is three letters, one per axis: right or left, up or down, front or back. A trained ``.ply`` is ``RDF``,
 SPZ is ``RUB``, glTF is ``LUF``. Only the order and signs of coordinates change, so nothing is rounded up to SH
@@ -25,7 +25,7 @@ def axes_matrix(a: str, b: str) -> np.ndarray:
 
 
 def change_axes(gaussians: Gaussians, a: str, b: str) -> Gaussians:
-    """Convert Gaussians from convention b to convention a, including mirrored conventions."""
+    """Convert Gaussians from convention b to convention a; either convention may be mirrored."""
     M = axes_matrix(a, b)
     if np.array_equal(M, np.eye(3)):
         return gaussians
@@ -58,7 +58,7 @@ def _turn_sh(sh: np.ndarray, M: np.ndarray) -> np.ndarray:
 
 
 def _from_letters(convention: str) -> np.ndarray:
-    """Return the axes of the convention as columns, in right-down-front coordinates."""
+    """Return the axes of a convention as columns of a matrix, in right-down-front coordinates."""
     out = np.zeros((3, 3))
     for column, letter in enumerate(convention):
         row, sign = _LETTERS[letter]

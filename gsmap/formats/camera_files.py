@@ -1,4 +1,4 @@
-"""Helpers shared by camera files: reading JSON, and one name for each camera."""
+"""Helpers for all camera files: read JSON, and make camera names unique."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def load_json(path: Path) -> Any:
 
 
 def unique(names: list[str]) -> tuple[str, ...]:
-    """Return the names, with ``#2`` and so on appended to repeated ones."""
+    """Return the names, with ``#2``, ``#3`` and so on appended to repeated names."""
     seen: dict[str, int] = {}
     out = []
     for name in names:

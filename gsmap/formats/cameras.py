@@ -30,7 +30,8 @@ def read(path: str | os.PathLike[str]) -> Cameras:
                 return colmap.read(model)
             if not (path / "transforms.json").is_file():
                 raise InputError(
-                    f"{path} holds no cameras: no COLMAP model (cameras.bin/.txt) and no transforms.json",
+                    f"{path} holds no cameras: the folder has no COLMAP model (cameras.bin/.txt) and no "
+                    "transforms.json",
                     code="no_cameras",
                 )
             path = path / "transforms.json"

@@ -1,4 +1,4 @@
-"""``cameras.json`` as INRIA's gaussian-splatting writes it: a list of camera-to-scene poses, OpenCV axes."""
+"""Read and write the ``cameras.json`` of INRIA's gaussian-splatting: a list of camera-to-scene poses in OpenCV axes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmap.types import Cameras
 
 
 def parse(entries: list[dict[str, Any]], path: Path) -> Cameras:
-    """Cameras of a parsed file. ``cx cy`` are read where present; else the principal point is the image centre."""
+    """Return the cameras of a parsed file. Without ``cx cy``, the principal point is the image centre."""
     if not entries:
         raise InputError(f"{path} holds no cameras: the list is empty", code="no_cameras")
     pose = np.tile(np.eye(4), (len(entries), 1, 1))
@@ -29,7 +29,7 @@ def parse(entries: list[dict[str, Any]], path: Path) -> Cameras:
 
 
 def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
-    """Write the INRIA layout, with ``cx cy`` where the principal point is not the image centre."""
+    """Write cameras in the INRIA layout; add ``cx cy`` where the principal point is not the image centre."""
     entries = []
     for i, name in enumerate(cameras.names):
         fx, fy, cx, cy = cameras.intrinsics_px[i].tolist()

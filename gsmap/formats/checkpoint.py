@@ -1,4 +1,4 @@
-"""Checkpoints of trainers (read only): gsplat's ``.pt``, nerfstudio's ``.ckpt``, gaussian-splatting's ``.pth``.
+"""Read checkpoints of trainers: gsplat's ``.pt``, nerfstudio's ``.ckpt``, gaussian-splatting's ``.pth``.
 
 Read by ``torch.load(weights_only=True)``, which runs no code of the file, and mapped: what is not asked for is not
 read. Frames are the trainer's own, right-down-front; nerfstudio turns and scales a capture before it trains
@@ -49,7 +49,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     found = _tensors(path, _loaded(path))
     missing = [name for name in _REQUIRED if name not in found]
     if missing:
-        held = ", ".join(sorted(found)) or "none of what a splat has"
+        held = ", ".join(sorted(found)) or "none of the tensors of a splat"
         raise NotGaussiansError(f"{path} holds no Gaussians: it has {held} and lacks {', '.join(missing)}")
     n = len(found["means"])
     size = os.path.getsize(path)
@@ -71,14 +71,19 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Note that the frame of a nerfstudio checkpoint differs from that of its camera file."""
+    """Return a note that the frame of a nerfstudio checkpoint differs from the frame of its camera file."""
     if Path(path).suffix.lower() != ".ckpt":
         return FileInfo()
-    return FileInfo(notes=(f"{Path(path).name} is in nerfstudio's own frame: see dataparser_transforms.json",))
+    return FileInfo(
+        notes=(
+            f"{Path(path).name} is in the frame of nerfstudio's dataparser, not in that of the cameras: see "
+            "dataparser_transforms.json",
+        )
+    )
 
 
 def _loaded(path: str | os.PathLike[str]) -> Any:
-    """Load the checkpoint with ``torch.load``, weights only, after checking its container."""
+    """Load a checkpoint with ``torch.load(weights_only=True)``, after checking its container."""
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -99,7 +104,7 @@ def _loaded(path: str | os.PathLike[str]) -> Any:
                 f"{path}: its {entry.filename!r} is more than {_MAX_PICKLE_BYTES >> 20} MiB", code="file_too_large"
             )
     if not any(entry.filename.endswith("/data.pkl") for entry in entries):
-        raise InputError(f"{path} is a ZIP, but not of torch: it has no data.pkl", code="wrong_file_type")
+        raise InputError(f"{path} is a ZIP file, but no torch checkpoint: it has no data.pkl", code="wrong_file_type")
     import torch
 
     try:
@@ -123,7 +128,7 @@ def _loaded(path: str | os.PathLike[str]) -> Any:
 
 
 def _tensors(path: str | os.PathLike[str], loaded: Any) -> dict[str, Any]:
-    """Find the tensors of Gaussians in a checkpoint, by field of `Gaussians`."""
+    """Find the tensors of the Gaussians in a checkpoint; return them by field of `Gaussians`."""
     if isinstance(loaded, tuple | list) and loaded and isinstance(loaded[0], tuple | list):  # (capture(), iteration)
         loaded = dict(zip(_TUPLE, loaded[0], strict=False))
     names = {name: ours for ours, all_names in _FIELDS.items() for name in all_names}
@@ -140,7 +145,7 @@ def _tensors(path: str | os.PathLike[str], loaded: Any) -> dict[str, Any]:
             if ours is not None and hasattr(value, "stride"):
                 if ours in found:
                     raise InputError(
-                        f"{path} holds {name!r} twice, more than one splat: export a .ply of one",
+                        f"{path} holds {name!r} twice, so it has more than one splat: export one splat as .ply",
                         code="unsupported_feature",
                     )
                 found[ours] = value
@@ -152,11 +157,14 @@ def _tensors(path: str | os.PathLike[str], loaded: Any) -> dict[str, Any]:
 def _array(
     path: str | os.PathLike[str], name: str, tensor: Any, n: int, shape: tuple[int, ...], size: int
 ) -> np.ndarray:
-    """Return a tensor as (n, *shape), checked against the size of the file; -1 matches any size."""
+    """Return a tensor as an array (n, *shape), where -1 matches any size; check its size against that of the file."""
     import torch
 
     if tensor.layout != torch.strided or not tensor.is_floating_point() or tensor.dtype.itemsize not in (2, 4, 8):
-        raise InputError(f"{path}: {name} is {tensor.layout} of {tensor.dtype}, not numbers", code="wrong_tensor_type")
+        raise InputError(
+            f"{path}: {name} is a {tensor.layout} tensor of {tensor.dtype}, expected dense numbers",
+            code="wrong_tensor_type",
+        )
     given = tuple(tensor.shape)
     if name == "logit_opacities" and given == (n, 1):
         given, tensor = (n,), tensor[:, 0]
@@ -176,6 +184,6 @@ def _array(
     if tensor.numel() * tensor.dtype.itemsize > size:  # a stride of 0 makes a splat of any size out of one number
         check_size(path, tensor.numel() * 4, 0)
         raise InputError(
-            f"{path}: {name} has {tensor.numel()} numbers, more than the file holds", code="decompression_bomb"
+            f"{path}: {name} has {tensor.numel()} numbers, more than fit into the file", code="decompression_bomb"
         )
     return tensor.detach().to(torch.float64 if name == "means" else torch.float32).numpy().copy()

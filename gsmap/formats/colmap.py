@@ -1,4 +1,4 @@
-"""COLMAP models: ``cameras`` and ``images``, read as text or binary, written as text.
+"""Read COLMAP models (the files ``cameras`` and ``images``, text or binary), and write them as text.
 
 ``points3D``, ``rigs`` and ``frames`` are not needed.
 pycolmap knows the camera models; the two files are walked here, because its readers hang on a truncated one.
@@ -25,7 +25,7 @@ _PLACES = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
 
 
 def find_model(folder: Path) -> Path | None:
-    """Return the folder with the files of the model: the folder, ``sparse/0`` or ``sparse``; None without a model."""
+    """Return the folder with a model's files (``folder``, its ``sparse/0`` or ``sparse``); None without a model."""
     for place in _PLACES:
         for suffix in ("bin", "txt"):
             if all((folder / place / f"{name}.{suffix}").is_file() for name in ("cameras", "images")):
@@ -34,7 +34,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def read(folder: str | os.PathLike[str]) -> Cameras:
-    """Read the images of a model, sorted by name; poses are in COLMAP's world frame.
+    """Read the cameras of a model, sorted by image name, with poses in COLMAP's world frame.
 
     Cameras with distortion are read as pinholes, and those that no pinhole stands for are left out: ``notes`` say so
     (`gsmap.formats.lenses`).
@@ -62,7 +62,7 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
         chosen = [calibrations[camera] for _, _, camera in images]
     except KeyError as error:
         raise InputError(
-            f"{folder}: an image names camera {error}, which the model does not have", code="file_damaged"
+            f"{folder}: an image refers to camera {error}, which the model does not have", code="file_damaged"
         ) from error
     except (ValueError, RuntimeError, struct.error) as error:  # RuntimeError: pycolmap does not know the model
         if isinstance(error, InputError):
@@ -91,7 +91,8 @@ def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
     folder = Path(folder)
     if (folder / "cameras.bin").exists() or (folder / "images.bin").exists():
         raise InputError(
-            f"{folder} holds a binary COLMAP model, which would be read instead: write to another folder",
+            f"{folder} holds a binary COLMAP model, which readers would prefer to the text model: write to another "
+            "folder",
             code="binary_model_in_the_way",
         )
     if not folder.parent.is_dir():
@@ -144,7 +145,7 @@ def _binary_images(data: bytes) -> Iterator[tuple[str, tuple[float, ...], int]]:
         yield data[offset + 64 : end].decode("utf-8", "replace"), tuple(pose), camera_id
         offset = end + 9 + 24 * num_points
         if offset > len(data):
-            raise ValueError(f"images.bin ends before its {count} images do")
+            raise ValueError(f"images.bin ends before the last of its {count} images")
 
 
 def _text_cameras(text: str) -> Iterator[tuple[int, Lens]]:

@@ -1,4 +1,4 @@
-"""PlayCanvas' ``.compressed.ply``: chunks of 256 Gaussians, each with the bounds that its packed integers lie between.
+"""Read and write PlayCanvas' ``.compressed.ply``: chunks of 256 Gaussians, as integers between the bounds of the chunk.
 
 16 bytes a Gaussian and 3 a coefficient of SH beyond degree 0. Positions and scales have 11, 10 and 11 bits, a
 quaternion 2 + 3 x 10 (smallest three, of wxyz), colours and opacity 8 bits each, SH 8 bits over [-4, 4].
@@ -34,7 +34,7 @@ _MAX_LOG_SCALE = 20.0
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a ``.compressed.ply``, with or without bounds of the colours (older files), SH degree 0 to 3.
+    """Read a ``.compressed.ply`` of SH degree 0 to 3, also an older file without bounds of the colours.
 
     Raises:
         InputError: Another kind of PLY, truncated, or with inconsistent counts.
@@ -49,7 +49,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     n = len(rows)
     if len(chunks) != -(-n // _CHUNK):
         raise InputError(
-            f"{path}: {n} Gaussians need {-(-n // _CHUNK)} chunks, it has {len(chunks)}", code="count_mismatch"
+            f"{path}: {n} Gaussians need {-(-n // _CHUNK)} chunks, but the file has {len(chunks)}",
+            code="count_mismatch",
         )
     low, high, scale_low, scale_high = (
         np.stack([chunks[name] for name in _BOUNDS[at : at + 3]], 1) for at in (0, 3, 6, 9)
@@ -74,7 +75,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a ``.compressed.ply``, sorted along a Morton curve (which is what keeps the chunks' bounds tight)."""
+    """Write a ``.compressed.ply``, sorted along a Morton curve, which keeps the bounds of chunks tight."""
     require_writable(path, gaussians)
     g = gaussians[morton_order(gaussians.means)]
     n, k = len(g), g.sh.shape[1]
@@ -138,13 +139,13 @@ def _require(path: str | os.PathLike[str], rows: np.ndarray, names: list[str], k
 
 
 def _between(t: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the values at fractions t (N, 3) between the bounds (C, 3) of each chunk."""
+    """Return the values (N, 3) at fractions ``t`` (N, 3) between the bounds (C, 3) of their chunks."""
     chunk = np.arange(len(t)) // _CHUNK
     return low[chunk] * (1 - t) + high[chunk] * t
 
 
 def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return values (N, 3) as fractions of the bounds of their chunk, and the bounds (C, 3)."""
+    """Return values (N, 3) as fractions between the bounds of their chunks, and the lower and upper bounds (C, 3)."""
     starts = np.arange(0, len(values), _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     chunk = np.arange(len(values)) // _CHUNK

@@ -1,4 +1,4 @@
-"""``.g2o`` pose graphs: ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` lines, for exchange with other solvers.
+"""Read and write pose graphs as ``.g2o`` (``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT``), for exchange with other solvers.
 
 ``VERTEX_SE3:QUAT id x y z qx qy qz qw`` and ``EDGE_SE3:QUAT i j x y z qx qy qz qw`` followed by the 21 numbers of the
 upper triangle, row by row, of a 6x6 information matrix ordered [translation, rotation]. ``i j`` measures the pose of j
@@ -30,7 +30,7 @@ _UPPER = np.triu_indices(6)
 
 @dataclass(frozen=True, eq=False)
 class G2o:
-    """A pose graph file: scenes in file order with their poses, edges, and the ids of ``FIX`` lines."""
+    """The content of a pose graph file: the scenes with their poses, in file order, the edges, and the fixed scenes."""
 
     poses: dict[str, Sim3] = field(default_factory=dict)
     edges: tuple[Edge, ...] = ()
@@ -64,7 +64,7 @@ def read_graph(path: str | os.PathLike[str], *, confirmed: bool = True) -> G2o:
             elif words[0] == "VERTEX_SE3:QUAT":
                 name, values = _split(words, 1, 7, where)
                 if name[0] in poses:
-                    raise InputError(f"{where}: vertex {name[0]} is given twice", code="duplicate")
+                    raise InputError(f"{where}: vertex {name[0]} appears a second time", code="duplicate")
                 poses[name[0]] = _pose(values, where)
             elif words[0] == "EDGE_SE3:QUAT":
                 (target, source), values = _split(words, 2, 28, where)
@@ -94,7 +94,7 @@ def write_graph(
     names: Mapping[str, str] | None = None,
     remarks: Sequence[str] = (),
 ) -> dict[str, int]:
-    """Write poses and edges; g2o wants integers, so scenes are numbered in the order of ``poses``.
+    """Write poses and edges. As g2o requires integer ids, scenes are numbered in the order of ``poses``.
 
     Ids that are whole numbers already are kept where all are. The scale row of the information is left out.
 
@@ -120,7 +120,7 @@ def write_graph(
         name = f"edge {edge.target}:{edge.source}"
         if edge.target not in numbers or edge.source not in numbers:
             raise InputError(
-                f"{name} names a scene without a pose: write all scenes of the component", code="unsupported_output"
+                f"{name} refers to a scene without a pose: write all scenes of the component", code="unsupported_output"
             )
         information = without_scale(np.asarray(edge.information, dtype=np.float64))[np.ix_(_SWAP, _SWAP)]
         upper = " ".join(repr(float(v)) for v in information[_UPPER])

@@ -1,4 +1,4 @@
-"""``gcp_list.txt`` of OpenDroneMap and WebODM: ground control points in photos.
+"""Read and write the ``gcp_list.txt`` of OpenDroneMap and WebODM: ground control points in photos.
 
 The first line names the coordinate reference system: ``EPSG:25832``, a PROJ string (``+proj=utm +zone=32 ...``), or
 ``WGS84 UTM 32N``. Every other line is a control point in one photo, ``geo_x geo_y geo_z im_x im_y image_name
@@ -48,7 +48,7 @@ class GcpLine:
 
 @dataclass(frozen=True)
 class GcpList:
-    """Content of a ``gcp_list.txt``.
+    """The content of a ``gcp_list.txt``.
 
     Args:
         crs: Coordinate reference system in a form that PROJ accepts.
@@ -60,7 +60,7 @@ class GcpList:
 
 
 def read(path: str | os.PathLike[str]) -> GcpList:
-    """Read a file.
+    """Read a ``gcp_list.txt``.
 
     Raises:
         NotFoundError: The file is missing.
@@ -79,19 +79,19 @@ def read(path: str | os.PathLike[str]) -> GcpList:
 
 
 def parse(text: str, where: str = "gcp_list") -> GcpList:
-    """The content of a file; see `read`."""
+    """Parse the text of a ``gcp_list.txt``; see `read`."""
     rows = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     rows = [(number, line) for number, line in rows if line and not line.startswith("#")]
     if not rows:
         raise InputError(
-            f"{where} is empty: its first line names the coordinate system, such as EPSG:25832", code="file_empty"
+            f"{where} is empty: its first line must name the coordinate system, such as EPSG:25832", code="file_empty"
         )
     crs = _crs(re.sub(r"\s+#.*", "", rows[0][1]), f"{where}, line {rows[0][0]}")
     found = [_line(number, line, f"{where}, line {number}") for number, line in rows[1:]]
     found = _with_names(found, [line for _, line in rows[1:]])
     if not found:
         raise InputError(
-            f"{where} names no control point: each line is geo_x geo_y geo_z im_x im_y image [name]",
+            f"{where} has no control point: add lines such as geo_x geo_y geo_z im_x im_y image [name]",
             code="no_control_points",
         )
     places: dict[str, GcpLine] = {}
@@ -107,14 +107,15 @@ def parse(text: str, where: str = "gcp_list") -> GcpList:
         before = seen.setdefault((one.name, one.image), one)
         if before is not one:
             raise InputError(
-                f"{where}, line {one.line}: point {one.name} in {one.image} again, as on line {before.line}",
+                f"{where}, line {one.line}: point {one.name} in photo {one.image} is already on line {before.line}: "
+                "remove one of the lines",
                 code="duplicate",
             )
     return GcpList(crs, tuple(found))
 
 
 def write(path: str | os.PathLike[str], crs: str, lines: list[GcpLine]) -> None:
-    """Write a file that `read` gives back to the last digit."""
+    """Write a file from which `read` returns the same numbers to the last digit."""
     parts = [crs]
     for one in lines:
         numbers = "\t".join(repr(float(v)) for v in (*one.position, *one.pixel))
@@ -132,7 +133,7 @@ def _crs(line: str, where: str) -> str:
         return line
     if all(_is_number(part) for part in line.split()[:3]):
         raise InputError(
-            f"{where}: the first line names the coordinate system, such as EPSG:25832; this is a point",
+            f"{where}: the first line must name the coordinate system, such as EPSG:25832, but it is a point",
             code="gcp_crs_missing",
         )
     raise InputError(
@@ -165,27 +166,27 @@ def _line(number: int, line: str, where: str) -> GcpLine:
             raise InputError(f"{where}: {name} is {part[:40]!r}, not a finite number", code="invalid_line")
         values.append(float(part))
     if not parts[5]:
-        raise InputError(f"{where} names no photo", code="invalid_line")
+        raise InputError(f"{where} has no name of a photo", code="invalid_line")
     name = parts[6] if len(parts) > 6 else ""
     x, y, z, u, v = values
     return GcpLine(number, name, (x, y, z), (u, v), parts[5])
 
 
 def _image_and_name(text: str, where: str) -> list[str]:
-    """The name of an image, which may have spaces, and that of the point where there is one."""
+    """Split the end of a line into the name of the image, which may have spaces, and the name of the point, if any."""
     ends = [found.end() for found in _IMAGE_END.finditer(text)]
     words = [text[: ends[0]], *text[ends[0] :].split()[:1]] if ends else text.split()
     # What looks like the number of a copy, "DJI_0001 (2)", is no point's name.
     if len(ends) > 1 or (not ends and len(words) > 2) or (len(words) == 2 and re.fullmatch(r"\(\d+\)", words[1])):
         raise InputError(
-            f"{where}: it is not clear where the photo's name ends in {text[:60]!r}: part the fields with tabs",
+            f"{where}: it is not clear where the photo's name ends in {text[:60]!r}: separate the fields with tabs",
             code="invalid_line",
         )
     return words
 
 
 def _with_names(found: list[GcpLine], lines: list[str]) -> list[GcpLine]:
-    """Name points without a name: as another line names their place, else by their place as it is first written."""
+    """Name unnamed points: by a named point with the same coordinates, or by the text of their coordinates."""
     named = {one.position: one.name for one in reversed(found) if one.name}
     for one, line in zip(found, lines, strict=True):
         named.setdefault(one.position, "_".join(line.split(None, 3)[:3]))

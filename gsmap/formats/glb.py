@@ -1,4 +1,4 @@
-"""Binary glTF 2.0 (``.glb``) with the ratified ``KHR_gaussian_splatting``, as float32 or packed as SPZ.
+"""Read and write binary glTF 2.0 (``.glb``) with the ratified ``KHR_gaussian_splatting``, as float32 or packed as SPZ.
 
 Scales are linear, opacities in [0, 1], quaternions xyzw, and the axes left-up-front; colours are as trained (sRGB).
 A file is written with everything, SH included, turned into glTF's axes, so that viewers agree whether or not they turn
@@ -31,8 +31,9 @@ HOLDS_ORIGIN = True
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
-"""A draft. Its text asks for left-up-front axes; CesiumJS and cesium-native, whose makers wrote it, take the numbers of
-the SPZ as they are in the node's frame, and so are they written and read here."""
+"""An extension in draft. Its text requires left-up-front axes, but CesiumJS and cesium-native, whose makers wrote the
+draft, take the numbers of the SPZ as coordinates in the node's frame; gsmap writes and reads them likewise.
+"""
 _MAX_JSON_BYTES = 16 << 20
 _MAX_NODES = 10_000
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -43,7 +44,7 @@ _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read all splats of the file's scene into one set, in the axes of a ``.ply``; node transforms are applied.
+    """Read all splats of the default scene as one set in the axes of a ``.ply``, with node transforms applied.
 
     Raises:
         InputError: Not a GLB, damaged, without splats, of a draft of the extension, compressed, or with buffers
@@ -53,7 +54,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: bool = False) -> None:
-    """Write a ``.glb``, in the order given, with point colours for viewers that know no splats.
+    """Write a ``.glb`` in the order of the Gaussians, with point colours for viewers that cannot draw splats.
 
     Args:
         compressed: Pack the Gaussians as SPZ: about a fifth of the bytes, for viewers that read `SPZ_EXTENSION`.
@@ -74,7 +75,7 @@ def holds_splats(path: str | os.PathLike[str]) -> bool:
 
 
 def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -> Gaussians:
-    """The splats of a GLB in glTF's own world, y up, or in the frame that ``matrix`` (4, 4) takes that world to."""
+    """Read the splats of a GLB in glTF's world (y up), or in the frame to which ``matrix`` (4, 4) maps that world."""
     gltf, binary = _read_container(path)
     outer = np.eye(4) if matrix is None else matrix
     try:
@@ -87,12 +88,12 @@ def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -
             raise
         raise InputError(f"{path} is not valid glTF: {type(error).__name__} {error}", code="not_json") from error
     if not parts:
-        raise NotGaussiansError(f"{path} holds no Gaussian splats ({EXTENSION}): a mesh or a point cloud?")
+        raise NotGaussiansError(f"{path} holds no Gaussian splats ({EXTENSION}); it may be a mesh or a point cloud")
     return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)
 
 
 def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.ndarray | None = None) -> None:
-    """Write Gaussians as they are; ``matrix`` (4, 4) takes them to glTF's world, as the transform of their node."""
+    """Write Gaussians unchanged, in a node whose transform ``matrix`` (4, 4) maps them to glTF's world."""
     g, matrix = gaussians, _from_origin(gaussians.origin, matrix)
     unit = g.quats / np.maximum(np.linalg.norm(g.quats, axis=1, keepdims=True), 1e-30)
     unit[~unit.any(1), 0] = 1
@@ -117,7 +118,7 @@ def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.n
 
 
 def write_packed(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.ndarray | None = None) -> None:
-    """As `write_world`, packed as SPZ; positions are kept to about a part in 100,000 of the extent.
+    """Write Gaussians like `write_world`, packed as SPZ, which keeps positions to about 1/100,000 of the extent.
 
     They are counted from the middle, which the node's transform gives back: SPZ has 24 bits for a position.
     """
@@ -154,7 +155,7 @@ def _from_origin(origin: np.ndarray, matrix: np.ndarray | None) -> np.ndarray | 
 
 
 def _gltf(accessors: dict[str, dict[str, Any]], matrix: np.ndarray | None) -> dict[str, Any]:
-    """A scene of one node with one splat primitive, whose attributes these are; buffers are left to the caller."""
+    """Return the glTF JSON of one node with one splat primitive and its attributes; the caller adds the buffers."""
     splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     splatting |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     attributes = {name: i for i, name in enumerate(accessors)}
@@ -192,7 +193,7 @@ def _sh_names(count: int) -> list[str]:
 
 
 def _write_container(path: str | os.PathLike[str], gltf: dict[str, Any], chunks: Sequence[bytes | memoryview]) -> None:
-    """Write a GLB of one buffer: the chunks one after another, each a multiple of 4 bytes."""
+    """Write a GLB whose one buffer consists of the chunks in order, each of a multiple of 4 bytes."""
     length = sum(memoryview(chunk).nbytes for chunk in chunks)
     gltf["buffers"] = [{"byteLength": length}]
     text = json.dumps(gltf, separators=(",", ":")).encode()
@@ -211,7 +212,7 @@ def _write_container(path: str | os.PathLike[str], gltf: dict[str, Any], chunks:
 
 
 def _point_colours(g: Gaussians) -> np.ndarray:
-    """(N, 4) uint8 linear RGB and opacity, for viewers that draw the Gaussians as points."""
+    """Return linear RGB and opacity (N, 4) uint8, for viewers that draw the Gaussians as points."""
     srgb = np.clip(rgb_of_sh0(g.sh[:, 0]), 0, 1)
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     rgb = np.round(linear * 255).astype(np.uint8)
@@ -219,7 +220,7 @@ def _point_colours(g: Gaussians) -> np.ndarray:
 
 
 def _read_container(path: str | os.PathLike[str]) -> tuple[dict[str, Any], np.ndarray]:
-    """The JSON and the bytes of the binary chunk, mapped from the file."""
+    """Return the JSON of a GLB and the bytes of its binary chunk, memory-mapped from the file."""
     size = Path(path).stat().st_size
     with open(path, "rb") as file:
         head = file.read(20)
@@ -262,7 +263,7 @@ def _read_container(path: str | os.PathLike[str]) -> tuple[dict[str, Any], np.nd
 def _primitives(
     path: str | os.PathLike[str], gltf: dict[str, Any], outer: np.ndarray
 ) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Every splat primitive of the default scene with the matrix (4, 4) from its node to the outermost frame."""
+    """Yield each splat primitive of the default scene with the matrix (4, 4) from its node to the outermost frame."""
     nodes = gltf.get("nodes", [])
     scenes = gltf.get("scenes", [])
     roots = scenes[gltf.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
@@ -305,13 +306,14 @@ def _read_primitive(
         local = spz.unpack(path, _view(path, gltf, binary, nested[SPZ_EXTENSION]["bufferView"]).tobytes())
         if len(local) != gltf["accessors"][attributes["POSITION"]]["count"]:
             raise InputError(
-                f"{path}: its SPZ holds {len(local)} Gaussians, its accessors do not; it is damaged",
+                f"{path} is damaged: its SPZ holds {len(local)} Gaussians, its accessors another number",
                 code="count_mismatch",
             )
         return _placed(path, local, world)
     if nested:
         raise InputError(
-            f"{path} is compressed or extended by {', '.join(nested)}: convert it to plain {EXTENSION}",
+            f"{path} uses the extension {', '.join(nested)}, which gsmap does not read: convert it to plain "
+            f"{EXTENSION}",
             code="unsupported_feature",
         )
     if splatting.get("kernel") != "ellipse" or splatting.get("colorSpace") != "srgb_rec709_display":
@@ -338,7 +340,8 @@ def _read_primitive(
     opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
     if not ((opacities >= 0) & (opacities <= 1)).all():
         raise InputError(
-            f"{path} has opacities outside [0, 1]: a draft of {EXTENSION}? export it anew", code="unsupported_version"
+            f"{path} has opacities outside [0, 1], as files of an early draft of {EXTENSION} may have: export it anew",
+            code="unsupported_version",
         )
     degree = 0
     while degree < 3 and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
@@ -364,7 +367,7 @@ def _placed(path: str | os.PathLike[str], local: Gaussians, world: np.ndarray) -
         S_world_local = Sim3.from_matrix(world)
     except InputError as error:
         raise InputError(
-            f"{path}: a node or tile is placed by more than a turn, shift and scale: {error}",
+            f"{path}: the transform of a node or tile is more than a rotation, translation and uniform scale: {error}",
             code="unsupported_transform",
         ) from error
     return transform_with_origin(local, S_world_local)
@@ -379,7 +382,7 @@ def _require_inside(path: str | os.PathLike[str], gltf: dict[str, Any], view: di
 
 
 def _view(path: str | os.PathLike[str], gltf: dict[str, Any], binary: np.ndarray, index: int) -> np.ndarray:
-    """The bytes of one buffer view, its place in the file checked."""
+    """Return the bytes of one buffer view after checking that they lie within the file."""
     view = gltf["bufferViews"][index]
     _require_inside(path, gltf, view)
     begin, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
@@ -394,12 +397,12 @@ def _view(path: str | os.PathLike[str], gltf: dict[str, Any], binary: np.ndarray
 def _accessor(
     path: str | os.PathLike[str], gltf: dict[str, Any], binary: np.ndarray, index: int, count: int, width: int
 ) -> np.ndarray:
-    """(count, width) float32 of one accessor, its place in the file checked before anything is allocated."""
+    """Return the values (count, width) float32 of one accessor, after checking that they lie within the file."""
     accessor = gltf["accessors"][index]
     kind, stored = _COMPONENTS.get(accessor["componentType"]), _WIDTHS.get(accessor["type"])
     if "sparse" in accessor or "bufferView" not in accessor or kind is None or stored != width:
         raise InputError(
-            f"{path}: accessor {index} is sparse or of a kind that splats do not have", code="invalid_accessor"
+            f"{path}: accessor {index} is sparse or of a type that no attribute of splats has", code="invalid_accessor"
         )
     if accessor["count"] != count:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The ``.ksplat`` of mkkellogg's GaussianSplats3D (read only): sections of buckets, in float32, half floats or bytes.
+"""Read the ``.ksplat`` of mkkellogg's GaussianSplats3D: sections of buckets, in float32, half floats or bytes.
 
 A header of 4096 bytes, one of 1024 for each section, then for each section the lengths of its partly filled buckets,
 the centres of all buckets, and the splats. https://github.com/mkkellogg/GaussianSplats3D (src/loaders/SplatBuffer.js).
@@ -57,7 +57,7 @@ _SECTION = np.dtype(
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a ``.ksplat``; scales of zero become the smallest there is, sections of lower SH degree are padded.
+    """Read a ``.ksplat``; replace scales of zero by the smallest positive scale, and pad sections of lower SH degree.
 
     Raises:
         InputError: another version or compression level, truncated, or sections that do not fit the file.
@@ -65,7 +65,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     size = Path(path).stat().st_size
     if size < _HEADER_BYTES:
         raise InputError(
-            f"{path} is not a .ksplat: it has {size} bytes, its header alone {_HEADER_BYTES}", code="wrong_file_type"
+            f"{path} is not a .ksplat: it has {size} bytes, fewer than the {_HEADER_BYTES} of the header",
+            code="wrong_file_type",
         )
     header = np.fromfile(path, _HEADER, 1)[0]
     level, count = int(header["level"]), int(header["max_sections"])
@@ -77,7 +78,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         )
     if not 0 < count <= _MAX_SECTIONS or _HEADER_BYTES + count * _SECTION_BYTES > size:
         raise InputError(
-            f"{path}: {count} sections do not fit into its {size} bytes; is it whole?", code="file_truncated"
+            f"{path}: {count} sections do not fit into its {size} bytes; it may be truncated", code="file_truncated"
         )
     low, high = (
         float(end) or standard for end, standard in zip(header["sh_range"], (-_SH_RANGE, _SH_RANGE), strict=True)
@@ -88,7 +89,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         section = _Section.of(path, np.fromfile(path, _SECTION, 1, offset=begin)[0], level)
         if at + section.num_bytes > size:
             raise InputError(
-                f"{path}: section {i} ends at byte {at + section.num_bytes} of {size}; is it whole?",
+                f"{path}: section {i} would end at byte {at + section.num_bytes}, but the file has {size}; it may be "
+                "truncated",
                 code="file_truncated",
             )
         if section.splats:
@@ -98,7 +100,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         raise InputError(f"{path} has no Gaussians", code="no_gaussians")
     if sum(map(len, parts)) != int(header["splats"]):
         raise InputError(
-            f"{path}: {int(header['splats'])} Gaussians, its sections have {sum(map(len, parts))}",
+            f"{path}: its header promises {int(header['splats'])} Gaussians, its sections have {sum(map(len, parts))}",
             code="count_mismatch",
         )
     return Gaussians.concatenate(parts)
@@ -106,7 +108,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 @dataclass(frozen=True)
 class _Section:
-    """Byte layout of a section; see the module."""
+    """The byte layout of a section."""
 
     level: int
     splats: int
@@ -131,12 +133,13 @@ class _Section:
             )
         if section.splats > section.max_splats:
             raise InputError(
-                f"{path}: a section of {section.splats} Gaussians with room for {section.max_splats}",
+                f"{path}: a section promises {section.splats} Gaussians, but has room for {section.max_splats}",
                 code="count_mismatch",
             )
         if level and section.splats and not (section.bucket_bytes == 12 and section.buckets >= section.all_buckets > 0):
             raise InputError(
-                f"{path}: {section.buckets} buckets of {section.bucket_bytes} bytes do not hold its Gaussians",
+                f"{path}: {section.buckets} buckets of {section.bucket_bytes} bytes do not fit the Gaussians of their "
+                "section",
                 code="invalid_buckets",
             )
         return section
@@ -156,7 +159,7 @@ class _Section:
         return 4 * self.partial_buckets + self.bucket_bytes * self.buckets + self.row.itemsize * self.max_splats
 
     def read(self, path: str | os.PathLike[str], data: np.ndarray, sh_range: tuple[float, float]) -> Gaussians:
-        """The Gaussians in the bytes of a section."""
+        """Read the Gaussians in the bytes of a section."""
         begin = 4 * self.partial_buckets + self.bucket_bytes * self.buckets
         rows = data[begin : begin + self.row.itemsize * self.splats].view(self.row)
         means: np.ndarray = rows["mean"].astype(np.float32)
@@ -178,12 +181,13 @@ class _Section:
         return Gaussians(means, quats, log_scales, logits_of_bytes(rows["rgba"][:, 3]), sh)
 
     def _centres(self, path: str | os.PathLike[str], data: np.ndarray) -> np.ndarray:
-        """(N, 3) the centre of each Gaussian's bucket: full ones first, then the partly filled."""
+        """Return the centre (N, 3) of each Gaussian's bucket; full buckets precede partly filled buckets."""
         partial = data[: 4 * self.partial_buckets].view("<u4").astype(np.int64)
         sizes = np.concatenate([np.full(self.full_buckets, self.bucket_size, np.int64), partial])
         if int(sizes.sum()) < self.splats or (sizes > self.splats).any():
             raise InputError(
-                f"{path}: buckets of {int(sizes.sum())} Gaussians for {self.splats}", code="invalid_buckets"
+                f"{path}: the buckets of a section hold {int(sizes.sum())} Gaussians, but it promises {self.splats}",
+                code="invalid_buckets",
             )
         begin = 4 * self.partial_buckets
         centres = data[begin : begin + 12 * len(sizes)].view("<f4").reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""XGRIDS' ``.lcc`` (read only): JSON beside ``index.bin``, ``data.bin`` and, with SH, ``shcoef.bin``; levels of detail.
+"""Read XGRIDS' ``.lcc``: JSON beside ``index.bin``, ``data.bin`` and, with SH, ``shcoef.bin``, with levels of detail.
 
 Units of a grid in x and y, each with a run of rows for every level in ``data.bin``: positions in float32, the rest
 within bounds that the JSON gives. Frame: x right, y front, z up, in metres. Data Organization Format originated from
@@ -40,7 +40,7 @@ _OTHERS = np.array([[2, 0, 1], [2, 0, 1], [2, 0, 1], [0, 1, 2]])
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the finest level; the environment (``environment.bin``) is left out.
+    """Read the finest level of an ``.lcc``; leave out the environment (``environment.bin``).
 
     Raises:
         InputError: Not the JSON of an ``.lcc``, missing files, or invalid row ranges.
@@ -49,7 +49,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def stream(path: str | os.PathLike[str]) -> LccSource:
-    """As `read`, a chunk at a time.
+    """Open the finest level of an ``.lcc``, to be read in chunks; see `read`.
 
     Raises:
         InputError: as `read`.
@@ -77,7 +77,7 @@ def stream(path: str | os.PathLike[str]) -> LccSource:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Return the metadata, with a note if an environment is left out.
+    """Return the metadata, with a note if the file has an environment, which is left out.
 
     Raises:
         InputError: as `read`.
@@ -86,13 +86,13 @@ def info(path: str | os.PathLike[str]) -> FileInfo:
     _meta(path)
     notes = ["Data Organization Format originated from XGRIDS"]
     if any(one.name.lower() == "environment.bin" for one in path.parent.iterdir()):
-        notes.append(f"{path.name}: its environment was left out")
+        notes.append(f"{path.name}: the environment was left out")
     return FileInfo(notes=tuple(notes))
 
 
 @dataclass(frozen=True, eq=False)
 class LccSource:
-    """The finest level of an ``.lcc``, read as it is asked for.
+    """A source of the finest level of an ``.lcc``, which reads the file on demand.
 
     Args:
         path: Path of the JSON.
@@ -125,7 +125,7 @@ class LccSource:
                     more = np.fromfile(self.sh, "<u4", 16 * wanted, offset=begin * _SH_ROW.itemsize).reshape(-1, 16)
                 if len(rows) != wanted or (more is not None and len(more) != wanted):
                     raise InputError(
-                        f"{self.path}: {self.data.name} was changed while it was read", code="file_changed"
+                        f"{self.path}: {self.data.name} changed during reading: read it again", code="file_changed"
                     )
                 yield self._decoded(rows, more)
 
@@ -154,7 +154,7 @@ class LccSource:
 
 
 def _quats(packed: np.ndarray) -> np.ndarray:
-    """(N, 4) w, x, y, z: three components of 10 bits, and two bits that say which of x, y, z, w is the fourth."""
+    """Unpack quaternions (N, 4) wxyz from three components of 10 bits and the index of the fourth (2 bits, xyzw)."""
     three: np.ndarray = np.stack([packed & 1023, packed >> 10 & 1023, packed >> 20 & 1023], axis=1).astype(np.float32)
     three = three / 1023 * np.float32(2**0.5) - np.float32(0.5**0.5)
     fourth = packed >> 30
@@ -178,13 +178,13 @@ def _bounds(one: dict[str, Any]) -> np.ndarray:
 
 
 def _beside(path: Path, name: str) -> Path:
-    """A file of the scene, whatever its case: the white paper and the scanners differ."""
+    """Return the path of a file of the scene, in any letter case, as the white paper and the scanners differ."""
     found = next((one.name for one in sorted(path.parent.iterdir()) if one.name.lower() == name), name)
     return file_inside(path, found)
 
 
 def _runs(path: Path, levels: int, data: Path, sh: Path | None) -> np.ndarray:
-    """(R, 2) first row and number of rows of the finest level of each unit."""
+    """Return the first row and the number of rows (R, 2) of each unit's finest level."""
     index = _beside(path, "index.bin")
     unit = np.dtype([("cell", "<u4"), ("levels", [("rows", "<u4"), ("offset", "<u8"), ("size", "<u4")], levels)])
     size = index.stat().st_size
@@ -199,10 +199,14 @@ def _runs(path: Path, levels: int, data: Path, sh: Path | None) -> np.ndarray:
     if sh is not None:
         there = min(there, sh.stat().st_size // _SH_ROW.itemsize)
     if not len(finest) or odd.any() or (first > there).any():
-        raise InputError(f"{index} names no rows of {data.name}, or rows that are not there", code="rows_outside_file")
+        raise InputError(
+            f"{index} refers to no rows of {data.name}, or to rows beyond its end", code="rows_outside_file"
+        )
     runs = np.stack([first.astype(np.int64), finest["rows"].astype(np.int64)], axis=1)
     in_order = runs[np.argsort(runs[:, 0], kind="stable")]
     ends = in_order.sum(1)
     if ends[-1] > there or (in_order[1:, 0] < ends[:-1]).any():
-        raise InputError(f"{index} names rows that are not in {data.name}, or one twice", code="rows_outside_file")
+        raise InputError(
+            f"{index} refers to rows beyond the end of {data.name}, or to a row twice", code="rows_outside_file"
+        )
     return runs

@@ -1,4 +1,4 @@
-"""Lenses: the pinhole that stands for a camera of another model, and its error at the corners of the image.
+"""Approximate cameras of other models by pinholes, and measure the error at the corners of the image.
 
 Splats are trained on undistorted images, and gsmap's cameras are pinholes. A camera file may hold the cameras of the
 distorted images all the same: its poses are right, and its rays are not those of the pinhole.
@@ -27,7 +27,7 @@ _UNDISTORT = (
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera model with its parameters, as the pinhole of its focal lengths and principal point.
+    """The pinhole that approximates a camera of some model, with the focal lengths and principal point of that camera.
 
     Args:
         model: Name of the model in COLMAP or nerfstudio.
@@ -44,13 +44,13 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Return true if a pinhole camera approximates the lens."""
+        """True if a pinhole camera can approximate the lens."""
         return self.shift_px <= _MAX_SHIFT * math.hypot(*self.size_px) / 2
 
 
 @lru_cache(maxsize=4096)
 def lens_of(model: object, width: int, height: int, params: tuple[float, ...]) -> Lens:
-    """The lens of a camera model of COLMAP.
+    """Return the lens of a COLMAP camera model and its parameters.
 
     Args:
         model: Name of the model, or its `pycolmap.CameraModelId`.
@@ -87,7 +87,7 @@ def lens_of(model: object, width: int, height: int, params: tuple[float, ...]) -
 
 
 def keep_pinholes(lenses: Sequence[Lens], where: object) -> tuple[np.ndarray, tuple[str, ...]]:
-    """(C,) mask of the cameras that a pinhole stands for, and notes on the lenses of all.
+    """Return a mask (C,) that is True for cameras that a pinhole can approximate, and notes on all lenses.
 
     Args:
         where: File or folder of the cameras, for messages.

@@ -1,4 +1,4 @@
-"""``transforms.json`` of nerfstudio and instant-ngp: camera-to-world poses in OpenGL axes."""
+"""Read and write the ``transforms.json`` of nerfstudio and instant-ngp: camera-to-world poses in OpenGL axes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DATAPARSER = "dataparser_transforms.json"
 
 
 def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -> Cameras:
-    """Cameras of a parsed file, moved into the frame the splats were trained in.
+    """Return the cameras of a parsed file, transformed to the frame in which the splats were trained.
 
     Args:
         path: The file; image sizes and ``dataparser_transforms.json`` are looked up beside it.
@@ -68,7 +68,7 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
 
 
 def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
-    """Write a ``transforms.json`` with poses in the cameras' own frame, OpenGL axes, intrinsics in every frame.
+    """Write a ``transforms.json`` (OpenGL axes) with poses in the frame of ``cameras`` and intrinsics per image.
 
     A camera's name is its ``file_path``, relative to the file. Nerfstudio centres and scales poses as it loads them;
     ``--orientation-method none --center-method none --auto-scale-poses False`` keeps the frame.
@@ -98,7 +98,7 @@ def _rows_to_matrix(rows: list[list[float]]) -> np.ndarray:
 
 
 def _lens(both: dict[str, Any], path: Path) -> Lens:
-    """The lens of one frame, of which each figure may stand in the frame or once for all."""
+    """Return the lens of one image; each parameter may be specified for the image or for the whole file."""
     fisheye = "OPENCV_FISHEYE"
     model = fisheye if both.get("is_fisheye") else str(both.get("camera_model") or "OPENCV").upper()
     if model not in (*_PERSPECTIVE, fisheye):

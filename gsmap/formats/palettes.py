@@ -1,4 +1,4 @@
-"""Few numbers, or few vectors, that stand for many: the codebooks and the palette of a SOG."""
+"""Vector quantization for SOG: codebooks of numbers, and a palette of vectors."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _BLOCK = 1 << 13  # vectors compared at once
 
 
 def codebook(values: np.ndarray, size: int = 256) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers that finite values are best told by, in the square, and which of them stands for each.
+    """Compute the codebook with the least squared error for finite values, and the index of each value's entry.
 
-    Neighbouring cells of a fine histogram are joined where that costs least (Ward 1963) until ``size`` are left, and
-    their borders moved by Lloyd's iteration.
+    Neighbouring cells of a fine histogram are joined where this adds the least error (Ward 1963) until ``size`` cells
+    are left; then Lloyd's iteration moves their borders.
 
     Returns:
-        (size,) float32 rising, and uint8 of the values' shape.
+        The ascending entries (size,) float32, and uint8 indices in the shape of the values.
     """
     flat = np.sort(values.reshape(-1).astype(np.float64))
     cuts = _cells(flat)
@@ -37,7 +37,7 @@ def codebook(values: np.ndarray, size: int = 256) -> tuple[np.ndarray, np.ndarra
 
 
 def _cells(flat: np.ndarray) -> np.ndarray:
-    """Return the boundaries that split sorted values into cells, evenly by count and width, never between equals."""
+    """Divide sorted values into cells, evenly by count and by width, never between equal values; return the bounds."""
     at = np.concatenate(
         [
             np.searchsorted(flat, flat[np.linspace(0, len(flat) - 1, _CELLS).astype(np.int64)]),
@@ -50,7 +50,7 @@ def _cells(flat: np.ndarray) -> np.ndarray:
 
 
 def _joined(cuts: np.ndarray, sums: np.ndarray, size: int) -> np.ndarray:
-    """The cuts that are left when neighbouring cells are joined, cheapest first, until there are ``size``."""
+    """Join neighbouring cells to ``size`` cells, those that add the least error first; return the remaining bounds."""
     count = np.diff(cuts).astype(float).tolist()
     total = np.diff(sums[cuts]).tolist()
     left, right = [*range(-1, len(count) - 1)], [*range(1, len(count) + 1)]
@@ -77,9 +77,9 @@ def _joined(cuts: np.ndarray, sums: np.ndarray, size: int) -> np.ndarray:
 
 
 def palette(vectors: np.ndarray, size: int, turns: int, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vectors that stand for many others, by k-means in two steps: coarse clusters, and entries within each.
+    """Compute a palette of vectors by k-means in two steps: coarse clusters, and palette entries within each cluster.
 
-    A vector is compared with the coarse clusters and the entries of one, 2 sqrt(size) of them instead of ``size``.
+    So each vector is compared with all coarse clusters and the entries of one cluster, not with all ``size`` entries.
 
     Args:
         vectors: (N, D) float32.
@@ -88,8 +88,8 @@ def palette(vectors: np.ndarray, size: int, turns: int, weights: np.ndarray) -> 
         weights: (N,) weight of each vector, at least 0.
 
     Returns:
-        (P, D) float32 with P <= size, and (N,) int64: which stands for each vector. Those of one coarse cluster are
-        beside each other, and the clusters are along the direction in which the vectors vary most.
+        The entries (P, D) float32 with P <= size, and the index (N,) int64 of each vector's entry. Entries of one
+        coarse cluster are consecutive; clusters are sorted along the direction in which cluster centres vary most.
     """
     rng = np.random.default_rng(0)
     n = len(vectors)
@@ -125,7 +125,7 @@ def palette(vectors: np.ndarray, size: int, turns: int, weights: np.ndarray) -> 
 
 
 def _shares(vectors: np.ndarray, weights: np.ndarray, coarse: np.ndarray, cluster: np.ndarray, size: int) -> np.ndarray:
-    """(K,) how many entries each cluster gets, at most ``size`` in all: by the error that one entry leaves in it."""
+    """Return the number of entries (K,) of each cluster, by the error of one entry; at most ``size`` in total."""
     count = np.bincount(cluster, minlength=len(coarse))
     away = ((vectors - coarse[cluster]) ** 2).sum(1) * weights
     error = np.sqrt(np.bincount(cluster, away, minlength=len(coarse)) * count)
@@ -137,7 +137,7 @@ def _shares(vectors: np.ndarray, weights: np.ndarray, coarse: np.ndarray, cluste
 
 
 def _lloyd(vectors: np.ndarray, weights: np.ndarray, size: int, turns: int, rng: np.random.Generator) -> np.ndarray:
-    """(size, D) means that k-means finds; an empty cluster takes a vector that is told worst."""
+    """Return the means (size, D) of k-means; an empty cluster restarts at a vector with a large error."""
     centres = vectors[np.sort(rng.choice(len(vectors), size, replace=False))].copy()
     for _ in range(turns):
         nearest = _nearest(vectors, centres)
@@ -156,7 +156,7 @@ def _lloyd(vectors: np.ndarray, weights: np.ndarray, size: int, turns: int, rng:
 
 
 def _nearest(vectors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """(N,) which centre each vector is nearest to."""
+    """Return the index (N,) of the centre nearest to each vector."""
     half = 0.5 * (centres**2).sum(1)
     out = np.empty(len(vectors), np.int64)
     for start in range(0, len(vectors), _BLOCK):

@@ -1,4 +1,4 @@
-"""Pictures from outside: the one place where gsmap opens photographs, masks, depth pictures and textures.
+"""Open photographs, masks, depth pictures and textures; all image files that gsmap reads are opened here.
 
 Pillow reads some fifty formats, one of them (PostScript) by starting another program, and decodes pictures of any size
 that a few bytes claim. Here a picture has one of five formats, whatever its name, and its header is checked first.
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from PIL import Image
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF")
-"""Names that Pillow gives the formats. HEIF (HEIC) is read where pillow-heif is installed."""
+"""Accepted formats, by Pillow's names. HEIF (HEIC) is read only if pillow-heif is installed."""
 
 MAX_PIXELS = 1 << 27
-"""The most pixels of a picture: those of phones have up to 108 million, of medium-format cameras 102 million."""
+"""Largest number of pixels of a picture; phones make up to 108 million, medium-format cameras 102 million."""
 
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 
@@ -36,9 +36,9 @@ def open_picture(
     formats: Sequence[str] = FORMATS,
     max_pixels: int = MAX_PIXELS,
 ) -> Iterator[Image.Image]:
-    """Open a picture whose header passed; its pixels are decoded in the ``with`` block, by what asks for them.
+    """Open a picture after checking its header; the code in the ``with`` block decodes the pixels.
 
-    Whatever a damaged picture makes Pillow raise in the block becomes an `InputError`: decode there, and compute later.
+    Any error that Pillow raises in the block becomes an `InputError`, so decode in the block and compute after it.
 
     Args:
         path: Path of the image.
@@ -64,7 +64,7 @@ def open_picture(
             width, height = picture.size
             if width * height > max_pixels:
                 raise InputError(
-                    f"{name} has {width} x {height} pixels, more than {max_pixels:,}: reduce the picture",
+                    f"{name} has {width} x {height} pixels, more than {max_pixels:,}: downscale the picture",
                     code="picture_too_large",
                 )
             yield picture
@@ -72,17 +72,20 @@ def open_picture(
         raise
     except UnidentifiedImageError as error:
         if "HEIF" in formats and "HEIF" not in readable and _is_heif(path, data):
-            raise MissingDependencyError(f"{name} is a HEIC picture: pip install 'gsmap[heic]'") from error
+            raise MissingDependencyError(
+                f"{name} is a HEIC picture, which pillow-heif reads: pip install 'gsmap[heic]'"
+            ) from error
         raise InputError(
-            f"{name} cannot be read as a {_listed(readable)} picture: convert it to one", code="picture_unreadable"
+            f"{name} cannot be read as a {_listed(readable)} picture: convert it to one of these formats",
+            code="picture_unreadable",
         ) from error
     except Image.DecompressionBombError as error:
         raise InputError(
-            f"{name} has more than {max_pixels:,} pixels: reduce the picture", code="picture_too_large"
+            f"{name} has more than {max_pixels:,} pixels: downscale the picture", code="picture_too_large"
         ) from error
     except MemoryError as error:
         raise InputError(
-            f"{name} needs more memory to be decoded than there is: reduce the picture", code="picture_too_large"
+            f"{name} needs more memory for decoding than is available: downscale the picture", code="picture_too_large"
         ) from error
     except Exception as error:  # damage makes Pillow's readers raise nearly anything
         raise InputError(
@@ -92,7 +95,7 @@ def open_picture(
 
 
 def _readable(formats: Sequence[str]) -> list[str]:
-    """The formats that this installation reads."""
+    """Return those of the formats that this installation can read."""
     if "HEIF" in formats:
         try:
             import pillow_heif

@@ -1,4 +1,4 @@
-"""The INRIA ``.ply`` of 3D Gaussian Splatting, by property name.
+"""Read and write the INRIA ``.ply`` of 3D Gaussian Splatting, whose columns are found by property name.
 
 Any SH degree 0-3, any column order, any numeric type; positions that float32 cannot hold are written as doubles. The
 header reader is our own: those of the libraries hang or abort the process on a malformed header, or allocate whatever
@@ -60,7 +60,7 @@ _ENCODINGS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">
 
 @dataclass(frozen=True)
 class Element:
-    """One element of a header: ``count`` rows of ``dtype``, which is empty where a property is a list."""
+    """One element of a PLY header: ``count`` rows of ``dtype``, which is empty if a property is a list."""
 
     name: str
     count: int
@@ -74,7 +74,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """A parsed PLY header; the data begins ``data_offset`` bytes into the file.
+    """A parsed PLY header, with the number of bytes before the data (``data_offset``).
 
     ``renamed``: the properties of a splat had the prefix that CloudCompare gives to scalar fields, which was taken off.
     """
@@ -96,7 +96,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def stream(path: str | os.PathLike[str]) -> PlySource:
-    """A 3DGS ``.ply``, to be read a chunk at a time.
+    """Open a 3DGS ``.ply``, to be read in chunks.
 
     A file without ``f_dc`` but with ``red green blue`` takes its colours from those, one without ``scale_2`` (2DGS)
     gets flat Gaussians, and the 3D filter of Mip-Splatting (``filter_3D``) is folded into scales and opacities.
@@ -109,7 +109,7 @@ def stream(path: str | os.PathLike[str]) -> PlySource:
     header = read_header(path)
     if is_compressed(header):
         raise InputError(
-            f"{path} holds the layout of a .compressed.ply: read it with gsmap.formats.read, which looks",
+            f"{path} has the layout of a .compressed.ply: read it with gsmap.formats.read, which detects the layout",
             code="unsupported_format",
         )
     rows = _rows(path, header, "vertex")
@@ -134,7 +134,7 @@ def stream(path: str | os.PathLike[str]) -> PlySource:
 
 @dataclass(frozen=True, eq=False)
 class PlySource:
-    """The Gaussians of a ``.ply``, read as they are asked for.
+    """A source of the Gaussians of a ``.ply``, which reads the file on demand.
 
     Args:
         rows: Rows of the file.
@@ -172,7 +172,7 @@ class PlySource:
         return load_all(self)
 
     def _field(self, name: str, part: np.ndarray) -> np.ndarray:
-        """One field of `Gaussians`, of some rows."""
+        """Return one field of `Gaussians` for some rows of the file."""
         if name == "sh":
             return self._sh(part)
         if name == "means" and self.origin.any():
@@ -209,7 +209,7 @@ class PlySource:
 
 
 def _is_activated(path: str | os.PathLike[str], source: PlySource) -> bool:
-    """Return true if opacities are in [0, 1] and scales are lengths, as some programs write them.
+    """Return true if opacities are in [0, 1] and scales are lengths; false for logits and logarithms.
 
     Logits of a capture do not all lie in 0 to 1, which are opacities of 0.5 to 0.73, and its logarithms of scales are
     not all positive unless its unit is small beside its Gaussians.
@@ -259,7 +259,7 @@ def _is_activated(path: str | os.PathLike[str], source: PlySource) -> bool:
 
 
 def _origin(rows: Rows) -> np.ndarray:
-    """Return the origin to subtract from positions in double precision; zeros if float32 holds them exactly."""
+    """Return an origin to subtract from positions in double precision; zeros if float32 represents them exactly."""
     if all(rows.dtype[name] == np.float32 for name in "xyz"):
         return np.zeros(3)  # nothing is lost yet
     if not origin_of(_positions(next(rows.parts()))).any():  # the first rows lie near zero: so do all together
@@ -269,27 +269,27 @@ def _origin(rows: Rows) -> np.ndarray:
 
 
 def _positions(part: np.ndarray) -> np.ndarray:
-    """(n, 3) float64 of some rows."""
+    """Return the positions (n, 3) float64 of some rows."""
     return np.stack([part[name].astype(np.float64) for name in "xyz"], axis=1)
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Return the metadata: antialiased training, and notes on what reading changed."""
+    """Return the metadata: whether training was antialiased, and notes on properties that reading changes."""
     header = read_header(path)
     names = header.elements["vertex"].names if "vertex" in header.elements else ()
     text = " ".join(header.comments).lower()
     notes = []
     if "splatrendermode: 2dgs" in text or (names and "scale_0" in names and "scale_2" not in names):
-        notes.append("2D Gaussians (2DGS): rendered as flat 3D ones")
+        notes.append("2D Gaussians (2DGS) are rendered as flat 3D Gaussians")
     if "filter_3D" in names:
         notes.append("the 3D filter of Mip-Splatting was folded into scales and opacities")
     if names and "f_dc_0" not in names and "red" in names:
-        notes.append("colours from red green blue: no view dependence")
+        notes.append("colours come from red, green, blue and do not depend on the view")
     if header.renamed:
-        notes.append("its columns are named as CloudCompare does (scalar_f_dc_0), and read as those of a splat")
+        notes.append("its columns have CloudCompare's names (scalar_f_dc_0) and were read as those of a splat")
     if {"x", "opacity", "scale_0", "rot_3"} <= set(names) and stream(path).activated:
         notes.append(
-            "its opacities lie in 0 to 1 and its scales are lengths: read as such, not as logits and logarithms"
+            "its opacities lie in 0 to 1 and its scales are lengths, so they were not read as logits and logarithms"
         )
     antialiased = "splatrendermode: mip" in text or "filter_3D" in names
     antialiased |= any(not m[1] and not m[2] for m in map(_ANTIALIASED.search, header.comments) if m)
@@ -303,7 +303,7 @@ def write(
     antialiased: bool = False,
     extra: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Write the INRIA layout (float32, little endian, normals of zero, quaternions as they are).
+    """Write the INRIA layout (float32, little endian, normals of zero, quaternions not normalized).
 
     Positions about an origin are written in full, in double precision.
 
@@ -387,7 +387,10 @@ def read_header(path: str | os.PathLike[str]) -> Header:
         elif keyword == "property" and blocks and len(words) == 4 and words[0] == "list":
             blocks[-1][2].append((words[3], None))
         else:
-            raise InputError(f"{path}: line {number} of the PLY header means nothing: {line[:80]!r}", code="ply_header")
+            raise InputError(
+                f"{path}: line {number} of the PLY header is not a valid PLY statement: {line[:80]!r}",
+                code="ply_header",
+            )
     if not encoding:
         raise InputError(f"{path}: the PLY header has no 'format' line; the file is damaged", code="ply_header")
     elements: dict[str, Element] = {}
@@ -409,7 +412,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
 
 
 def read_element(path: str | os.PathLike[str], header: Header, name: str) -> np.ndarray:
-    """The rows of one element as a structured array, mapped from the file where it is binary.
+    """Return the rows of one element as a structured array, memory-mapped from a binary file.
 
     Raises:
         InputError: no such element, a list property in the way, or fewer or more bytes than the header promises.
@@ -422,7 +425,7 @@ def read_element(path: str | os.PathLike[str], header: Header, name: str) -> np.
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The rows of one element, read in parts; those of an ASCII file are in memory.
+    """The rows of one element, to be read in parts; rows of an ASCII file are kept in memory.
 
     Args:
         count: Number of rows.
@@ -440,7 +443,7 @@ class Rows:
     held: np.ndarray | None = None
 
     def parts(self) -> Iterator[np.ndarray]:
-        """Structured arrays of at most `CHUNK_ROWS` rows."""
+        """Yield the rows as structured arrays of at most `CHUNK_ROWS` rows."""
         if self.held is not None:
             for start in range(0, self.count, CHUNK_ROWS):
                 yield self.held[start : start + CHUNK_ROWS]
@@ -452,14 +455,14 @@ class Rows:
                 part = np.fromfile(file, self.dtype, wanted)
                 if _version(os.fstat(file.fileno())) != self.version or len(part) < wanted:
                     raise InputError(
-                        f"{self.path} was written to while it was read: let its writer finish first",
+                        f"{self.path} changed during reading: let the program that writes it finish first",
                         code="file_changed",
                     )
                 yield part
 
 
 def _rows(path: str | os.PathLike[str], header: Header, name: str) -> Rows:
-    """As `read_element`, in parts."""
+    """Return the rows of one element, to be read in parts; see `read_element`."""
     element, offset, skip = _located(path, header, name)
     held = _read_ascii(path, header, element, skip) if header.encoding == "ascii" else None
     return Rows(Path(path), element.count, element.dtype, offset, _version(os.stat(path)), held)
@@ -470,7 +473,7 @@ def _version(found: os.stat_result) -> tuple[int, ...]:
 
 
 def _located(path: str | os.PathLike[str], header: Header, name: str) -> tuple[Element, int, int]:
-    """An element, where its rows begin in a binary file, and how many rows are before them."""
+    """Return an element, the byte at which its rows begin in a binary file, and the number of rows before it."""
     if name not in header.elements or not header.elements[name].count:
         raise InputError(f"{path} has no {name} rows: there is nothing to read", code="no_gaussians")
     offset, skip = header.data_offset, 0
@@ -519,7 +522,7 @@ def _too_long(path: str | os.PathLike[str], element: Element, more: str) -> Inpu
 
 
 def is_compressed(header: Header) -> bool:
-    """Return true for the ``.compressed.ply`` layout of PlayCanvas, whatever the file's name."""
+    """Return true for PlayCanvas' ``.compressed.ply`` layout, whatever the name of the file."""
     return "vertex" in header.elements and "packed_position" in header.elements["vertex"].names
 
 
@@ -555,7 +558,7 @@ def _rest_names(path: str | os.PathLike[str], names: set[str]) -> list[str]:
 
 
 def _take(rows: np.ndarray, names: list[str], out: np.ndarray) -> None:
-    """Copy named columns into ``out`` (n, len(names)), all at once where every column is a float32."""
+    """Copy named columns into ``out`` (n, len(names)), in one operation if all columns are float32."""
     dtype = rows.dtype
     order = list(dtype.names or ())
     if all(dtype[n] == np.float32 for n in order):
@@ -570,7 +573,7 @@ def _take(rows: np.ndarray, names: list[str], out: np.ndarray) -> None:
 
 
 def _fold_filter(logits: np.ndarray, log_scales: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mip-Splatting (Yu et al. 2024, eq. 9): widen by the filter, dim by the ratio of the volumes."""
+    """Apply Mip-Splatting's 3D filter (Yu et al. 2024, eq. 9): widen Gaussians, dim them by the ratio of volumes."""
     variance = np.exp(2 * log_scales.astype(np.float64))
     widened = variance + size[:, None] ** 2
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

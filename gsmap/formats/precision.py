@@ -1,4 +1,4 @@
-"""Origins that keep single precision exact: subtracted on reading positions far from zero, required on writing."""
+"""Keep positions exact in single precision: subtract an origin from positions far from zero."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FINE = 100.0  # steps of a format between neighbours, at least: rounding then m
 
 
 def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> GaussianSource:
-    """The Gaussians of a source about an origin, where they lie so far from zero that float32 needs one.
+    """Return the source with positions relative to an origin, if they lie too far from zero for float32.
 
     Args:
         where: Name of the source in messages.
@@ -51,7 +51,7 @@ def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> Gauss
 
 
 def rounded_to(source: GaussianSource) -> float:
-    """The step that the positions of a source about an origin were rounded to by single precision; 0 by none."""
+    """Return the step to which single precision rounded the positions of a source with an origin; 0 if it did not."""
     first = next(source.chunks()).positions
     return float32_step(first) if is_float32(first) else 0.0
 
@@ -59,7 +59,7 @@ def rounded_to(source: GaussianSource) -> float:
 def about_zero(
     path: str | os.PathLike[str], gaussians: Gaussians, step_of: Callable[[np.ndarray], float] | None = None
 ) -> Gaussians:
-    """Gaussians about an origin with it added to their positions, for a format that holds single precision at most.
+    """Add the origin of Gaussians to their positions, for a format that stores at most single precision.
 
     Args:
         step_of: Function that returns the step of stored positions (N, 3); None for single precision.

@@ -1,4 +1,4 @@
-"""Quantization shared by the compressed formats: opacities as bytes, quaternions as three numbers, limits on input."""
+"""Quantization for all compressed formats: opacities as bytes, quaternions as three numbers, limits on input."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MAX_RATIO = 32
 
 
 def check_size(path: str | os.PathLike[str], expanded: int, compressed: int) -> None:
-    """Refuse to expand ``compressed`` bytes to more than 8 MiB and more than 32 times as many.
+    """Raise an error if ``compressed`` bytes would expand to more than 8 MiB and to more than 32 times their number.
 
     Raises:
         InputError: A decompression bomb, or an inconsistent header.
@@ -31,7 +31,7 @@ def check_size(path: str | os.PathLike[str], expanded: int, compressed: int) -> 
 
 
 def require_writable(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Refuse what a format without room for it cannot hold: nothing at all, NaN, or infinite positions and colours.
+    """Raise an error for Gaussians that a compressed format cannot store: none, NaN, infinite positions or colours.
 
     Infinite logits and scales of minus infinity are fine: they have an opacity and a size.
     """
@@ -51,27 +51,27 @@ def require_writable(path: str | os.PathLike[str], gaussians: Gaussians) -> None
 
 
 def opacity_bytes(logits: np.ndarray) -> np.ndarray:
-    """Opacities as uint8, 0 to 255."""
+    """Convert logits to opacities as uint8, 0 to 255."""
     with np.errstate(over="ignore"):
         return np.round(255.0 / (1.0 + np.exp(-logits))).astype(np.uint8)
 
 
 def logits_of_bytes(values: np.ndarray) -> np.ndarray:
-    """Logits float32 of opacities stored as uint8; 0 and 255 stand for the middle of their half-wide bins."""
+    """Convert opacities stored as uint8 to logits float32; 0 and 255 become the middle of their bins of half width."""
     opacity = np.clip(np.arange(256), 0.25, 254.75) / 255.0
     return np.log(opacity / (1.0 - opacity)).astype(np.float32)[values]
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The index (N,) of the largest component of normalised quaternions (N, 4), and the other three (N, 3) in order.
+    """Normalize quaternions (N, 4); return the index (N,) of the largest component and the other three (N, 3) in order.
 
-    The sign is chosen so that the largest is positive; a zero quaternion is the one with only component 0.
+    The sign makes the largest component positive; a zero quaternion counts as the identity, with component 0 only.
     """
     largest, three = three_and_largest(np.ascontiguousarray(quats, np.float32))
     return largest, three
 
 
 def from_smallest_three(largest: np.ndarray, three: np.ndarray) -> np.ndarray:
-    """Unit quaternions (N, 4) float32 from the index of the largest component and the other three."""
+    """Return unit quaternions (N, 4) float32 from the index of the largest component and the other three components."""
     out: np.ndarray = unit_quats(largest.astype(np.uint8), np.ascontiguousarray(three))
     return out

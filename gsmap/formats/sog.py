@@ -1,4 +1,4 @@
-"""PlayCanvas' SOG version 2: ``meta.json`` and lossless WebP images, one texel a Gaussian; a folder, or a ``.sog``.
+"""Read and write PlayCanvas' SOG version 2 (``meta.json``, and lossless WebP images with one texel per Gaussian).
 
 Positions are 16 bits of a signed logarithm, scales and colours go through a codebook of 256, quaternions are
 smallest-three of 8 bits, SH comes from a palette. A bundled ``.sog`` is a ZIP of the same files.
@@ -59,7 +59,7 @@ Files = Callable[[str, int], bytes]  # one of the files by its name, refused bey
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read SOG version 2, bundled or from the ``meta.json`` of a folder.
+    """Read SOG version 2, from a ``.sog`` or from the ``meta.json`` of a folder.
 
     Raises:
         InputError: not a ZIP, another version, files missing or outside the folder, images too small or far too large
@@ -86,7 +86,7 @@ def write(
     ordered: bool = False,
     antialiased: bool = False,
 ) -> None:
-    """Write SOG version 2: a ``.sog``, or a folder by its ``meta.json``, with images named by their digests.
+    """Write SOG version 2, as a ``.sog`` or (if ``path`` is a ``meta.json``) as a folder; name images by digests.
 
     Args:
         palette_size: Maximum number of entries of the SH palette; at most half the number of Gaussians.
@@ -106,11 +106,12 @@ def write(
     require_writable(path, gaussians)
     if gaussians.sh_degree > 3:
         raise InputError(
-            f"{path}: SOG holds SH of degree 3 at most, these have {gaussians.sh_degree}", code="unsupported_output"
+            f"{path}: SOG can store SH of degree 3 at most, but the Gaussians have degree {gaussians.sh_degree}",
+            code="unsupported_output",
         )
     if len(gaussians) > _MAX_PIXELS:
         raise InputError(
-            f"{path}: {len(gaussians):,} Gaussians; a SOG holds {_MAX_PIXELS:,}: write lod-meta.json",
+            f"{path}: one SOG can store {_MAX_PIXELS:,} Gaussians, not {len(gaussians):,}: write lod-meta.json",
             code="unsupported_output",
         )
     g = gaussians if ordered else gaussians[morton_order(gaussians.means)]
@@ -131,14 +132,14 @@ def write(
 
 
 def unbundled(path: str | os.PathLike[str], folder: Path) -> None:
-    """Put the files of a ``.sog`` that gsmap wrote into a folder, as they are, ``meta.json`` last."""
+    """Copy the files of a ``.sog`` that gsmap wrote into a folder unchanged, ``meta.json`` last."""
 
     def copy(path: str | os.PathLike[str], files: Files, size: int) -> None:
         meta = _meta(path, files)
         parts = [part["files"] for part in meta.values() if isinstance(part, dict) and "files" in part]
         for name in [name for names in parts for name in names]:
             if name != Path(name).name:
-                raise InputError(f"{path}: {name!r} is no name of a file", code="content_invalid")
+                raise InputError(f"{path}: {name!r} is not a valid file name", code="content_invalid")
             (folder / name).write_bytes(files(name, size))
         (folder / "meta.json").write_bytes(files("meta.json", _MAX_META_BYTES))
 
@@ -146,7 +147,7 @@ def unbundled(path: str | os.PathLike[str], folder: Path) -> None:
 
 
 def _opened(path: str | os.PathLike[str], work: Callable[[str | os.PathLike[str], Files, int], Any]) -> Any:
-    """Do something with the files of a SOG and their size in bytes, its faults explained."""
+    """Call ``work`` with the files of a SOG and their size in bytes; convert its errors to typed errors."""
     path = Path(path)
     try:
         if path.suffix.lower() == ".json":
@@ -164,7 +165,7 @@ def _opened(path: str | os.PathLike[str], work: Callable[[str | os.PathLike[str]
 
 
 def _folder(path: Path) -> tuple[Files, int]:
-    """The files beside a ``meta.json``, and the bytes of its images."""
+    """Return a reader of the files beside a ``meta.json``, and the total size of its images in bytes."""
 
     def file(name: str, limit: int) -> bytes:
         place = path if name == "meta.json" else file_inside(path, name)
@@ -179,13 +180,13 @@ def _folder(path: Path) -> tuple[Files, int]:
 
 
 def _encode(g: Gaussians, palette_size: int, turns: int) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """``meta.json`` and the images of Gaussians in the order in which they are to be stored."""
+    """Return the ``meta.json`` and the images for Gaussians, which must have the order of storage."""
     n, k = g.sh.shape[:2]
     width = min(_MAX_SIDE // 4 * 4, 4 * math.ceil(math.sqrt(n) / 4))
     images: dict[str, bytes] = {}
 
     def put(name: str, texels: np.ndarray, width: int = width) -> str:
-        """Store (N, 1 to 4) bytes, opaque where there is no fourth."""
+        """Store texels (N, 1 to 4) uint8 as an image, opaque if there is no fourth channel."""
         rows = -(-len(texels) // width)
         out = np.zeros((rows * width, 4), np.uint8)
         out[:, 3] = 255
@@ -233,8 +234,7 @@ def _encode(g: Gaussians, palette_size: int, turns: int) -> tuple[dict[str, Any]
 
 
 def _palette_weights(g: Gaussians) -> np.ndarray:
-    """Return (N,) weights of the Gaussians for the palette: opacity times projected area, at most four times the
-    median, so that a few large Gaussians do not dominate it."""
+    """Return the weights (N,) of the Gaussians for the palette: opacity times projected area, with an upper limit."""
     scales = np.sort(np.clip(g.log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE), axis=1)[:, 1:]
     area = np.exp((scales - np.median(scales, axis=0)).clip(-5, 5).sum(1))
     weights = area / (1 + np.exp(-g.logit_opacities.clip(-20, 20)))
@@ -250,7 +250,7 @@ def _webp(texels: np.ndarray) -> bytes:
 
 
 def _placed(folder: Path, name: str, data: bytes) -> str:
-    """Write an image under a name with its digest, so that an older ``meta.json`` stays whole; returns the name."""
+    """Write an image under a name with its digest, so that an older ``meta.json`` keeps its images; return the name."""
     stem, suffix = name.split(".")
     name = f"{stem}-{hashlib.sha256(data).hexdigest()[:12]}.{suffix}"
     staged = folder / f".{uuid.uuid4().hex[:8]}.{name}"
@@ -270,7 +270,7 @@ def _decode(path: str | os.PathLike[str], files: Files, size: int) -> Gaussians:
     meta = _meta(path, files)
     n = int(meta["count"])
     if not 0 < n <= _MAX_PIXELS:
-        raise InputError(f"{path}: a count of {n} Gaussians; gsmap reads 1 to {_MAX_PIXELS}", code="count_mismatch")
+        raise InputError(f"{path} promises {n} Gaussians; gsmap reads 1 to {_MAX_PIXELS}", code="count_mismatch")
     check_size(path, n * _LEAST_BYTES, size)
 
     def texels(part: str, file: int = 0) -> np.ndarray:
@@ -313,11 +313,11 @@ def _meta(path: str | os.PathLike[str], files: Files) -> dict[str, Any]:
 
 
 def _member(path: str | os.PathLike[str], archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """One file of the archive, in memory only: its name is never a path on disk."""
+    """Read one file of the archive to memory; its name is never used as a path on disk."""
     try:
         entry = archive.getinfo(name)
     except KeyError as error:
-        raise InputError(f"{path} lacks {name!r}; is it a whole .sog?", code="content_missing") from error
+        raise InputError(f"{path} lacks {name!r}; it may be truncated", code="content_missing") from error
     if entry.file_size > limit:
         raise InputError(
             f"{path}: {name} is {entry.file_size:,} bytes, more than the {limit:,} gsmap reads", code="file_too_large"
@@ -330,7 +330,7 @@ def _member(path: str | os.PathLike[str], archive: zipfile.ZipFile, name: str, l
 
 
 def _image(path: str | os.PathLike[str], files: Files, name: str, most: int) -> np.ndarray:
-    """(H, W, 4) uint8 of a lossless WebP of at most as many pixels, and some to spare."""
+    """Read a lossless WebP as (H, W, 4) uint8; reject an image with clearly more than ``most`` pixels."""
     most += _SPARE_PIXELS
     data = files(name, 4 * most)
     with open_picture(f"{path}: {name}", data=data, formats=["WEBP"], max_pixels=most) as image:
@@ -354,17 +354,19 @@ def _bands(path: str | os.PathLike[str], meta: dict[str, Any]) -> int:
 def _palette_sh(
     path: str | os.PathLike[str], files: Files, part: dict[str, Any], labels: np.ndarray, k: int
 ) -> np.ndarray:
-    """(N, k, 3): 64 palette entries a row of the image, each of k texels."""
+    """Read the SH coefficients (N, k, 3) of each label; a row of the palette's image has 64 entries of k texels."""
     image = _image(path, files, part["files"][0], _MAX_PALETTE * k)
     if image.shape[1] != _PALETTE_COLUMNS * k:
         raise InputError(
-            f"{path}: an SH palette {image.shape[1]} wide, expected {_PALETTE_COLUMNS * k}", code="invalid_palette"
+            f"{path}: its SH palette is {image.shape[1]} texels wide, expected {_PALETTE_COLUMNS * k}",
+            code="invalid_palette",
         )
     entries = image.reshape(-1, k, 4)[:, :, :3]
     label = labels[:, 0] | labels[:, 1].astype(np.uint16) << 8
     if label.max() >= min(int(part["count"]), len(entries)):
         raise InputError(
-            f"{path}: an SH label of {label.max()} beyond the palette's {part['count']} entries", code="invalid_palette"
+            f"{path}: the SH label {label.max()} is beyond the palette's {part['count']} entries",
+            code="invalid_palette",
         )
     return _codebook(path, part)[entries][label]
 

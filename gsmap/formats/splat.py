@@ -1,4 +1,4 @@
-"""The ``.splat`` of antimatter15's viewer: 32 bytes a Gaussian, no header, no view-dependent colour.
+"""Read and write the ``.splat`` of antimatter15's viewer: 32 bytes per Gaussian, no header, no view-dependent colour.
 
 Position and linear scale in float32, then colour and opacity, then the quaternion, in bytes.
 """
@@ -22,7 +22,7 @@ _TINY = np.finfo(np.float32).tiny
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a ``.splat``; scales of zero become the smallest there is.
+    """Read a ``.splat``; replace scales of zero by the smallest positive scale.
 
     Raises:
         InputError: The file is empty, or its size is not a multiple of a row.
@@ -30,7 +30,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     size = Path(path).stat().st_size
     if size == 0 or size % _ROW.itemsize:
         what = "empty" if size == 0 else f"{size} bytes long, not a multiple of {_ROW.itemsize}"
-        raise InputError(f"{path} is not a whole .splat file: it is {what}", code="wrong_file_type")
+        raise InputError(f"{path} is not a complete .splat file: it is {what}", code="wrong_file_type")
     rows = np.fromfile(path, _ROW)
     quats = (rows["quat"].astype(np.float32) - 128) / 128
     quats[~quats.any(1), 0] = 1
@@ -41,7 +41,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a ``.splat`` in the order given; SH beyond degree 0 is left out, colours are clipped to [0, 1]."""
+    """Write a ``.splat`` in the order of the Gaussians; drop SH beyond degree 0, and clip colours to [0, 1]."""
     require_writable(path, gaussians)
     rows = np.empty(len(gaussians), _ROW)
     rows["mean"] = gaussians.means

@@ -1,4 +1,4 @@
-"""Niantic's ``.spz``: quantised attributes, as one gzip stream (versions 1 to 3) or by zstd each (version 4).
+"""Read and write Niantic's ``.spz``: quantized attributes in one gzip stream (versions 1 to 3) or in zstd streams (4).
 
 Positions are 24-bit fixed point, scales 8-bit logarithms, quaternions smallest-three (versions 1 and 2: xyz),
 opacities, colours and SH 8 bits. The axes are right-up-back; we turn them, which Open3D and gsply do not.
@@ -55,7 +55,7 @@ class _Header:
 
     @property
     def strides(self) -> dict[str, int]:
-        """Bytes a Gaussian of each attribute, in the order of the file."""
+        """Return the bytes per Gaussian of each attribute, in the order of the file."""
         return {
             "positions": 6 if self.version == 1 else 9,
             "alphas": 1,
@@ -71,7 +71,7 @@ class _Header:
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read an ``.spz`` of version 1 to 4 into the axes of a ``.ply``; SH beyond degree 3 is left out.
+    """Read an ``.spz`` of version 1 to 4 in the axes of a ``.ply``; drop SH beyond degree 3.
 
     Raises:
         InputError: not an SPZ, an unknown version, truncated, or a decompression bomb.
@@ -82,7 +82,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Return the metadata: antialiased training, and notes on what reading leaves out."""
+    """Return the metadata: whether training was antialiased, and notes on data that reading drops."""
     with open(path, "rb") as file:
         head = file.read(32)
         if head.startswith(_GZIP):
@@ -100,7 +100,7 @@ def write(
     sh_bits: tuple[int, int] = (5, 4),
     antialiased: bool = False,
 ) -> None:
-    """Write an ``.spz``, in the order given.
+    """Write an ``.spz`` in the order of the Gaussians.
 
     Args:
         version: 3 (gzip, read everywhere) or 4 (zstd, faster; not every viewer reads it).
@@ -163,7 +163,7 @@ def unpack(path: str | os.PathLike[str], data: bytes) -> Gaussians:
 
 
 def _load(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple[_Header, dict[str, np.ndarray], str]:
-    """Header, raw uint8 streams by attribute, and the axes that the file, of so many bytes, is in."""
+    """Return the header, the raw uint8 stream of each attribute, and the axes of a file of ``size`` bytes."""
     head = file.read(4)
     file.seek(0)
     if head.startswith(_GZIP):
@@ -263,7 +263,7 @@ def _parse_header(path: str | os.PathLike[str], head: bytes) -> _Header:
 
 
 def _axes(path: str | os.PathLike[str], extensions: bytes) -> str:
-    """Axes named by the extension records ``[type u32, length u32, payload]``, or those of every SPZ."""
+    """Return the axes from the extension records ``[type u32, length u32, payload]``, or the default axes of SPZ."""
     at, axes = 0, SPZ
     while at + 8 <= len(extensions):
         kind, length = struct.unpack_from("<II", extensions, at)
@@ -277,7 +277,7 @@ def _axes(path: str | os.PathLike[str], extensions: bytes) -> str:
 
 
 def _zstd_content_size(frame: bytes) -> int | None:
-    """The decompressed size in a zstd frame's header (RFC 8878, 3.1.1.1), or None where it names none.
+    """Return the decompressed size from a zstd frame's header (RFC 8878, 3.1.1.1); None if the header has no size.
 
     numcodecs leaves the rest of a buffer as it was when a frame holds less than the buffer.
     """
@@ -325,12 +325,12 @@ class _Inflater:
 
 
 def position_step(positions: np.ndarray) -> float:
-    """The step that a file holds positions (N, 3) in."""
+    """Return the step in which an SPZ would store positions (N, 3)."""
     return float(2.0 ** -_fractional_bits("SPZ", positions))
 
 
 def _require_distances(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Reject Gaussians so far from the origin that the positions of neighbours would coincide."""
+    """Reject Gaussians that lie so far from the origin that the stored positions of neighbours would coincide."""
     bits = _fractional_bits(path, gaussians.means)
     apart = np.inf if bits >= _USUAL_BITS else neighbour_distance(gaussians)
     if apart < 2 * 2.0**-bits:
@@ -342,7 +342,7 @@ def _require_distances(path: str | os.PathLike[str], gaussians: Gaussians) -> No
 
 
 def _fractional_bits(path: str | os.PathLike[str], means: np.ndarray) -> int:
-    """Choose the fractional bits: 12 (0.24 mm) as usual, more for small scenes, fewer for a large range."""
+    """Choose the number of fractional bits: 12 (0.24 mm) by default, more for small scenes, fewer for a large range."""
     extent = float(np.abs(means).max())
     if extent > _MAX_FIXED:
         raise InputError(
@@ -373,7 +373,7 @@ def _encode(header: _Header, g: Gaussians, sh_bits: tuple[int, int]) -> list[np.
 
 
 def _quantise_sh(values: np.ndarray, step: int) -> np.ndarray:
-    """1/128 a level, rounded to multiples of ``step``, so that zero stays zero and the last bits compress away."""
+    """Quantize SH to multiples of ``step`` / 128: zero stays zero, and the last bits compress well."""
     level = values * np.float32(128 / step)
     np.rint(level, out=level)
     level *= step
@@ -406,7 +406,7 @@ def _decode(header: _Header, streams: dict[str, np.ndarray]) -> Gaussians:
 
 
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
-    """2 bits for which of xyzw is largest, then a sign and 9 bits for each of the others."""
+    """Pack quaternions in 32 bits: 2 bits for the largest component (of xyzw), a sign and 9 bits for each other."""
     largest, three = smallest_three(quats[:, [1, 2, 3, 0]])
     level = np.round(np.abs(three) * (511 * 2**0.5)).clip(0, 511).astype(np.uint32)
     packed = (level | (three < 0).astype(np.uint32) << 9) @ np.array([1 << 20, 1 << 10, 1], np.uint32)

@@ -1,4 +1,4 @@
-"""PlayCanvas' streamed SOG, version 1: ``lod-meta.json`` beside folders of SOG, for viewers that load by place.
+"""Read and write PlayCanvas' streamed SOG, version 1: ``lod-meta.json`` beside SOG folders that viewers load by place.
 
 Leaves of a tree of boxes name, for each level of detail, a run of the Gaussians of one SOG: level 0 is the finest. A
 viewer draws one level of each leaf. Numbers that gsmap adds to a run (``error_m``, in the unit of the positions, and
@@ -43,7 +43,7 @@ _BLOCK = 1 << 10  # Gaussians that are compared with all leaves at once
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Run of Gaussians that a leaf draws at one level.
+    """The run of consecutive Gaussians in a file that a leaf draws at one level.
 
     Args:
         uri: Path of the ``meta.json`` of a SOG, relative to ``lod-meta.json``, with ``/``.
@@ -59,7 +59,7 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class LodNode:
-    """Node of the tree.
+    """A node of the tree in ``lod-meta.json``.
 
     Args:
         box: (2, 3) bounding box of its Gaussians over all levels.
@@ -73,7 +73,7 @@ class LodNode:
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the finest level of every leaf; an environment (sky) is left out.
+    """Read the finest level of every leaf; leave out an environment (sky).
 
     Raises:
         InputError: not a streamed SOG of version 1, a SOG that is none or lies outside its folder, or runs that are not
@@ -96,17 +96,17 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
-    """Return the metadata, with a note if an environment is left out.
+    """Return the metadata, with a note if the file has an environment, which is left out.
 
     Raises:
         InputError: as `read`.
     """
     left_out = bool(_meta(Path(path)).get("environment"))
-    return FileInfo(notes=(f"{Path(path).name}: its environment was left out",) if left_out else ())
+    return FileInfo(notes=(f"{Path(path).name}: the environment was left out",) if left_out else ())
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians, *, max_per_leaf: int = 100_000) -> None:
-    """Write a streamed SOG of an octree: level 0 holds the originals, each above a quarter of ``max_per_leaf`` a cell.
+    """Write a streamed SOG of an octree: level 0 has all Gaussians, other levels ``max_per_leaf / 4`` per cell.
 
     What is coarse is merged pair by pair with its moments kept, never dropped. Folders are named by their digests, so
     an older ``lod-meta.json`` beside them stays whole until it is replaced.
@@ -126,7 +126,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, max_per_leaf: i
 
 
 def write_tree(path: str | os.PathLike[str], root: LodNode) -> None:
-    """Write ``lod-meta.json``; write it last, when the folders that it names are there."""
+    """Write ``lod-meta.json``; call this last, when the folders that it refers to exist."""
     files: dict[str, int] = {}
     counts: dict[int, int] = defaultdict(int)
     tree = _node_json(root, files, counts)
@@ -144,7 +144,7 @@ def write_tree(path: str | os.PathLike[str], root: LodNode) -> None:
 
 
 def parted(gaussians: Gaussians, cells: np.ndarray) -> tuple[Gaussians, tuple[int, ...]]:
-    """The Gaussians of each of some boxes (P, 2, 3) behind those of the one before, and how many each has.
+    """Sort Gaussians by the boxes (P, 2, 3) that they lie in; return them and the number of Gaussians of each box.
 
     A Gaussian belongs to the box that its mean is nearest to; within one they are along a Morton curve.
     """
@@ -159,7 +159,7 @@ def parted(gaussians: Gaussians, cells: np.ndarray) -> tuple[Gaussians, tuple[in
 
 
 def runs(meta: Mapping[str, Any]) -> dict[str, list[Run]]:
-    """The runs of each file that a parsed ``lod-meta.json`` names, by their offsets.
+    """Return the runs of each file in a parsed ``lod-meta.json``, sorted by offset.
 
     Raises:
         one of `MALFORMED`: what is parsed is no streamed SOG.
@@ -173,7 +173,7 @@ def runs(meta: Mapping[str, Any]) -> dict[str, list[Run]]:
 
 @dataclass(frozen=True, eq=False)
 class _Cell:
-    """A cube of the octree: where what it draws lies, how many of it stand for each leaf below, and their boxes."""
+    """A cube of the octree: the file of its Gaussians, and the number and box of those drawn for each leaf below it."""
 
     bounds: np.ndarray
     uri: str
@@ -185,7 +185,7 @@ class _Cell:
 
     @property
     def height(self) -> int:
-        """Above the deepest leaf below it: a file is of one level, whichever leaf draws it."""
+        """Height of the cell above the deepest leaf below it, which is the level of its file for all leaves."""
         return max((1 + child.height for child in self.children), default=0)
 
     @property
@@ -193,7 +193,7 @@ class _Cell:
         return [leaf for child in self.children for leaf in child.leaves] or [self]
 
     def node(self, above: tuple[tuple[_Cell, int], ...]) -> LodNode:
-        """Its place in the tree; ``above`` are the cells over it, each with the number of its first leaf in theirs."""
+        """Return this cell's node; ``above`` has the cells above it, each with the index there of its first leaf."""
         if not self.children:
             shown = [(cell, at) for cell, at in (*above, (self, 0)) if cell.parts[at]]
             boxes = np.stack([box for cell, at in shown if (box := cell.boxes[at]) is not None])
@@ -212,7 +212,7 @@ class _Cell:
 
 
 def _octree(path: Path, gaussians: Gaussians, center: np.ndarray, side: float, max_per_leaf: int, name: str) -> _Cell:
-    """The cell of a cube, written with all below it."""
+    """Write the SOG folders of a cube and of all cubes below it; return its cell."""
     children = []
     if len(gaussians) > max_per_leaf and len(name) < _MAX_DEPTH // 2:
         for i, inside, middle in octants(gaussians.means, center, side):
@@ -230,7 +230,7 @@ def _octree(path: Path, gaussians: Gaussians, center: np.ndarray, side: float, m
 
 
 def _place(path: Path, gaussians: Gaussians, name: str) -> str:
-    """Write the folder of a SOG under a name with its digest; returns its uri."""
+    """Write the folder of a SOG under a name with its digest; return its uri."""
     staged = path.parent / f".{uuid.uuid4().hex[:8]}.{name}"
     try:
         staged.mkdir()
@@ -282,7 +282,7 @@ def _not_ours(path: Path, error: Exception) -> InputError:
 
 
 def _leaves(path: Path, meta: Mapping[str, Any]) -> Iterator[dict[int, Run]]:
-    """The runs of each leaf by level."""
+    """Return the runs of each leaf, by level."""
     names = meta["filenames"]
     todo = [(meta["tree"], 0)]
     seen = 0
@@ -302,7 +302,8 @@ def _run(path: Path, names: list[str], entry: Mapping[str, Any]) -> Run:
     file, offset, count = int(entry["file"]), int(entry.get("offset", 0)), int(entry.get("count", 0))
     if not 0 <= file < len(names) or offset < 0 or count < 0:
         raise InputError(
-            f"{path}: file {file} of {len(names)}, from {offset}, {count} Gaussians: no such run",
+            f"{path}: a leaf refers to {count} Gaussians from {offset} in file {file} of {len(names)}, which is not a "
+            "valid run",
             code="rows_outside_file",
         )
     extras = {name: value for name, value in entry.items() if name not in ("file", "offset", "count")}
@@ -310,7 +311,7 @@ def _run(path: Path, names: list[str], entry: Mapping[str, Any]) -> Run:
 
 
 def _parts(path: Path, file: Path, runs: list[Run]) -> Iterator[Gaussians]:
-    """The Gaussians of the runs of one SOG, in the file's order."""
+    """Read the Gaussians of some runs of one SOG, in the order of the file."""
     gaussians = sog.read(file)
     end = 0
     for run in sorted(runs, key=lambda run: run.offset):

@@ -1,4 +1,4 @@
-"""A 3D Tiles 1.1 tileset: ``tileset.json`` beside a folder of GLB files, coarse tiles replaced by finer ones.
+"""Read and write 3D Tiles 1.1: ``tileset.json`` beside a folder of GLB files, where finer tiles replace coarser tiles.
 
 The root tile's frame is the frame of the Gaussians. 3D Tiles turns glTF from y up to z up, so every GLB carries the
 inverse of that turn on its node: what is stored is in the root's frame as it is, and viewers agree whether or not they
@@ -62,7 +62,7 @@ class TileNode:
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the finest level of a tileset, in the frame of its root tile (the root's own transform is left out).
+    """Read the finest level of a tileset in the frame of its root tile, without applying the root's own transform.
 
     Raises:
         InputError: not a tileset, implicit tiling, content that is not splats in GLB, or that lies outside the
@@ -97,7 +97,7 @@ def write(
     transform: np.ndarray | None = None,
     compressed: bool = True,
 ) -> None:
-    """Write a tileset of an octree: the leaves hold the originals, every tile above a quarter of ``max_per_tile``.
+    """Write a tileset of an octree: leaves have all Gaussians, each tile above them at most ``max_per_tile / 4``.
 
     What is coarse is merged pair by pair with its moments kept, never dropped. Content files are named by their
     digest, so an older ``tileset.json`` in the same folder stays whole until it is replaced.
@@ -117,14 +117,14 @@ def write(
 
 
 def write_content(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: bool = True) -> None:
-    """Write one tile's GLB."""
+    """Write the GLB file of one tile."""
     require_writable(path, gaussians)
     writer = glb.write_packed if compressed else glb.write_world
     writer(path, gaussians, np.linalg.inv(_Y_UP_TO_Z_UP))
 
 
 def read_content(path: str | os.PathLike[str]) -> Gaussians:
-    """Read one tile's GLB back, in the frame it was written in."""
+    """Read the GLB file of one tile, in the frame in which it was written."""
     return glb.read_world(Path(path), _Y_UP_TO_Z_UP).about(np.zeros(3))
 
 
@@ -136,7 +136,7 @@ def write_tileset(
     compressed: bool = True,
     origin: np.ndarray | None = None,
 ) -> None:
-    """Write ``tileset.json``; write it last, when the content that it names is there.
+    """Write ``tileset.json``; call this last, when the content that it refers to exists.
 
     Args:
         compressed: The content is packed as SPZ.
@@ -168,10 +168,10 @@ def write_tileset(
 
 
 def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
-    """At most ``max_count`` Gaussians that look alike from afar, and how far what they draw is from where it was.
+    """Reduce Gaussians to at most ``max_count`` that look alike from afar; return them and how far content moved.
 
-    Moments and transmittance are kept; see `gsmap.geometry.decimate`. The distance is the one that a twentieth of the
-    Gaussians lie beyond from the one that is drawn for them, in the frame's unit; 0 where none was merged.
+    Moments and transmittance are kept; see `gsmap.geometry.decimate`. The distance is the 95th percentile of the
+    distances from each Gaussian to the Gaussian that replaces it, in the frame's unit; 0 if none was merged.
     """
     level, into = decimate(gaussians, max_count)
     if len(level) == len(gaussians):
@@ -181,14 +181,14 @@ def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
 
 
 def box_of(gaussians: Gaussians) -> np.ndarray:
-    """(2, 3) float64 box of the Gaussians, each widened by three standard deviations along the axes."""
+    """Return the box (2, 3) float64 around the Gaussians, each extended by three standard deviations along the axes."""
     return reached_box(gaussians, _SIGMAS)
 
 
 def _octree(
     path: Path, gaussians: Gaussians, center: np.ndarray, side: float, max_per_tile: int, name: str, compressed: bool
 ) -> tuple[TileNode, Gaussians]:
-    """The tile of a cube, written with all below it; and what it draws, from which its parent's level is made."""
+    """Write the tile of a cube and all tiles below it; return it and its Gaussians, which the parent reduces."""
     children, levels = [], []
     if len(gaussians) > max_per_tile and len(name) < _MAX_DEPTH // 2:
         for i, inside, middle in octants(gaussians.means, center, side):
@@ -206,7 +206,7 @@ def _octree(
 
 
 def _place(path: Path, gaussians: Gaussians, name: str, compressed: bool) -> str:
-    """Write one GLB into the content folder under a name with its digest; returns its uri."""
+    """Write one GLB into the content folder under a name with its digest; return its uri."""
     folder = path.parent / CONTENT_FOLDER
     folder.mkdir(exist_ok=True)
     staged = folder / f".{os.getpid()}.{name}.glb"
@@ -235,7 +235,7 @@ def _tile_json(node: TileNode) -> dict[str, Any]:
 
 
 def _finest(path: Path, root: dict[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
-    """Uri and matrix of the content that is drawn when every tile is refined."""
+    """Yield the uri and matrix of each content that is drawn when every tile is refined."""
     todo = [(root, np.eye(4), "REPLACE", 0)]
     seen = 0
     while todo:
@@ -258,10 +258,8 @@ def _finest(path: Path, root: dict[str, Any]) -> Iterator[tuple[str, np.ndarray]
 
 
 def _file_of(path: Path, content: dict[str, Any]) -> str:
-    """The uri of a tile's content (``url`` before 3D Tiles 1.0) without what is for a server: query and fragment."""
+    """Return the uri of a tile's content (``url`` before 3D Tiles 1.0), without query and fragment."""
     uri = content.get("uri", content.get("url"))
     if not isinstance(uri, str) or not uri:
-        raise InputError(
-            f"{path} is not a 3D Tiles tileset: the content of a tile names no file (uri)", code="wrong_file_type"
-        )
+        raise InputError(f"{path} is not a 3D Tiles tileset: the content of a tile has no uri", code="wrong_file_type")
     return uri.split("#", 1)[0].split("?", 1)[0]

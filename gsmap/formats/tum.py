@@ -1,4 +1,4 @@
-"""TUM trajectories: one pose per line, ``timestamp tx ty tz qx qy qz qw``, as most evaluation tools read."""
+"""Read and write TUM trajectories, which most evaluation tools read: ``timestamp tx ty tz qx qy qz qw`` per line."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> list[tuple[float, Sim3]]:
                 values = []
             if len(values) != 8 or not all(math.isfinite(v) for v in values):
                 raise InputError(
-                    f"{path} line {number}: a TUM pose is 8 finite numbers: time, position, quaternion",
+                    f"{path} line {number}: a TUM pose needs 8 finite numbers: time, position, quaternion",
                     code="invalid_line",
                 )
             x, y, z, w = values[4:]
@@ -57,7 +57,7 @@ def write_trajectory(
     names: Sequence[str] | None = None,
     remarks: Sequence[str] = (),
 ) -> None:
-    """Write poses in order, at ``timestamps_s`` or at 0, 1, 2, ...; a scale is left out, as the format has none.
+    """Write poses in order, at ``timestamps_s`` or at 0, 1, 2, ... seconds; drop scales, which the format cannot store.
 
     Args:
         names: Names of the poses, written as comment lines before the poses.

@@ -1,4 +1,4 @@
-"""OpenUSD's ``ParticleField3DGaussianSplat`` (26.03 and later): ``.usda``, ``.usdc``, ``.usdz``; by usd-core.
+"""Read and write OpenUSD's ``ParticleField3DGaussianSplat`` (26.03 and later) with usd-core: ``.usda .usdc .usdz``.
 
 Positions, quaternions, linear scales, opacities and SH coefficients by splat, degree by degree, as a trained ``.ply``
 has them. A file says which of its axes is up: what gsmap writes has y up, and is turned. Reading is left to a process
@@ -37,7 +37,7 @@ _TINY = np.finfo(np.float32).tiny
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read all splats of a stage, each where its transforms put it.
+    """Read all splats of a stage, with their transforms applied.
 
     Raises:
         MissingDependencyError: usd-core is not installed.
@@ -61,12 +61,14 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         raise InputError(f"{path}: its up axis is {up!r}; gsmap reads Y and Z", code="unsupported_axes")
     parts = [_splat(path, stage, i) for i in range(int(stage["count"]))]
     if not parts:
-        raise NotGaussiansError(f"{path} holds no ParticleField3DGaussianSplat: a mesh, or splats of an older schema?")
+        raise NotGaussiansError(
+            f"{path} holds no ParticleField3DGaussianSplat; it may have a mesh, or splats of an older schema"
+        )
     return change_axes(Gaussians.concatenate(parts), PLY, _UP[up])
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians, *, half: bool = False) -> None:
-    """Write a stage of one splat, y up, metres, its bounds three standard deviations wide.
+    """Write a stage with one splat (y up, metres), whose bounds extend three standard deviations beyond the means.
 
     Args:
         half: Store all values except positions as half floats: 52 bytes per Gaussian at SH degree 1 instead of 92.
@@ -131,14 +133,14 @@ def _splat(path: Path, stage: dict[str, np.ndarray], i: int) -> Gaussians:
 
     means = array("positions")
     if means is None or not len(means):
-        raise InputError(f"{path}: a ParticleField3DGaussianSplat without positions", code="missing_attribute")
+        raise InputError(f"{path}: a ParticleField3DGaussianSplat has no positions", code="missing_attribute")
     n, degree = len(means), int(stage[f"{i}.degree"])
     if not 0 <= degree <= 3:
         raise InputError(f"{path}: SH degree {degree}; gsmap reads 0 to 3", code="unsupported_sh_degree")
     k = (degree + 1) ** 2
 
     def of_each(name: str, width: int, default: float | tuple[float, ...]) -> np.ndarray:
-        """(n, width): too long is cut, too short is the default, as the schema says."""
+        """Return an attribute (n, width): cut a too long array, replace a too short array by the default."""
         found = array(name)
         if found is None or len(found) < n * (k if name == "sh" else 1):
             return np.broadcast_to(np.array(default, np.float32), (n, width))
@@ -171,4 +173,6 @@ def _similarity(path: Path, matrix: np.ndarray) -> Sim3:
 
 def _require_usd(path: Path) -> None:
     if importlib.util.find_spec("pxr") is None:
-        raise MissingDependencyError(f"{path}: USD needs usd-core, which is not installed: pip install 'gsmap[usd]'")
+        raise MissingDependencyError(
+            f"{path}: reading and writing USD needs usd-core, which is not installed: pip install 'gsmap[usd]'"
+        )

@@ -66,7 +66,7 @@ def test_g2o_refuses_what_it_cannot_say(tmp_path, poses, edges):
     scaled = Sim3(np.eye(3), np.zeros(3), 2.0)
     with raises(InputError, code="unsupported_output", match="scene a has scale 2"):
         write_graph(tmp_path / "a.g2o", {"a": scaled}, [])
-    with raises(InputError, code="unsupported_output", match="edge k0:k1 names a scene"):
+    with raises(InputError, code="unsupported_output", match="edge k0:k1 refers to a scene"):
         write_graph(tmp_path / "a.g2o", {"k0": poses[0]}, edges[:1])
     both = {"k0": poses[0], "k1": poses[1]}
     with raises(InputError, code="unsupported_output", match="edge k0:k1 has scale 2"):

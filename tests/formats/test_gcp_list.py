@@ -59,7 +59,7 @@ def test_the_first_line_names_the_system(line: str, crs: str) -> None:
         ("EPSG:1\n1 2 3 4 five a.jpg", "invalid_line", "line 2: im_y is 'five'"),
         ("EPSG:1\n1 nan 3 4 5 a.jpg", "invalid_line", "line 2: geo_y is 'nan'"),
         ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 4 4 5 b.jpg P", "duplicate", "line 3: point P has other .*line 2"),
-        ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 3 6 7 a.jpg P", "duplicate", "line 3: point P in a.jpg .*line 2"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 3 6 7 a.jpg P", "duplicate", "line 3: point P in photo a.jpg .*line 2"),
         ("EPSG:1\nG1 1 2 3", "invalid_line", "line 2 has 4 fields and begins with 'G1'"),
         ("EPSG:1\n1 2 3 4 5 a.jpg b.jpg G1", "invalid_line", "line 2: .*'a.jpg b.jpg G1'"),
         ("EPSG:1\n1 2 3 4 5 DJI_0001 (2) G1", "invalid_line", "line 2: .*'DJI_0001 .2. G1'"),

@@ -112,7 +112,7 @@ def put(data: bytes, kind: str, at: int, *values: int) -> bytes:
         (lambda d: put(d, "<I", 4, 0), "file_truncated", " 0 sections"),
         (lambda d: put(d, "<I", 4, 2**32 - 1), "file_truncated", "4294967295 sections"),
         (lambda d: put(d, "<I", 16, 7), "count_mismatch", " 7 Gaussians"),
-        (lambda d: put(d, "<I", 4096, 2**31), "count_mismatch", "2147483648 Gaussians with room for 200"),
+        (lambda d: put(d, "<I", 4096, 2**31), "count_mismatch", "2147483648 Gaussians, but has room for 200"),
         (lambda d: put(d, "<2I", 4096, 2**31, 2**31), "file_truncated", "byte 90194318388 of 13572"),
         (lambda d: put(d, "<2I", 4096, 0, 200), "no_gaussians", "no Gaussians"),
         (lambda d: put(d, "<I", 4096 + 12, 2**32 - 1), "file_truncated", "byte 51539621064 of 13572"),

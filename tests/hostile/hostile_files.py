@@ -193,7 +193,7 @@ def a_broken_file_whose_name_steers_the_terminal(w: World) -> None:
     (w.captures / "x\x1b[31m.ply").write_bytes(b"ply\nformat \x1b[31m 1.0\n\x9b\nend_header\n")
 
 
-@case(r"lies outside its folder", verbs=INGEST)
+@case(r"lies outside the folder", verbs=INGEST)
 def a_tileset_whose_tiles_lie_elsewhere(w: World) -> None:
     root = {"geometricError": 0, "content": {"uri": "../home/thesis.txt.glb"}}
     box = {"box": np.r_[np.zeros(3), np.eye(3).ravel()].tolist()}

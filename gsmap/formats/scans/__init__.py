@@ -1,4 +1,4 @@
-"""Scans: point clouds, meshes and depth pictures, read to be looked for in a map.
+"""Read scans (point clouds, meshes and depth pictures) for localization in a map.
 
 Nothing that a file says of itself is believed: counts are held against its size, values against what they can be, and
 what only a library can read is read by a process of its own, within limits (`gsmap.formats.scans.process`).
@@ -17,20 +17,20 @@ from gsmap.formats.scans.limits import Params
 from gsmap.types.scan import Scan
 
 SUFFIXES = (".ply", ".pcd", ".xyz", ".las", ".laz", ".obj", ".stl", ".glb")
-"""Of point clouds and meshes. A ``.ply`` or ``.glb`` may hold a splat instead (`holds_splat`)."""
+"""Suffixes of point clouds and meshes. A ``.ply`` or ``.glb`` may hold a splat instead (`holds_splat`)."""
 
 __all__ = ["SUFFIXES", "Params", "holds_splat", "is_scan", "read", "read_depth"]
 
 
 def is_scan(path: str | os.PathLike[str]) -> bool:
-    """Return true if a file has the suffix of a point cloud, mesh or splat; it need not exist."""
+    """Return true if a path has the suffix of a point cloud, mesh or splat; the file need not exist."""
     from gsmap.formats import suffix_of
 
     return _suffix(Path(path)) in SUFFIXES or suffix_of(path) is not None
 
 
 def holds_splat(path: str | os.PathLike[str]) -> bool:
-    """Return true if a file holds Gaussians, for `gsmap.formats.read`, rather than a scan.
+    """Return true if a file holds Gaussians (read by `gsmap.formats.read`), false if it holds a scan.
 
     Raises:
         NotFoundError: no such file.
@@ -58,7 +58,7 @@ def holds_splat(path: str | os.PathLike[str]) -> bool:
 
 
 def read(path: str | os.PathLike[str], params: Params | None = None) -> Scan:
-    """The points of a cloud, or points spread evenly over the area of a mesh; see `Scan` for frames and units.
+    """Read the points of a cloud, or sample points evenly over the area of a mesh; `Scan` documents frames and units.
 
     Raises:
         NotFoundError: no such file.

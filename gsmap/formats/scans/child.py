@@ -1,4 +1,4 @@
-"""The process that reads one mesh, cloud, LAS or USD file by a library, within limits that it sets itself.
+"""A process that reads one mesh, cloud, LAS or USD file with a library, within limits that it sets for itself.
 
 It is run as a script, knows nothing of gsmap, and writes one ``.npz`` to the descriptor it is given. What a file makes
 of the library ends here: crashes, aborts for want of memory, and loops.
@@ -63,7 +63,7 @@ def _mesh(path: Path, max_points: int) -> dict[str, Any]:
 
 
 def _las(path: Path, max_points: int) -> dict[str, Any]:
-    """The integers of an even share of the points, their scales and offsets, and their colours where they have some."""
+    """Read evenly spaced points as integers, with their scales and offsets, and with colours if the file has any."""
     import laspy
 
     with laspy.open(path) as reader:
@@ -89,13 +89,13 @@ def _las(path: Path, max_points: int) -> dict[str, Any]:
 
 
 def _usd(path: Path, max_points: int) -> dict[str, Any]:
-    """The arrays of every splat by its number, its matrix, and which axis of the stage is up; or why it is refused."""
+    """Read the arrays and the matrix of each splat, by number, and the stage's up axis; or the reason for refusal."""
     from pxr import Sdf, Usd, UsdGeom, UsdVol
 
     layer = Sdf.Layer.FindOrOpen(str(path))
     packed = path.suffix.lower() == ".usdz"
     if layer is None:
-        return {"refused": np.array("USD cannot read it: it is damaged, or something else")}
+        return {"refused": np.array("USD cannot read it: it is damaged, or not a USD file")}
     named = [name for name in layer.GetCompositionAssetDependencies() if name]
     if any(not packed or name.startswith("/") or ".." in name or ":" in name for name in named):
         return {"refused": np.array(f"it wants {named[0][:100]!r} read as well, which gsmap does not do: flatten it")}
@@ -123,7 +123,7 @@ def _usd(path: Path, max_points: int) -> dict[str, Any]:
 
 
 def _limit(memory_bytes: int) -> None:
-    """From now on: so many bytes beyond what the libraries have mapped, no file made longer, no core dumped."""
+    """Limit this process to some bytes of memory beyond those of its libraries; forbid writing files and core dumps."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     with contextlib.suppress(OSError, ValueError):  # not Linux, where nothing limits the memory of a process

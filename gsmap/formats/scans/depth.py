@@ -1,4 +1,4 @@
-"""A depth picture with its colours: one view of an RGB-D camera."""
+"""Read a depth picture with its colours, one view of an RGB-D camera, as a scan."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def read_depth(
     picture, mode = _picture(path)
     if mode not in _DEPTHS:
         raise InputError(
-            f"{path} is a picture of mode {mode}: a depth picture has one channel of 16 bits or floats",
+            f"{path} is a picture of mode {mode}, but a depth picture needs one channel of 16 bits or floats",
             code="not_a_depth_picture",
         )
     if not (np.isfinite(units_per_m) and units_per_m > 0):
         raise InputError(
-            f"a metre is a positive number of units of the depth picture, got {units_per_m}", code="invalid_depth_scale"
+            f"the depth scale (units per metre) must be positive, got {units_per_m}", code="invalid_depth_scale"
         )
     fx, fy, cx, cy = _checked(intrinsics_px)
     depth = picture.astype(np.float64) / units_per_m
@@ -73,14 +73,14 @@ def _checked(intrinsics_px: Sequence[float]) -> np.ndarray:
     values = np.asarray(intrinsics_px, dtype=np.float64)
     if values.shape != (4,) or not np.isfinite(values).all() or not (values[:2] > 0).all():
         raise InputError(
-            f"intrinsics are fx, fy, cx, cy in pixels, focal lengths positive, got {list(intrinsics_px)}",
+            f"intrinsics must be fx, fy, cx, cy in pixels, with positive focal lengths, got {list(intrinsics_px)}",
             code="invalid_intrinsics",
         )
     return values
 
 
 def _steep(depth: np.ndarray, edge: float) -> np.ndarray:
-    """(H, W) where the depth jumps to a neighbour, NaN where nothing was measured."""
+    """Return a mask (H, W) that is True where the depth jumps to a neighbouring pixel; unmeasured depths are NaN."""
     out = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         step = np.abs(np.diff(depth, axis=axis)) > edge * np.minimum(*_pairs(depth, axis))
@@ -102,13 +102,14 @@ def _pairs(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _colours(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """(H, W, 3) float32 in [0, 1] of the depth picture's shape."""
+    """Read the colours (H, W, 3) float32 in [0, 1], in the size of the depth picture."""
     height, width = shape
     colours, _ = _picture(path, "RGB")
     tall, wide = colours.shape[:2]
     if abs(tall * width - wide * height) > max(tall * width, wide * height) * 0.02:
         raise InputError(
-            f"{path} is {wide} x {tall} pixels, the depth {width} x {height}: they are not of one view",
+            f"{path} has {wide} x {tall} pixels, but the depth picture {width} x {height}: pass two pictures of one "
+            "view",
             code="size_mismatch",
         )
     if (tall, wide) != shape:
@@ -120,6 +121,6 @@ def _colours(path: Path, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _picture(path: Path, mode: str | None = None) -> tuple[np.ndarray, str]:
-    """A picture's pixels, and its mode."""
+    """Return the pixels of a picture, and its mode."""
     with open_picture(path, max_pixels=_MAX_PIXELS) as image:
         return np.asarray(image if mode is None else image.convert(mode)), image.mode

@@ -1,4 +1,4 @@
-"""LAS and LAZ: integers with a scale and an offset, kept in float64; read by laspy (extra ``las``)."""
+"""Read LAS and LAZ (integers with a scale and an offset) as float64, with laspy (extra ``las``)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SIXTEEN_BITS, _EIGHT_BITS = 65535.0, 255.0
 
 
 def read(path: Path, params: limits.Params) -> Scan:
-    """The points with their colours, about an origin near them.
+    """Read the points with their colours, relative to an origin near them.
 
     Raises:
         InputError: damaged, truncated, or a scale or offset that is no number.
@@ -36,7 +36,8 @@ def read(path: Path, params: limits.Params) -> Scan:
     total, seen = found["total"].tolist()
     if not (np.isfinite(scales).all() and np.isfinite(offsets).all() and (scales > 0).all()):
         raise InputError(
-            f"{path}: its scales {scales.tolist()} or offsets {offsets.tolist()} make no sense", code="file_damaged"
+            f"{path} is damaged: its scales {scales.tolist()} or offsets {offsets.tolist()} are not usable",
+            code="file_damaged",
         )
     if seen < total:
         raise InputError(
@@ -52,7 +53,7 @@ def read(path: Path, params: limits.Params) -> Scan:
 
 
 def _require_header(path: Path) -> None:
-    """Refuse a header whose records the file has no room for: laspy would look for each of them.
+    """Raise an error if the header promises more records than fit into the file, as laspy would search for all of them.
 
     The layout is that of the public header block (ASPRS LAS 1.4 R15, 2.4).
     """
@@ -78,6 +79,6 @@ def _require_header(path: Path) -> None:
 
 
 def _colours(values: np.ndarray) -> np.ndarray | None:
-    """(N, 3) in [0, 1]; None where the file has room for colours and none in it. Some writers fill 8 of the 16 bits."""
+    """Return colours (N, 3) in [0, 1]; None if all are zero. Some writers use only 8 of the 16 bits."""
     most = int(values.max(initial=0))
     return None if most == 0 else values / (_SIXTEEN_BITS if most > _EIGHT_BITS else _EIGHT_BITS)

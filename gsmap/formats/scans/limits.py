@@ -1,4 +1,4 @@
-"""Limits within which scans are read."""
+"""Limits on the size and time of reading scans."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from gsmap.errors import ConfigError
 
 MAX_POINTS = 2_000_000
-"""Points that are kept of a cloud (an even share of more), and samples of a mesh."""
+"""Largest number of points that are read from a cloud (evenly spaced if it has more), and of samples of a mesh."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Meshes (``.obj .stl .glb``, ``.ply`` with faces) and ``.pcd`` clouds, read by open3d in a process of its own.
+"""Read meshes (``.obj .stl .glb``, ``.ply`` with faces) and ``.pcd`` clouds with open3d, in a separate process.
 
 A mesh becomes points spread evenly over its area, coloured by its textures, else by its vertices.
 """
@@ -20,7 +20,7 @@ _SEED = 0
 
 
 def read(path: Path, params: limits.Params) -> Scan:
-    """The points of a cloud, or points of a mesh.
+    """Read the points of a cloud, or sample points on a mesh.
 
     Raises:
         InputError: not what its suffix says, damaged, or beyond the limits of time and memory.
@@ -47,17 +47,17 @@ def read(path: Path, params: limits.Params) -> Scan:
 
 
 def _sampled(path: Path, found: dict[str, Any], vertices: np.ndarray, colours: np.ndarray | None, count: int) -> Scan:
-    """Points spread evenly over a mesh's area (Osada et al. 2002, eq. 1), the same for the same file."""
+    """Sample points evenly over a mesh's area (Osada et al. 2002, eq. 1), always the same points for the same file."""
     triangles = _checked(found, "triangles", 3, path).astype(np.int64)
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(
-            f"{path}: its triangles name vertices that it does not have: it is damaged", code="file_damaged"
+            f"{path} is damaged: its triangles refer to vertices that it does not have", code="file_damaged"
         )
     corners = vertices[triangles]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     areas = np.where(np.isfinite(areas), areas, 0.0)
     if not areas.sum() > 0:
-        raise InputError(f"{path}: its triangles have no area: there is no surface to look for", code="empty_scan")
+        raise InputError(f"{path}: its triangles have no area, so there is no surface to localize", code="empty_scan")
     rng = np.random.default_rng(_SEED)
     # Strata of equal area: each point from its own, so that no patch is missed by chance.
     at = (np.arange(count) + rng.uniform(size=count)) / count
@@ -74,7 +74,7 @@ def _sampled(path: Path, found: dict[str, Any], vertices: np.ndarray, colours: n
 
 
 def _textured(found: dict[str, Any], rows: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
-    """(N, 3) colours of the samples from the mesh's pictures; None where it has none, or where they do not fit."""
+    """Return the colours (N, 3) of the samples from the mesh's textures; None if it has none, or if they do not fit."""
     pictures = [found[name] for name in sorted(n for n in found if n.startswith("texture"))]
     pictures = [found[f"texture{number}"] for number in range(len(pictures))]
     uvs, materials = found.get("uvs"), found.get("materials")
@@ -101,12 +101,12 @@ def _textured(found: dict[str, Any], rows: np.ndarray, shares: np.ndarray) -> np
 def _checked(found: dict[str, np.ndarray], name: str, width: int, path: Path) -> np.ndarray:
     array = found.get(name, np.zeros((0, width)))
     if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in "fiu":
-        raise InputError(f"{path}: its {name} cannot be read: it is damaged", code="file_damaged")
+        raise InputError(f"{path} is damaged: its {name} cannot be read", code="file_damaged")
     return array
 
 
 def _require_vertices(path: Path) -> None:
-    """Refuse a PLY header that promises more than the file holds, before a library allocates it."""
+    """Raise an error if a PLY header promises more rows than the file holds, before a library allocates them."""
     from gsmap.formats import ply
 
     header = ply.read_header(path)

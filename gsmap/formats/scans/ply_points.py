@@ -1,4 +1,4 @@
-"""Point clouds in a ``.ply``: any numeric type, float64 kept."""
+"""Read point clouds from a ``.ply`` of any numeric type, with the full precision of float64."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_
 
 
 def is_mesh(path: Path) -> bool:
-    """Return true if the header names faces."""
+    """Return true if the header has an element with faces."""
     elements = ply.read_header(path).elements
     return any(name in elements and elements[name].count for name in ("face", "tristrips"))
 
 
 def read(path: Path) -> Scan:
-    """The points of the element ``vertex``, with ``red green blue`` where they have them.
+    """Read the points of the element ``vertex``, with ``red green blue`` if the vertices have these properties.
 
     Raises:
         InputError: damaged, truncated, or vertices without ``x y z``.
@@ -31,7 +31,7 @@ def read(path: Path) -> Scan:
     rows = ply.read_element(path, header, "vertex")
     names = set(rows.dtype.names or ())
     if not {"x", "y", "z"} <= names:
-        raise InputError(f"{path}: its vertices lack x, y or z: it is no point cloud", code="wrong_file_type")
+        raise InputError(f"{path} is not a point cloud: its vertices lack x, y or z", code="wrong_file_type")
     total = len(rows)
     rows = rows[:: -(-total // limits.MAX_POINTS)]
     points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)

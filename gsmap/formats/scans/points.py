@@ -1,4 +1,4 @@
-"""Checks that all readers of points share."""
+"""Checks for all readers of point clouds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsmap.types.scan import Scan
 
 
 def scan_of(points: np.ndarray, colours: np.ndarray | None, what: Path, total: int, **about: Any) -> Scan:
-    """A `Scan` of those of the points that are finite, with notes of what was left out.
+    """Return a `Scan` of the finite points, with notes on points that were left out.
 
     Raises:
         InputError: none is finite.
@@ -22,10 +22,10 @@ def scan_of(points: np.ndarray, colours: np.ndarray | None, what: Path, total: i
     notes = []
     if not finite.all():
         points, colours = points[finite], None if colours is None else colours[finite]
-        notes.append(f"{int((~finite).sum()):,} points are not finite: left out")
+        notes.append(f"{int((~finite).sum()):,} points with NaN or infinite coordinates were left out")
     if not len(points):
         raise InputError(
-            f"{what} has no point with finite coordinates: there is nothing to look for", code="empty_scan"
+            f"{what} has no point with finite coordinates, so there is nothing to localize", code="empty_scan"
         )
     if total > len(finite):
         notes.append(f"{len(finite):,} of its {total:,} points are used, evenly spread over the file")

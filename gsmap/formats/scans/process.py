@@ -1,4 +1,4 @@
-"""Files that only libraries read, which may abort, are read by a process of its own (`gsmap.formats.scans.child`)."""
+"""Read files with libraries that may crash, in a separate process (`gsmap.formats.scans.child`)."""
 
 from __future__ import annotations
 
@@ -50,14 +50,15 @@ def read_in_process(path: Path, kind: str, params: limits.Params) -> dict[str, n
             return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(
-            f"{path} cannot be read: its reader gave it up, or needs more than {params.max_memory_mb} MB: it is "
+            f"{path} cannot be read: the reading process failed, or needs more than {params.max_memory_mb} MB; the "
+            "file is "
             "damaged or too large; convert it to a .ply",
             code="reader_failed",
         ) from error
 
 
 def _read_output(pipe: Any, process: subprocess.Popen[bytes], params: limits.Params, path: Path) -> bytes:
-    """Read all output of the process within its limits of time and size."""
+    """Read all output of the reading process within the limits of time and size."""
     timer = threading.Timer(params.max_seconds, process.kill)
     timer.start()
     parts, size = [], 0

@@ -1,4 +1,4 @@
-"""Point clouds as text (``.xyz``): a point a line, ``x y z`` and perhaps ``r g b`` behind it."""
+"""Read point clouds as text (``.xyz``): one point per line, ``x y z`` with or without ``r g b`` after it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _BYTE = 255.0
 
 
 def read(path: Path) -> Scan:
-    """Three columns are a point; three more that are whole numbers from 0 to 255, behind it or behind an intensity, are
-    its colour. Columns are parted by spaces, commas or semicolons; lines before the first point are left out, and so
-    are those that begin with ``#`` or ``//``.
+    """Read points from the first three columns. Three more columns of whole numbers from 0 to 255, directly after the
+    point or after an intensity, are the colour. Spaces, commas or semicolons separate columns; lines before the first
+    point, and lines that begin with ``#`` or ``//``, are skipped.
 
     Raises:
         InputError: no numbers, fewer than three in a line, or lines of different lengths.
@@ -47,12 +47,12 @@ def read(path: Path) -> Scan:
     notes: tuple[str, ...] = ()
     colours = next((c for c in (rest[:, :3], rest[:, 1:4]) if _are_bytes(c)), None)
     if colours is None and rest.shape[1]:
-        notes = (f"columns 4 to {3 + rest.shape[1]} hold no colours from 0 to 255: they are not used",)
+        notes = (f"columns 4 to {3 + rest.shape[1]} hold no colours from 0 to 255 and were not used",)
     return scan_of(points, None if colours is None else colours / _BYTE, path, total, notes=notes)
 
 
 def _layout(path: Path) -> tuple[int, re.Pattern[str], int]:
-    """Lines before the first point, what parts columns, and how many there are."""
+    """Return the number of lines before the first point, the separator of columns, and the number of columns."""
     split = re.compile(r"[,;\t]")
     with open(path, encoding="utf-8", errors="replace") as file:
         for number in range(_MAX_HEAD_LINES):
@@ -68,10 +68,11 @@ def _layout(path: Path) -> tuple[int, re.Pattern[str], int]:
                 return number, split, len(numbers)
             if len(numbers) not in (0, 1):  # a count in the first line is common
                 raise InputError(
-                    f"{path}: line {number + 1} has {len(numbers)} numbers: a point has x, y and z", code="invalid_line"
+                    f"{path}: line {number + 1} has {len(numbers)} numbers, but a point needs x, y and z",
+                    code="invalid_line",
                 )
     raise InputError(
-        f"{path} begins with no point: a .xyz has x y z in every line, and perhaps r g b behind them",
+        f"{path} has no point in its first lines: a .xyz needs x y z in every line, with or without r g b after them",
         code="wrong_file_type",
     )
 
