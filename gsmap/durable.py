@@ -1,4 +1,4 @@
-"""Durable and atomic file operations, and safe access below folders that may come from an untrusted source.
+"""Write files durably and atomically, and access files safely in folders that an untrusted source may have made.
 
 Files appear whole or not at all and survive a power cut; deleting, inspecting and opening below a folder never follows
 a link in it. An output path from the user is different: `write_output` follows its links and writes to pipes and
@@ -23,7 +23,7 @@ from gsmap.errors import BusyError, CorruptError, InputError
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable (fsync)."""
+    """Make the entries of a folder durable on disk (fsync)."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -32,7 +32,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Make the bytes of a file durable (fsync)."""
+    """Make the content of a file durable on disk (fsync)."""
     handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     try:
         os.fsync(handle)
@@ -41,7 +41,7 @@ def sync_file(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents durably; does nothing if it exists."""
+    """Create a folder and its parents durably, unless it exists."""
     if path.is_dir():
         return
     make_folder(path.parent)
@@ -55,7 +55,7 @@ def write_text_whole(path: Path, text: str) -> None:
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a staged file, synchronize it, and rename it to ``path``.
+    """Let ``write`` fill a staged file, make that file durable (fsync), and rename it to ``path``.
 
     For files in gsmap's own folders: a link at ``path`` is replaced and never followed. See `write_output`.
 
@@ -104,7 +104,7 @@ def write_text_output(path: Path, text: str) -> None:
 
 
 def is_stream(path: Path) -> bool:
-    """Return True if bytes written to a path go to a pipe, a character device or an open file of this process."""
+    """Return True if a path is a pipe, a character device or an open file of this process."""
     if _descriptor(path) is not None:
         return True
     try:
@@ -115,7 +115,7 @@ def is_stream(path: Path) -> bool:
 
 
 def _descriptor(path: Path) -> int | None:
-    """Return the file descriptor of this process that a path names (``/dev/stdout``, ``/dev/fd/63``); otherwise None.
+    """Return the file descriptor of this process that a path such as ``/dev/stdout`` names; None for other paths.
 
     Opening such a path again would truncate a shell redirection, and replacing it would replace another process's file.
     """
@@ -148,8 +148,7 @@ def _replace(path: Path, staged: Path, write: Callable[[Path], object]) -> None:
 
 
 def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
-    """Lock an open file or folder (``how``: `fcntl.LOCK_EX`, `fcntl.LOCK_SH`) within a time limit; the kernel frees it
-    with the process.
+    """Lock an open file or folder (``how``: `fcntl.LOCK_EX`, `fcntl.LOCK_SH`), waiting up to ``patience_s`` for it.
 
     Raises:
         BusyError: another process kept the lock for ``patience_s``; ``busy`` begins the message.
@@ -170,7 +169,7 @@ def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
 
 
 def remove_tree(root: Path, *names: str) -> None:
-    """Delete a folder with its content, or a file; links are deleted, not their targets. Does nothing if it is missing.
+    """Delete a folder with its content, or a file, unless it is missing; delete links, never their targets.
 
     Raises:
         CorruptError: a folder on the path is a link, or a name is invalid.
@@ -192,7 +191,7 @@ def remove_tree(root: Path, *names: str) -> None:
 
 
 def remove_file(root: Path, *names: str) -> None:
-    """Delete a file, or a link and not its target. Does nothing if it is missing.
+    """Delete a file, or a link without its target, unless it is missing.
 
     Raises:
         CorruptError: a folder on the path is a link, or a name is invalid.
@@ -212,7 +211,7 @@ def remove_empty_folder(root: Path, *names: str) -> None:
 
 
 def refuse_links(root: Path, *names: str) -> None:
-    """Raise if any part of a path is a link; missing parts are allowed.
+    """Raise an error if any part of a path is a link; missing parts are allowed.
 
     Raises:
         CorruptError: a part is a link, or a name is invalid.
@@ -229,17 +228,17 @@ def refuse_links(root: Path, *names: str) -> None:
 
 
 def is_folder(path: Path) -> bool:
-    """Return True for a folder itself, not a link to one."""
+    """Return True for a folder, False for a link to a folder."""
     return _is(path, stat.S_ISDIR)
 
 
 def is_file(path: Path) -> bool:
-    """Return True for a plain file itself: not a link to one, a pipe or a device."""
+    """Return True for a plain file, False for a link to a file, a pipe or a device."""
     return _is(path, stat.S_ISREG)
 
 
 def files_below(folder: Path) -> dict[str, os.stat_result]:
-    """Return the status of all entries below a folder that are not folders, by relative path.
+    """Return the `os.stat_result` of all entries below a folder except folders, by relative path.
 
     A link is listed as itself and not followed. Empty if the folder is missing or a link.
     """
@@ -260,7 +259,7 @@ def files_below(folder: Path) -> dict[str, os.stat_result]:
 
 
 def open_file(path: Path) -> int:
-    """Open a plain file for reading, without following a link or waiting at a pipe.
+    """Open a plain file for reading; never follow a link, and never wait for a pipe.
 
     Raises:
         CorruptError: not a plain file.
@@ -269,7 +268,7 @@ def open_file(path: Path) -> int:
     if not is_file(path):
         path.lstat()  # raises FileNotFoundError if it is missing
         raise CorruptError(
-            f"{path} is not a regular file (it is a link, folder, pipe or device), and gsmap creates none: remove it",
+            f"{path} is not a regular file (but a link, folder, pipe or device): remove it",
             code="not_a_plain_file",
         )
     return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
@@ -284,8 +283,7 @@ def _is(path: Path, kind: Callable[[int], bool]) -> bool:
 
 @contextlib.contextmanager
 def _parent_of(root: Path, names: tuple[str, ...]) -> Iterator[int | None]:
-    """Yield a descriptor of the parent folder of a path below ``root``, reached without following links; None if it
-    is missing."""
+    """Yield a descriptor of a path's parent folder below ``root``, opened without following links; None without one."""
     for name in names:
         _checked_name(root, name)
     handle: int | None = None
@@ -324,7 +322,7 @@ def _mode(name: str, folder: int) -> int | None:
 def _checked_name(root: Path, name: str) -> str:
     if name in ("", ".", "..") or "/" in name or "\0" in name:
         raise CorruptError(
-            f"{name!r} is not the name of an entry of {root}; nothing was changed", code="invalid_stored_name"
+            f"{name!r} is not a valid name of an entry in {root}; nothing was changed", code="invalid_stored_name"
         )
     return name
 

@@ -1,4 +1,4 @@
-"""The errors gsmap raises.
+"""The errors that gsmap raises.
 
 ::
 
@@ -24,13 +24,13 @@ results with a status and a reason, never errors.
 import errno
 
 MALFORMED = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
-"""What Python raises where parsed JSON or TOML is damaged, nested without end or of another shape than expected."""
+"""Exceptions that Python raises for JSON or TOML that is damaged, too deeply nested, or of another structure."""
 
 _MAX_MESSAGE = 1000  # characters; longer messages quote the content of a file
 
 
 class GsmapError(Exception):
-    """Root of every error that gsmap raises on purpose; its message is one printable line, whatever it quotes.
+    """Base class of all errors that gsmap raises on purpose; its message is one printable line, whatever it quotes.
 
     Args:
         args: the message.
@@ -47,38 +47,38 @@ class GsmapError(Exception):
 
 
 def _one_line(text: str) -> str:
-    """The text without control characters, and without its middle where it is long: what to do stands at its end."""
+    """Return a text without control characters; shorten a long text in its middle, as its end states what to do."""
     if not text.isprintable():
         text = " ".join("".join(c if c.isprintable() or c.isspace() else "?" for c in text).split())
     return text if len(text) <= _MAX_MESSAGE else f"{text[:600]} ... {text[605 - _MAX_MESSAGE :]}"
 
 
 class InputError(GsmapError, ValueError):
-    """A file, array or argument cannot be used as given."""
+    """A file, an array or an argument is invalid."""
 
     code = "input"
 
 
 class NotGaussiansError(InputError):
-    """A sound file that holds something other than Gaussians, such as a point cloud or a mesh."""
+    """A valid file holds something other than Gaussians, such as a point cloud or a mesh."""
 
     code = "not_gaussians"
 
 
 class NotPinholesError(InputError):
-    """Cameras of lenses that no pinhole stands for, such as panoramas and wide fisheyes."""
+    """The cameras have lenses that no pinhole camera approximates, such as panoramas and wide fisheyes."""
 
     code = "not_pinholes"
 
 
 class ConfigError(GsmapError, ValueError):
-    """An option, or a combination of options, makes no sense."""
+    """An option, a setting or a combination of them is invalid."""
 
     code = "config"
 
 
 class NotFoundError(GsmapError, LookupError):
-    """A scene, edge, revision or file that is named does not exist."""
+    """A scene, edge, revision or file that the user named does not exist."""
 
     code = "not_found"
 
@@ -108,19 +108,19 @@ class BusyError(StoreError):
 
 
 class DiskFullError(StoreError):
-    """The disk, or a quota on it, is used up."""
+    """The disk or the user's quota on it is full."""
 
     code = "disk_full"
 
 
 class ReadOnlyError(StoreError):
-    """The disk or the folder cannot be written."""
+    """The disk or the folder does not permit writing."""
 
     code = "read_only"
 
 
 class DiskError(StoreError):
-    """The disk failed: an I/O error."""
+    """The disk failed with an I/O error."""
 
     code = "disk_failed"
 
@@ -132,7 +132,7 @@ class MissingDependencyError(GsmapError, ImportError):
 
 
 def of_system(error: OSError) -> type[StoreError]:
-    """Return the class of error that an error of the operating system becomes, by its code."""
+    """Return the error class that an error of the operating system is converted to, by its number."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFullError
     if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):

@@ -1,4 +1,4 @@
-"""Format values for people, and keep control characters from terminals."""
+"""Format values for people, with control characters escaped."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def escaped(text: str, *, lines: bool = False) -> str:
 
 
 def shown(value: Any, *, lines: bool = False) -> str:
-    """Format a value for a table; control characters are escaped.
+    """Format a value for a table, with control characters escaped.
 
     Args:
         lines: keep line breaks.
@@ -61,5 +61,5 @@ def _steers(c: str) -> bool:
 
 
 def few(names: Sequence[str], most: int = 5) -> str:
-    """List the first names, and the number of the others."""
+    """List the first names, and the number of the remaining names."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,3 +1,3 @@
-"""The version of gsmap: the one place where it stands."""
+"""The version of gsmap, which is defined here only."""
 
 __version__ = "0.2.0"

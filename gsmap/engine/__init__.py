@@ -1,4 +1,4 @@
-"""Execution of stage jobs: the executors, the choice of one, and workers that are kept between stages."""
+"""Run the jobs of stages: choose an executor, and keep its workers between stages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Params:
-    """Settings of job execution. They belong to a run: a map's own settings may not choose an executor.
+    """Settings of job execution. They hold for one run: the settings stored with a map cannot choose an executor.
 
     Args:
         executor: Executor that runs jobs: ``local`` (processes of this machine), ``dask`` (a running cluster), or one
@@ -37,7 +37,7 @@ class Params:
             family("executor").get(self.executor)
 
     def chosen(self) -> tuple[str, Any]:
-        """Return name and settings of the executor to use.
+        """Return the name and settings of the executor to use.
 
         Raises:
             ConfigError: there is none of that name.
@@ -48,14 +48,14 @@ class Params:
 
 
 def is_beginning() -> bool:
-    """Return True in a worker that still imports the script it was started by, where no work may be started."""
+    """Return True in a worker that still imports the script that started it; no jobs may be started then."""
     return bool(getattr(current_process(), "_inheriting", False))
 
 
 def run_jobs(
     job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params | None = None, *, quick: bool = False
 ) -> Iterator[tuple[int, Any]]:
-    """Yield ``(index, job(*arguments))`` as each is done; see `gsmap.methods.executor.Workers.run`.
+    """Yield ``(index, job(*arguments))`` whenever a job is done; see `gsmap.methods.executor.Workers.run`.
 
     Workers that it starts stay for the next call as long as anything keeps them (`WorkerSession`).
 
@@ -71,7 +71,7 @@ def run_jobs(
 
 
 class WorkerSession(AbstractContextManager["WorkerSession"]):
-    """Reference that keeps idle workers alive; an open map holds one. With the last one all workers end."""
+    """A reference that keeps idle workers alive. Each open map has one; closing the last session ends all workers."""
 
     def __init__(self) -> None:
         self._open = True
@@ -90,7 +90,7 @@ class WorkerSession(AbstractContextManager["WorkerSession"]):
 
 
 class _IdleWorkers:
-    """Idle workers of this process, by executor and settings."""
+    """The idle workers of this process, by executor and settings."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()  # a finalizer may call within any call

@@ -1,4 +1,4 @@
-"""Pool of processes that never outlive this one, and that end by being killed: no running job is waited for.
+"""A pool of worker processes that never outlive this process; closing it kills them without waiting for jobs.
 
 The pools of the standard library wait for running jobs on exit, their workers outlive a killed parent, and one dead
 worker ends them. Workers are spawned: a forked child inherits threads and locks of torch and OpenMP that do not run in
@@ -24,16 +24,16 @@ from gsmap.methods.executor import QuarantinedJob
 
 _WORKER = Path(__file__).with_name("worker.py")
 _NOT_TO_WORKERS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
-"""Terminals and service managers signal the whole process group; only the parent decides on its workers."""
+"""Signals that workers ignore: terminals send them to the whole process group, but the parent ends its workers."""
 
 _RECENT_JOBS = 4
-"""Recent jobs of a worker by which its next one is chosen: about the number whose inputs it caches."""
+"""Number of a worker's recent jobs that its next job should share inputs with, about as many as the worker caches."""
 
 _MAX_LOSSES = 2
-"""A job that ended so many processes is quarantined."""
+"""Number of lost processes after which a job is quarantined."""
 
 _MAX_FALSE_STARTS = 3
-"""Consecutive workers that may end before they have begun."""
+"""Largest number of consecutive workers that may end before their first job."""
 
 
 class WorkerDeath(Exception):
@@ -42,7 +42,7 @@ class WorkerDeath(Exception):
 
 @dataclass(eq=False)
 class _Task:
-    """A job with its arguments, those of them that may name input data, and the number of workers lost with it."""
+    """A job: its arguments, the arguments that may name input data, and the number of workers lost with the job."""
 
     index: int
     arguments: tuple[Any, ...]
@@ -70,7 +70,7 @@ class Worker:
         self._unsent = [pickle.dumps(about)]
 
     def begin(self, job: Callable[..., Any], arguments: tuple[Any, ...], reads: frozenset[Hashable]) -> None:
-        """Send a job; the worker must have none.
+        """Send a job to the worker, which must be idle.
 
         Raises:
             WorkerDeath: the process ended before.
@@ -84,7 +84,7 @@ class Worker:
         self.read.append(reads)
 
     def answer(self) -> tuple[bool, Any] | None:
-        """Wait for (returned, value or error) of the job; None if the worker has only begun.
+        """Wait for (True, value) or (False, error) of the job; None if the worker reports only that it has started.
 
         Raises:
             WorkerDeath: the process ended.
@@ -117,7 +117,7 @@ class Worker:
 
 
 class Pool:
-    """Pool of at most ``size`` workers, started on demand and kept from run to run until the pool is closed."""
+    """A pool of at most ``size`` workers, which start on demand and are kept between runs until the pool is closed."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -138,10 +138,11 @@ class Pool:
     def run(
         self, job: Callable[..., Any], numbered: Iterable[tuple[int, tuple[Any, ...]]]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield ``(index, result)`` of each ``(index, arguments)`` as it is done: see `gsmap.methods.executor.Workers`
+        """Yield ``(index, result)`` for each ``(index, arguments)``, as in `gsmap.methods.executor.Workers.run`.
 
-        As many arguments as there may be workers are taken ahead, so that each worker gets a job whose scenes it has
-        cached. A job that was lost with its worker is tried again when nothing else runs, with all memory to itself.
+        Arguments of as many jobs as there may be workers are taken ahead, so that each worker gets a job whose scenes
+        it has cached. A job that was lost with its worker is tried again when no other job runs, so that it can use all
+        memory.
         """
         todo = iter(numbered)
         ahead: deque[_Task] = deque()
@@ -150,7 +151,7 @@ class Pool:
         false_starts = 0
 
         def lost(worker: Worker, task: _Task, died: WorkerDeath) -> bool:
-            """Return True if the job is to be quarantined; otherwise it will be tried again."""
+            """Record a lost worker; return True if its job is to be quarantined, False if it is tried again."""
             nonlocal false_starts
             if not worker.has_begun:
                 false_starts += 1
@@ -196,7 +197,9 @@ class Pool:
                     except WorkerDeath as died:
                         del at[connection]
                         if lost(worker, task, died):
-                            done.append((task.index, QuarantinedJob(f"{died}, like the one that had tried it before")))
+                            done.append(
+                                (task.index, QuarantinedJob(f"{died}, like the worker that had tried the job before"))
+                            )
                         continue
                     if answer is None:
                         continue
@@ -220,7 +223,7 @@ class Pool:
         return self._idle.pop() if self.num_idle else Worker()
 
     def _matched(self, ahead: deque[_Task]) -> tuple[Worker, _Task]:
-        """Match an idle worker with the job ahead that shares most input data with it; or start a new worker."""
+        """Choose the idle worker and waiting job that share most input data; without an idle worker, start one."""
         if not self.num_idle:
             return Worker(), ahead.popleft()
         known = [set().union(*worker.read) for worker in self._idle]
@@ -232,7 +235,7 @@ class Pool:
 
 
 def _reads(arguments: tuple[Any, ...]) -> frozenset[Hashable]:
-    """Return the texts and tuples among the arguments of a job but the first, which is the map of all jobs."""
+    """Return the texts and tuples among the arguments of a job, except the first argument, which is the map."""
     found = set()
     for argument in arguments[1:]:
         if isinstance(argument, (str, tuple)):

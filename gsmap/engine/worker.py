@@ -1,4 +1,4 @@
-"""Script of a worker process of `gsmap.engine.pool`: ``worker.py SOCKET PARENT``.
+"""The script of worker processes of `gsmap.engine.pool`: ``worker.py SOCKET PARENT``.
 
 It ends with its parent, however that ends (SIGKILL included), even before imports. On Linux the kernel kills it.
 Elsewhere, or where the parent's thread may end before the parent, a thread ends it that reads the socket to the parent;
@@ -12,7 +12,7 @@ import sys
 
 
 def end_with_parent(parent: int) -> None:
-    """Let the kernel kill this process when the thread that started it ends (Linux only).
+    """Make the kernel kill this process when the thread that started it ends (Linux only).
 
     Args:
         parent: id of the process that started this one.

@@ -1,4 +1,4 @@
-"""Export of a map as tiles: planning, incremental updates, and crash-safe writing.
+"""Export a map as tiles: plan them, update changed tiles only, and write crash-safely.
 
 Independent of the store and of mergers: a callable makes the content of a tile::
 

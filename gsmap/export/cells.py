@@ -1,4 +1,4 @@
-"""Intersection of oriented boxes with the cells of a grid, at a cost independent of empty space."""
+"""Intersect oriented boxes with the cells of a grid, in time that does not depend on empty space."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class OrientedBoxes:
 
     @classmethod
     def of(cls, poses: Sequence[Sim3], scene_bounds: Sequence[np.ndarray]) -> OrientedBoxes:
-        """Make boxes from ``S_map_scene`` and the (2, 3) box of each scene in its own frame."""
+        """Make boxes from the pose ``S_map_scene`` and the box (2, 3) of each scene in its scene frame."""
         count = len(poses)
         low, high = np.asarray(scene_bounds, dtype=np.float64).reshape(count, 2, 3).transpose(1, 0, 2)
         scales = np.array([pose.scale for pose in poses])[:, None]
@@ -48,11 +48,11 @@ class OrientedBoxes:
 
     @property
     def around(self) -> np.ndarray:
-        """(2, 3) box around all boxes."""
+        """Axis-aligned box (2, 3) around all boxes."""
         return np.array([self.bounds[:, 0].min(0), self.bounds[:, 1].max(0)])
 
     def touch(self, which: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return (K,) bool, whether box ``which[k]`` intersects the box from ``low[k]`` to ``high[k]`` (K, 3).
+        """Return a mask (K,) that is True where box ``which[k]`` intersects the box from ``low[k]`` to ``high[k]``.
 
         By the separating axes of the face normals, so that an intersection is never missed.
         """
@@ -90,13 +90,13 @@ class CellSet:
         return len(self.keys)
 
     def find(self, cells: np.ndarray) -> np.ndarray:
-        """Return (K,) the index of each of the cells (K, 3) in the set; -1 for none."""
+        """Return the index (K,) in the set of each cell (K, 3); -1 for cells outside the set."""
         keys, known = _key(self.values, cells)
         places = np.minimum(np.searchsorted(self.keys, keys), len(self) - 1)
         return np.where(known & (self.keys[places] == keys), places, -1)
 
     def coarser(self, level: int) -> CellSet:
-        """Return the blocks of 2^level cells that contain any cell."""
+        """Return the set of blocks, 2^level cells wide, that contain cells of this set."""
         return self if level == 0 else CellSet.of(self.cells >> level)
 
 
@@ -115,14 +115,14 @@ class Grid:
     most: int
 
     def bounds(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners (K, 3) of blocks of cells from ``low`` to below ``high`` (K, 3), clipped to the box."""
+        """Return the corners (K, 3) of blocks from cell ``low`` to ``high`` (K, 3, exclusive), clipped to the box."""
         a, b = low * self.edge, high * self.edge
         return (a, b) if self.bbox is None else (np.maximum(a, self.bbox[0]), np.minimum(b, self.bbox[1]))
 
     def reached(
         self, boxes: OrientedBoxes, reach: float = 0.0, within: CellSet | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Find the cells, of a set or of all, that each box intersects when they are grown by ``reach``.
+        """Find the cells within ``reach`` of each box, among all cells or those of a set.
 
         An octree descent for all boxes at once: each starts from the few cubes of 2^k cells around it, which are split,
         and parts without intersection are dropped, down to single cells.
@@ -161,7 +161,7 @@ class Grid:
         return which, low
 
     def _ranges(self, boxes: OrientedBoxes, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return (B, 3) the first cell, and the one after the last, of the bounds of each box."""
+        """Return the first cell (B, 3) of each box's bounds, and the cell after the last (B, 3)."""
         low, high = boxes.bounds[:, 0] - reach, boxes.bounds[:, 1] + reach
         if self.bbox is not None:
             low, high = np.maximum(low, self.bbox[0]), np.minimum(high, self.bbox[1])
@@ -184,7 +184,7 @@ class Grid:
 
 
 def _key(values: tuple[np.ndarray, ...], cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a key for each cell, and whether all its coordinates are in the set."""
+    """Return a key for each cell, and a mask that is True if all coordinates of the cell occur in the set."""
     key, known = np.zeros(len(cells), dtype=np.int64), np.ones(len(cells), dtype=bool)
     for axis, of_axis in enumerate(values):
         places = np.minimum(np.searchsorted(of_axis, cells[:, axis]), len(of_axis) - 1)
@@ -194,7 +194,9 @@ def _key(values: tuple[np.ndarray, ...], cells: np.ndarray) -> tuple[np.ndarray,
 
 
 def _corners(low: np.ndarray, width: int) -> np.ndarray:
-    """Return (8 K, 3) the lowest cells of the eight blocks of a width starting at each cell (K, 3)."""
+    """Return the lowest cells (8 K, 3) of the 2 x 2 x 2 blocks, ``width`` cells wide, that begin at each cell (K,
+    3).
+    """
     steps = np.indices((2, 2, 2)).reshape(3, 8).T * width
     found: np.ndarray = (low[:, None] + steps).reshape(-1, 3)
     return found

@@ -1,4 +1,4 @@
-"""Levels of detail of a tileset: merged, fitted to the finer level, and measured.
+"""Make levels of detail of a tileset: merge Gaussians, fit them to the finer level, and measure the error.
 
 A level is merged pair by pair (`gsmap.geometry.decimate`), fitted to renders of the finer level from the scenes'
 cameras, at a resolution that matches the size of its Gaussians, and compared with renders of held-out views; a fit that
@@ -23,7 +23,7 @@ from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Cameras, Gaussians
 
 VERSION = 4
-"""Raised whenever the levels of the same tiles and cameras change: they are then made again."""
+"""Raised whenever the same tiles and cameras give other levels; all levels are then made again."""
 
 _SCREEN_PX = 16.0  # default screen-space error of viewers of 3D Tiles, above which they refine
 _DEVIATION_PX = 3.0  # size of a level's Gaussians (largest deviation, median) in the views that it is fitted to
@@ -112,14 +112,14 @@ def make_level(
 
 @dataclass(frozen=True, eq=False)
 class _MeasuredView:
-    """A camera and its target image (H, W, 3)."""
+    """A camera and the target image (H, W, 3) that it should see."""
 
     camera: Cameras
     picture: np.ndarray
 
 
 def _select_views(gaussians: Gaussians, cameras: Cameras, count: int) -> Cameras | None:
-    """Select the cameras with most of the Gaussians in view; None if fewer than four have enough."""
+    """Select the cameras that see most Gaussians; None if fewer than four cameras see enough."""
     low, high = np.quantile(gaussians.means, (0.02, 0.98), axis=0)
     eyes = cameras.T_frame_camera[:, :3, 3]
     away = np.linalg.norm(np.maximum(0, np.maximum(low - eyes, eyes - high)), axis=1)
@@ -136,7 +136,7 @@ def _select_views(gaussians: Gaussians, cameras: Cameras, count: int) -> Cameras
 
 
 def _depths(gaussians: Gaussians, views: Cameras) -> np.ndarray:
-    """Return (V,) the median depth of each view, from small renders."""
+    """Return the median depth (V,) of each view, from small renders."""
     out = np.full(len(views), np.nan)
     for v in range(len(views)):
         seen = render(gaussians, views[v].resized(64), dominant_id=False)
@@ -147,7 +147,7 @@ def _depths(gaussians: Gaussians, views: Cameras) -> np.ndarray:
 
 
 def _resized_views(views: Cameras, depths: np.ndarray, footprint: float) -> list[Cameras]:
-    """Resize each view so that a pixel at its depth is ``footprint`` wide; never above its own size."""
+    """Resize each view so that a pixel at its median depth is ``footprint`` wide, but never enlarge a view."""
     focal = views.intrinsics_px[:, 0]
     longest = views.sizes_px.max(1) * depths / (footprint * focal)
     return [views[v].resized(int(np.clip(longest[v], 24, views.sizes_px[v].max()))) for v in range(len(views))]
@@ -159,7 +159,7 @@ def _render(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
 
 
 def _psnr_db(level: Gaussians, views: list[_MeasuredView]) -> np.ndarray:
-    """Return (V,) the PSNR of a level in each view."""
+    """Return the PSNR (V,) of a level in each view."""
     errors = [np.mean((_render(level, view.camera) - view.picture) ** 2) for view in views]
     return -10 * np.log10(np.maximum(errors, 1e-10))
 
@@ -173,7 +173,7 @@ def _fit(
     params: Params,
     backend: str,
 ) -> Gaussians:
-    """Fit the initial Gaussians to renders of the finer level."""
+    """Fit Gaussians, from initial values, to renders of the finer level."""
     seen = _resized_views(views, depths, footprint)
     wanted = [_render(finer, camera) for camera in seen]
     size = float(np.exp(np.median(start.log_scales.max(1))))
@@ -193,7 +193,7 @@ def _fit(
 def _measure(
     level: Gaussians, judges: Callable[[float], list[_MeasuredView]], footprint: float
 ) -> tuple[float, np.ndarray]:
-    """Return the smallest pixel footprint at which the median view is similar enough, and PSNR (V,) there.
+    """Return the smallest pixel footprint at which the median view is similar enough, and the PSNR (V,) at it.
 
     Searched from half to four times the given footprint; the last if none is similar enough.
     """

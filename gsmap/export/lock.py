@@ -1,4 +1,4 @@
-"""Exclusive lock of an export folder, held by the kernel and released with its process."""
+"""An exclusive lock of an export folder, which the kernel releases when the process ends."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmap.errors import BusyError, StoreError
 from gsmap.types.lock_owner import LockOwner, this_process
 
 LOCK_FILE = ".gsmap-export"
-"""Lock file with the description of its owner; after a crash it is unlocked, and stale."""
+"""Name of the lock file, which describes the lock owner; after a crash, an unlocked file may remain."""
 
 _POLL_S = 0.5
 _NOT_OURS_TO_WRITE = (errno.EACCES, errno.EPERM, errno.EROFS)
@@ -25,7 +25,7 @@ _NOT_OURS_TO_WRITE = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 @contextmanager
 def folder_lock(out: Path, *, wait: bool = False, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Lock a folder for one export; it is made if missing, and removed if it is still empty at the end.
+    """Lock a folder for one export; create a missing folder, and remove it if it is still empty at the end.
 
     A read-only folder is not locked: there is nothing to do in it, or writing raises an error.
 
@@ -59,7 +59,7 @@ def folder_lock(out: Path, *, wait: bool = False, waiting: Callable[[str], None]
 
 
 def _acquire(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> tuple[int | None, bool]:
-    """Return the open lock file, None in a read-only folder, and whether the folder was made."""
+    """Return the open lock file (None in a read-only folder), and true if the folder was created."""
     path, reported, fresh = out / LOCK_FILE, False, False
     while True:
         if not out.is_dir():
@@ -78,7 +78,7 @@ def _acquire(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> tu
             os.close(handle)
             if not wait:
                 raise BusyError(
-                    f"{out}: {owner} is exporting to it; retry later, or pass --wait",
+                    f"{owner} is exporting to {out}; retry later, or pass --wait",
                     code="export_busy",
                 ) from None
             if waiting is not None and not reported:

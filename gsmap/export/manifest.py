@@ -1,4 +1,4 @@
-"""Manifest of an export folder, ``tiles.json``, replaced atomically after its tiles."""
+"""The manifest of an export folder, ``tiles.json``, which is replaced atomically after its tiles are written."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _PATH = re.compile(r"component_\d+/[^/\\]+")
 
 @dataclass
 class Manifest:
-    """The tiles of a folder, by component and name.
+    """The tiles of an export folder, by component and name.
 
     Args:
         map_id: id of the map that the folder belongs to.
@@ -58,7 +58,7 @@ class Manifest:
 
     @classmethod
     def load(cls, folder: Path, map_id: str) -> Manifest:
-        """Load the folder's manifest; an empty one if the folder is empty or missing.
+        """Load the manifest of a folder; return an empty manifest if the folder is empty or missing.
 
         Tiles of version 1 have an empty key, which makes them all dirty.
 
@@ -69,7 +69,7 @@ class Manifest:
         path = folder / FILE_NAME
         if not path.exists():
             if folder.exists() and not folder.is_dir():
-                raise ConfigError(f"{folder} is a file: give a folder to export to", code="not_a_folder")
+                raise ConfigError(f"{folder} is a file: name a folder to export to", code="not_a_folder")
             if folder.exists() and any(p for p in folder.iterdir() if not p.name.startswith(".")):
                 raise ConfigError(
                     f"{folder} holds files but no {FILE_NAME}: export to an empty or a new folder",
@@ -81,7 +81,7 @@ class Manifest:
             version, owner = content["version"], str(content["map_id"])
             if version not in (_NAMELESS, _VERSION):
                 raise ConfigError(
-                    f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder",
+                    f"{path} has version {version}, but this gsmap writes version {_VERSION}: export to another folder",
                     code="export_version",
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
@@ -93,7 +93,8 @@ class Manifest:
             if isinstance(error, ConfigError):
                 raise
             raise InputError(
-                f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder", code="foreign_export"
+                f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder",
+                code="foreign_export",
             ) from error
         if owner != map_id:
             raise ConfigError(
@@ -102,7 +103,7 @@ class Manifest:
             )
         notes: tuple[str, ...] = ()
         if version == _NAMELESS and entries:
-            notes = (f"{path} has version {version}, which has no recipes of tiles: all of them are made again",)
+            notes = (f"{path} has version {version}, which has no recipes of tiles: all tiles are made again",)
         return cls(
             map_id,
             {(tile.component, name): tile for name, tile, _ in entries},
@@ -115,11 +116,11 @@ class Manifest:
         )
 
     def metres_per_unit(self, component: int) -> float:
-        """Return the metric scale of a component; 1 if unknown."""
+        """Return the metres per unit of a component; 1 if unknown."""
         return self.metres[component].metres_per_unit if component in self.metres else 1.0
 
     def has_file(self, folder: Path, tile: Tile) -> bool:
-        """Return whether the tile's file exists in its original size; a tile without Gaussians has no file."""
+        """Return true if the tile's file exists in its original size; also for a tile without Gaussians or file."""
         if not tile.path:
             return True
         path = folder / tile.path
@@ -129,12 +130,12 @@ class Manifest:
             return False
 
     def save_sometimes(self, folder: Path) -> None:
-        """Save unless it was saved recently, so that an interrupted export loses seconds at most."""
+        """Save the manifest unless it was saved seconds ago, so that an interrupted export loses seconds at most."""
         if time.monotonic() - self._saved_at > max(_SAVE_EVERY_S, _SAVE_SHARE * self._save_took_s):
             self.save(folder)
 
     def save(self, folder: Path) -> None:
-        """Replace the folder's manifest atomically."""
+        """Replace the manifest of a folder atomically."""
         entries = [
             _entry(name, tile, self.num_bytes.get(tile.path, 0), self.metres_per_unit(tile.component))
             for (_, name), tile in sorted(self.tiles.items())
@@ -152,7 +153,7 @@ class Manifest:
 
 
 def _as_json(content: Mapping[str, object]) -> str:
-    """Serialize to JSON with a line per tile, eight times as fast as with the indents of `json`."""
+    """Serialize to JSON with one line per tile, which is eight times as fast as `json` with indents."""
     lines = []
     for name, value in content.items():
         if isinstance(value, list):
@@ -211,9 +212,9 @@ def _text(path: Path) -> str:
 
 
 def _checked_path(path: Any) -> str:
-    """Validate the path of a tile: a file in a component's folder, or empty for a tile without Gaussians."""
+    """Validate the path of a tile's file, which must lie in a component's folder, or be empty without Gaussians."""
     if not isinstance(path, str) or control_characters(path) or (path and _PATH.fullmatch(path) is None):
-        raise ValueError(f"the path {path!r} of a tile is not component_N/NAME")
+        raise ValueError(f"the path {path!r} of a tile is not of the form component_N/NAME")
     if path.rpartition("/")[2] in (".", ".."):
         raise ValueError(f"the path {path!r} of a tile leads out of its folder")
     return path

@@ -1,4 +1,4 @@
-"""Planning of the tiles of an export."""
+"""Plan the tiles of an export."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Params:
 
 @dataclass(frozen=True, eq=False)
 class PlannedTile:
-    """A tile to be exported.
+    """A tile to be exported, with the scenes that may reach into it.
 
     Args:
         component: its component, each of which has its own frame and folder.
@@ -73,7 +73,7 @@ def plan_tiles(
     metres_per_unit: Mapping[int, float] | None = None,
     max_tiles: int = Params.max_tiles,
 ) -> list[PlannedTile]:
-    """Plan the tiles of a grid through the map's origin that scenes reach into, in a fixed order.
+    """Plan the tiles that scenes reach into, in a fixed order, on a grid through the map's origin.
 
     Args:
         poses: ``S_map_scene`` by scene id, of the scenes to export.
@@ -126,7 +126,7 @@ def plan_tiles(
 
 
 def _require_near(component: int, box: np.ndarray, metres_per_unit: float) -> None:
-    """Raise an error for a component at map coordinates, where its Gaussians would be rounded."""
+    """Raise an error for a component so far from zero that single precision would round its Gaussians coarsely."""
     offset = origin_of(box)
     rounded_m = float32_step(box) / 2 * metres_per_unit
     if offset.any() and rounded_m > _MAX_ROUNDED_M:
@@ -142,7 +142,7 @@ _Tiles = Iterator[tuple[tuple[int, ...] | None, np.ndarray, list[int]]]
 
 
 def _in_one(boxes: OrientedBoxes, bbox: np.ndarray | None, reach: float) -> _Tiles:
-    """Yield a component as one tile: no cell, its bounds, and the rows of the boxes that reach into it."""
+    """Yield the whole component as one tile: None as cell, its bounds, and the rows of all boxes that reach into it."""
     bounds = boxes.around if bbox is None else bbox
     everyone = np.arange(len(boxes))
     low, high = (np.tile(corner, (len(boxes), 1)) for corner in bounds)
@@ -151,7 +151,7 @@ def _in_one(boxes: OrientedBoxes, bbox: np.ndarray | None, reach: float) -> _Til
 
 
 def _in_cells(boxes: OrientedBoxes, grid: Grid, reach: float) -> _Tiles:
-    """Yield every cell that a box intersects, in order, with its bounds and the rows of the boxes within reach."""
+    """Yield each cell that a box intersects, in order, with its bounds and the rows of all boxes within reach."""
     which, cells = grid.reached(boxes)
     holding = CellSet.of(cells)
     if not len(holding):
@@ -172,7 +172,7 @@ def _checked_box(bbox: np.ndarray) -> np.ndarray:
     bbox = np.asarray(bbox, dtype=np.float64)
     if bbox.shape != (2, 3) or not np.isfinite(bbox).all() or not (bbox[1] > bbox[0]).all():
         raise InputError(
-            f"a box needs x0 y0 z0 below x1 y1 z1 on every axis, got {_text(bbox)}: the box is empty",
+            f"the box {_text(bbox)} is empty: x0 y0 z0 must be below x1 y1 z1 on every axis",
             code="invalid_box",
         )
     return bbox

@@ -1,4 +1,4 @@
-"""Pyramid of levels of detail over the tiles of an export: built bottom-up, two by two by two, and reused."""
+"""Build a pyramid of levels of detail over exported tiles, bottom-up in blocks of 2 x 2 x 2; reuse unchanged levels."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _Cell = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class PyramidNode:
-    """A node of the pyramid: a tile, or a level that replaces its children from afar.
+    """A node of the pyramid: a tile, or a level that is shown from afar in place of its children.
 
     Args:
         uri: its file, relative to the component's folder.
@@ -53,17 +53,17 @@ class PyramidNode:
 
     @cached_property
     def tiles(self) -> tuple[PyramidNode, ...]:
-        """Tiles below the node, in order; itself if it is a tile."""
+        """All tiles below the node, in order; the node itself if it is a tile."""
         return tuple(tile for child in self.children for tile in child.tiles) or (self,)
 
     @cached_property
     def box(self) -> np.ndarray:
-        """(2, 3) box around the Gaussians of the node and of all below it."""
+        """Box (2, 3) around the Gaussians of the node and of all nodes below it."""
         boxes = np.concatenate([self.boxes, *(child.box[None] for child in self.children)])
         return np.stack([np.nanmin(boxes[:, 0], axis=0), np.nanmax(boxes[:, 1], axis=0)])
 
     def walk(self) -> Iterator[PyramidNode]:
-        """Yield the node and all below it."""
+        """Yield the node and all nodes below it."""
         yield self
         for child in self.children:
             yield from child.walk()
@@ -71,7 +71,7 @@ class PyramidNode:
 
 @dataclass(frozen=True, eq=False)
 class StoredNode:
-    """Data of a level or tile in a folder's present tree; see `PyramidNode`. Missing boxes are read from the file."""
+    """Data of a level or tile in the tree of a folder; see `PyramidNode`. Missing boxes are read from its file."""
 
     error_m: float
     extras: Mapping[str, float]
@@ -80,7 +80,7 @@ class StoredNode:
 
 
 class TreeLayout(Protocol):
-    """Files of one format of tree."""
+    """The files of a pyramid in one format."""
 
     @property
     def file_name(self) -> str:
@@ -89,13 +89,13 @@ class TreeLayout(Protocol):
 
     @property
     def key(self) -> str:
-        """Text that identifies how a level's file is written."""
+        """Text that identifies the format of a level's file, as part of its recipe."""
         ...
 
     def tile(
         self, folder: Path, tile: Tile, known: Mapping[str, StoredNode]
     ) -> tuple[str, int, np.ndarray, Gaussians | None]:
-        """Return the uri of a tile's file, its number of Gaussians, their box (2, 3), and the Gaussians if read.
+        """Return a tile's uri, its number of Gaussians, their box (2, 3), and the Gaussians if they were read.
 
         Args:
             folder: folder of the component.
@@ -105,7 +105,7 @@ class TreeLayout(Protocol):
         ...
 
     def level_uri(self, name: str) -> str:
-        """Return the uri of the level of a name."""
+        """Return the uri of a level with some name."""
         ...
 
     def read(self, path: Path) -> Gaussians:
@@ -119,12 +119,12 @@ class TreeLayout(Protocol):
         ...
 
     def known(self, folder: Path) -> dict[str, StoredNode]:
-        """Return the nodes of the folder's present tree, by uri; none for an unknown file."""
+        """Return the nodes of the tree in a folder, by uri; empty if the tree's file is missing or unknown."""
         ...
 
 
 def is_stale(out: Path, tiles: Sequence[Tile], layout: TreeLayout) -> bool:
-    """Return whether the trees over an export's tiles must be written, such as after an interruption."""
+    """Return true if the pyramids over exported tiles must be written, such as after an interruption."""
     changed_ns = (out / MANIFEST).stat().st_mtime_ns
     for folder in {(out / tile.path).parent for tile in tiles if tile.path}:
         try:
@@ -170,7 +170,7 @@ def build_pyramids(
 
 
 def remove_unnamed(folder: Path, root: PyramidNode) -> None:
-    """Delete levels that no node of the tree refers to."""
+    """Delete levels to which no node of the pyramid refers."""
     named = {node.uri.split("/")[1] for node in root.walk() if node.uri.startswith(f"{LEVELS_FOLDER}/")}
     for path in (folder / LEVELS_FOLDER).glob("*"):
         if path.name not in named:
@@ -212,7 +212,7 @@ class _PyramidBuilder:
     levels: Params
 
     def place(self, tiles: Mapping[_Cell, Tile], height: int) -> tuple[PyramidNode, Gaussians | None]:
-        """Return the node of a block of 2^height cells along each axis, and the Gaussians of a tile if read."""
+        """Return the node of a block, 2^height cells wide, and the Gaussians if it is a tile that was read."""
         if not height:
             (tile,) = tiles.values()
             uri, count, box, read = self.layout.tile(self.folder, tile, self.known)
@@ -224,7 +224,7 @@ class _PyramidBuilder:
         return (below[0][0] if len(below) == 1 else self.parent(below, height)), None
 
     def parent(self, below: Sequence[tuple[PyramidNode, Gaussians | None]], height: int) -> PyramidNode:
-        """Return the level over its children, reused if it was made of the same inputs."""
+        """Return the level above some children; reuse the stored level if its inputs are the same."""
         children = [child for child, _ in below]
         recipe = f"levels {VERSION} {self.levels} {self.layout.key} {backend()}"
         made_of = [recipe, *(child.digest for child in children)]
@@ -255,7 +255,7 @@ class _PyramidBuilder:
 
 
 def _usable_children(children: Sequence[PyramidNode], error_m: float) -> list[PyramidNode]:
-    """Return the children of a level, those with no smaller error than its own replaced by their children."""
+    """Return the children of a level; replace a child whose error is not below the level's by its own children."""
     kept: list[PyramidNode] = []
     for child in children:
         kept += [child] if not child.children or child.error_m < error_m else child.children
@@ -263,7 +263,7 @@ def _usable_children(children: Sequence[PyramidNode], error_m: float) -> list[Py
 
 
 def boxes_of(gaussians: Gaussians, parts: Sequence[int]) -> np.ndarray:
-    """Return (P, 2, 3) boxes around runs of Gaussians; NaN for an empty run."""
+    """Return boxes (P, 2, 3) around runs of consecutive Gaussians; NaN for an empty run."""
     from gsmap.formats.tiles3d import box_of
 
     ends = np.cumsum([0, *parts])

@@ -1,4 +1,4 @@
-"""Recipes of tiles, and the reasons for which an existing tile is made again."""
+"""Recipes of tiles, and the reasons for making an existing tile again."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from gsmap.methods import RecipeKey
 from gsmap.types import Tile
 
 VERSION = 1
-"""Raised whenever the same merged Gaussians are written differently: every tile is then made again."""
+"""Raised whenever the same merged Gaussians are written differently; all tiles are then made again."""
 
 _TILES_3D, _STREAMED_SOG = "3dtiles", "streamed-sog"
 _TREES = {_TILES_3D: "glb", _STREAMED_SOG: "sog"}
-"""Formats that are a tree of levels over tiles, and the suffix of those tiles."""
+"""Formats that are a tree of levels over tiles, with the suffix of the tiles."""
 
 
 @dataclass(frozen=True, eq=False)
 class TileRecipe:
-    """Recipe of all tiles of one export; together with a `PlannedTile` it identifies that tile.
+    """The recipe that all tiles of one export share; with a `PlannedTile`, it determines the content of that tile.
 
     Args:
         merge: recipe of the merger and its settings (`gsmap.merge.recipe_key`).
@@ -58,24 +58,24 @@ class TileRecipe:
             raise ConfigError(f"cannot write {self.format!r}: choose one of {known}", code="unsupported_output")
         if self.provenance and self.format != "ply":
             raise ConfigError(
-                f"provenance is only available in .ply, not in {self.format}",
+                f"only .ply can store provenance, not {self.format}",
                 code="unsupported_output",
             )
 
         if self.uncompressed and self.format != _TILES_3D:
             raise ConfigError(
-                f"uncompressed is only available in {_TILES_3D}, not in {self.format}",
+                f"uncompressed applies only to {_TILES_3D}, not to {self.format}",
                 code="unsupported_output",
             )
 
     @property
     def is_tileset(self) -> bool:
-        """True if the tiles are the leaves of a 3D Tiles tree."""
+        """True if the format is 3D Tiles, a tree whose leaves are the tiles."""
         return self.format == _TILES_3D
 
     @property
     def is_tree(self) -> bool:
-        """True if the tiles lie below a tree of coarser levels."""
+        """True if the format is a tree of coarser levels above the tiles."""
         return self.format in _TREES
 
     @property
@@ -84,11 +84,11 @@ class TileRecipe:
         return _TREES.get(self.format, self.format)
 
     def with_dates(self, dates: Mapping[str, str | None]) -> TileRecipe:
-        """Return the recipe with dates, for a merger that uses them."""
+        """Return the recipe with the dates of scenes, for a merger that uses dates."""
         return replace(self, dates=dates)
 
     def key(self, planned: PlannedTile) -> str:
-        """Return the digest of all inputs of the tile's content but the poses; scene ids are digests of content."""
+        """Return the digest of all inputs of a tile except the poses; scenes enter by id, a digest of their content."""
         scenes = sorted(planned.poses)
         inputs = [
             f"export {VERSION}",
@@ -112,7 +112,7 @@ class TileRecipe:
 def dirty_reason(
     planned: PlannedTile, tile: Tile | None, recipe: TileRecipe, max_shift_m: float = Params.max_shift_m
 ) -> str:
-    """Return the reason for which an existing tile must be made again, as text; empty if it need not.
+    """Return the reason why an existing tile must be made again, as text; empty if the tile can be reused.
 
     Poses are compared with those that the tile was made with, not with the last revision, so that slow drift counts.
     """
@@ -133,7 +133,7 @@ def dirty_reason(
 
 
 def _first_change(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
-    """Return the first difference between the recipe of a tile and the present one."""
+    """Return the first difference between the recipe of an existing tile and that of this export, as text."""
     before, now = tile.recipe, recipe.merge.to_json()
     if before.get("method") != now["method"]:
         return f"another merge method: {before.get('method')}, now {now['method']}"
@@ -142,11 +142,11 @@ def _first_change(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
             return f"another {part} of the merge method: {_difference(before.get(part), now[part])}"
     if set(tile.poses) != set(planned.poses):
         return "other scenes"
-    return "another date of a scene, format, budget, extent, metre or provenance, or other photographs"
+    return "a scene's date, the format, budget, extent, metric scale or provenance, or the reference photos changed"
 
 
 def _difference(before: Any, now: Any) -> str:
-    """Return the first leaf that differs, with both values."""
+    """Return the name of the first leaf in which two settings differ, with both values."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         for name in sorted({*before, *now}):
             if before.get(name) != now.get(name):

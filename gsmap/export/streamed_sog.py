@@ -1,4 +1,4 @@
-"""Streamed SOG over the tiles of an export, for PlayCanvas' engine and SuperSplat's viewer.
+"""Write the tiles of an export as streamed SOG, for PlayCanvas' engine and SuperSplat's viewer.
 
 The tiles are stored beside it as bundled ``.sog``, and unbundled in the folders that the format requires.
 """
@@ -57,7 +57,7 @@ def write_streams(
 
 @dataclass(frozen=True)
 class StreamedSog:
-    """Files of a streamed SOG: a folder with ``meta.json`` and images for every tile and level."""
+    """The files of a streamed SOG: for each tile and level, a folder with ``meta.json`` and images."""
 
     file_name: str = FILE_NAME
     key: str = f"sog {sog.VERSION}"
@@ -106,7 +106,7 @@ class StreamedSog:
 
 
 def _node(drawn: PyramidNode, above: tuple[tuple[PyramidNode, int], ...]) -> LodNode:
-    """Return a node of the tree; ``above`` are the levels over it, each with the index there of its first tile."""
+    """Return the tree's node of a pyramid node; ``above``: levels above it, each with the index of its first tile."""
     if not drawn.children:
         shown = {}
         boxes = []
@@ -126,7 +126,7 @@ def _node(drawn: PyramidNode, above: tuple[tuple[PyramidNode, int], ...]) -> Lod
 
 
 def _sync(meta: Path) -> None:
-    """Sync the folder of a SOG to disk."""
+    """Make the folder of a SOG durable on disk (fsync)."""
     for file in meta.parent.iterdir():
         sync_file(file)
     sync_folder(meta.parent)

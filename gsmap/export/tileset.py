@@ -1,4 +1,4 @@
-"""3D Tiles tileset over the tiles of an export, with levels of detail above them."""
+"""Write the tiles of an export as a 3D Tiles tileset, with levels of detail above the tiles."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def write_tilesets(
 
 @dataclass(frozen=True)
 class Tiles3D:
-    """Files of 3D Tiles: a ``.glb`` for every tile and level.
+    """The files of 3D Tiles: a ``.glb`` for each tile and level.
 
     Args:
         compressed: whether they are packed as SPZ.

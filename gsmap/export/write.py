@@ -1,4 +1,4 @@
-"""Incremental, crash-safe writing of an export: dirty tiles only, each atomically, and the manifest last."""
+"""Write an export incrementally and crash-safely: dirty tiles only, each tile atomically, and the manifest last."""
 
 from __future__ import annotations
 
@@ -42,7 +42,9 @@ Content = Callable[[Progress], MergeResult]
 Run = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 _At = tuple[int, str]  # component and name of a tile
 
-_within: ContextVar[Progress] = ContextVar("progress of a tile that is made in this process", default=silent)
+_within: ContextVar[Progress] = ContextVar(
+    "Reports the progress of a tile that is made in this process.", default=silent
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,7 @@ def export_tiles(
     made: Callable[[Tile], None] | None = None,
     progress: Progress | None = None,
 ) -> ExportResult:
-    """Update a folder to exactly the planned tiles, making only those that are missing or dirty.
+    """Update a folder to exactly the planned tiles; make only missing and dirty tiles.
 
     The manifest exists before the first tile. Every tile is written under a temporary name, fsynced and renamed; the
     manifest follows, and obsolete files are deleted last. If interrupted, the folder holds complete tiles only, and the
@@ -183,8 +185,8 @@ def export_tiles(
             manifest.save(out)
         if isinstance(error, OSError):
             raise of_system(error)(
-                f"cannot write the export to {out}: {error.strerror or error}; finished tiles are kept, "
-                "run the same export again to go on"
+                f"cannot write the export to {out}: {error.strerror or error}; finished tiles are kept: "
+                "run the same export again to continue"
             ) from error
         raise
     finally:
@@ -211,7 +213,7 @@ def _make_tiles(
     staging: Path,
     report: _ProgressReport,
 ) -> Generator[tuple[PlannedTile, StagedTile | QuarantinedJob], None, None]:
-    """Yield each tile with its staged file, or the reason for quarantine; closing it cancels the running jobs."""
+    """Yield each tile with its staged file or its reason for quarantine; closing the generator cancels running jobs."""
     folder = str(staging.absolute())
     shared = os.path.join(folder, _SHARED)
     arguments = ((make(planned, shared), recipe, folder, _staged_name(planned, recipe)) for planned in todo)
@@ -227,7 +229,7 @@ def _make_tiles(
 
 
 def make_file(content: Content, recipe: TileRecipe, folder: str, name: str) -> StagedTile:
-    """Make one tile and its file in a folder, or its bytes on a machine without access to the folder: a job."""
+    """Make a tile and write its file to a folder; return the bytes if this machine cannot access the folder. A job."""
     found = content(_within.get())
     empty = StagedTile("", "", 0, len(found.gaussians), found.truncated, tuple(found.notes))
     if not len(found.gaussians):
@@ -258,7 +260,7 @@ def _staged_name(planned: PlannedTile, recipe: TileRecipe) -> str:
 def _install(
     planned: PlannedTile, staged: StagedTile, out: Path, staging: Path, recipe: TileRecipe
 ) -> tuple[_At, Tile, int]:
-    """Move the file of a tile to its place, and return its key, description and size."""
+    """Move the staged file of a tile to its final path; return the tile's key, description and size."""
     path = ""
     if staged.name:
         path = f"component_{planned.component}/{planned.name}.{recipe.suffix}"
@@ -302,7 +304,7 @@ def _synced_digest(path: Path) -> tuple[str, int]:
 
 
 def _remove_doomed(out: Path, manifest: Manifest) -> None:
-    """Delete the files of obsolete tiles, and their component's folder with the last one."""
+    """Delete the files of obsolete tiles, and each component's folder that becomes empty."""
     kept = {tile.path for tile in manifest.tiles.values()}
     doomed = sorted(manifest.doomed - kept)
     for path in doomed:
@@ -317,7 +319,7 @@ def _remove_doomed(out: Path, manifest: Manifest) -> None:
 
 
 def leftovers(out: Path) -> list[tuple[str, ...]]:
-    """Return the paths, in its folder, that an interrupted export may have left incomplete."""
+    """Return the paths within an export folder that an interrupted export may have left incomplete."""
     found = [
         *out.glob(f".{FILE_NAME}.*"),
         *out.glob("component_*/.tileset.json.*"),
@@ -327,7 +329,7 @@ def leftovers(out: Path) -> list[tuple[str, ...]]:
 
 
 def _collect_notes(news: dict[_At, Tile]) -> tuple[str, ...]:
-    """Return the unique notes of new tiles, each with its tile or number of tiles."""
+    """Return the unique notes of new tiles, each with the name of its tile or with the number of its tiles."""
     about: dict[str, list[str]] = {}
     for (component, name), tile in sorted(news.items()):
         for note in tile.notes:
@@ -336,7 +338,7 @@ def _collect_notes(news: dict[_At, Tile]) -> tuple[str, ...]:
 
 
 class _ProgressReport:
-    """Progress report over all tiles."""
+    """A progress report over all tiles of an export."""
 
     def __init__(self, progress: Progress, total: int, done: int) -> None:
         self._progress, self._total, self._done = progress, total, done

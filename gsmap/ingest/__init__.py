@@ -1,4 +1,4 @@
-"""Read captures as people have them, and check their Gaussians and cameras."""
+"""Find captures in files, folders and trainer outputs, read them, and check their Gaussians and cameras."""
 
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.ingest.capture import Capture, check_scale, read_capture, read_captures, take_capture

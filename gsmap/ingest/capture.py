@@ -55,7 +55,7 @@ class Capture:
 
     @cached_property
     def gaussians(self) -> Gaussians:
-        """Return its Gaussians and keep them in memory."""
+        """Return the Gaussians of the capture and keep them in memory."""
         return self.content.load()
 
 
@@ -68,7 +68,7 @@ def read_captures(
     scale_policy: str = "auto",
     progress: Progress | None = None,
 ) -> list[Capture]:
-    """Read every capture in files and folders. For many large ones loop over `find_captures` and `read_capture`.
+    """Read all captures in files and folders at once; for many large ones, loop over `find_captures` instead.
 
     Args:
         cameras, name: for a single capture only.
@@ -82,7 +82,7 @@ def read_captures(
     found = find_captures([paths] if isinstance(paths, (str, os.PathLike)) else paths)
     if len(found) > 1 and (cameras is not None or name is not None):
         raise ConfigError(
-            f"cameras and name are for one capture, but {len(found)} were found: ingest them one by one",
+            f"cameras and name apply to one capture, but {len(found)} captures were found: ingest them one by one",
             code="many_captures",
         )
     out = []
@@ -163,7 +163,7 @@ def take_capture(
         notes += _origin_notes(gaussians, origin)
     if cameras is None:
         cameras = synthesise_cameras(gaussians)
-        notes.append(f"no cameras for it were found: {len(cameras)} were synthesised in its free space")
+        notes.append(f"no cameras were found for the capture: {len(cameras)} were synthesised in its free space")
     else:
         notes += validate_cameras(cameras, gaussians, f"{where} with {cameras_source}" if cameras_source else where)
     notes += [date.note] if date.note else []
@@ -171,19 +171,19 @@ def take_capture(
 
 
 def _origin_notes(gaussians: GaussianSource, origin: np.ndarray) -> list[str]:
-    """Return remarks on a capture with large coordinates."""
+    """Return notes on the origin and precision of a capture with large coordinates."""
     notes = [
-        "its coordinates are large: poses and positions in its frame are those of the file less "
+        "the coordinates of the file are large: in the scene frame, all positions are reduced by "
         f"{format_origin(origin)}"
     ]
     step = rounded_to(gaussians)
     if step:
-        notes.append(f"the file has its positions in single precision, which rounds them to {step:g} there")
+        notes.append(f"the file stores positions in single precision, which rounds them to {step:g} there")
     return notes
 
 
 def check_scale(policy: str) -> None:
-    """Refuse an unknown scale policy.
+    """Raise an error for an unknown scale policy.
 
     Raises:
         ConfigError: not ``auto``, ``known`` or ``unknown``.

@@ -1,4 +1,4 @@
-"""Search files, folders and trainer outputs for captures."""
+"""Search files, folders and outputs of trainers for captures."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class CaptureFiles:
 
 @dataclass(frozen=True)
 class SkippedPath:
-    """A file or folder that is not ingested.
+    """A file or folder that the search skipped, with the reason.
 
     Args:
         reason: one line that names it.
@@ -103,7 +103,7 @@ def search_captures(paths: Iterable[str | os.PathLike[str]]) -> SearchResult:
             _search_folder(path, search)
         elif not path.is_file():
             raise InputError(
-                f"{path} is a pipe or a device, not a file: save what comes from it first", code="not_a_plain_file"
+                f"{path} is a pipe or a device, not a file: save its data to a file first", code="not_a_plain_file"
             )
         elif formats.suffix_of(path) is None:
             search.skipped.append(SkippedPath(path, _unknown(path)))
@@ -115,7 +115,7 @@ def search_captures(paths: Iterable[str | os.PathLike[str]]) -> SearchResult:
 
 
 def _search_folder(path: Path, search: SearchResult) -> None:
-    """Add the captures of a given folder, or the reason why it has none."""
+    """Add the captures in a folder that the user named to the search, or the reason why it has none."""
     if (folder := _product(path)) == "a gsmap map":
         search.skipped.append(SkippedPath(path, f"{path} is {folder}, no capture: gsmap merge adds its scenes"))
         return
@@ -129,7 +129,7 @@ def _search_folder(path: Path, search: SearchResult) -> None:
 
 
 def _folder(folder: Path, depth: int, seen: set[Path], search: SearchResult) -> list[CaptureFiles]:
-    """Return the captures in a folder and below; each folder is visited once, however many links lead to it."""
+    """Return the captures in a folder and below; visit each folder once, even if several links lead to it."""
     if folder.resolve() in seen:
         return []
     seen.add(folder.resolve())
@@ -171,7 +171,7 @@ def _product(folder: Path) -> str | None:
 
 
 def _checkpoint(folder: Path) -> Path | None:
-    """Return the newest checkpoint of a trainer's output; None if several GPUs wrote a part each."""
+    """Return the newest checkpoint in a trainer's output; None if several GPUs each wrote a part."""
     found = [
         *folder.glob("nerfstudio_models/step-*.ckpt"),
         *folder.glob("ckpts/ckpt_*.pt"),
@@ -184,33 +184,35 @@ def _checkpoint(folder: Path) -> Path | None:
 
 
 def _is_whole(path: Path) -> bool:
-    """Return true if a file makes its folder one scene; a ``meta.json`` may be something else."""
+    """Return true if the whole folder of a file is one capture; a ``meta.json`` may also belong to another format."""
     return path.is_file() and (path.name != "meta.json" or any(path.parent.glob("means_l*.webp")))
 
 
 def _splats(folder: Path, search: SearchResult | None = None) -> list[Path]:
-    """Return the splat files by suffix and header, damaged ones included, without SfM points that trainers leave.
+    """Return the splat files in a folder, including damaged files, but not the SfM points that trainers leave.
 
     Args:
-        search: gets the others that are called as splats are.
+        search: receives files with the suffix of a splat that are no splats.
     """
     out, search = [], search or SearchResult()
     for path in sorted(p for p in folder.iterdir() if not p.is_dir() and _readable(p)):
         if path.name in (*_SFM_POINTS, *_WHOLE) or path.suffix.lower() in _CHECKPOINTS:
             continue
         if not path.exists():
-            search.unreadable.append(SkippedPath(path, f"cannot read {path}: the file that it is a link to is missing"))
+            search.unreadable.append(SkippedPath(path, f"cannot read {path}: it is a link to a missing file"))
         elif not path.is_file():
             search.skipped.append(SkippedPath(path, f"{path} is a pipe or a device, not a file"))
         elif _may_hold_gaussians(path):
             out.append(path)
         else:
-            search.skipped.append(SkippedPath(path, f"{path} is no splat but a point cloud or a mesh (gsmap localize)"))
+            search.skipped.append(
+                SkippedPath(path, f"{path} is a point cloud or a mesh, not a splat (gsmap localize reads it)")
+            )
     return out
 
 
 def _may_hold_gaussians(path: Path) -> bool:
-    """Return true if a file's header promises Gaussians or is damaged; the error is raised on reading."""
+    """Return true if a file's header promises Gaussians, or is damaged, which is reported when the file is read."""
     try:
         return path.suffix.lower() not in scans.SUFFIXES or scans.holds_splat(path)
     except (GsmapError, OSError):
@@ -222,7 +224,7 @@ def _readable(path: Path) -> bool:
 
 
 def _last(paths: Iterable[Path]) -> Path | None:
-    """Return the path with the highest number in its last two parts (``iteration_30000``)."""
+    """Return the path with the highest number in its last two parts, such as ``iteration_30000``."""
     numbered = [(int(m[-1]), p) for p in paths if _readable(p) and (m := re.findall(r"\d+", "/".join(p.parts[-2:])))]
     return max(numbered, default=(0, None))[1]
 
@@ -240,12 +242,12 @@ def _file(path: Path, *, alone: bool) -> CaptureFiles:
     shared = _shared_cameras(path)
     if shared is None or alone:
         return CaptureFiles(path, shared, name, names=names, alone=alone)
-    note = f"{shared.name} was not taken: several captures lie beside it (call it {own.name}, or pass --cameras)"
+    note = f"{shared.name} was not used, as several captures lie beside it (rename it to {own.name}, or pass --cameras)"
     return CaptureFiles(path, None, name, note, names, alone)
 
 
 def _names(path: Path, stem: str) -> tuple[tuple[Path, str], ...]:
-    """Return the names of a capture; see `CaptureFiles`."""
+    """Return the names that describe a capture; see `CaptureFiles`."""
     out = [(path.parent, stem)]
     folder = path.resolve().parent
     while _tells_nothing(out[-1][1]) and folder.name:
@@ -259,7 +261,7 @@ def _tells_nothing(name: str) -> bool:
 
 
 def _shared_cameras(path: Path) -> Path | None:
-    """Return the camera file beside the file, or above it in gaussian-splatting's ``point_cloud/iteration_N``."""
+    """Return the camera file beside a splat, or two folders above gaussian-splatting's ``iteration_N``."""
     folder = path.resolve().parent
     places = [folder]
     if re.fullmatch(r"iteration_\d+", folder.name) and folder.parent.name == "point_cloud":
@@ -277,7 +279,7 @@ def _shared_cameras(path: Path) -> Path | None:
 def _unknown(path: Path) -> str:
     """Return the reason why a given file is not a capture."""
     for kind in _kind(path):
-        return f"{path} is a {kind} and no splat: {_TRAIN}, or localize it: gsmap localize MAP {path}"
+        return f"{path} is a {kind}, not a splat: {_TRAIN}, or localize it: gsmap localize MAP {path}"
     return f"{path} has the unknown suffix {path.suffix!r}: gsmap can read {', '.join(formats.known('read'))}"
 
 
@@ -289,20 +291,20 @@ def _why_none(folder: Path, *, is_empty: bool) -> str:
     """
     files = [path for path in folder.rglob("*") if not path.is_dir()]
     if any(path.suffix in _CHECKPOINTS for path in files):
-        where = "not where trainers put those of one GPU"
-        return f"no captures: it has checkpoints, but {where}: name the file, or export a .ply"
+        where = "not where trainers put the checkpoint of a single GPU"
+        return f"no captures; it has checkpoints, but {where}: name the file, or export a .ply"
     if (told := _photographed(Counter(kind for path in files for kind in _kind(path)))) is not None:
-        return f"{told} and no splat: {_TRAIN}, or localize them: gsmap localize MAP {folder}/*"
+        return f"{told}, but no splat: {_TRAIN}, or localize them: gsmap localize MAP {folder}/*"
     if any(path.name in _SFM_POINTS for path in files):
-        return f"the points of a COLMAP model and no splat: {_TRAIN}"
-    return f"no captures: no file of it ends with {', '.join(formats.known('read'))}" if is_empty else ""
+        return f"the points of a COLMAP model, but no splat: {_TRAIN}"
+    return f"no captures: none of its files ends with {', '.join(formats.known('read'))}" if is_empty else ""
 
 
 def _why_nothing(given: list[Path], skipped: list[SkippedPath]) -> str:
-    """Return one line why none of the given paths is a capture."""
+    """Return one line that explains why none of the given paths is a capture."""
     kinds = Counter(kind for path in given if path.is_file() for kind in _kind(path))
     if sum(kinds.values()) == len(given) > 1:
-        return f"{_photographed(kinds)} and no splat: {_TRAIN}, or localize them: gsmap localize MAP FILE..."
+        return f"{_photographed(kinds)}, but no splat: {_TRAIN}, or localize them: gsmap localize MAP FILE..."
     more = f" (and {len(skipped) - 1} more without a capture)" if len(skipped) > 1 else ""
     return f"{skipped[0].reason}{more}"
 
@@ -317,6 +319,6 @@ def _kind(path: Path) -> list[str]:
 
 
 def _photographed(kinds: Counter[str]) -> str | None:
-    """Describe the numbers of photos and videos; None if there are none."""
+    """Return the numbers of photos and videos as text; None without photos and videos."""
     told = [f"{n} {kind}{'s' * (n != 1)}" for kind in ("photograph", "video") if (n := kinds[kind])]
     return " and ".join(told) or None

@@ -1,4 +1,4 @@
-"""Find the date of a capture from files beside it. Modification times are ignored, since copying changes them."""
+"""Find the date of a capture in files beside it; ignore modification times, since copying changes them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmap.formats.pictures import open_picture
 from gsmap.ingest.capture_search import CaptureFiles
 
 MAX_FRAMES = 32
-"""How many photographs are opened at most to date one capture."""
+"""Largest number of photos that are opened to date one capture."""
 
 _T = TypeVar("_T")
 _MAX_SIDECAR_BYTES = 1 << 20  # what is larger is something else that happens to have the name
@@ -56,7 +56,7 @@ class CaptureDate:
 
 
 def parse_date(when: str | datetime | None) -> str | None:
-    """Parse an ISO 8601 date (UTC if it has no zone); None stays None.
+    """Return a date as ISO 8601 text with a zone (UTC if it has none); None for None.
 
     Raises:
         ConfigError: not a date.
@@ -66,7 +66,7 @@ def parse_date(when: str | datetime | None) -> str | None:
 
 
 def given_date(when: str | datetime | None) -> CaptureDate:
-    """Return the date that the user gave.
+    """Check and return the date that the user specified.
 
     Raises:
         ConfigError: not a date, or one that lies more than a day in the future.
@@ -79,11 +79,13 @@ def given_date(when: str | datetime | None) -> CaptureDate:
         raise ConfigError(
             f"captured-at {known} lies in the future: correct it, or this computer's clock", code="date_in_future"
         )
-    return CaptureDate(known, "", "" if date.tzinfo else f"dated {known} as told: no zone was given, taken as UTC")
+    return CaptureDate(
+        known, "", "" if date.tzinfo else f"dated {known} as specified: no zone was given, so UTC was assumed"
+    )
 
 
 def photo_date(path: str | os.PathLike[str]) -> CaptureDate:
-    """Return the EXIF date of a photo; empty if there is none that is plausible."""
+    """Return the EXIF date of a photo; empty without a plausible date."""
     found = _exif_date(Path(path))
     if found is None:
         return CaptureDate()
@@ -91,7 +93,7 @@ def photo_date(path: str | os.PathLike[str]) -> CaptureDate:
     name = shown(Path(path).name)
     if not _plausible(date, datetime.now(UTC) + timedelta(days=1)):
         return CaptureDate(note=f"no date: {_in_future(date, f'the EXIF of {name}')}")
-    return _dated(date, f"the EXIF of {name}", "" if zoned else f"{name}: its EXIF has no zone, taken as UTC")
+    return _dated(date, f"the EXIF of {name}", "" if zoned else f"{name}: its EXIF has no zone, so UTC was assumed")
 
 
 def find_date(
@@ -99,9 +101,10 @@ def find_date(
 ) -> CaptureDate:
     """Find the date of a capture on disk.
 
-    In this order: a sidecar beside it (``NAME.json`` or ``NAME.meta.json`` with ``captured_at``), where NAME is its
-    file's or, as for the output of trainers, its folder's; the first EXIF ``DateTimeOriginal`` of its frames; a date in
-    the name of its file, or of the folders that it is named by or lies in.
+    The sources are tried in this order: a sidecar beside the capture (``NAME.json`` or ``NAME.meta.json`` with
+    ``captured_at``), where NAME is the name of its file or, for the output of trainers, of its folder; the earliest
+    EXIF ``DateTimeOriginal`` of its frames; a date in the name of its file, or in the names of the folders that name or
+    contain it.
 
     Args:
         cameras: the file or folder its cameras were read from.
@@ -125,7 +128,7 @@ def find_date(
 
 
 def date_in_name(name: str, *, now: datetime | None = None) -> tuple[datetime | None, str]:
-    """Find a date in a name such as ``hall_2026-05-31T14-00`` (UTC if it has no zone), with a remark.
+    """Find a date in a name such as ``hall_2026-05-31T14-00`` (UTC if it has no zone); return it with a note.
 
     None where there is no date, where there are several, or where it lies in the future.
     """
@@ -135,19 +138,19 @@ def date_in_name(name: str, *, now: datetime | None = None) -> tuple[datetime | 
 
 
 def _date_in_name(name: str, latest: datetime, notes: list[str]) -> tuple[datetime | None, str]:
-    """Find a date in a name; a date in the future is added to ``notes``."""
+    """Find a date in a name; for a date in the future, append a note to ``notes`` and find none."""
     dates = [date for match in _DATE.finditer(name) if (date := _matched(match)) is not None]
     future = [day for day, _ in dates if day > latest]
     dates = [(day, note) for day, note in dates if day <= latest]
     if future and not dates:
         notes.append(_in_future(min(future), f"the name {shown(name)}"))
     if len({day.date() for day, _ in dates}) > 1:
-        return None, f"the name {shown(name)} has several dates: none of them was taken"
+        return None, f"the name {shown(name)} has several dates, so none was used"
     return max(dates, key=lambda date: not date[1], default=(None, ""))
 
 
 def _in_future(date: datetime, source: str) -> str:
-    return f"{date.isoformat()} by {source} lies in the future and was not taken: is this computer's clock behind?"
+    return f"{date.isoformat()} by {source} lies in the future and was not used; check this computer's clock"
 
 
 def shown(name: str) -> str:
@@ -177,12 +180,12 @@ def _from_sidecar(found: CaptureFiles, latest: datetime) -> CaptureDate | None:
                     f"{path}: captured_at {said} lies in the future: correct it, or give --captured-at",
                     code="date_in_future",
                 )
-            return _dated(date, shown(path.name), "" if date.tzinfo else "no zone was given, taken as UTC")
+            return _dated(date, shown(path.name), "" if date.tzinfo else "no zone was given, so UTC was assumed")
     return None
 
 
 def _captured_at(path: Path) -> Any:
-    """Read the date from a sidecar file; None if there is none."""
+    """Read the capture date from a sidecar file; None if the file is missing or has no date."""
     try:
         if not path.is_file() or path.stat().st_size > _MAX_SIDECAR_BYTES:
             return None
@@ -202,7 +205,7 @@ def _captured_at(path: Path) -> Any:
 
 
 def _photographs(found: CaptureFiles, cameras: Path | None, frames: Sequence[str]) -> list[Path]:
-    """Choose some of the images of a capture, evenly, by the names of its cameras.
+    """Choose evenly spaced images of a capture, found by the names of its cameras.
 
     Where they name none, those in ``images/`` beside it, unless other captures lie there too.
     """
@@ -226,7 +229,7 @@ def _picture_folders(cameras: Path) -> list[Path]:
 
 
 def _picture(name: str, folders: Sequence[Path]) -> Path | None:
-    """Return the image file of a camera name; gaussian-splatting leaves the suffix out."""
+    """Return the image file of a camera, whose name may lack the suffix, as gaussian-splatting writes it."""
     if not name or "\0" in name:
         return None
     for folder in folders:
@@ -250,14 +253,16 @@ def _from_frames(pictures: Sequence[Path], latest: datetime, notes: list[str]) -
         return None
     first, has_zone, path = min(taken, key=lambda one: one[0])
     last = max(one[0] for one in taken)
-    note = f"the first of {len(taken)} dates in {len(pictures)} frames read, the last is {last.isoformat()}"
+    note = (
+        f"this is the earliest of {len(taken)} dates in {len(pictures)} frames read; the latest is {last.isoformat()}"
+    )
     if not has_zone:
-        note += "; no zone was given, taken as UTC"
+        note += "; no zone was given, so UTC was assumed"
     return _dated(first, f"the EXIF of {shown(path.name)}", note)
 
 
 def _exif_date(path: Path) -> tuple[datetime, bool] | None:
-    """Return the date of a photo and whether its zone is known; None if there is no plausible date."""
+    """Return the EXIF date of a photo, and true if it has a zone; None without a plausible date."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large pictures and of damaged tags: only the header is read
@@ -292,7 +297,7 @@ def _from_names(found: CaptureFiles, latest: datetime, notes: list[str]) -> Capt
 
 
 def _names(found: CaptureFiles) -> Sequence[tuple[Path, str]]:
-    """Return `CaptureFiles.names`, which may be empty."""
+    """Return the names of a capture (see `CaptureFiles`), or only its name with the folder of its file."""
     return found.names or ((found.path.parent, found.name),)
 
 
@@ -306,19 +311,19 @@ def _telling_names(found: CaptureFiles) -> Iterator[str]:
 
 
 def _matched(match: re.Match[str]) -> tuple[datetime, str] | None:
-    """Return the date of a match with a remark; None if it is not a plausible date."""
+    """Return the date of a regular expression's match with a note; None if it is not a plausible date."""
     if match["stamp"]:
         try:
             date = _zoned(datetime.strptime(match["stamp"], "%Y%m%d%H%M%S"))
         except ValueError:
             return None
-        return (date, "no zone was given, taken as UTC") if date.year >= _FIRST_YEAR else None
+        return (date, "no zone was given, so UTC was assumed") if date.year >= _FIRST_YEAR else None
     day = match["day"] or match["y"] + match["m"] + match["d"]
     try:
         date = datetime.strptime(day, "%Y%m%d")
     except ValueError:
         return None
-    note = "no time of day was given, taken as 00:00 UTC"
+    note = "no time of day was given, so 00:00 UTC was assumed"
     if match["h"]:
         try:
             milliseconds = int(match["ms"] or 0)
@@ -328,10 +333,10 @@ def _matched(match: re.Match[str]) -> tuple[datetime, str] | None:
                 second=int(match["sec"] or 0),
                 microsecond=1000 * milliseconds,
             )
-            note = "" if match["z"] else "no zone was given, taken as UTC"
+            note = "" if match["z"] else "no zone was given, so UTC was assumed"
             date = datetime.fromisoformat(date.isoformat() + (match["z"] or ""))
         except ValueError:  # a number that follows, and no time
-            date, note = datetime.strptime(day, "%Y%m%d"), "no time of day was given, taken as 00:00 UTC"
+            date, note = datetime.strptime(day, "%Y%m%d"), "no time of day was given, so 00:00 UTC was assumed"
     date = _zoned(date)
     return (date, note) if date.year >= _FIRST_YEAR else None
 
@@ -362,7 +367,7 @@ def _plausible(date: datetime, latest: datetime) -> bool:
 
 
 def _evenly(things: Sequence[_T]) -> list[_T]:
-    """Return at most `MAX_FRAMES` items, the first and last among them."""
+    """Return at most `MAX_FRAMES` evenly spaced items, including the first and the last."""
     if len(things) <= MAX_FRAMES:
         return list(things)
     return [things[round(i * (len(things) - 1) / (MAX_FRAMES - 1))] for i in range(MAX_FRAMES)]

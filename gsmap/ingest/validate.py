@@ -1,4 +1,4 @@
-"""Validate captures; errors name the invalid row."""
+"""Validate captures; error messages name the first invalid row."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SAMPLE = 20_000
 def validate(
     gaussians: GaussianSource, cameras: Cameras | None = None, *, where: str = "the capture"
 ) -> tuple[str, ...]:
-    """Refuse an invalid capture; return notes on unusual values.
+    """Raise an error for an invalid capture; return notes on unusual values of a valid capture.
 
     Args:
         where: what to call it in messages (its file).
@@ -38,7 +38,7 @@ def validate(
 
 
 def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]:
-    """Validate Gaussians alone; they are read once."""
+    """Validate the Gaussians of a capture, reading them once; return notes."""
     n = gaussians.num_gaussians
     if not n:
         raise InputError(f"{where} has no Gaussians", code="no_gaussians")
@@ -67,17 +67,17 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
     extent = max(float(np.linalg.norm(high - low)), float(np.exp(min(float(np.median(widest)), 80.0))))
     absurd = _BadRows()
     absurd.note(0, widest.astype(np.float64) > np.log(MAX_SCALE_OVER_EXTENT * extent))
-    absurd.refuse(where, f"a scale over {MAX_SCALE_OVER_EXTENT:g} extents")
+    absurd.refuse(where, f"a scale of more than {MAX_SCALE_OVER_EXTENT:g} extents of the capture")
     if not opacities and not scales:
         return ()
     return (
-        f"{opacities} opacities are 0 or 1 and {scales} scales are 0, which is infinite as a logit or logarithm: "
-        "finite numbers that draw the same stand for them",
+        f"{opacities} opacities are 0 or 1 and {scales} scales are 0, whose logits or logarithms are infinite: "
+        "they were replaced by finite numbers that look the same",
     )
 
 
 def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) -> tuple[str, ...]:
-    """Validate the cameras of valid Gaussians."""
+    """Validate the cameras of a capture with valid Gaussians; return notes."""
     if not len(cameras):
         raise InputError(
             f"{where} has an empty list of cameras: omit it, and gsmap synthesizes cameras", code="no_cameras"
@@ -88,14 +88,14 @@ def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) ->
         width, height = cameras.sizes_px[i]
         raise InputError(
             f"{where}: camera {cameras.names[i]!r} has {width} x {height} pixels, more than {MAX_SIDE_PX} on a side: "
-            "correct its size",
+            "correct the size of this camera",
             code="invalid_camera",
         )
     n = gaussians.num_gaussians
     seen = sees(cameras, gathered(gaussians, "means", np.arange(0, n, _step(n))))
     if not seen.any() and not any(sees(cameras, means).any() for means in gaussians.columns("means")):
         raise InputError(
-            f"{where}: none of its {len(cameras)} cameras sees a Gaussian: they belong to another scene",
+            f"{where}: none of its {len(cameras)} cameras sees a Gaussian: pass the cameras of this capture",
             code="cameras_see_nothing",
         )
     blind = int((~seen).sum())
@@ -103,7 +103,7 @@ def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) ->
 
 
 def sees(cameras: Cameras, points: np.ndarray) -> np.ndarray:
-    """Return (C,) whether any of the points (N, 3) projects into each camera's image; occlusion is ignored."""
+    """Return a mask (C,) that is True for cameras with a point (N, 3) in the image, ignoring occlusion."""
     out = np.zeros(len(cameras), bool)
     for i, (view, intrinsics, size) in enumerate(
         zip(cameras.T_camera_frame, cameras.intrinsics_px, cameras.sizes_px, strict=True)
@@ -113,19 +113,19 @@ def sees(cameras: Cameras, points: np.ndarray) -> np.ndarray:
 
 
 def _step(n: int) -> int:
-    """Return the stride for checks that would cost too much on all Gaussians."""
+    """Return the stride between the Gaussians of checks that would take too long on all."""
     return max(1, n // _SAMPLE)
 
 
 @dataclass
 class _BadRows:
-    """The first invalid rows of a check."""
+    """The first invalid row that a check found, and their number."""
 
     first: int = 0
     count: int = 0
 
     def note(self, start: int, bad: np.ndarray) -> None:
-        """Record invalid rows from ``start`` on."""
+        """Record invalid rows: ``bad`` is a mask of rows that begin at row ``start``."""
         if bad.any():
             self.first = self.first if self.count else start + int(np.argmax(bad))
             self.count += int(bad.sum())

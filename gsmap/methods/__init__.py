@@ -1,4 +1,4 @@
-"""The families of methods, their contracts, and the keys of results.
+"""Families of methods, their contracts, and the recipe keys of results.
 
 Each family has its contract, a ``Protocol`` with the shapes and units of every argument, in a module of its name. This
 room names the folders in which built-in methods lie, and imports none of them.
@@ -37,7 +37,7 @@ _FORMATS = (
 
 @lru_cache(maxsize=1)
 def families() -> dict[str, Family]:
-    """Return all families by name."""
+    """Return all families of methods, by name."""
     found = (
         Family("segmenter", "gsmap.describe.segmenters", ("MODELS", "make")),
         Family("embedder", "gsmap.describe.embedders", ("MODELS", "make")),
@@ -56,7 +56,7 @@ def families() -> dict[str, Family]:
 
 
 def family(name: str) -> Family:
-    """Return a family by name."""
+    """Return the family of methods with this name."""
     return families()[name]
 
 

@@ -1,4 +1,4 @@
-"""The contract of an embedder: from masks of a view to feature vectors."""
+"""The contract of embedders, which compute a feature vector for each mask of a view."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Embedder(Protocol):
     """
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
-        """Features of the masks of a view.
+        """Compute the features of all masks of a view.
 
         Args:
             view: the render that the masks are parts of.
@@ -81,7 +81,7 @@ class EmbedderMethod(Protocol):
         ...
 
     def probe(self, spec: ModelSpec) -> None:
-        """Refuse an unsuitable model of a kind in ``MODELS``; called when it is added to a map.
+        """Raise an error for an unsuitable model of a kind in ``MODELS``; called when a model is added to a map.
 
         Raises:
             InputError: its inputs and outputs do not fit, or it does not run.

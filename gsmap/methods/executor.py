@@ -1,4 +1,4 @@
-"""The contract of an executor, which runs the jobs of a stage."""
+"""The contract of executors, which run the jobs of a stage."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 @dataclass(frozen=True)
 class QuarantinedJob:
-    """The result of a job that twice ended the process it ran in.
+    """The result of a job that was given up because it twice ended its worker process.
 
     Args:
         reason: what happened to the processes, for the user.
@@ -19,12 +19,12 @@ class QuarantinedJob:
 
 
 class Workers(Protocol):
-    """The worker processes of an executor; kept between stages, used by one stage at a time."""
+    """The worker processes of an executor, which are kept between stages and serve one stage at a time."""
 
     def run(
         self, job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], *, quick: bool = False
     ) -> Iterator[tuple[int, Any]]:
-        """Yield ``(index, job(*arguments))`` as each is done, in any order; the index counts the arguments.
+        """Yield ``(index, job(*arguments))`` whenever a job is done; the index counts ``arguments``, in any order.
 
         Arguments are taken as there is room to run them and little ahead, since taking them says to others that this
         process does them. Jobs that share an argument best run where the other one ran, which has read what it names.
@@ -44,12 +44,12 @@ class Workers(Protocol):
         ...
 
     def close(self) -> None:
-        """End all started processes without waiting."""
+        """End all processes that were started, without waiting for them."""
         ...
 
 
 class Executor(Protocol):
-    """Runs jobs on this machine or elsewhere.
+    """An executor, which runs jobs on this machine or on others.
 
     A job is a module-level function, and arguments that are small and picklable: the location of a map, ids, settings;
     never arrays. Whoever runs it opens the map for reading, computes, and sends the result back. Only the caller
@@ -64,7 +64,7 @@ class Executor(Protocol):
     VERSION: int
 
     def start(self, params: Any) -> Workers:
-        """Return workers with these settings; processes start with the first job.
+        """Return workers with these settings; their processes start with the first job.
 
         Raises:
             ConfigError: settings with which nothing can run.

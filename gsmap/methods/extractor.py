@@ -1,4 +1,4 @@
-"""The contract of an extractor of local features."""
+"""The contract of extractors, which compute the local features of an image."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ExtractorMethod(Protocol):
         ...
 
     def probe(self, spec: ModelSpec) -> None:
-        """Refuse an unsuitable model of a kind in ``MODELS``; called when it is added to a map.
+        """Raise an error for an unsuitable model of a kind in ``MODELS``; called when a model is added to a map.
 
         Raises:
             InputError: its inputs and outputs do not fit, or it does not run.

@@ -64,11 +64,11 @@ class Family:
         return tuple(sorted({**self._added(), **self._built_in()}))
 
     def usable(self) -> tuple[str, ...]:
-        """Return the names of the methods that load and keep the contract; warn once of each other one."""
+        """Return the names of the methods that load and keep the contract; warn once about each broken method."""
         return _usable(self, tuple(sys.path))
 
     def get(self, name: str) -> Any:
-        """Load a method by name.
+        """Load and return a method by name.
 
         Raises:
             ConfigError: no such method, or one that does not keep the contract.
@@ -104,7 +104,7 @@ class Family:
             except (Exception, SystemExit) as error:  # another package's code may fail in any way
                 raise ConfigError(
                     f"{self.name} {name!r} of the package {_package(added[name])} cannot be loaded "
-                    f"({type(error).__name__}: {error}): repair or uninstall that package",
+                    f"({type(error).__name__}: {error}):  repair or uninstall that package",
                     code="method_not_loadable",
                 ) from error
         else:
@@ -165,14 +165,14 @@ class MethodParams(Mapping[str, Any]):
         return len(_family(self.family).usable())
 
     def __contains__(self, name: object) -> bool:
-        """Return true if a method has this name; nothing is imported, so it may fail to load."""
+        """Return true if a method has this name; the method is not imported and may fail to load."""
         return name in _family(self.family).names()
 
     def __hash__(self) -> int:
         return hash((self.family, self.changed))
 
     def with_params(self, name: str, params: Any) -> MethodParams:
-        """Return a copy with other parameters for one method.
+        """Return a copy in which one method has other parameters.
 
         Raises:
             ConfigError: no such method, or the parameters of another.
@@ -199,26 +199,26 @@ def _is_frozen(params: Any) -> bool:
 
 @lru_cache(maxsize=64)
 def _modules_in(places: tuple[str, ...]) -> tuple[str, ...]:
-    """List the methods in the folders of a package, cached."""
+    """List the methods in the folders of a package; the answer is cached."""
     found = [module.name for module in pkgutil.iter_modules(list(places))]
     return tuple(name for name in found if not name.startswith("_") and name != "base")
 
 
 @lru_cache(maxsize=64)
 def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """List the entry points of other packages, cached per search path."""
+    """List the entry points of other packages; the answer is cached per search path."""
     return tuple(entry_points(group=group))
 
 
 @lru_cache(maxsize=64)
 def _usable(family: Family, path: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the methods that load, cached per search path; each broken method is reported once."""
+    """Return the names of the methods that load, cached per search path; report each broken method once."""
     found = []
     for name in family.names():
         try:
             family.get(name)
         except ConfigError as error:
-            _log.warning("%s; gsmap goes on without it", error)
+            _log.warning("%s; gsmap continues without this method", error)
         else:
             found.append(name)
     return tuple(found)
@@ -230,7 +230,7 @@ def _loaded(family: Family, name: str) -> Any:
 
 
 def declare(found: Mapping[str, Family]) -> None:
-    """Register the families; `gsmap.methods` calls it, which avoids an import cycle."""
+    """Register the families; `gsmap.methods` calls this function, which avoids an import cycle."""
     _DECLARED.update(found)
 
 

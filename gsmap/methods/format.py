@@ -1,4 +1,4 @@
-"""The contract of a file format of Gaussians."""
+"""The contract of file formats of Gaussians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsmap.types import FileInfo, Gaussians, GaussianSource
 
 
 class Format(Protocol):
-    """A file format, known by its suffix.
+    """A file format, which the suffix of a file selects.
 
     Its name in the family is the suffix itself, in lower case (``.ply``, ``.compressed.ply``, ``tileset.json``); where
     several fit a path, the longest counts, and a built-in one goes before another package's of the same name::
@@ -40,7 +40,7 @@ class ReadableFormat(Format, Protocol):
     """A format that can be read."""
 
     def read(self, path: str | os.PathLike[str], /) -> Gaussians:
-        """Read the Gaussians of a file; values are not checked and may be NaN.
+        """Read the Gaussians of a file; their values are not checked and may be NaN.
 
         Raises:
             InputError: the file is not what its suffix says, is damaged, or promises more than its size can hold.
@@ -62,10 +62,10 @@ class DescribedFormat(ReadableFormat, Protocol):
 
 
 class StreamedFormat(ReadableFormat, Protocol):
-    """A format that is read in chunks; its ``write``, if it has one, also takes a `GaussianSource`."""
+    """A format that can be read in chunks; if it has a ``write``, this also accepts a `GaussianSource`."""
 
     def stream(self, path: str | os.PathLike[str], /) -> GaussianSource:
-        """Open a file to read it in chunks; errors of the whole file are raised when it is opened.
+        """Open a file to read it in chunks; errors that concern the whole file are raised now.
 
         Raises:
             InputError, OSError: as ``read``.
@@ -77,7 +77,7 @@ class WritableFormat(Format, Protocol):
     """A format that can be written."""
 
     def write(self, path: str | os.PathLike[str], gaussians: Gaussians, /, **options: Any) -> None:
-        """Write a file under a temporary name in its final folder; the caller renames it.
+        """Write a file under a temporary name in its final folder; the caller renames the file.
 
         Raises:
             InputError: Gaussians that the format cannot hold.

@@ -1,4 +1,4 @@
-"""The contract of a merger: from scenes in one frame to one set of Gaussians."""
+"""The contract of mergers, which merge scenes in one frame to one set of Gaussians."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsmap.types.progress import Progress
 
 
 class Merger(Protocol):
-    """A method of merging: a module of `gsmap.merge.mergers`, or an entry point in ``gsmap.mergers``.
+    """A method that merges scenes: a module of `gsmap.merge.mergers`, or an entry point in ``gsmap.mergers``.
 
     All lengths are in metres of the map frame. Importing a merger must not import torch: recipes are computed of
     settings alone. The same scenes, params and bounds give the same bits, whatever the order of the scenes was and for
@@ -24,29 +24,29 @@ class Merger(Protocol):
     """
 
     Params: type
-    """Frozen dataclass of its settings, all with defaults."""
+    """Frozen dataclass of the merger's settings, all with defaults."""
 
     VERSION: int
-    """Raised whenever the output changes for the same input: every tile it made is then made again."""
+    """Raised whenever the output changes for the same input; all tiles of this merger are then made again."""
 
     STEPS: str | None
-    """The field of ``Params`` that sets how many optimisation steps are taken; None for a closed form."""
+    """The field of ``Params`` that sets the number of optimization steps; None for a closed-form merger."""
 
     RENDERS: bool
-    """Whether it renders, so that the render backend may change its bits and belongs to the name of its results."""
+    """True if the merger renders; the render backend, which may change the last bits, is then part of the recipe."""
 
     def reach_m(self, params: Any) -> float:
         """Return the distance beyond a tile's bounds within which Gaussians affect the tile, in metres.
 
-        A tile depends on the scenes that come that near to it, and on no others.
+        A tile depends only on the scenes within this distance.
         """
         ...
 
     def reading_m(self, params: Any, dated: bool) -> float:
         """Return the distance beyond a tile's bounds within which Gaussians are read, in metres; at least `reach_m`.
 
-        More than that where Gaussians farther away stand in cameras' ways, and `PosedScene.reference_views` does not
-        do.
+        The distance is larger than `reach_m` if Gaussians farther away may occlude the tile from cameras, and
+        `PosedScene.reference_views` does not suffice.
 
         Args:
             dated: true if captures of several dates come near the tile.
@@ -58,7 +58,7 @@ class Merger(Protocol):
         ...
 
     def min_cameras(self, params: Any) -> int:
-        """Return the minimum number of a scene's cameras to use, nearest first, at any distance.
+        """Return the number of a scene's cameras, nearest first, that are used however far they are.
 
         0 where those within `looking_m` are enough. Where more is read than `reach_m`, so are the Gaussians between
         such cameras and the tile.

@@ -1,4 +1,4 @@
-"""The contract of proposers, which propose poses of a pair of scenes without an initial pose."""
+"""The contract of proposers, which propose relative poses of two scenes without an initial pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Proposal", "Proposer", "Scene", "Surface"]
 
 
 class Scene(Protocol):
-    """A scene as proposers see it."""
+    """The data of a scene that a proposer gets."""
 
     @property
     def graph(self) -> SceneGraph:
@@ -20,27 +20,26 @@ class Scene(Protocol):
 
     @property
     def unit_m(self) -> float:
-        """Metres per unit of the scene, known or guessed."""
+        """Metres per unit of the scene, known or estimated."""
 
     def surface(self) -> Surface:
         """Return the surface in metres, computed on first use."""
 
 
 class Proposer(Protocol):
-    """The interface of a proposer module or object, beside ``Params`` and ``VERSION``."""
+    """The interface of a proposer, which is a module or an object."""
 
     Params: ClassVar[type]
     VERSION: ClassVar[int]
 
     SCALES: ClassVar[bool]
-    """Whether it can find a pose whose scale is not known; where not, it is only asked for rigid ones."""
+    """True if the proposer can find poses of unknown scale; otherwise it is called for rigid poses only."""
 
     PACKAGES: ClassVar[tuple[str, ...]]
-    """Python packages that it needs and that may be missing, or whose version may change its answers: all of them are
-    named, with their versions, in the key of every registration that might have asked it."""
+    """Optional Python packages that the proposer needs, which recipe keys name with their versions."""
 
     def propose(self, target: Scene, source: Scene, params: Any = None, *, with_scale: bool = False) -> list[Proposal]:
-        """Propose poses to refine and verify, most promising first; empty if there are none.
+        """Propose poses to refine and verify, most promising first; return an empty list without a proposal.
 
         Args:
             target, source: the scenes. Where no scale is sought both have the same ``unit_m``.

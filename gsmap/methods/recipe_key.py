@@ -1,4 +1,4 @@
-"""Recipe keys, which name stored results by everything that determines them."""
+"""Recipe keys, which name each stored result by everything that determines it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class RecipeKey:
 
     @cached_property
     def _parts(self) -> dict[str, Any]:
-        """Return the common parts of all keys of this recipe, cached."""
+        """Return the parts that all keys of this recipe share; the answer is cached."""
         return {one.name: getattr(self, one.name) for one in fields(self)} | {"recipe": self.recipe}
 
     def to_json(self) -> dict[str, Any]:

@@ -12,22 +12,22 @@ from gsmap.types import Sim3
 __all__ = ["Correspondences", "Refiner", "Surface"]
 
 Correspondences = tuple[np.ndarray, np.ndarray]
-"""Points (K, 3) of the target and points (K, 3) of the source that are taken for the same, in metres."""
+"""Points (K, 3) of the target and the corresponding points (K, 3) of the source, in metres."""
 
 
 class Refiner(Protocol):
-    """The interface of a refiner module or object, beside ``Params`` and ``VERSION``."""
+    """The interface of a refiner, which is a module or an object."""
 
     Params: ClassVar[type]
     VERSION: ClassVar[int]
 
     SCALES: ClassVar[bool]
-    """Whether it can refine the scale as well; where not, ``colored_icp`` takes its place for such pairs."""
+    """True if the refiner can refine the scale as well; otherwise ``colored_icp`` refines pairs of unknown scale."""
 
     def refine(
         self, target: Surface, source: Surface, start: Sim3, params: Any = None, *, with_scale: bool = False
     ) -> Sim3:
-        """Refine a start pose.
+        """Refine an approximate pose.
 
         A refiner whose module or object has ``USES_CORRESPONDENCES = True`` takes one more keyword,
         ``correspondences``: those that the start rests on (`Correspondences`), or None. One that has ``SCHEDULES``, a

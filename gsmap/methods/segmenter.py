@@ -1,4 +1,4 @@
-"""The contract of a segmenter: from renders of a scene to object masks."""
+"""The contract of segmenters, which find masks of objects in renders of a scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Segmenter(Protocol):
     """A segmenter for one scene."""
 
     def segment(self, view: View) -> list[Mask]:
-        """Return the masks of a view, in any order; they may overlap.
+        """Return the masks of a view, in any order; masks may overlap.
 
         Args:
             view: a render: colour (H, W, 3) uint8, depth (H, W) in scene units.
@@ -55,7 +55,7 @@ class SegmenterMethod(Protocol):
         ...
 
     def probe(self, spec: ModelSpec) -> None:
-        """Refuse an unsuitable model of a kind in ``MODELS``; called when it is added to a map.
+        """Raise an error for an unsuitable model of a kind in ``MODELS``; called when a model is added to a map.
 
         Raises:
             InputError: its inputs and outputs do not fit, or it does not run.

@@ -1,4 +1,4 @@
-"""The surface of a scene for proposers and refiners."""
+"""The surface of a scene, as proposers and refiners get it."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from gsmap.types import Cameras, Gaussians
 
 
 class Surface(Protocol):
-    """The surface of a scene in metres: the scene's axes and origin, lengths times `unit_m`.
+    """The surface of a scene in metres: coordinates in the scene frame, multiplied by `unit_m`.
 
-    Everything is computed once, when it is first asked for, and kept; arrays are not to be written to.
+    Each value is computed on first use and kept; arrays must not be written to.
     """
 
     @property
     def points(self) -> np.ndarray:
-        """(N, 3) float64 centres of the scene's surface Gaussians, metres."""
+        """Centres (N, 3) float64 of the scene's surface Gaussians, metres."""
 
     @property
     def colours(self) -> np.ndarray:
-        """(N, 3) float32 their view-independent colours, RGB in [0, 1]."""
+        """View-independent colours (N, 3) float32 of the points, RGB in [0, 1]."""
 
     @property
     def resolution_m(self) -> float:
-        """Side of the cells over which `coarse` averages."""
+        """Edge length of the cells over which `coarse` averages, metres."""
 
     @property
     def unit_m(self) -> float:
-        """Metres per unit of the scene, under which this surface was made."""
+        """Metres per unit of the scene that this surface was made with."""
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -37,32 +37,32 @@ class Surface(Protocol):
 
     @property
     def cameras(self) -> Cameras | None:
-        """Return the scene's cameras in its own unit; None if it has none."""
+        """Return the scene's cameras in the scene's own unit; None if the scene has no cameras."""
 
     def __len__(self) -> int:
         """Number of points."""
 
     @property
     def coarse(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the means of points (M, 3), float64 metres, and of colours, float32, over cells in spatial order."""
+        """Return the mean point (M, 3), float64 metres, and colour (M, 3), float32, of each cell, in spatial order."""
 
     def scaled(self, factor: float) -> Surface:
-        """Return the surface without Gaussians in a unit ``factor`` times smaller."""
+        """Return the surface, without Gaussians, with all coordinates multiplied by ``factor``."""
 
     def sample(self, count: int) -> np.ndarray:
-        """Return rows of at most ``count`` cells, evenly strided."""
+        """Return the indices of at most ``count`` cells, evenly spaced."""
 
     @property
     def normals(self) -> np.ndarray:
-        """Return (M, 3) float64 unit normals at the cell means; signs are arbitrary."""
+        """Return unit normals (M, 3) float64 at the cell means, with arbitrary signs."""
 
     @property
     def lightness(self) -> np.ndarray:
-        """(M,) float64 lightness of the cells, 0 to 1."""
+        """Lightness (M,) float64 of the cells, 0 to 1."""
 
     @property
     def lightness_gradients(self) -> np.ndarray:
-        """(M, 3) float64 change of lightness per metre within the tangent planes of the cells."""
+        """Gradients (M, 3) float64 of the lightness, per metre, within the tangent planes of the cells."""
 
     @property
     def tree(self) -> Any:
@@ -74,14 +74,13 @@ class Surface(Protocol):
 
     @property
     def oriented_normals(self) -> np.ndarray | None:
-        """(M, 3) float64 the normals turned to the side that the scene's own cameras saw, zeros where that is not
-        known; None where it nowhere is."""
+        """Normals (M, 3) float64 towards the scene's own cameras; zeros where none saw the cell; None without any."""
 
     def nearest(
         self, points: np.ndarray, radius_m: float, normals: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (P,) to and row (P,) of the nearest cell mean of each point (P, 3); inf and 0 beyond the
+        """Return the distance (P,) and index (P,) of the cell mean nearest to each point (P, 3); inf and 0 beyond the
         radius.
 
-        Cells that face the other way than the points (``normals`` (P, 3), in this frame) are passed over.
+        Cells whose normals oppose those of the points (``normals`` (P, 3), in this frame) are ignored.
         """

@@ -1,4 +1,4 @@
-"""Content of a report: rows as the verbs print them, and the data of its drawings."""
+"""The content of a report: rows that verbs print as well, and data for the drawings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, ObjectsReport, PoseChangeRow, RevisionRow, SceneRow
 
 CHI2_DOF = 7
-"""Degrees of freedom of an edge: rotation, translation, scale."""
+"""Degrees of freedom of an edge: three of rotation, three of translation, one of scale."""
 
 CHI2_95, CHI2_999 = 14.067, 24.322
 """Quantiles of the chi-square distribution with 7 degrees of freedom: 95 % and 99.9 %."""
@@ -21,7 +21,7 @@ CHI2_95, CHI2_999 = 14.067, 24.322
 
 @dataclass(frozen=True, eq=False)
 class SceneEntry:
-    """Row of a scene with the uncertainty of its pose.
+    """A scene of the report, with the uncertainty of its pose.
 
     Args:
         row: Row of the scene as in `gsmap list`.
@@ -42,7 +42,7 @@ class SceneEntry:
 
     @property
     def position_sigma_m(self) -> float | None:
-        """Largest standard deviation of the reference point over all directions, metres; None if unknown."""
+        """Standard deviation of the reference point in its least certain direction, metres; None if unknown."""
         if self.covariance_m2 is None:
             return None
         return float(np.sqrt(max(0.0, np.linalg.eigvalsh(self.covariance_m2)[-1])))
@@ -50,7 +50,7 @@ class SceneEntry:
 
 @dataclass(frozen=True, eq=False)
 class EdgeEntry:
-    """Row of an edge with its residual under the newest poses.
+    """An edge of the report, with its residual under the newest poses.
 
     Args:
         row: Row of the edge as in `gsmap list`.
@@ -70,7 +70,7 @@ class EdgeEntry:
 
     @property
     def use(self) -> str:
-        """``undecided``, ``tentative``, ``used``, ``unused`` (accepted, but not in the solution), or the status."""
+        """``undecided``, ``tentative``, ``used``, ``unused`` (accepted, not in the solution), or the edge's status."""
         if self.row.undecided:
             return "undecided"
         if self.row.used == "tentative":
@@ -112,7 +112,9 @@ class Island:
 
 @dataclass(frozen=True, eq=False)
 class PairPicture:
-    """Both captures of a pair from the same cameras, as ``gsmap show A:B --picture`` draws them: (H, W, 3) uint8."""
+    """A picture (H, W, 3) uint8 of both captures of a pair from the same cameras, as from ``gsmap show A:B
+    --picture``.
+    """
 
     row: EdgeRow
     picture: np.ndarray
@@ -120,7 +122,7 @@ class PairPicture:
 
 @dataclass(frozen=True, eq=False)
 class ChangePicture:
-    """A change before and after, (H, W, 3) uint8, by its id (``c12``)."""
+    """A picture (H, W, 3) uint8 of a place before and after a change, with the change's id (``c12``)."""
 
     change: str
     picture: np.ndarray
@@ -128,7 +130,7 @@ class ChangePicture:
 
 @dataclass(frozen=True, eq=False)
 class PoseDifferences:
-    """Differences of the scene poses between a revision and an earlier one."""
+    """Differences of the scene poses between a revision and an earlier revision."""
 
     before: int
     after: int
@@ -213,5 +215,5 @@ class Report:
 
     @property
     def revision(self) -> RevisionRow | None:
-        """Newest revision; None if there is none."""
+        """Newest revision; None if the map has no revisions."""
         return self.revisions[-1] if self.revisions else None

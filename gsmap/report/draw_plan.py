@@ -1,4 +1,4 @@
-"""Floor plan as SVG: top view, outlines, camera paths, edges by use, and error ellipses."""
+"""Draw a floor plan as SVG: top view, outlines, camera paths, edges by use, and error ellipses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ELLIPSE_SHARE = 0.08  # usual maximum of the half axis of an ellipse, as a frac
 
 
 def draw_plan(plan: Plan, title: str) -> tuple[Markup, int]:
-    """Draw a plan; return the drawing and the magnification of its error ellipses (0 without ellipses)."""
+    """Draw a plan; return the drawing and the factor by which its error ellipses are magnified (0 without ellipses)."""
     low, high = plan.bounds
     span = high - low
     scale = min(_WIDTH / span[0], _MOST_HEIGHT / span[1])
@@ -73,7 +73,7 @@ def draw_plan(plan: Plan, title: str) -> tuple[Markup, int]:
 
 
 def _walked(track: np.ndarray) -> np.ndarray:
-    """Return indices of cameras with a short step to the next one, so that gaps of the path stay open."""
+    """Return the indices of cameras close to the next camera, so that gaps in the path stay open."""
     steps = np.linalg.norm(np.diff(track, axis=0), axis=1)
     walked = steps[steps > 0]
     found: np.ndarray = np.flatnonzero(steps <= min(_JUMP * (np.median(walked) if len(walked) else 0.0), _STRIDE_M))
@@ -110,7 +110,7 @@ def _magnification(plan: Plan) -> int:
 
 
 def _names(plan: Plan, middles: np.ndarray, size: np.ndarray) -> Markup:
-    """Draw labels beside their dots, shifted up or down to avoid overlap."""
+    """Draw the names of scenes beside their dots, shifted up or down to avoid overlap."""
     taken: list[tuple[float, float, float]] = []
     out = []
     crowded = len(plan.names) > _MANY
@@ -147,7 +147,7 @@ def _scale_bar(scale: float, size: np.ndarray) -> Markup:
 
 
 def _axes(plan: Plan, size: np.ndarray) -> Markup:
-    """Return the directions on the page of the map axes that lie in it."""
+    """Return the directions on the page of those map axes that are parallel to the page."""
     x, y = size[0] - 48, size[1] + 8
     out = []
     for k, name in enumerate("xyz"):

@@ -1,4 +1,4 @@
-"""HTML page of a report: one self-contained file, composed of sections."""
+"""Compose the HTML page of a report, one self-contained file of several sections."""
 
 from __future__ import annotations
 
@@ -230,8 +230,8 @@ def _doubt(report: Report) -> Markup | None:
     parts: list[Part] = []
     if doubtful:
         parts.append(
-            tag("p", "No cycle of other edges confirms a tentative edge: it may well be right, but needs a review. An "
-                "undecided edge contradicts other edges, and gsmap cannot decide which of them is right. Each row "
+            tag("p", "No cycle of other edges confirms a tentative edge: it may be correct, but needs a review. An "
+                "undecided edge contradicts other edges, and gsmap cannot decide which is correct. Each row "
                 "shows one camera: the first scene, the second scene, and their differences in red. If walls and "
                 "furniture coincide, confirm the edge; if not, reject it.")
         )  # fmt: skip
@@ -267,7 +267,9 @@ def _doubt(report: Report) -> Markup | None:
 
 def _probably(edge: EdgeEntry | None) -> str:
     return (
-        "" if edge is None or edge.probability is None else f", right with probability {probability(edge.probability)}"
+        ""
+        if edge is None or edge.probability is None
+        else f", correct with probability {probability(edge.probability)}"
     )
 
 
@@ -289,7 +291,7 @@ def _edges(report: Report) -> Markup | None:
             _figure(
                 plots.residual_bars(solved),
                 f"{_largest(plots.pulled(solved))}. Dashed: 95 % and 99.9 % of correct edges lie below. "
-                "An edge in no cycle has no residual, whether right or wrong.",
+                "An edge in no cycle has no residual, whether it is correct or not.",
             )
         )
     if len(checked) > 1:
@@ -327,8 +329,8 @@ def _redundancy(report: Report) -> Markup | None:
         return None
     total = sum(edge.chi2 or 0.0 for edge in used)
     if spare <= 0:
-        return tag("p", f"{count(len(used), 'edge is', 'edges are')} used, without redundancy: "
-                   "nothing checks them.")  # fmt: skip
+        return tag("p", f"{count(len(used), 'edge is', 'edges are')} used, without redundancy, "
+                   "so that nothing checks these edges.")  # fmt: skip
     factor = total / spare
     verdict_ = (
         "residuals agree with the standard deviations of the edges"
@@ -529,7 +531,7 @@ def _changes(report: Report) -> Markup | None:
 
 
 def _things(report: Report) -> Markup | None:
-    """Format rooms and objects, named objects first."""
+    """Format the rooms and objects of the map, named objects first."""
     known = report.objects
     if known is None or not known.objects:
         return None
@@ -726,7 +728,7 @@ def _table(
 def _folded(
     head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = (), long: Sequence[int] = ()
 ) -> Markup:
-    """Return a table whose later rows are folded if there are many."""
+    """Return a table that shows its first rows and folds the remaining rows if there are many."""
     if len(rows) <= 2 * _FEW:
         return _table(head, rows, numeric, long)
     rest = tag("details", tag("summary", f"{len(rows) - _FEW:,} more"), _table(head, rows[_FEW:], numeric, long))

@@ -1,4 +1,4 @@
-"""Settings of the report, which bound its size and time whatever the size of the map."""
+"""Settings that limit the size of a report and the time to make it, whatever the size of the map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Floor plan of a component: vertical projection in metres, aligned with its walls."""
+"""Compute the floor plan of a component: its vertical projection in metres, aligned with its walls."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Plan:
     picture_kind: str = ""
 
     def place(self, points: np.ndarray) -> np.ndarray:
-        """Return map points (N, 3) in plan axes, metres: right, up the page, height."""
+        """Transform map points (N, 3) to plan coordinates in metres: right, up the page, height."""
         found: np.ndarray = np.asarray(points, np.float64).reshape(-1, 3) @ self.R_plan_map.T * self.metres_per_unit
         return found
 
@@ -158,7 +158,7 @@ def _turn(angle: float) -> np.ndarray:
 
 
 def _inner(points: np.ndarray) -> np.ndarray:
-    """Return the points without the outermost ones on each axis; few points are returned unchanged."""
+    """Drop the outermost points on each axis; return a small number of points unchanged."""
     if len(points) < 50:
         return points
     low, high = np.quantile(points[:, :2], _KEPT, axis=0)

@@ -1,4 +1,4 @@
-"""Plots of a report, in the style of evo: plain axes, a tooltip for each value."""
+"""Draw the plots of a report in the style of evo: plain axes, and a tooltip for each value."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def residual_bars(edges: Sequence[EdgeEntry]) -> Markup:
 
 
 def pulled(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
-    """Return the edges with a residual, which are those in cycles."""
+    """Return the edges in cycles; only they have a residual."""
     return [edge for edge in edges if edge.chi2 is not None and edge.chi2 > NOT_PULLED]
 
 
@@ -78,7 +78,7 @@ def residual_distribution(edges: Sequence[EdgeEntry]) -> Markup:
 
 
 def offset_bars(edges: Sequence[EdgeEntry]) -> Markup:
-    """Plot the distance between each edge's measurement and the poses, metres, the largest first."""
+    """Plot the distance in metres between each edge's measurement and the poses, the largest first."""
     chosen = [e for e in pulled(edges) if e.translation_m is not None]
     chosen = sorted(chosen, key=lambda e: -(e.translation_m or 0.0))[:MAX_BARS]
     values = [max(e.translation_m or 0.0, 1e-5) for e in chosen]
@@ -152,7 +152,7 @@ def growth(revisions: Sequence[RevisionRow]) -> Markup:
 
 
 def stacked(parts: Sequence[tuple[str, float, str]], title: str) -> Markup:
-    """Plot shares of a whole, (name, value, tooltip), as one stacked bar."""
+    """Plot the parts of a whole, each (name, value, tooltip), as one stacked bar."""
     total, x, width = sum(value for _, value, _ in parts), 0.0, svg.WIDTH
     drawn = []
     for i, (_, value, tip) in enumerate(parts):
@@ -163,7 +163,7 @@ def stacked(parts: Sequence[tuple[str, float, str]], title: str) -> Markup:
 
 
 def matrix(names: Sequence[str], cells: Sequence[tuple[int, int, str, str]], title: str) -> Markup:
-    """Plot the matrix of pairs by outcome: one square per pair, below the diagonal.
+    """Plot the outcome of each pair as a square in a matrix, below the diagonal.
 
     Args:
         names: Names of the scenes, in the order of rows and columns.

@@ -1,4 +1,4 @@
-"""SVG axes, ticks and frames of plots, in units of the view box.
+"""Draw the axes, ticks and frames of plots as SVG, in units of the view box.
 
 Colours and fonts are classes of ``style.css``, so that one drawing serves light and dark pages and print.
 """
@@ -61,7 +61,7 @@ def _least(axis: Axis) -> float:
 
 
 def log_axis(values: Sequence[float], start: float, end: float) -> Axis:
-    """Return a logarithmic axis from power of ten to power of ten that contains the positive values."""
+    """Return a logarithmic axis that contains all positive values and begins and ends at powers of ten."""
     found = np.array([v for v in values if np.isfinite(v) and v > 0] or [1.0])
     low, high = 10.0 ** np.floor(np.log10(found.min())), 10.0 ** np.ceil(np.log10(found.max()))
     return Axis(float(low), float(high if high > low else low * 10), start, end, log=True)
@@ -172,7 +172,7 @@ def paths(lines: Sequence[np.ndarray], class_: str, *, closed: bool = True, tip:
 
 
 def marks(points: np.ndarray, class_: str, tip: str = "") -> Markup:
-    """Draw a round mark at each of (N, 2) points as one element, by zero-length lines with round ends."""
+    """Draw a round mark at each point (N, 2), all in one element of zero-length lines with round ends."""
     data = "".join(f"M{f(x)} {f(y)}h0" for x, y in points)
     return tag("path", tag("title", tip) if tip else None, d=data, class_=class_) if data else Markup("")
 

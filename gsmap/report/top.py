@@ -1,4 +1,4 @@
-"""Top views of a component with a transparent background, for floor plans."""
+"""Draw top views of a component with a transparent background, for floor plans."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def top_picture(parts: Sequence[Gaussians], plan: Plan, eyes: np.ndarray, longes
 
 
 def density_picture(points: np.ndarray, plan: Plan, longest_px: int) -> bytes:
-    """Draw the density of points (K, 3) from above, darker where more of them lie; WebP as in `top_picture`."""
+    """Draw points (K, 3) from above, darker where they are denser; return a WebP as `top_picture` does."""
     from PIL import Image
 
     width, height = _size_px(plan, longest_px // 3)
@@ -88,7 +88,7 @@ def _camera(plan: Plan, heights: np.ndarray, longest_px: int) -> Cameras:
 
 
 def _size_px(plan: Plan, longest_px: int) -> tuple[int, int]:
-    """Return width and height of a picture that fills the plan."""
+    """Return the width and height of a picture that fills the plan."""
     span = plan.bounds[1] - plan.bounds[0]
     width, height = np.maximum(1, np.round(span / span.max() * longest_px)).astype(int)
     return int(width), int(height)

@@ -1,4 +1,4 @@
-"""Formatting of numbers, dates and the state of a map for readers."""
+"""Format numbers, dates and the state of a map for readers."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def angle(degrees: float | None) -> str:
 
 
 def chi_square(value: float | None) -> str:
-    """Format a chi-square; rounding errors of edges in no cycle are 0."""
+    """Format a chi-square; for an edge in no cycle, whose chi-square is a rounding error, format 0."""
     return "0" if value is not None and abs(value) < NOT_PULLED else number(value)
 
 
@@ -105,7 +105,7 @@ def cut(name: str, most: int = 22) -> str:
 
 
 def cut_pair(pair: tuple[str, str], most: int = 22) -> str:
-    """Shorten two names for a drawing, keeping their ends, in which names mostly differ."""
+    """Shorten two names for a drawing; keep their ends, where names mostly differ."""
     if sum(map(len, pair)) + 1 <= most:
         return ":".join(pair)
     half = (most - 1) // 2
@@ -145,7 +145,7 @@ def _percent(share: float) -> str:
 
 
 def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
-    """Return the state of a map (``good``, ``look``, ``act`` or ``empty``) and the sentences that explain it.
+    """Return the state of a map (``good``, ``look``, ``act`` or ``empty``) and sentences that explain it.
 
     ``act``: the poses are missing or outdated, or a job failed. ``look``: something needs a review.
     """
@@ -243,4 +243,4 @@ def strained(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
 
 
 NOT_PULLED = 1e-6
-"""Chi-square below which an edge counts as unchecked by any cycle."""
+"""Largest chi-square of an edge that counts as not being in any cycle."""

@@ -1,4 +1,4 @@
-"""Settings: a frozen tree of parameters with dotted names, stored as TOML and set by ``--set``.
+"""Settings: a frozen tree of parameters with dotted names, which a map stores as TOML and ``--set`` changes.
 
 This room knows how any such tree is walked, changed and written; the tree itself is put together in `gsmap.map`, which
 knows all stages. Stages are handed their own ``Params``: nothing here is global.

@@ -24,7 +24,7 @@ _ENTRY = re.compile(r"^(?P<names>[A-Za-z_]\w*(?:, [A-Za-z_]\w*)*): (?P<text>.*)$
 
 @lru_cache(maxsize=512)
 def field_docs(cls: type) -> dict[str, str]:
-    """Return the meaning of each field of a dataclass from the ``Args:`` of its docstring; names may share an entry.
+    """Return the meaning of each field of a dataclass, from the ``Args:`` of its docstring; fields may share an entry.
 
     A docstring may also begin with ``Args:``, followed by a remark in brackets on the units.
     """

@@ -1,4 +1,4 @@
-"""``settings.toml``: the settings of a map that differ from the defaults; comments are kept."""
+"""Read and write ``settings.toml``, the settings of a map that differ from the defaults; keep its comments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HEADER = "Settings of this map that differ from the defaults; `gsmap settings M
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Load settings by dotted name (``preset`` among them); empty if there is no file.
+    """Load settings by dotted name, including ``preset``; empty if the file is missing.
 
     Raises:
         ConfigError: not TOML; the line is named.
@@ -39,7 +39,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def save(path: Path, values: Mapping[str, Any], drop: tuple[str, ...] = ()) -> None:
-    """Set and remove settings in a file; the rest of it, comments included, stays unchanged.
+    """Set and remove settings in a file; keep the rest of the file, including comments.
 
     Args:
         values: by dotted name.

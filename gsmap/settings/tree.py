@@ -1,4 +1,4 @@
-"""A tree of frozen settings: list its leaves by dotted name, and change some of them.
+"""List the leaves of a frozen settings tree by dotted name, and change some of them.
 
 The nodes are frozen dataclasses and `gsmap.methods.MethodParams`; a leaf is anything else: a number, a text, a switch,
 a tuple of them, or None where nothing is chosen.
@@ -20,12 +20,12 @@ from gsmap.methods import MethodParams
 from gsmap.settings.docs import field_docs, unit_of
 
 _BARE_DOT = re.compile(r"(?<![\w.])\.(?=\d)")
-"""The point of a number without a digit before it, which TOML refuses."""
+"""Matches a decimal point without a digit before it, which TOML refuses."""
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """One setting.
+    """One setting: its name, value, type, meaning and unit.
 
     Args:
         name: dotted, such as ``register.verdict.max_log_nfa``.
@@ -53,7 +53,7 @@ def leaves(tree: Any, prefix: str = "") -> Iterator[Leaf]:
 
 
 def changed(tree: Any, values: Mapping[str, Any]) -> Any:
-    """Return the tree with some settings changed; values are plain (as TOML or JSON hold them) or typed.
+    """Return the tree with some settings changed; values may be plain, as in TOML or JSON, or typed.
 
     Raises:
         ConfigError: an unknown name (the nearest known one is named), a value of another type, or one that the
@@ -85,7 +85,7 @@ def contains(tree: Any, name: str) -> bool:
 
 
 def parse(text: str) -> tuple[str, Any]:
-    """Parse ``a.b=value`` of ``--set``; the value is TOML (``.3`` is accepted, too) or plain text.
+    """Parse ``a.b=value`` from ``--set``; the value is TOML (also ``.3``) or plain text.
 
     Raises:
         ConfigError: no ``=``, or nothing before it.
@@ -96,7 +96,7 @@ def parse(text: str) -> tuple[str, Any]:
     name, value = name.strip(), value.strip()
     if not equals or not name:
         raise ConfigError(
-            f"a setting is given as name=value, such as register.verdict.max_log_nfa=-6, got {text!r}",
+            f"a setting must be written as name=value, such as register.verdict.max_log_nfa=-6, got {text!r}",
             code="invalid_assignment",
         )
     for text in (value, _BARE_DOT.sub(r"0.", value)):
@@ -124,12 +124,12 @@ def _children(tree: Any) -> Iterator[tuple[str, Any, Any, str]]:
 
 @lru_cache(maxsize=512)
 def _names(cls: type) -> tuple[str, ...]:
-    """Return the names of the fields that can be set."""
+    """Return the names of a dataclass's fields that can be set."""
     return tuple(field.name for field in fields(cls) if field.init)
 
 
 def _annotation(cls: type, name: str, value: Any) -> Any:
-    """Return the annotation of a leaf; None for a node, whose class need not be imported where it is declared."""
+    """Return the type annotation of a leaf; None for a node, whose class may not be imported where it is declared."""
     return None if _is_node(value) else _hints(cls)[name]
 
 
@@ -139,7 +139,7 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def _child(tree: Any, name: str) -> tuple[Any, Any]:
-    """Return value and annotation of one child; of a family only the named method is loaded.
+    """Return the value and annotation of one child; load only the named method of a family.
 
     Raises:
         KeyError: no such child.
@@ -167,7 +167,7 @@ def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:
     elif _is_node(below):
         inside = ", ".join(leaf.name for leaf in list(leaves(below, f"{name}."))[:4])
         raise ConfigError(
-            f"{name} holds several settings: set one of them, such as {inside}", code="setting_not_a_leaf"
+            f"{name} is a group of settings: set one of them, such as {inside}", code="setting_not_a_leaf"
         )
     else:
         new = _of_type(value, annotation, name)

@@ -1,4 +1,4 @@
-"""Browser page of a map, and pictures of scenes, edges and changes.
+"""The browser page of a map, and pictures of scenes, edges and changes.
 
 This package does not import the store. `gsmap.view.page_source` is the interface of a map, and `ViewServer` serves it
 on this machine only::

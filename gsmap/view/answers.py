@@ -1,4 +1,4 @@
-"""Responses of the page's server by address; `gsmap/view/page/src/contract.ts` defines their content."""
+"""Compute the response to each address of the page's server, as `gsmap/view/page/src/contract.ts` defines it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Answer:
 
 
 class Answers:
-    """Responses to the addresses of one map's page.
+    """The responses of the page of one map.
 
     Args:
         page_source: Content of the map.
@@ -104,7 +104,7 @@ class Answers:
         for pattern, route in self._routes:
             if (found := pattern.fullmatch(path)) is not None:
                 return route(*found.groups(), **({"asked": asked} if route in self._asking else {}))
-        raise NotFoundError(f"no page at {path}", code="page_not_found")
+        raise NotFoundError(f"the page has no address {path}", code="page_not_found")
 
     @property
     def _asking(self) -> tuple[Callable[..., Answer], ...]:
@@ -136,7 +136,9 @@ class Answers:
     def _entry(self, key: str) -> ViewScene:
         found = next((one for one in self.content().scenes if one.key == key), None)
         if found is None:
-            raise NotFoundError("no scene has this content any more: fetch map.json again", code="content_outdated")
+            raise NotFoundError(
+                "the map has no scene of this id any more: fetch map.json again", code="content_outdated"
+            )
         return found
 
     def _tileset(self, key: str, asked: Mapping[str, str]) -> Answer:
@@ -213,7 +215,7 @@ class Answers:
         return self._drawn(change, lambda: {change: self._page_source.change_picture(change)})
 
     def _drawn(self, name: str, draw: Callable[[], Mapping[str, np.ndarray]]) -> Answer:
-        """Return a picture from memory, or draw it with the pictures of the same call, one call at a time."""
+        """Return a picture from memory, or draw it together with all pictures of the same call, one call at a time."""
         state = self._page_source.state()
         with self._drawing:
             found = self._pictures.get(f"{state} {name}")
@@ -226,7 +228,7 @@ class Answers:
             else:
                 self._pictures.move_to_end(f"{state} {name}")
         if found is None:
-            raise NotFoundError(f"no such picture of {name.partition(' ')[0]}", code="page_not_found")
+            raise NotFoundError(f"there is no such picture of {name.partition(' ')[0]}", code="page_not_found")
         return Answer(found, JPEG)
 
 

@@ -1,4 +1,4 @@
-"""Location of the built page of `gsmap view`."""
+"""Find the built page of `gsmap view`."""
 
 from __future__ import annotations
 

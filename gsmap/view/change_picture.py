@@ -1,4 +1,4 @@
-"""Pictures of a change for review: both captures from the same camera, side by side."""
+"""Draw pictures of a change for review: both captures from the same camera, side by side."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FRAME = (255, 64, 64)
 
 @dataclass(frozen=True, eq=False)
 class _Crop:
-    """Camera of a cropped image, with a score of how well it shows the box."""
+    """The camera of a cropped image, with a score that is higher the better it shows the box."""
 
     camera: Cameras
     score: float
@@ -33,7 +33,7 @@ class _Crop:
 def draw_change(
     older: PosedScene, newer: PosedScene, box: np.ndarray, points: np.ndarray, side_px: int = 320
 ) -> np.ndarray:
-    """Draw a change, before on the left and after on the right, with its box outlined: (H, W, 3) uint8.
+    """Draw the place before a change on the left and after it on the right, with the change's box: (H, W, 3) uint8.
 
     Args:
         older, newer: Both captures in one metric frame.
@@ -48,7 +48,7 @@ def draw_change(
 
 
 def draw_place(scene: PosedScene, box: np.ndarray, side_px: int = 320) -> np.ndarray:
-    """Render a scene in a box from the camera that sees most of it, (H, W, 3) uint8, with the box outlined.
+    """Render a place in a scene from the camera that sees most of its box, with the box outlined: (H, W, 3) uint8.
 
     Args:
         scene: Scene in a metric frame.
@@ -86,7 +86,7 @@ def _best(older: PosedScene, newer: PosedScene, box: np.ndarray, points: np.ndar
 
 
 def _crop(camera: Cameras, box: np.ndarray, points: np.ndarray) -> _Crop | None:
-    """Crop a camera to the image region around a box; None if it shows none of the points."""
+    """Crop a camera to the image region around a box; None if the region shows none of the points."""
     pixels, depth = _project(points, camera)
     shown = in_image(pixels, depth, camera.sizes_px[0])
     if not shown.any():
@@ -107,7 +107,7 @@ def _crop(camera: Cameras, box: np.ndarray, points: np.ndarray) -> _Crop | None:
 
 
 def _num_seen(scene: PosedScene, camera: Cameras, points: np.ndarray) -> int:
-    """Return the number of points on the surface that a camera sees."""
+    """Count the points that a camera sees, which lie on the surface in its image."""
     small = _sized(camera, _TRIED_PX)
     depth = render(scene.gaussians, small).depth[0]
     pixels, deep = _project(points, small)

@@ -1,4 +1,4 @@
-"""Local connections: a bounded number with timeouts, on Linux from the same user only."""
+"""Serve a limited number of local connections with timeouts, on Linux from the same user only."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Address = tuple[str, int]
 
 @dataclass(eq=False)
 class Connection:
-    """Connection of one client.
+    """The connection of one client.
 
     Args:
         socket: Socket of the client.
@@ -42,7 +42,7 @@ class Connection:
 
 
 class LocalServer(HTTPServer):
-    """HTTP server with at most `MAX_CONNECTIONS` connections, one thread each.
+    """An HTTP server with at most `MAX_CONNECTIONS` connections, each in a thread of its own.
 
     A further connection replaces the one that has been idle for longest, so that incomplete requests cannot block the
     page.
@@ -110,7 +110,7 @@ class LocalServer(HTTPServer):
 
 
 def is_of_another_user(client: Address, server: Address) -> bool:
-    """Return true if the client of a local connection is a user other than this one and root.
+    """Return true if the client of a local connection belongs to another user, except root.
 
     Returns false if unknown: outside Linux, or for a socket that is closing.
     """

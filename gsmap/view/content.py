@@ -1,4 +1,4 @@
-"""Content of the page as `gsmap/view/page/src/contract.ts` defines it, and its conversion to JSON.
+"""The content of the page, as `gsmap/view/page/src/contract.ts` defines it, and its conversion to JSON.
 
 This module reads no files; `gsmap.view.page_source` loads what the page requests.
 """
@@ -18,7 +18,7 @@ from gsmap.types import Scene, ScenePose, Sim3
 
 SCHEMA = 1
 UNPLACED_UP = (0.0, -1.0, 0.0)
-"""Up direction assumed for a scene without one: frames of trainers are right, down, front."""
+"""Up direction assumed for a scene whose up direction is unknown, as frames of trainers are right, down, front."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class ViewEdge:
 
 @dataclass(frozen=True)
 class ViewRevision:
-    """A revision on the page; ``is_kept`` if its poses are still stored."""
+    """A revision on the page; ``is_kept`` is true if its poses are still stored."""
 
     id: int
     created_at: str
@@ -140,7 +140,7 @@ class ViewPhoto:
 
 @dataclass(frozen=True, eq=False)
 class ViewMap:
-    """Content of the page at one time.
+    """The content of the page at one time.
 
     Args:
         title: Name of the map.
@@ -167,14 +167,14 @@ class ViewMap:
     stale: bool = False
 
     def components(self) -> list[int]:
-        """Return the component of each scene; each scene without a pose gets a further component of its own."""
+        """Return the component of each scene; each scene without a pose gets a new component of its own."""
         last = 1 + max((s.pose.component for s in self.scenes if s.pose is not None), default=-1)
         return [s.pose.component if s.pose else last + i for i, s in enumerate(self.scenes)]
 
 
 @dataclass(frozen=True)
 class ViewOverview:
-    """Overview of a component: the coarsest levels of its scenes in one file.
+    """An overview of a component: the coarsest levels of its scenes in one file.
 
     Args:
         uri: Address of the file.
@@ -195,7 +195,7 @@ class ViewOverview:
 
 @dataclass(frozen=True, eq=False)
 class ServerState:
-    """Content that a server or a static page adds to a map.
+    """Content that a server or a static page adds to the content of a map.
 
     Args:
         actions: The page offers reviews and edits.
@@ -213,7 +213,7 @@ class ServerState:
 
 
 def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
-    """Return ``map.json``, the lists of the page."""
+    """Return the content of ``map.json``, which has the lists of the page."""
     components = view.components()
     at = {entry.scene.id: index for index, entry in enumerate(view.scenes)}
     boxes = [served.boxes.get(entry.key, entry.scene.bounds) for entry in view.scenes]
@@ -292,7 +292,7 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
 
 
 def up_of(scenes: Sequence[ViewScene]) -> list[float]:
-    """Return the up direction of a component: the median over its scenes.
+    """Return the up direction of a component, the median over its scenes.
 
     Default: z of the map, or `UNPLACED_UP` for a single scene without edges.
     """

@@ -1,4 +1,4 @@
-"""Picture of a scene graph for inspection."""
+"""Draw a scene graph for inspection."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def draw_graph(
     width_px: int = 960,
     local_distance_m: float = 1.5,
 ) -> np.ndarray:
-    """Draw the graph over a render: (H, W, 3) uint8.
+    """Draw a scene graph over a render of the scene: (H, W, 3) uint8.
 
     Objects are discs with their number (the row of the layer), joined to the nearest of the visible neighbours that
     their context is counted over; a disc is a small ring where the object is hidden. The strongest landmarks are small
@@ -46,7 +46,7 @@ def draw_graph(
         NotFoundError: No camera has the name.
     """
     if len(cameras) == 0:
-        raise InputError("a picture of the graph needs a camera to look through", code="nothing_to_draw")
+        raise InputError("a picture of the graph needs a scene with at least one camera", code="nothing_to_draw")
     if camera is None:
         view = _best_view(gaussians, cameras, graph, width_px)
     else:
@@ -69,7 +69,7 @@ def draw_graph(
 
 
 def _best_view(gaussians: Gaussians, cameras: Cameras, graph: SceneGraph, width_px: int) -> View:
-    """Render the camera, of a few sampled ones, that sees most nodes."""
+    """Sample a few cameras, and render the view of the camera that sees most nodes."""
     nodes = np.concatenate([layer.positions for layer in graph.layers.values()] or [np.zeros((0, 3))])
     some = cameras.evenly(12)
     seen = [_visible(nodes, _render(gaussians, some[i], 240), 0.1).sum() for i in range(len(some))]

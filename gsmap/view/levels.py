@@ -1,4 +1,4 @@
-"""Levels of detail of scenes and overviews of components, from a cache or computed in the background."""
+"""Provide levels of detail of scenes and overviews of components, from a cache or computed in the background."""
 
 from __future__ import annotations
 
@@ -58,8 +58,7 @@ def overview_file(parts: Sequence[tuple[ViewScene, Sketch]]) -> bytes:
 def extent_of(
     parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]
 ) -> tuple[tuple[tuple[float, float], ...], tuple[float, float, float]]:
-    """Return floor and ceiling of each scene along a direction of the map, and length, width and height of all scenes,
-    without a few outliers on every side."""
+    """Return the floor and ceiling of each scene, and the length, width and height of all scenes, without outliers."""
     points = [entry.S_map_scene.apply(one.gaussians.means) for entry, one in parts]
     ends = [np.quantile(one @ np.asarray(up), (_STRAYS, 1 - _STRAYS)).tolist() for one in points]
     return tuple((low, high) for low, high in ends), upright_size(np.concatenate(points), np.asarray(up), _STRAYS)
@@ -67,7 +66,7 @@ def extent_of(
 
 @dataclass(eq=False)
 class _ComponentSketches:
-    """Sketches of one component, and those of them in the overview that the page has."""
+    """The sketches of one component, and the keys of those in the overview that the page has."""
 
     size: int
     sketches: dict[str, Sketch] = field(default_factory=dict)
@@ -77,7 +76,7 @@ class _ComponentSketches:
 
 
 class Levels:
-    """Trees and overviews of one map.
+    """The trees and overviews of one map.
 
     Args:
         page_source: Content of the map.
@@ -122,7 +121,7 @@ class Levels:
         data = self._cache.tile(entry.key, uri)
         if data is None:
             raise NotFoundError(
-                f"{entry.scene.name} has no tile {uri} any more: fetch its tileset again", code="content_outdated"
+                f"scene {entry.scene.name} has no tile {uri} any more: fetch its tileset again", code="content_outdated"
             )
         return data
 
@@ -172,7 +171,7 @@ class Levels:
             return {key: one.box for group in self._components.values() for key, one in group.sketches.items()}
 
     def overviews(self, view: ViewMap) -> tuple[dict[int, ViewOverview], str]:
-        """Return the overview of each component as far as it exists, and its `state`.
+        """Return the overview of each component for which one exists, and their `state`.
 
         This starts the overview of the largest component.
         """
@@ -186,7 +185,7 @@ class Levels:
             return out, self.state()
 
     def look_at(self, view: ViewMap, scene: str) -> None:
-        """Start the overview of a scene's component, because a user views the scene."""
+        """Start computing the overview of a scene's component, as a user views the scene."""
         place = next((i for i, entry in enumerate(view.scenes) if entry.scene.id == scene), None)
         if place is not None:
             component = view.components()[place]
@@ -202,7 +201,7 @@ class Levels:
         """
         inside = members(view).get(component)
         if inside is None:
-            raise NotFoundError(f"no component {component}", code="component_not_found")
+            raise NotFoundError(f"the map has no component {component}", code="component_not_found")
         with self._lock:
             overview = self._overview(component, inside)
             if name == "none":
@@ -217,7 +216,7 @@ class Levels:
             return parts
 
     def state(self) -> str:
-        """Return a text that differs whenever the page has to load another overview."""
+        """Return a text that changes whenever the page has to load another overview."""
         with self._lock:
             parts = [f"{component} {len(group.published)}" for component, group in self._components.items()]
         return " ".join(sorted(parts))
@@ -225,7 +224,7 @@ class Levels:
     def whole(
         self, inside: Mapping[int, ViewScene], size: int | None = None
     ) -> tuple[bytes, ViewOverview, dict[str, np.ndarray]]:
-        """Compute the overview of a component in this thread, with bounding boxes of its scenes by key.
+        """Compute the overview of a component in this thread; return it with the bounding boxes of its scenes, by key.
 
         Args:
             inside: Scenes of the component by index.
@@ -248,7 +247,7 @@ class Levels:
         return overview_file(parts), ViewOverview("", tuple(places), counts, 0, heights, sides), boxes
 
     def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
-        """Return the overview of one component as far as it exists, and request the rest."""
+        """Return the overview of a component with the sketches that exist, and request the missing sketches."""
         size = sketch_size(len(inside))
         group = self._components.get(component)
         if group is None or group.size != size:
@@ -291,7 +290,7 @@ class Levels:
         return group.overview
 
     def _publish(self, group: _ComponentSketches, num_scenes: int) -> None:
-        """Publish the sketches when all are there or their number has doubled, so that the page reloads rarely."""
+        """Publish the sketches when all exist or their number has doubled, so that the page reloads rarely."""
         found = group.sketches.keys()
         if len(found) >= num_scenes or len(found) >= 2 * len(group.published & found):
             group.published = frozenset(found)
@@ -323,7 +322,7 @@ def members(view: ViewMap) -> dict[int, dict[int, ViewScene]]:
 
 
 def _digest(parts: Sequence[tuple[ViewScene, Sketch]]) -> str:
-    """Return a digest of the content and poses of an overview."""
+    """Return a digest of the content of an overview and of its scenes' poses."""
     out = hashlib.sha256()
     for entry, one in parts:
         out.update(f"{entry.key} {len(one.gaussians)}".encode())

@@ -1,4 +1,4 @@
-"""Background jobs of the page, by priority; jobs that are no longer requested are dropped."""
+"""Run background jobs of the page by priority, and drop jobs that are no longer requested."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Work = Callable[[Progress], object]
 
 @dataclass(frozen=True)
 class PendingResult:
-    """Result that is not available yet.
+    """A result that is not available yet.
 
     Args:
         progress: Completed fraction of its job, in [0, 1].
@@ -45,7 +45,7 @@ class _ShutdownRequest(Exception):
 
 
 class Maker:
-    """Threads that run named jobs, each once, lowest rank first."""
+    """Threads that run named jobs, each job once, in the order of rank."""
 
     def __init__(self, workers: int) -> None:
         self._jobs: dict[str, _Job] = {}
@@ -56,7 +56,7 @@ class Maker:
             thread.start()
 
     def ask(self, name: str, work: Work, *, rank: float = 0.0, lasting: bool = False) -> PendingResult:
-        """Request a job; call again until its result exists.
+        """Request a job; call this again until it returns the job's result.
 
         Args:
             name: Name of the job; a pending job of the same name is not started twice.

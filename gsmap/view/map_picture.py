@@ -1,4 +1,4 @@
-"""Picture of a map: oblique view and top view without ceilings and near walls, with the camera paths."""
+"""Draw a map with its camera paths: an oblique view without ceilings and near walls, and a top view."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _find_up(parts: Sequence[Part]) -> np.ndarray:
 
 
 def _normals(gaussians: Gaussians) -> np.ndarray:
-    """Return the shortest axes of flat Gaussians, which lie along surfaces."""
+    """Return the normals of flat Gaussians, which lie along surfaces: their shortest axes."""
     log_scales = np.sort(gaussians.log_scales, axis=1)
     flat = gaussians[(log_scales[:, 1] - log_scales[:, 0] > 1.0) & (gaussians.opacities > 0.5)]
     rotation = quats_to_matrices(flat.quats)
@@ -110,7 +110,7 @@ def _normals(gaussians: Gaussians) -> np.ndarray:
 
 
 def _bounds(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the drawn box: 99 % of the Gaussians, with its top slightly above the cameras."""
+    """Return the box to draw: it contains 99 % of the Gaussians, and its top is slightly above the cameras."""
     means = np.concatenate([g.means for _, g, _ in parts])
     low, high = np.quantile(means, [0.005, 0.995], axis=0)
     eyes = np.median(np.concatenate([cameras.centers[:, 2] for *_, cameras in parts]))
@@ -165,7 +165,7 @@ def _render(parts: Sequence[Part], view: Cameras, low: np.ndarray, high: np.ndar
 
 
 def _faces(gaussians: Gaussians, cameras: Cameras, eye: np.ndarray) -> np.ndarray:
-    """Return a mask (N,) of Gaussians whose side seen by the scene's cameras faces the eye.
+    """Return a mask (N,) that is True for Gaussians that face the eye with the side that the scene's cameras saw.
 
     The side seen is the one towards the cameras in whose renders the Gaussian dominates a pixel.
     """
@@ -190,7 +190,7 @@ def _project(points: np.ndarray, view: Cameras, corner: tuple[int, int]) -> np.n
 
 
 def _draw_walks(draw, parts: Sequence[Part], view: Cameras, corner, unit: float, full: bool) -> None:
-    """Draw the camera path of each scene in its colour and, with ``full``, the viewing directions."""
+    """Draw the camera path of each scene in the scene's colour and, with ``full``, the viewing directions."""
     for k, (_, _, cameras) in enumerate(parts):
         colour = _COLOURS[k % len(_COLOURS)]
         path = [tuple(p) for p in _project(cameras.centers, view, corner)]

@@ -1,4 +1,4 @@
-"""Interface of a map to the page's server, read for each request so that changes by other processes are visible."""
+"""The interface of a map to the page's server, which reads it on each request to see changes of other processes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsmap.types import GaussianSource
 from gsmap.view.content import ViewMap
 
 Action = Callable[[Mapping[str, Any]], None]
-"""Function that applies an action of the page, with the fields of `contract.ts`; raises `gsmap.errors.GsmapError`."""
+"""Applies an action of the page, with the fields of `contract.ts`; raises `gsmap.errors.GsmapError`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +32,14 @@ class PairPictures:
 
 
 class PageSource(Protocol):
-    """Content of a map for the page.
+    """The content of a map for the page.
 
     Every method is thread-safe and may raise `GsmapError`, for missing items `NotFoundError`. Returned dicts are JSON
     of `contract.ts`.
     """
 
     def state(self) -> str:
-        """Return a text that differs after every change of the map; fast."""
+        """Return quickly a text that differs after every change of the map."""
         ...
 
     def content(self) -> ViewMap:
@@ -55,13 +55,13 @@ class PageSource(Protocol):
     def revision(self, number: int) -> dict[str, Any]: ...
 
     def edge(self, target: str, source: str) -> dict[str, Any]:
-        """Return the `EdgeDetail` of a pair without its views."""
+        """Return the `EdgeDetail` of a pair, without its views."""
         ...
 
     def pair_pictures(self, target: str, source: str) -> PairPictures: ...
 
     def pair_cameras(self, target: str, source: str) -> tuple[str, ...]:
-        """Return the names of the cameras of `pair_pictures` without drawing."""
+        """Return the names of the cameras that `pair_pictures` would use, without drawing."""
         ...
 
     def change_picture(self, change: str) -> np.ndarray: ...

@@ -1,4 +1,4 @@
-"""Picture of a pair of scenes for review: both captures from the same cameras, and their differences."""
+"""Draw a pair of scenes for review: both captures from the same cameras, and their differences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MARK = np.array([1.0, 0.25, 0.25])
 def draw_pair(
     target: PosedScene, source: PosedScene, cameras: Sequence[Cameras], unit_m: float = 1.0, side_px: int = 320
 ) -> np.ndarray:
-    """Draw a row per camera, (H, W, 3) uint8: the target, the source, and the target with differences marked.
+    """Draw one row per camera: the target, the source, and the target with differences marked; (H, W, 3) uint8 in all.
 
     Args:
         target, source: Both captures, in one frame.

@@ -180,7 +180,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self._waits_since(None)
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
-            self.send_error(HTTPStatus.BAD_REQUEST, "A request here has no body")
+            self.send_error(HTTPStatus.BAD_REQUEST, "A GET request must not have a body")
             return
         path, _, query = self.path.partition("?")
         asked = parse_qs(query)
@@ -195,7 +195,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._guarded(lambda: self.answers.get(path, {name: values[0] for name, values in asked.items()}))
 
     def do_POST(self) -> None:
-        """Handle an action of the page: from the page itself, small, one at a time."""
+        """Handle an action: accept it only from the page itself, only if small, and one at a time."""
         self._waits_since(None)
         length = self.headers.get("Content-Length", "")
         own = f"http://{self.headers.get('Host', '')}"
@@ -204,9 +204,9 @@ class _Handler(BaseHTTPRequestHandler):
         elif self.headers.get("Origin") != own or self.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
             self.send_error(HTTPStatus.FORBIDDEN, "Only the page itself may send actions")
         elif self.headers.get_content_type() != "application/json" or "Transfer-Encoding" in self.headers:
-            self.send_error(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Actions are JSON")
+            self.send_error(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Actions must be sent as application/json")
         elif not length.isdecimal() or len(length) > 9 or int(length) > _MAX_BODY_BYTES:
-            self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"An action has at most {_MAX_BODY_BYTES} bytes")
+            self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"An action may have at most {_MAX_BODY_BYTES} bytes")
         else:
             self._guarded(lambda: self._act(self.rfile.body(int(length))))
 
@@ -236,7 +236,7 @@ class _Handler(BaseHTTPRequestHandler):
         return Answer.json({"map": self.answers.summary()})
 
     def _guarded(self, answer: Any) -> None:
-        """Send an answer, or the error that prevents it."""
+        """Send a response, or the error that its computation raises."""
         try:
             found = answer()
         except GsmapError as error:
@@ -254,7 +254,7 @@ class _Handler(BaseHTTPRequestHandler):
         return host.lower() in ("127.0.0.1", "localhost") and port in ("", str(self.server.server_port))
 
     def _file_of_page(self, path: str) -> Path | None:
-        """Return the file of the built page at an address; None for all other files."""
+        """Return the file of the built page at an address; None if the built page has no such file."""
         name = "index.html" if path == "/" else path[1:]
         file = self.page / name
         return file if _FILE.fullmatch(name) and file.suffix in _KINDS and file.is_file() else None
@@ -269,7 +269,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     @property
     def _cookie_name(self) -> str:
-        """Name of the cookie: differs by port, because browsers send cookies to every port of a host."""
+        """Name of the cookie, which contains the port because browsers send cookies to every port of a host."""
         return f"gsmap_view_{self.server.server_port}"
 
     def _cookie(self) -> str:
@@ -319,7 +319,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class _BoundedStream:
-    """Request stream with a limit on the length of each request."""
+    """A request stream with a limit on the length of each request."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -333,7 +333,7 @@ class _BoundedStream:
         return line
 
     def body(self, size: int) -> bytes:
-        """Read the body of a request; the caller has checked its size."""
+        """Read the body of a request, whose size the caller has checked."""
         data = self._stream.read(size)
         if len(data) < size:
             raise ConnectionError("the request ended early")

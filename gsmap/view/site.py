@@ -1,4 +1,4 @@
-"""Static page of a map: a folder for any web server, or one HTML file.
+"""Write a static page of a map: a folder for any web server, or one HTML file.
 
 Both contain the responses of `gsmap.view.answers` to GET requests, under the same addresses, except for those computed
 on request. A folder has the whole tree of each scene; a file the part of the trees that fits.
@@ -69,7 +69,7 @@ _EMBEDDED = """
 
 @dataclass(frozen=True)
 class SiteContents:
-    """Summary of a written site.
+    """A summary of the content of a static page.
 
     Args:
         num_bytes: Total size.
@@ -91,7 +91,7 @@ class _Maker:
     notes: list[str] = field(default_factory=list)
 
     def files(self, view: ViewMap, *, size: int | None = None, pictures: bool = True) -> Iterator[tuple[str, bytes]]:
-        """Yield address and bytes of all files except trees and merged tiles; ``map.json`` last.
+        """Yield the address and bytes of all files except trees and merged tiles, ``map.json`` last.
 
         Args:
             view: Content of the map.
@@ -158,11 +158,11 @@ class _Maker:
             yield f"edges/{pair[0]}-{pair[1]}.json", _json(detail | {"views": views})
 
     def tried(self, what: str, make: Callable[[], Any]) -> Any:
-        """Return what the function makes; None, with a note, if its input is damaged or missing."""
+        """Return the result of a function; if its input is damaged or missing, note this and return None."""
         try:
             return make()
         except (CorruptError, NotFoundError, InputError) as error:
-            self.notes.append(f"{what} is left out: {error}")
+            self.notes.append(f"{what} is missing on the page: {error}")
             return None
 
 
@@ -302,7 +302,7 @@ def _fitting(
 
 
 def _cut(tile: dict[str, Any], kept: set[str]) -> dict[str, Any]:
-    """Return a tile without omitted children; either all children of a tile are kept, or none."""
+    """Return a tile with the children that were chosen; either all children of a tile are kept, or none."""
     children = [_cut(child, kept) for child in tile.get("children", ()) if child["content"]["uri"] in kept]
     rest = {name: value for name, value in tile.items() if name != "children"}
     return rest | ({"children": children} if children else {})
@@ -357,7 +357,7 @@ def _hash(code: str) -> str:
 
 
 def _merged(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the files of the 3D Tiles of a component in an export folder, with their addresses."""
+    """Yield the addresses and the files of a component's 3D Tiles in an export folder."""
     for path in sorted(folder.rglob("*")):
         if path.is_file() and not path.is_symlink() and path.suffix in _MERGED_SUFFIXES:
             yield path.relative_to(folder).as_posix(), path

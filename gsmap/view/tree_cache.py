@@ -1,4 +1,4 @@
-"""Cache of trees and sketches of scenes, outside the maps, so that a page opens immediately the next time.
+"""Cache trees and sketches of scenes in the user's cache folder, so that a page opens immediately the next time.
 
 Entries are named by content and method (``KEY.tree``, a folder; ``KEY.N.sketch``, a file), so that maps share them. An
 entry is created by one rename; a damaged entry counts as missing; the least recently used entries are evicted first.
@@ -33,7 +33,7 @@ _STALE_S = 3600.0  # age after which a staged entry counts as left over by a pro
 
 
 class TreeCache:
-    """Cache of levels of detail below one folder; several processes may use it at once.
+    """A cache of levels of detail in one folder, which several processes may use at once.
 
     Args:
         root: Folder of the cache; created with the first entry.
@@ -102,7 +102,7 @@ class TreeCache:
             return None
 
     def tile(self, key: str, uri: str) -> bytes | None:
-        """Return the bytes of a tile; None if it is missing or damaged, in which case the tree is deleted."""
+        """Return the bytes of a tile; if the tile is missing or damaged, delete its tree and return None."""
         named = _TILE.fullmatch(uri)
         if named is None:
             return None
@@ -116,7 +116,7 @@ class TreeCache:
         return data
 
     def make_tree(self, key: str, write: Callable[[Path], object]) -> Path:
-        """Let ``write`` create a folder, and store it as the tree of a scene.
+        """Let ``write`` fill a folder, and store that folder as the tree of a scene.
 
         If another process was faster, its tree is kept.
         """
@@ -139,12 +139,12 @@ class TreeCache:
     # --- all entries -------------------------------------------------------------------------------------------------
 
     def num_files(self, scene: str) -> int:
-        """Return the number of cached files of a scene, by the prefix of its keys."""
+        """Count the cached files of a scene, which the prefix of their keys identifies."""
         found = self.root.glob(f"{glob.escape(scene)}*")
         return sum(sum(f.is_file() for f in path.rglob("*")) if path.is_dir() else 1 for path in found)
 
     def forget(self, scene: str) -> None:
-        """Delete all entries of a scene, by the prefix of its keys."""
+        """Delete all entries of a scene, which the prefix of their keys identifies."""
         for path in self.root.glob(f"{glob.escape(scene)}*"):
             self._drop(path)
 
@@ -161,7 +161,7 @@ class TreeCache:
         self.root.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _drop(self, path: Path) -> None:
-        """Delete an entry, atomically for other processes."""
+        """Delete an entry such that other processes see it whole or not at all."""
         grave = self._staged()
         try:
             os.rename(path, grave)
@@ -173,7 +173,7 @@ class TreeCache:
             grave.unlink(missing_ok=True)
 
     def _make_room(self, size_bytes: int) -> None:
-        """Evict the least recently used entries until the given bytes fit, and leftovers of dead processes."""
+        """Evict leftovers of dead processes, and the least recently used entries until ``size_bytes`` fit."""
         kept = []
         for entry in os.scandir(self.root):
             with contextlib.suppress(OSError):
@@ -192,7 +192,7 @@ class TreeCache:
 
 
 def _num_bytes(path: Path) -> int:
-    """Return the size of an entry; for a tree from its manifest, which is faster than its files."""
+    """Return the size of an entry in bytes; read a tree's size from its manifest, which is faster than adding files."""
     if not path.is_dir():
         return path.stat().st_size
     try:

@@ -1,4 +1,4 @@
-"""Levels of detail of one scene for viewing: a 3D Tiles tree with the original Gaussians as leaves, and a sketch.
+"""Make the levels of detail of a scene for viewing: a 3D Tiles tree, whose leaves have all Gaussians, and a sketch.
 
 Stored Gaussians are ordered along a space-filling curve, so that each octree cell is a range of rows. The tree is built
 in one pass from the leaves up; each level merges the Gaussians of a grid cell and keeps their moments
@@ -54,7 +54,7 @@ class TreeParams:
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """Coarse approximation of a scene, and its extent.
+    """A coarse approximation of a scene, with the scene's extent.
 
     Args:
         gaussians: Merged Gaussians of SH degree 0, scene frame.
@@ -67,7 +67,7 @@ class Sketch:
 
 @dataclass(frozen=True, eq=False)
 class _Cell:
-    """A cell of the octree: rows ``[start, stop)``."""
+    """A cell of the octree, which contains the rows ``[start, stop)``."""
 
     start: int
     stop: int
@@ -76,7 +76,7 @@ class _Cell:
 
 @dataclass(frozen=True, eq=False)
 class _Extent:
-    """Corners (K, 3) of sampled Gaussians below a tile, and the light (K,) that each represents.
+    """Lower and upper corners (K, 3) of sampled Gaussians below a tile, and the light (K,) that each sample represents.
 
     The weight is light, not number, because a viewer skips content outside the box: one large haze would be missed,
     a hundred small floaters would not.
@@ -100,7 +100,7 @@ class _Extent:
         return cls(low, high, weight).few()
 
     def few(self) -> _Extent:
-        """Return the brightest entries, and a sample of the remaining entries with increased weights."""
+        """Reduce the samples: keep the brightest, and some others with increased weights that represent the rest."""
         if len(self.weight) <= _EXTENT_ROWS:
             return self
         order = np.argsort(-self.weight, kind="stable")
@@ -112,13 +112,12 @@ class _Extent:
         return _Extent(self.low[rows], self.high[rows], weight)
 
     def core(self) -> np.ndarray:
-        """Return the box (2, 3) that contains all but a fraction of the light on each side."""
+        """Return the box (2, 3) that contains all light except a small fraction on each side."""
         low, high = (robust_box(corners, self.weight, _STRAYS) for corners in (self.low, self.high))
         return np.stack([low[0], high[1]])
 
     def extras(self, content: Gaussians) -> dict[str, float]:
-        """Return the extras of a tile: its number of Gaussians, which is its cost, and its box without outliers, from
-        which viewers compute its distance."""
+        """Return the extras of a tile: its number of Gaussians (cost) and its box without outliers (for distances)."""
         low, high = self.core().round(4).tolist()
         corners = zip(("core_x0", "core_y0", "core_z0", "core_x1", "core_y1", "core_z1"), (*low, *high), strict=True)
         return {"num_gaussians": len(content), **dict(corners)}
@@ -126,7 +125,7 @@ class _Extent:
 
 @dataclass(frozen=True, eq=False)
 class _FinishedTile:
-    """A finished tile."""
+    """A tile whose file is written."""
 
     node: TileNode
     content: Gaussians
@@ -184,7 +183,7 @@ def sketch(source: GaussianSource, max_count: int) -> Sketch:
 
 
 def shown(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians that are finite and not transparent."""
+    """Return the Gaussians with finite values that are not transparent."""
     g = gaussians
     finite = np.isfinite(g.means).all(1) & np.isfinite(g.log_scales).all(1) & np.isfinite(g.quats).all(1)
     finite &= np.isfinite(g.sh).all((1, 2)) & (g.opacities > LEAST_OPACITY)
@@ -192,7 +191,7 @@ def shown(gaussians: Gaussians) -> Gaussians:
 
 
 class _Rows:
-    """Sequential reader of the rows of a source."""
+    """A reader of the rows of a source in ascending order."""
 
     def __init__(self, source: GaussianSource) -> None:
         self._chunks: Iterator[Gaussians] = source.chunks()
@@ -218,7 +217,7 @@ class _Builder:
     num_gaussians: int
 
     def build(self, cell: _Cell, name: str) -> _FinishedTile | None:
-        """Build the tile of a cell with all tiles below it; None without opaque Gaussians."""
+        """Build the tile of a cell and all tiles below it; None if the cell has no opaque Gaussians."""
         if not cell.children:
             content = shown(self.rows.take(cell.stop - cell.start))
             self.progress(cell.stop / self.num_gaussians, "")
@@ -259,7 +258,7 @@ class _Builder:
 
 
 def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
-    """Merge Gaussians per cell of the finest grid with at most ``max_count`` occupied cells.
+    """Merge the Gaussians in each cell of the finest grid that has at most ``max_count`` occupied cells.
 
     Returns the merged Gaussians, and the 95 % quantile of the distance from a Gaussian to its merged one.
     """

@@ -39,7 +39,7 @@ def test_a_capture_that_is_in_the_map_takes_a_date(site: Path, left: Path, cli: 
     told = cli("ingest", site, left, "--captured-at", "2026-06-01", "--json")
     (row,) = told.json["ingested"]
     assert (row["new"], row["dated"], row["captured_at"]) == (False, True, "2026-06-01T00:00:00+00:00")
-    assert "taken as UTC" in told.stderr
+    assert "UTC was assumed" in told.stderr
     assert "specified by a person" in " ".join(cli("show", site, "left").stdout.split())
     kept = cli("ingest", site, left)
     assert "nothing changed" in " ".join(kept.stdout.split())

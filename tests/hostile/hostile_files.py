@@ -144,7 +144,7 @@ def gaussians_that_are_a_device_or_a_pipe(w: World) -> None:
 
 
 @case(
-    r"save what comes from it first",
+    r"save its data to a file first",
     verbs=("ingest MAP HOME/../pipe.ply", "ingest MAP CAPTURES/c.ply --cameras HOME/../pipe.ply"),
 )
 def a_pipe_that_is_named_as_a_capture(w: World) -> None:

@@ -192,7 +192,7 @@ def test_a_sidecar_comes_first(sidecar: str, tmp_path: Path) -> None:
     assert (found.when, found.source) == ("2026-05-29T08:00:00+02:00", sidecar)
     assert found.note == f"dated 2026-05-29T08:00:00+02:00 by {sidecar}"
     (tmp_path / sidecar).write_text('{"captured_at": "2026-05-29"}')
-    assert "taken as UTC" in date_of(path).note
+    assert "UTC was assumed" in date_of(path).note
 
 
 def test_a_trainer_s_folder_has_its_sidecar_beside_it(tmp_path: Path) -> None:
@@ -239,10 +239,10 @@ def test_the_first_photograph_beside_it_tells(tmp_path: Path) -> None:
     photograph(tmp_path / "images" / "c.jpg")
     found = date_of(path)
     assert (found.when, found.source) == ("2026-05-31T12:05:00+00:00", "the EXIF of b.jpg")
-    assert "the first of 2 dates in 3 frames read, the last is 2026-05-31T14:10:00+02:00" in found.note
+    assert "the earliest of 2 dates in 3 frames read; the latest is 2026-05-31T14:10:00+02:00" in found.note
     assert "UTC" not in found.note
     photograph(tmp_path / "images" / "b.jpg", "2026:05:31 12:05:00")
-    assert "no zone was given, taken as UTC" in date_of(path).note
+    assert "no zone was given, so UTC was assumed" in date_of(path).note
 
 
 @pytest.mark.parametrize(
@@ -263,7 +263,7 @@ def test_an_offset_that_is_none_is_not_believed(tmp_path: Path) -> None:
     photograph(tmp_path / "images" / "a.jpg", "2026:05:31 14:00:00", "+99:00")
     found = date_of(path)
     assert found.when == "2026-05-31T14:00:00+00:00"
-    assert "taken as UTC" in found.note
+    assert "UTC was assumed" in found.note
 
 
 def test_images_of_several_captures_tell_of_none(tmp_path: Path) -> None:
@@ -331,7 +331,7 @@ def test_a_given_date_needs_no_finding(tmp_path: Path) -> None:
     path = capture(tmp_path / "hall_2026-05-31.ply")
     (told,) = read_captures(path, captured_at="2026-01-01T10:00")
     assert (told.captured_at, told.dated_by) == ("2026-01-01T10:00:00+00:00", "")
-    assert any("as told: no zone was given, taken as UTC" in note for note in told.notes)
+    assert any("as specified: no zone was given, so UTC was assumed" in note for note in told.notes)
     assert given_date("2026-01-01T10:00+01:00").note == ""
     assert given_date(None).when is None
     (found,) = read_captures(path)

@@ -1,1 +1,1 @@
-"""Executors, one file each; contract in `gsmap.methods.executor`."""
+"""Built-in executors, one per file; `gsmap.methods.executor` has their contract."""

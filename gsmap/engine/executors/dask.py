@@ -1,4 +1,4 @@
-"""Executor for a running Dask cluster, by the address of its scheduler.
+"""An executor for a running Dask cluster, which is found by the address of its scheduler.
 
 The scheduler holds little work and few results: jobs are submitted as workers are free, and each compressed result is
 fetched at once and committed to the map's catalog. So any part of the cluster may end.
@@ -24,7 +24,7 @@ from gsmap.methods.executor import QuarantinedJob
 VERSION = 1
 
 _ATTEMPTS = 2
-"""A job that was begun so often without an end killed its workers: it is quarantined."""
+"""Number of attempts after which a job that never ended is quarantined, as it probably killed its workers."""
 
 _BEGUN = "gsmap-begun"  # metadata key of the number of attempts
 _POLL_S = 1.0  # interval at which the number of workers is read
@@ -112,7 +112,7 @@ class DaskWorkers:
                 from distributed import Client
             except ImportError as error:
                 raise MissingDependencyError(
-                    "the executor dask needs the package distributed: pip install 'gsmap[cluster]'"
+                    "the dask executor needs the package distributed: pip install 'gsmap[cluster]'"
                 ) from error
             try:
                 self._client = Client(self._address, timeout=self._params.timeout_s, set_as_default=False, name="gsmap")
@@ -132,7 +132,7 @@ class DaskWorkers:
         return max(threads + math.ceil(_AHEAD * threads), _MIN_SUBMITTED)
 
     def _result(self, future: Any) -> tuple[bool, Any] | None:
-        """Return (returned, value or error) of a job; None where it must be submitted again.
+        """Return (True, value) or (False, error) of a job; None if the job must be submitted again.
 
         Raises:
             GsmapError: the scheduler is gone.
@@ -142,14 +142,17 @@ class DaskWorkers:
         try:
             packed = future.result(timeout=self._params.timeout_s)
         except KilledWorker as error:
-            return True, QuarantinedJob(f"the workers that tried it died, most likely for lack of memory ({error})")
+            return True, QuarantinedJob(
+                f"the workers that tried the job died, most likely for lack of memory ({error})"
+            )
         except (CancelledError, TimeoutError) as error:
             if self._client is None or self._client.status != "running":
                 raise self._lost() from error
             return None
         except (ImportError, pickle.UnpicklingError) as error:
             raise GsmapError(
-                f"a worker of {self._address} could not load its job ({error}): the same gsmap must be installed there",
+                f"a worker of {self._address} could not load its job ({error}): install the same version of gsmap "
+                "there",
                 code="worker_mismatch",
             ) from error
         returned, value = pickle.loads(zlib.decompress(packed))
@@ -158,7 +161,7 @@ class DaskWorkers:
     def _lost(self) -> GsmapError:
         self._client = None
         return GsmapError(
-            f"the Dask scheduler at {self._address} was lost; what was finished is kept, run the same command again",
+            f"the Dask scheduler at {self._address} was lost; finished results are kept: run the same command again",
             code="scheduler_lost",
         )
 
@@ -175,21 +178,22 @@ def start(params: Params) -> DaskWorkers:
     address = params.scheduler or os.environ.get("GSMAP_SCHEDULER", "")
     if not address:
         raise ConfigError(
-            "the executor dask needs the address of its scheduler: --scheduler tcp://HOST:8786, or GSMAP_SCHEDULER",
+            "the dask executor needs the address of its scheduler: pass --scheduler tcp://HOST:8786, or set the "
+            "environment variable GSMAP_SCHEDULER",
             code="missing_option",
         )
     return DaskWorkers(address, params)
 
 
 def do(run: str, key: str, message: bytes) -> bytes:
-    """Run a job on a worker and return its compressed answer; a job that killed its workers twice is not run again."""
+    """Run a job on a worker and return its compressed result; do not run a job that killed its workers twice."""
     from distributed import get_worker
     from distributed.utils import sync
 
     worker = get_worker()
 
     def begun(times: int | None = None) -> int:
-        """Get the number of attempts of the job from the scheduler, or set it."""
+        """Return the job's number of attempts from the scheduler, or set it to ``times``."""
         keys = [_BEGUN, run, key]
         if times is None:
             found: int = sync(worker.loop, worker.scheduler.get_metadata, keys=keys, default=0)
@@ -199,7 +203,7 @@ def do(run: str, key: str, message: bytes) -> bytes:
 
     before = begun()
     if before >= _ATTEMPTS:
-        reason = f"{before} workers that tried it died, most likely for lack of memory"
+        reason = f"{before} workers that tried the job died, most likely for lack of memory"
         return zlib.compress(pickle.dumps((True, QuarantinedJob(reason))), 1)
     begun(before + 1)
     packed = zlib.compress(answer(message), 1)

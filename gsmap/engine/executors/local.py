@@ -1,4 +1,4 @@
-"""Executor for a pool of processes on this machine, or this process where that is as fast."""
+"""An executor that runs jobs in processes on this machine, or in this process if that is as fast."""
 
 from __future__ import annotations
 
@@ -36,9 +36,7 @@ class Params:
 
 
 class LocalWorkers:
-    """Worker processes of this machine; see `gsmap.methods.executor.Workers`. One worker, or one job, keeps the
-    order.
-    """
+    """Worker processes of this machine; see `gsmap.methods.executor.Workers`. One worker yields results in order."""
 
     def __init__(self, params: Params) -> None:
         self._pool = Pool(params.workers or default_workers())
@@ -65,7 +63,7 @@ class LocalWorkers:
         yield from self._pool.run(job, chain(first, todo))
 
     def _is_worth_it(self, count: int, took_s: list[float]) -> bool:
-        """Return True if workers would finish the remaining jobs sooner than this process, their start included."""
+        """Return True if workers, including their start, would finish the remaining jobs sooner than this process."""
         if self._pool.num_idle:
             return True
         # The first job includes imports.
@@ -81,7 +79,7 @@ def start(params: Params) -> LocalWorkers:
 
 
 def default_workers() -> int:
-    """Return the number of processors that this process may use, or GSMAP_WORKERS."""
+    """Return the number set by the environment variable GSMAP_WORKERS, or the number of available processors."""
     named = os.environ.get("GSMAP_WORKERS", "")
     if named.isdigit() and int(named) > 0:
         return int(named)
