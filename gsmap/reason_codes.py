@@ -425,9 +425,7 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     # Anything else.
     "other": ("Another reason.", r""),
 }
-"""For each code, the reason in one sentence, and a pattern that matches the beginning of its texts, also of old texts
-in maps.
-"""
+"""The reason of each code in one sentence, and a pattern that matches the beginning of its texts, also of old texts."""
 
 
 _PATTERN = re.compile("|".join(f"(?P<{code}>{pattern})" for code, (_, pattern) in REASONS.items()))

@@ -1,4 +1,4 @@
-"""Store maps on disk: a relational catalog and immutable array groups (zarr)."""
+"""Store maps: a relational catalog, and immutable array groups (zarr)."""
 
 from gsmap.store.arrays import digest
 from gsmap.store.exports import Export

@@ -1,4 +1,4 @@
-"""Locks of a PostgreSQL server, used instead of file locks; one database holds one map.
+"""Locks of a PostgreSQL server, which replace file locks for a catalog on a server; one database holds one map.
 
 Each lock belongs to a transaction: the server frees it when the transaction or its connection ends.
 """

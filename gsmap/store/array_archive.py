@@ -1,4 +1,4 @@
-"""One file per array group: an uncompressed zip archive with the keys of a zarr v3 group.
+"""Write and read the file of an array group: an uncompressed zip archive with the keys of a zarr v3 group.
 
 `zarr.storage.ZipStore` and any unzip tool open it. gsmap writes it sequentially in an order that suits partial reads:
 the chunks of all long arrays row block by row block, so that the data of a region of a scene is contiguous; then arrays
@@ -24,7 +24,7 @@ import numpy as np
 
 FILE = "arrays.zip"
 TAIL_BYTES = 64 << 10
-"""Bytes read from the end first: enough for the table and metadata of a scene with two million Gaussians."""
+"""Number of bytes read first, from the end: enough for the table and metadata of a scene with two million Gaussians."""
 
 _ZSTD_LEVEL = 1
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # equal arrays give equal bytes, whenever they are written
@@ -48,7 +48,7 @@ class ByteRange:
 
 @dataclass(frozen=True)
 class StreamedArray:
-    """An array that is written block by block and is never in memory as a whole.
+    """An array that is written block by block and never fully in memory.
 
     Args:
         shape, dtype: of the whole array.
@@ -71,8 +71,9 @@ class StreamedArray:
 
 
 def write(path: Path, arrays: Mapping[str, np.ndarray | StreamedArray], *, chunk_rows: int) -> None:
-    """Write arrays in chunks of ``chunk_rows`` rows; streamed blocks are requested in row order across all arrays, so
-    that memory is bounded by one row block."""
+    """Write arrays in chunks of ``chunk_rows`` rows; only one block of rows of all streamed arrays is in memory at a
+    time.
+    """
     import zarr
     from numcodecs import zstd
     from zarr.codecs import ZstdCodec
@@ -103,7 +104,7 @@ def write(path: Path, arrays: Mapping[str, np.ndarray | StreamedArray], *, chunk
 
 
 def _chunk(array: np.ndarray | StreamedArray, i: int, rows: int) -> np.ndarray:
-    """Return the bytes of one chunk; the last one is padded with zeros, as zarr does."""
+    """Return the bytes of one chunk; the last chunk is padded with zeros, as in zarr."""
     part = np.ascontiguousarray(array[i * rows : (i + 1) * rows], array.dtype.newbyteorder("<"))
     if len(part) < rows:
         part = np.concatenate([part, np.zeros((rows - len(part), *part.shape[1:]), part.dtype)])
@@ -166,5 +167,5 @@ def _entries(table: bytes, count: int, end: int) -> Mapping[str, ByteRange]:
         out[name] = ByteRange(FILE, body, size, crc)
         lies = body + size
     if at != len(table) or lies != end:
-        raise ValueError("the archive's central directory does not list all of its members")
+        raise ValueError("the archive's central directory does not list all members of the archive")
     return MappingProxyType(out)

@@ -1,4 +1,4 @@
-"""Lossless encoding of arrays in few bytes, in an order that compresses well.
+"""Encode arrays without loss in few bytes, in an order that compresses well.
 
 Numbers that are multiples of a power of two are stored as small integers, others in the narrowest exact type. Types of
 several bytes are stored byte plane by byte plane (all high bytes of a column first), because neighbouring values share
@@ -39,14 +39,14 @@ def encode_array(values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def decode_array(stored: np.ndarray, encoding: Mapping[str, Any]) -> np.ndarray:
-    """Decode an array of `encode_array`; the stored array has the shape `encoded_shape`.
+    """Decode an array that `encode_array` returned, which has the shape `encoded_shape`.
 
     Raises:
         ValueError: the array has another type.
     """
     kept, dtype = _TYPES[encoding["as"]], _TYPES[encoding["is"]]
     if stored.dtype != (kept if kept.itemsize == 1 else np.uint8):
-        raise ValueError(f"its values are {stored.dtype}, but the catalog records {kept}")
+        raise ValueError(f"its values have the type {stored.dtype}, but the catalog records {kept}")
     values = stored if kept.itemsize == 1 else _join_bytes(stored, kept)
     values = values.reshape(encoding["shape"])
     if kept == dtype:
@@ -57,7 +57,7 @@ def decode_array(stored: np.ndarray, encoding: Mapping[str, Any]) -> np.ndarray:
 
 
 def encoded_shape(encoding: Mapping[str, Any]) -> Shape:
-    """Return the shape of the stored array.
+    """Return the shape of an encoded array.
 
     Raises:
         CorruptError: not an encoding of `encode_array`.
@@ -81,7 +81,7 @@ def _is_shape(value: object) -> TypeGuard[list[int]]:
 
 
 def _as(values: np.ndarray, dtype: np.dtype, step: float) -> np.ndarray | None:
-    """Convert values divided by ``step`` to another type; None if that loses anything."""
+    """Divide values by ``step`` and convert them to another type; return None if this is not exact."""
     if dtype.kind in "ui":
         limits = np.iinfo(dtype)
         over = values / step if step != 1.0 else values
@@ -107,7 +107,7 @@ def _step(values: np.ndarray) -> float:
 
 
 def _split_bytes(values: np.ndarray) -> np.ndarray:
-    """Convert (N, ...) of a type of B bytes to (B * columns, N) uint8."""
+    """Split an array (N, ...) of a type of B bytes into its bytes, (B * columns, N) uint8."""
     n, width = len(values), values.dtype.itemsize
     columns = math.prod(values.shape[1:])
     apart = np.ascontiguousarray(values).view(np.uint8).reshape(n, columns, width)[:, :, ::-1]

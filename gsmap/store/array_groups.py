@@ -1,4 +1,4 @@
-"""Array groups and the catalog rows that name them."""
+"""Publish and delete array groups together with the catalog rows that name them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def has_group(connection: Connection, group_id: str) -> bool:
 def publish(
     catalog: Catalog, connection: Connection, arrays: Arrays, staged: StagedGroup, kind: str, group_id: str
 ) -> None:
-    """Move a staged group to its final path and name it, inside a write transaction; replaces a damaged group.
+    """Move a staged group to its final path and insert its rows, inside a write transaction; replace a damaged group.
 
     Where another branch has the group and its files are sound, they are kept with that branch's manifest.
     """
@@ -43,13 +43,13 @@ def name(connection: Connection, kind: str, group_id: str, manifest: Sequence[St
 
 
 def unname(connection: Connection, group_id: str) -> None:
-    """Delete the rows that name a group; its referrers must change in the same transaction."""
+    """Delete the rows that name a group; rows that refer to the group must change in the same transaction."""
     connection.execute(delete(files).where(files.c.group_id == group_id))
     connection.execute(delete(groups).where(groups.c.id == group_id))
 
 
 def forget_derived(connection: Connection, scene: str) -> None:
-    """Delete the graphs and view features of a scene whose stored Gaussians change."""
+    """Delete the graphs and view features of a scene, as its stored Gaussians change."""
     for table in (graphs, view_features):
         made = table.c.scene == scene
         old = list(connection.execute(select(table.c.group_id).where(made)).scalars())
@@ -80,7 +80,7 @@ def unless_pruned(catalog: Catalog, group_id: str, gone: str) -> Iterator[None]:
 
 
 def num_bytes(connection: Connection, group_id: str) -> int:
-    """Return the size of a group's files, as written."""
+    """Return the size of a group's files in bytes, as they were written."""
     return sum(file.size_bytes for file in manifest(connection, group_id))
 
 

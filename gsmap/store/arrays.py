@@ -1,4 +1,4 @@
-"""Immutable groups of arrays on disk (zarr v3), staged beside, synchronised, renamed into place.
+"""Immutable groups of arrays on disk (zarr v3), which are staged, synchronized and renamed to their final path.
 
 A group is a folder ``arrays/KIND/ID`` with one archive in it (`gsmap.store.array_archive`). It appears by one rename
 once all its bytes are on the disk, and is valid only once a committed row of the catalog names it. Every chunk has a
@@ -81,8 +81,7 @@ class Arrays:
     def stage(
         self, arrays: Mapping[str, np.ndarray | array_archive.StreamedArray], kind: str, name: str
     ) -> Iterator[StagedGroup]:
-        """Write arrays to the staging folder and synchronize them; they are deleted at the end unless `publish` moved
-        them.
+        """Stage arrays on disk and synchronize them; delete them when the block ends unless `publish` moved them.
 
         Args:
             kind, name: kind and id of the group.
@@ -112,7 +111,7 @@ class Arrays:
     def stage_copies(
         self, source: Arrays, groups: Mapping[tuple[str, str], Sequence[StoredFile]]
     ) -> Iterator[dict[tuple[str, str], StagedGroup]]:
-        """Copy groups of another map to the staging folder; they are deleted at the end unless `publish` moved them.
+        """Stage copies of another map's groups; delete them when the block ends unless `publish` moved them.
 
         Files are hard links where the disk supports it, since no map writes to a stored file again; otherwise they are
         copies.
@@ -168,7 +167,7 @@ class Arrays:
         return _copy_group(self._group_folder(kind, name), target, files)
 
     def file_chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
-        """Yield the bytes of a file in order.
+        """Yield the bytes of a group's file in order.
 
         Raises:
             FileNotFoundError: the file is missing.
@@ -192,10 +191,10 @@ class Arrays:
         """
 
     def delete_models(self, named: Collection[str]) -> None:
-        """Delete all models of a remote map except the named ones; does nothing for a local map."""
+        """Delete all models of a remote map except those in ``named``; does nothing for a local map."""
 
     def publish(self, staged: StagedGroup, kind: str, name: str) -> None:
-        """Move a staged group to its final path; requires `lock`, and that no row names the group."""
+        """Move a staged group to its final path; the caller must hold `lock`, and no row may name the group yet."""
         place = self._group_folder(kind, name)
         fresh = not place.parent.exists()
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -279,7 +278,7 @@ class Arrays:
         return sum(found.st_size for found in files_below(self._group_folder(kind, name)).values())
 
     def drop(self, kind: str, name: str) -> None:
-        """Delete a group; for readers it disappears in one rename."""
+        """Delete a group, which disappears for readers in one rename."""
         place = self._group_folder(kind, name)
         if os.path.lexists(place):
             self._make_staging()
@@ -289,7 +288,7 @@ class Arrays:
                 self._remove_staged(grave.name)
 
     def groups(self) -> list[tuple[str, str]]:
-        """Return (kind, name) of every group on disk, whether or not a row names it."""
+        """Return (kind, name) of every group on disk, also of groups that no row names."""
         return [
             (kind, name)
             for kind in KINDS
@@ -298,14 +297,14 @@ class Arrays:
         ]
 
     def unknown_entries(self) -> list[str]:
-        """Return the paths of entries that are not groups; gsmap leaves them alone."""
+        """Return the paths of entries that are not groups, which gsmap never touches."""
         groups = {f"{kind}/{name}" for kind, name in self.groups()}
         kinds = [kind for kind in _names(self.root) if not (kind in KINDS and is_folder(self.root / kind))]
         out = [kind for kind in kinds if kind != self.staging.name or not is_folder(self.staging)]
         return out + [f"{k}/{name}" for k in KINDS for name in _names(self.root / k) if f"{k}/{name}" not in groups]
 
     def _group_folder(self, kind: str, name: str) -> Path:
-        """Return the folder of a group; validates the name, which may come from an untrusted catalog."""
+        """Return the folder of a group after validating its name, which may come from an untrusted catalog."""
         if kind not in KINDS or not is_digest(name):
             raise CorruptError(
                 f"{kind}/{name} is not the name of an array group; nothing was changed",
@@ -375,7 +374,7 @@ class ChunkedArray:
 
 
 def digest(*arrays: np.ndarray | ChunkedArray, text: str = "") -> str:
-    """Return 32 hex digits of SHA-256 over the bytes, shapes and types of arrays, and a text."""
+    """Return 32 hex digits of the SHA-256 of a text and of the bytes, shapes and types of arrays."""
     out = hashlib.sha256(text.encode())
     for array in arrays:
         out.update(f"|{array.dtype.str}{array.shape}|".encode())
@@ -417,7 +416,7 @@ def _copy_group(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
 
 
 class _FolderReader:
-    """Read files of a group that is a folder; the file read last stays open."""
+    """Reads the files of a group in a folder, and keeps the file that was read last open."""
 
     def __init__(self, place: Path) -> None:
         self._folder = place

@@ -1,4 +1,4 @@
-"""Record of the backups and clones of a map."""
+"""The record of a map's backups and clones."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class StoredBackup:
 
 
 class Backups:
-    """Backups recorded in the map; does not include copies of backups, and may list snapshots deleted since."""
+    """The backups recorded in a map. Copies of backups are not recorded, and deleted snapshots may still be listed."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog

@@ -1,4 +1,4 @@
-"""Branches and tags: further catalogs over the same arrays, opened as ``MAP@NAME``.
+"""Branches and tags: additional catalogs for the same arrays, which are opened as ``MAP@NAME``.
 
 A branch is a folder ``MAP/branches/NAME`` with its own catalog, settings and writer lock; arrays and models are shared
 with the map, so that making a branch copies no array. A tag is a read-only branch.
@@ -39,7 +39,7 @@ _log = logging.getLogger("gsmap.store")
 
 @dataclass(frozen=True)
 class MapLocation:
-    """Location of a map, or of a branch of one.
+    """The location of a map or of a branch.
 
     Args:
         home: root folder of the map, with arrays and models.
@@ -124,7 +124,7 @@ def branch_locations(home: Path) -> list[MapLocation]:
 
 
 def unknown_entries(home: Path) -> list[str]:
-    """Return relative paths of entries of the branches folder that are neither branches nor leftovers of a crash.
+    """Return the relative paths of entries in the branches folder that are neither branches nor leftovers of a crash.
 
     Each may be a branch that lost a file or its name, and may be the only catalog that names some arrays.
     """
@@ -143,12 +143,12 @@ def _is_leftover(name: str) -> bool:
 
 
 def other_locations(home: Path, folder: Path) -> list[MapLocation]:
-    """Return the locations of the other catalogs over a map's arrays: the map, its branches and its tags."""
+    """Return the locations of all other catalogs for the same arrays: the map, its branches and its tags."""
     return [place for place in (MapLocation(home, home), *branch_locations(home)) if place.folder != folder]
 
 
 def validated_name(name: str) -> str:
-    """Return a branch name if it is valid.
+    """Return the name of a branch if it is valid; otherwise raise an error.
 
     Raises:
         ConfigError: the name is invalid.
@@ -168,7 +168,7 @@ def is_map(folder: Path) -> bool:
 
 
 def has_catalog(folder: Path) -> bool:
-    """Return True if a folder is that of a map or a branch."""
+    """Return True if a folder has a catalog, as the folder of a map or a branch."""
     return (folder / sqlite.FILE).is_file() or (folder / trust.URL_FILE).is_file()
 
 
@@ -185,7 +185,7 @@ class Branches:
         self._arrays = arrays
 
     def make(self, name: str, *, tag: bool = False) -> Branch:
-        """Make a branch by copying the catalog and settings; no array is copied. It appears whole or not at all.
+        """Make a branch by copying the catalog and settings, but no arrays; after an error, no partial branch remains.
 
         The branch is a separate map for exports and merging: it has its own id, its revisions name the map that solved
         them, and it has no export targets.
@@ -252,7 +252,7 @@ class Branches:
         return [_branch(place) for place in branch_locations(self._place.home)]
 
     def delete(self, name: str) -> None:
-        """Delete a branch or tag; `prune` reclaims what only it named.
+        """Delete a branch or tag; `prune` then reclaims the arrays that only this branch or tag named.
 
         Raises:
             NotFoundError: no branch or tag has this name.
@@ -289,7 +289,7 @@ class Branches:
 
 
 class OtherCatalogs:
-    """The other catalogs over the arrays of a map; groups that they name must be kept.
+    """All other catalogs for the arrays of a map; groups that they name must be kept.
 
     Args:
         home: root folder of the map.
@@ -301,7 +301,7 @@ class OtherCatalogs:
         self._folder = folder
 
     def verify(self) -> None:
-        """Verify every page of the other catalogs; required before deleting arrays that none of them names.
+        """Verify every page of the other catalogs, which is required before deleting arrays that none of them names.
 
         Raises:
             CorruptError: a catalog is damaged.
@@ -334,7 +334,7 @@ class OtherCatalogs:
         return {path for connection in self._connections() for path in connection.execute(current).scalars()}
 
     def manifests(self, group_id: str) -> list[tuple[StoredFile, ...]]:
-        """Return the manifest of a group from each of the other catalogs that names it."""
+        """Return the manifest of a group from each other catalog that names the group."""
         query = select(files.c.path, files.c.size_bytes, files.c.sha256).where(files.c.group_id == group_id)
         found = [
             tuple(StoredFile(*row) for row in connection.execute(query.order_by(files.c.path)))
@@ -349,7 +349,7 @@ class OtherCatalogs:
 
 
 def remove_leftovers(home: Path) -> None:
-    """Delete what a crash left while making or deleting branches; requires the lock of the arrays."""
+    """Delete leftovers of crashes while branches were made or deleted; the caller must hold the lock of the arrays."""
     root = home / FOLDER
     for folder in root.iterdir() if is_folder(root) else ():
         if _is_leftover(folder.name) and is_folder(folder):

@@ -1,4 +1,4 @@
-"""Local cache for files of immutable groups that were read from an object store.
+"""A local cache of files of immutable groups that were read from an object store.
 
 Files are named by their digest and verified against it when they are stored, so that maps share common files. The least
 recently used ones are evicted first. All of it may be deleted at any time.
@@ -22,17 +22,20 @@ _DEFAULT_MB = 10_000
 
 
 def folder() -> Path:
-    """Return the cache folder: ``GSMAP_CACHE``, default: ``gsmap`` in the user's cache folder."""
+    """Return the cache folder: the environment variable ``GSMAP_CACHE``, or ``gsmap`` in the user's cache folder."""
     named = os.environ.get(FOLDER_VARIABLE)
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(named).expanduser() if named else Path(base).expanduser() / "gsmap"
 
 
 def max_bytes() -> int:
-    """Return the maximum size of the cache, from ``GSMAP_CACHE_MB``."""
+    """Return the maximum size of the cache in bytes, from the environment variable ``GSMAP_CACHE_MB``."""
     named = os.environ.get(SIZE_VARIABLE) or str(_DEFAULT_MB)
     if not named.isdecimal():
-        raise ConfigError(f"{SIZE_VARIABLE} must be a number of megabytes, got {named!r}", code="invalid_environment")
+        raise ConfigError(
+            f"the environment variable {SIZE_VARIABLE} must be a number of megabytes, got {named!r}",
+            code="invalid_environment",
+        )
     return int(named) * 1_000_000
 
 
@@ -78,7 +81,7 @@ def drop(sha256: str) -> None:
 
 
 def _make_room(root: Path) -> None:
-    """Delete the least recently used files until the cache, with the staged file, is within its limit."""
+    """Delete the least recently used files until the cache, including the staged file, is within its limit."""
     kept = []
     for entry in os.scandir(root):
         with contextlib.suppress(FileNotFoundError):

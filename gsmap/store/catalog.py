@@ -1,4 +1,4 @@
-"""Transactions of the catalog: one writer at a time, with readable errors."""
+"""Transactions of the catalog, with one writer at a time and readable errors."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Catalog:
 
     @contextlib.contextmanager
     def _reading(self) -> Iterator[Connection]:
-        """Open a connection; on a full disk open a frozen copy that needs no space, while writers wait."""
+        """Open a connection for reading; on a full disk, open a frozen state, which needs no space."""
         try:
             connection = self.engine.connect()
         except (SQLAlchemyError, sqlite3.Error) as error:
@@ -125,7 +125,7 @@ class Catalog:
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Connection]:
-        """Open a transaction that commits durably at the end of the block, or leaves nothing.
+        """Open a transaction that commits durably at the end of the block, or changes nothing if the block raises.
 
         Inside another transaction of the same thread it joins that one.
         """
@@ -196,7 +196,7 @@ class Catalog:
 
     @contextlib.contextmanager
     def _server_lock(self, lock: int, patience_s: float, *, shared: bool = False) -> Iterator[None]:
-        """Hold a lock of the server by a transaction of its own, which ends with this process."""
+        """Hold a lock of the server in a separate transaction, which ends with this process."""
         with translate_errors(self.folder, NOT_KEPT), self.engine.connect() as connection, connection.begin():
             advisory_locks.acquire(connection, lock, patience_s, self._busy_message, shared=shared)
             yield
@@ -243,7 +243,7 @@ class Catalog:
                         page_digests.save(file, backup)
 
     def page_problems(self, *, at_most_bytes: int | None = None) -> list[str]:
-        """Return a message for each difference of the catalog's file and log from the page digests.
+        """Return a message for each difference between the catalog's file or log and the page digests.
 
         Args:
             at_most_bytes: check only the log of a longer file.
@@ -270,7 +270,7 @@ class Catalog:
         return page_digests.problems(file, handle, stored, log)
 
     def unverified(self) -> list[str]:
-        """Return reasons why the catalog's bytes cannot be verified; empty if they can."""
+        """Return the reasons why the catalog's bytes cannot be verified; empty if they can be verified."""
         if self.is_sqlite:
             if page_digests.digests_path(self.folder / sqlite.FILE).exists():
                 return []
@@ -279,7 +279,9 @@ class Catalog:
             return ["the catalog lies in a database whose integrity gsmap cannot verify"]
         with self.read() as connection:
             checks = connection.exec_driver_sql("SHOW data_checksums").scalar() == "on"
-        says = "on: it verifies each page that it reads" if checks else "off: damaged pages go unnoticed"
+        says = (
+            "on, so that it verifies each page that it reads" if checks else "off, so that damaged pages go unnoticed"
+        )
         return [f"the catalog lies in a PostgreSQL server, whose own page checksums are {says}"]
 
     def accept(self) -> list[str]:
@@ -325,7 +327,7 @@ class Catalog:
             sqlite.dispose(self.engine, file, tidy=False)
 
     def _fold(self, at_bytes: int) -> None:
-        """Checkpoint the log under the lock. Committed data is in the log, so that a failure loses nothing."""
+        """Checkpoint the log, holding the lock. A failure loses nothing, since committed data stays in the log."""
         if not self.is_sqlite:
             return
         try:
@@ -362,7 +364,7 @@ def commit(connection: Connection, transaction: RootTransaction) -> None:
 
 
 def open_engine(folder: Path, *, writable: bool) -> Engine:
-    """Open the engine of a map: its ``map.sqlite``, or the database in ``catalog.url`` if the user trusts it."""
+    """Open the engine of a map's catalog: ``map.sqlite``, or the database in ``catalog.url`` if the user trusts it."""
     if (folder / sqlite.FILE).is_file():
         return sqlite.engine(folder / sqlite.FILE, writable=writable)
     return url_engine(trust.catalog_url(folder))
@@ -384,13 +386,13 @@ def url_engine(url: str) -> Engine:
 
 
 def url_without_password(url: str) -> str:
-    """Return a database URL without its password; the driver takes it from ``PGPASSWORD`` or ``~/.pgpass``."""
+    """Return a database URL without password; the driver reads the password from ``PGPASSWORD`` or ``~/.pgpass``."""
     known = make_url(url).difference_update_query(["password"])._replace(password=None)
     return known.render_as_string(hide_password=False)
 
 
 def now() -> str:
-    """Return the current time, ISO 8601, UTC."""
+    """Return the current UTC time in ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="microseconds")
 
 
@@ -400,7 +402,7 @@ def timestamp_after(moment: datetime) -> str:
 
 
 def next_timestamp(connection: Connection, created_at: Column[str], *among: ColumnElement[bool]) -> str:
-    """Return the current time, or the first time after the newest row if that is later because a clock was ahead.
+    """Return the current time, or a time just after the newest row if a clock was ahead when that row was written.
 
     Ordering rows by time then gives the order in which they were written.
 

@@ -31,7 +31,7 @@ _BOXES = Table(
 
 
 def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Catalog:
-    """Create all tables, empty, in a new ``map.sqlite`` or in an empty database named in ``catalog.url``.
+    """Create empty tables in a new ``map.sqlite``, or in an empty database at ``url``.
 
     Args:
         map_id: id of the map that a database is for.
@@ -61,7 +61,7 @@ def open_sqlite_catalog(folder: Path) -> Catalog:
 
 
 def make_independent(folder: Path, empty: Collection[Table], **about: Any) -> None:
-    """Turn a copied ``map.sqlite`` into that of another map: its revisions name the original map as origin.
+    """Make a copied ``map.sqlite`` the catalog of another map, whose revisions name the original map as their origin.
 
     Args:
         empty: tables that belong to the original map alone.
@@ -80,7 +80,7 @@ def make_independent(folder: Path, empty: Collection[Table], **about: Any) -> No
 
 
 def copy_catalog(source: Catalog, target: Catalog, *, leave_out: Collection[str] = ()) -> dict[str, int]:
-    """Copy all rows of all tables into a new catalog (`empty_catalog`), in one transaction of each.
+    """Copy all rows of all tables to a new catalog (`empty_catalog`), in one transaction of each catalog.
 
     The copy is a snapshot of the source and blocks no other process. Chunk boxes have 32 bits in SQLite's R*Tree and 64
     elsewhere: they widen by rounding on the way into the tree.
@@ -106,7 +106,7 @@ def copy_catalog(source: Catalog, target: Catalog, *, leave_out: Collection[str]
 
 
 def copy_rows(source: Connection, target: Connection, *, leave_out: Collection[str] = ()) -> dict[str, int]:
-    """Copy rows as `copy_catalog` does inside the caller's transactions; the source must be a `snapshot_read`."""
+    """Copy rows like `copy_catalog`, but in transactions of the caller; ``source`` must be a `snapshot_read`."""
     counts = {}
     for table in tables():
         if target.execute(select(text("1")).select_from(table).limit(1)).first() is not None:
@@ -128,7 +128,7 @@ def snapshot_read(catalog: Catalog) -> Iterator[Connection]:
 
 
 def tables() -> list[Table]:
-    """Return every table but ``alembic_version`` in order of references, with texts that are not decoded."""
+    """Return all tables except ``alembic_version`` in the order of references, with undecoded texts."""
     return [_plain(table) for table in schema.metadata.sorted_tables] + [_BOXES]
 
 

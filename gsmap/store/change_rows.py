@@ -1,4 +1,4 @@
-"""Rows of comparisons and changes, and matching of changes between comparisons."""
+"""Read rows of comparisons and changes, and match changes between comparisons."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PAD_M = 0.05
 
 @dataclass(frozen=True, eq=False)
 class StoredChange:
-    """A change, as found by the newest comparison of its pair.
+    """A change as the newest comparison of its pair found it.
 
     Args:
         number: of the change; kept when its pair is compared again.
@@ -99,7 +99,7 @@ class ChangeReview:
 
 
 def pair_of(older: str, newer: str) -> str:
-    """Return both ids with a colon between them, the lower first."""
+    """Return the ids of a pair joined by a colon, the lower id first."""
     return ":".join(sorted((older, newer)))
 
 
@@ -110,7 +110,7 @@ def newest(connection: Connection, pair: str) -> Row[Any] | None:
 
 
 def newest_of_all(connection: Connection) -> list[Row[Any]]:
-    """Return the current comparison of every pair, in the order they were made; scenes may be removed."""
+    """Return the current comparison of every pair, also of removed scenes, in the order of comparison."""
     query = select(comparisons).order_by(comparisons.c.created_at, comparisons.c.number)
     return list({row.pair: row for row in connection.execute(query)}.values())
 
@@ -134,7 +134,7 @@ def named_groups(
 def match_changes(
     connection: Connection, older: str, newer: str, S_frame_newer: Sim3, found: Sequence[tuple[str, np.ndarray]]
 ) -> dict[int, int]:
-    """Match changes of a new comparison to earlier changes of the pair; returns change numbers by place.
+    """Match new changes of a pair (``found``) to its earlier changes; return the change numbers by index in ``found``.
 
     Args:
         found: kind and box of each change, in the frame that ``S_frame_newer`` transforms the newer scene to.
@@ -162,7 +162,7 @@ def _overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def latest_changes(connection: Connection, pair: str) -> list[tuple[int, StoredChange, Sim3]]:
-    """Return every change a pair ever had with its number and the S_frame_newer of its box, as last found."""
+    """Return every change that a pair ever had as it was last found, with its number and its ``S_frame_newer``."""
     query = select(comparisons).where(comparisons.c.pair == pair)
     rows = connection.execute(query.order_by(comparisons.c.created_at, comparisons.c.number)).all()
     latest: dict[int, tuple[int, StoredChange, Sim3]] = {}
@@ -172,7 +172,7 @@ def latest_changes(connection: Connection, pair: str) -> list[tuple[int, StoredC
 
 
 def review_notes(connection: Connection, pair: str, same: Mapping[int, int]) -> list[str]:
-    """Return notes on what happens to the reviews of a pair's changes when it is compared again."""
+    """Return notes on the reviewed changes of a pair that was compared again."""
     notes = []
     for number, change, _ in latest_changes(connection, pair):
         if change.status == OPEN:
@@ -189,7 +189,7 @@ def read_comparison(connection: Connection, row: Row[Any]) -> Comparison:
 
 
 def read_comparisons(connection: Connection, rows: Sequence[Row[Any]]) -> list[Comparison]:
-    """Return comparisons with their changes and the status of these."""
+    """Return comparisons with their changes and the status of each change."""
     wanted = {row.number: row for row in rows}
     query = select(changes).order_by(changes.c.comparison, changes.c.place)
     if len(wanted) == 1:

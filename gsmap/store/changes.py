@@ -1,4 +1,4 @@
-"""Comparisons of scenes, the changes found, and their reviews; rows are never overwritten."""
+"""Comparisons of scenes, the changes that they found, and reviews of changes; rows are never overwritten."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ REVIEWS = ("confirm", "reject", "withdraw")
 
 
 class Changes:
-    """The changes of a map. The newest comparison of a pair is current, whichever scene was the older one then.
+    """The changes of a map. The newest comparison of a pair is current, even if the scenes' dates were swapped since.
 
     A change keeps its number and reviews when its pair is compared again: it is matched to the earlier change of the
     same kind whose box overlaps most.
@@ -65,7 +65,7 @@ class Changes:
         S_frame_newer: Sim3,
         num_at_comparison: tuple[int, int] | None = None,
     ) -> Comparison:
-        """Store a comparison; saving the same one again repairs damaged arrays.
+        """Store a comparison; saving the same comparison again repairs its damaged arrays.
 
         Args:
             key: its recipe; its inputs begin with the two scenes, the older one first.
@@ -141,7 +141,7 @@ class Changes:
             return read_comparison(connection, stored)
 
     def current(self) -> list[Comparison]:
-        """Return the current comparison of every pair of living scenes, in the order they were made."""
+        """Return the current comparison of every pair of living scenes, in the order of comparison."""
         with self._catalog.read() as connection:
             living = living_ids(connection)
             rows = [row for row in newest_of_all(connection) if {row.older, row.newer} <= living]
@@ -160,7 +160,7 @@ class Changes:
             return read_comparison(connection, row)
 
     def load(self, comparison: int) -> ChangeReport:
-        """Load a comparison with its arrays; row numbers refer to the scenes' Gaussians as stored now.
+        """Load a comparison with its arrays; row numbers refer to the Gaussians of the scenes as they are stored now.
 
         Raises:
             NotFoundError: no such comparison, or its arrays were pruned.
@@ -200,7 +200,7 @@ class Changes:
     def _whole(
         self, found: Sequence[Change], older: str, newer: str, num_at_comparison: tuple[int, int] | None
     ) -> list[Change]:
-        """Convert changes to rows of the whole captures; see `gsmap.store.row_index_maps`."""
+        """Convert row numbers of changes to rows of the whole captures; see `gsmap.store.row_index_maps`."""
         if not found:
             return []
         before, after = self._rows.of(older), self._rows.of(newer)
@@ -223,7 +223,7 @@ class Changes:
             }
 
     def get(self, number: int) -> StoredChange:
-        """Return a change by its number, as found by the newest comparison.
+        """Return a change by its number, as the newest comparison found it.
 
         Raises:
             NotFoundError: no such change, its scenes were removed, or the newest comparison of its pair did not find
@@ -259,7 +259,7 @@ class Changes:
             ConfigError: an unknown review.
         """
         if review not in REVIEWS:
-            raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
+            raise ConfigError(f"a review must be one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
         with self._catalog.write() as connection:
             if review == "withdraw" and self.get(number).status == OPEN:
                 raise InputError(f"c{number} has no review to withdraw", code="nothing_to_withdraw")

@@ -1,4 +1,4 @@
-"""Bounding boxes of chunks of Gaussians, to find the chunks that touch a region without reading them."""
+"""Bounding boxes of chunks of Gaussians, by which chunks that touch a region are found without reading them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from gsmap.types import Gaussians
 
 
 def chunk_boxes(gaussians: Gaussians, rows: int, *, sigmas: float = 3.0) -> np.ndarray:
-    """Compute (C, 2, 3) float64 boxes of every ``rows`` consecutive Gaussians, each widened by ``sigmas`` standard
-    deviations."""
+    """Compute boxes (C, 2, 3) float64 around all chunks of ``rows`` Gaussians, extended by ``sigmas`` deviations."""
     parts = (gaussians[start : start + rows] for start in range(0, len(gaussians), rows))
     return np.array([reached_box(part, sigmas) for part in parts]).reshape(-1, 2, 3)
 
 
 def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
-    """Store the boxes (C, 2, 3) of a scene's chunks, replacing the previous ones."""
+    """Store the boxes (C, 2, 3) of a scene's chunks in place of the previous boxes."""
     if number >= 1 << 24:  # float32 coordinates of the R*Tree represent integers exactly up to 2**24
-        raise StoreError("a map holds at most 16 million scenes", code="too_many_scenes")
+        raise StoreError("a map can have at most 16 million scenes", code="too_many_scenes")
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
     rows = [
         {"s": number, "chunk": i}

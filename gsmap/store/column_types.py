@@ -38,7 +38,7 @@ def is_relative(path: str) -> bool:
 
 
 class _CheckedText(TypeDecorator[Any]):
-    """A text column with validated values."""
+    """A text column whose values are validated."""
 
     impl = Text
     cache_ok = True
@@ -88,7 +88,7 @@ class DigestText(_CheckedText):
 
 
 class KeyText(_CheckedText):
-    """The key of a result, never used as a path: a digest, or any text in maps of schema 0001."""
+    """The key of a result, which is never used as a path: a digest, or any text in maps of schema 0001."""
 
     cache_ok = True
     what = "a text without control characters"
@@ -132,7 +132,7 @@ class EnumText(_CheckedText):
 
 
 class RelativePathText(_CheckedText):
-    """A path that leads downwards only; empty if there is no file."""
+    """A relative path that leads downwards only; empty if there is no file."""
 
     cache_ok = True
     what = "a relative path inside the map"
@@ -201,7 +201,7 @@ class JsonText(TypeDecorator[Any]):
 
 
 class PackedNumbers(TypeDecorator[Any]):
-    """Numbers as bytes (`gsmap.store.matrices`): a tenth of the time and a third of the space of JSON.
+    """Numbers stored as bytes (`gsmap.store.matrices`), ten times as fast as JSON and in a third of its space.
 
     Args:
         pack: converts a value to bytes; bytes are stored as they are.
@@ -354,7 +354,7 @@ def _numbers(value: Any, *shape: int) -> bool:
 
 
 def corrupt_value(where: str, value: Any, what: str) -> CorruptError:
-    """Return the error for a value that gsmap cannot have written."""
+    """Return the error for a stored value that gsmap cannot have written."""
     return CorruptError(
         f"the catalog holds {_short(value)} in {where}, which is not {what} and which gsmap did not write: "
         "restore the catalog from a backup, and do not trust the map if you received it like this",

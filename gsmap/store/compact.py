@@ -1,4 +1,4 @@
-"""Compact storage of superseded captures: Gaussians in a fifth of their bytes.
+"""Compact storage of superseded captures, which keeps Gaussians in a fifth of their bytes.
 
 Each value is quantized to 8 bits (positions to 16 within their chunk, rotations to the three smallest components at
 10), which is not visible in renders; `gsmap.thin` measures that. Row order is kept, so that parts of a scene are read
@@ -64,7 +64,7 @@ def pack(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
-    """Return the Gaussians of compact arrays.
+    """Return the Gaussians that compact arrays store.
 
     Args:
         arrays: arrays of `pack`: boxes and ranges whole, of the others the rows that were read.
@@ -93,7 +93,7 @@ def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
 
 
 def round_trip(gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians as they are read after compact storage."""
+    """Return the Gaussians as they would be read back from compact storage."""
     return unpack(pack(gaussians), np.arange(len(gaussians)))
 
 
@@ -138,12 +138,12 @@ def kept_shape(num_whole: int) -> Shape:
 
 
 def unpack_kept(bits: np.ndarray, num_whole: int) -> np.ndarray:
-    """Return (n,) int64 rows of the whole capture that are kept, ascending."""
+    """Return the rows (n,) int64 of the whole capture that are kept, ascending."""
     return np.flatnonzero(np.unpackbits(bits, count=num_whole))
 
 
 WHOLE: Sequence[str] = ("compact.boxes", *(f"compact.{name}_range" for name in _VALUES))
-"""Arrays that are always read whole."""
+"""Names of arrays that are always read as a whole."""
 
 
 def _split_bytes(values: np.ndarray) -> np.ndarray:

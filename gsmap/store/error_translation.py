@@ -24,11 +24,11 @@ from gsmap.errors import (
 )
 from gsmap.store import sqlite
 
-NOT_KEPT = "this step was undone; the steps before it are kept"
-"""Consequence of an error inside a transaction: it was rolled back."""
+NOT_KEPT = "this step was undone; earlier steps are kept"
+"""The consequence of an error inside a transaction, which was rolled back."""
 
-UNCERTAIN = "this last step may or may not be kept; the steps before it are kept"
-"""Consequence of a disk or connection failure during a commit."""
+UNCERTAIN = "this last step may or may not be kept; earlier steps are kept"
+"""The consequence of a disk or connection failure during a commit."""
 
 LITTLE_BYTES = 64 << 10  # a disk with less is full: the index of SQLite's log alone takes half of it
 
@@ -196,7 +196,7 @@ def _explain_sqlite(code: int, folder: Path) -> _Explanation:
 
 
 def _explain_disk(primary: int, folder: Path) -> _Explanation:
-    """Explain a disk error of SQLite, which hides the system's error code, by testing the disk.
+    """Explain a disk error of SQLite by testing the disk, as SQLite hides the system's error code.
 
     A full disk causes several codes: the log cannot be created (CANTOPEN), its index cannot (READONLY) or cannot grow
     (IOERR).
@@ -217,7 +217,7 @@ def _explain_disk(primary: int, folder: Path) -> _Explanation:
 
 
 def _explain_server(state: str) -> _Explanation:
-    """Explain an SQLSTATE of PostgreSQL; appendix A of its manual."""
+    """Explain an SQLSTATE of PostgreSQL (appendix A of its manual)."""
     if state == "53100":
         return (
             DiskFullError,
@@ -244,6 +244,6 @@ def _explain_server(state: str) -> _Explanation:
 
 
 def summary(found: list[str], most: int = 3) -> str:
-    """List the first findings and the number of the others."""
+    """List the first findings, and the number of the remaining findings."""
     more = f", and {len(found) - most} more" if len(found) > most else ""
     return ", ".join(found[:most]) + more

@@ -1,4 +1,4 @@
-"""Record of exports and their tiles, so that only changed tiles are made again."""
+"""The record of exports and their tiles, by which only changed tiles are made again."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Export:
 
 
 class Exports:
-    """The exports of a map. A tile belongs to a target; the newest tile of a path is the one on disk."""
+    """The exports of a map. A tile belongs to a target (export folder); for each path, the newest tile is on disk."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
@@ -76,11 +76,11 @@ class Exports:
         }
         with self._catalog.write() as connection:
             if connection.execute(select(exports.c.number).where(exports.c.number == export)).first() is None:
-                raise NotFoundError(f"no export {export}: begin one first", code="export_not_found")
+                raise NotFoundError(f"there is no export {export}: begin one first", code="export_not_found")
             connection.execute(insert(tiles), row | {"recipe": recipes.save_recipe(connection, tile.recipe)})
 
     def forget(self, target: str | os.PathLike[str], paths: Iterable[str]) -> None:
-        """Mark tiles (by path) as removed from a target; their rows stay as history."""
+        """Mark tiles as removed from a target, by path; their rows stay as history."""
         ours = select(exports.c.number).where(exports.c.target == _target(target))
         gone = tiles.c.export.in_(ours) & tiles.c.path.in_(list(paths)) & tiles.c.removed_at.is_(None)
         with self._catalog.write() as connection:

@@ -1,5 +1,4 @@
-"""Facts that people give about scenes and objects: names, dates, notes, tags and scales, with time and author; never
-overwritten."""
+"""Annotations of scenes and objects (names, dates, notes, tags, scales) with time and author, never overwritten."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from gsmap.texts import control_characters
 
 @dataclass(frozen=True)
 class Fact:
-    """A fact that was given about a scene or an object.
+    """An annotation that a person gave a scene or an object.
 
     Args:
         kind: of a scene ``name``, ``captured_at``, ``note``, ``tag``, ``untag`` or ``metres_per_unit``; of an object
@@ -36,7 +35,7 @@ class Fact:
 
 
 def add_facts(connection: Connection, scene: str, facts: Iterable[tuple[str, str]], author: str = "") -> None:
-    """Insert (kind, value) facts of a scene."""
+    """Insert facts (kind, value) about a scene."""
     when = now()
     rows = [
         {"scene": scene, "kind": kind, "value": value, "author": author, "created_at": when} for kind, value in facts
@@ -52,7 +51,7 @@ def list_facts(connection: Connection, scene: str) -> list[Fact]:
 
 
 def current_tags(connection: Connection, scene: str | None = None) -> dict[str, tuple[str, ...]]:
-    """Return the current tags by scene id, sorted; of one scene or of all scenes with tags."""
+    """Return the current tags, sorted, by scene id; for one scene, or for all scenes with tags."""
     query = select(scene_facts).where(scene_facts.c.kind.in_(("tag", "untag"))).order_by(scene_facts.c.number)
     rows: Iterable[Row[Any]] = connection.execute(query if scene is None else query.where(scene_facts.c.scene == scene))
     current: dict[str, set[str]] = {}
@@ -105,7 +104,7 @@ def validated_metres(value: float | str) -> str:
 def validated_facts(
     name: str | None, captured_at: str | None, note: str | None, metres_per_unit: float | None
 ) -> list[tuple[str, str]]:
-    """Return facts about a scene as (kind, value); an empty date, or 0 metres, withdraws the previous value.
+    """Validate facts about a scene; return (kind, value) of each. An empty date or 0 metres withdraws a value.
 
     Raises:
         InputError: an empty text, control characters, an invalid date or scale.
@@ -139,7 +138,7 @@ def validated_text(what: str, text: str, *, lines: bool = False) -> str:
 
 
 def validated_date(when: str) -> str:
-    """Format a capture date as stored: ISO 8601 with its time zone, default UTC.
+    """Format a capture date as it is stored: ISO 8601 with a time zone (default: UTC).
 
     Raises:
         InputError: not a date.

@@ -1,4 +1,4 @@
-"""Shared read handles for database files that SQLite has open in this process.
+"""Shared read handles of database files that SQLite has open in this process.
 
 POSIX locks belong to the process: closing *any* handle on a file drops every lock that SQLite holds on it. Another
 process that closes the database then assumes that it is the last one and deletes the log, with commits that this
@@ -39,7 +39,7 @@ class FileHandle:
             entry[1] += 1
             self.number = entry[0]
             self.index: IndexHeader | None = read_index_header(file) if entry[1] == 1 else None
-            """Header of the log's index before this process connected; None if it was connected already."""
+            """Header of the log's index before this process connected to it; None if it was connected already."""
         self._closed = False
 
     def is_of(self, file: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Conversion of scene graphs to arrays and catalog metadata.
+"""Convert scene graphs to arrays and catalog metadata, and back.
 
 Arrays of the same name and width of all layers are concatenated: a graph then has a dozen arrays instead of seven per
 layer, and the positions that landmarks of one capture share between layers compress to almost nothing.
@@ -110,7 +110,7 @@ def _layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[s
 
 
 def _older_layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[str, NodeLayer]:
-    """Rebuild layers of schema 0006 and older, with separate arrays for every layer, named by its number."""
+    """Rebuild the layers of schema 0006 and older, where each layer has its own arrays, named by its number."""
     out = {}
     for i, (name, layer) in enumerate(about["layers"].items()):
         own: dict[str, Any] = {key.split(".", 1)[1]: array for key, array in whole.items() if key.startswith(f"{i}.")}
@@ -119,8 +119,7 @@ def _older_layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> 
 
 
 def _keys(layer: Mapping[str, Any]) -> dict[str, str]:
-    """Return the array name of each part of a layer; the embedding of an object node is its feature and not stored
-    twice."""
+    """Return the array name of each part of a layer; embeddings of object nodes equal their features, stored once."""
     embeddings, features = layer["widths"]
     own = {part: f"nodes.{part}" for part in _NODES}
     own |= {"embeddings": f"nodes.embeddings.{embeddings}", "features": f"nodes.features.{features}"}
@@ -134,11 +133,11 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _around(nodes: NodeLayer) -> np.ndarray:
-    """Return extents relative to positions; those of a landmark are equal on all sides."""
+    """Return extents relative to positions; the extent of a landmark is equal on all sides."""
     out: np.ndarray = nodes.extents - nodes.positions[:, None]
     return out
 
 
 def _is_around(nodes: NodeLayer) -> bool:
-    """Return True if extents relative to positions are exact, as when both are rounded (`gsmap.describe.precision`)."""
+    """Return True if extents relative to positions are exact, as for rounded values (`gsmap.describe.precision`)."""
     return bool((_around(nodes) + nodes.positions[:, None]).tobytes() == nodes.extents.tobytes())

@@ -1,4 +1,4 @@
-"""Scene graphs, stored under their recipe and inputs (`RecipeKey`)."""
+"""Scene graphs, which are stored under their recipe and inputs (`RecipeKey`)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class StoredGraph:
 
 @dataclass(frozen=True)
 class GraphFrame:
-    """Scale and up direction of a scene frame as estimated by its graph; fields as in `StoredGraph`."""
+    """The scale and up direction of a scene frame that its graph estimates; the fields are those of `StoredGraph`."""
 
     key: str
     scene: str
@@ -73,7 +73,7 @@ class Graphs:
         self._frames: dict[tuple[str, str], GraphFrame] = {}  # by key and array group; cached, since neither changes
 
     def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
-        """Store a graph, replacing one with the same key; saving the same one again repairs damaged arrays.
+        """Store a graph in place of one with the same key; saving the same graph again repairs its damaged arrays.
 
         Args:
             key: its recipe; the scene must be among its inputs.
@@ -108,13 +108,13 @@ class Graphs:
             return _stored(connection.execute(select(graphs).where(mine)).one())
 
     def find(self, key: RecipeKey | str) -> StoredGraph | None:
-        """Return the record of the graph with this key (or digest); None if there is none."""
+        """Return the record of the graph with this key or digest; None without such a graph."""
         with self._catalog.read() as connection:
             row = connection.execute(select(graphs).where(graphs.c.key == recipes.digest_of(key))).first()
         return None if row is None else _stored(row)
 
     def load(self, ref: str, key: RecipeKey | str | None = None) -> SceneGraph | None:
-        """Load the graph of a scene with this key (or digest), or the newest one; None if there is none.
+        """Load the graph of a scene with this key or digest, by default the newest graph; None without such a graph.
 
         Segment members refer to the scene's Gaussians as stored now. Segments are left out if the row map of a thinned
         scene is unknown (`gsmap.store.row_index_maps`).
@@ -158,12 +158,12 @@ class Graphs:
             return sum(num_bytes(connection, group) for group in connection.execute(made).scalars())
 
     def stored_keys(self, keys: Iterable[RecipeKey | str]) -> set[str]:
-        """Return those of the keys (as digests) that have a graph."""
+        """Return, as digests, the keys that have a graph."""
         with self._catalog.read() as connection:
             return recipes.stored_keys(connection, graphs.c.key, keys)
 
     def damaged(self, keys: Iterable[RecipeKey | str]) -> set[str]:
-        """Return those of the keys (as digests) whose graph differs from its digest; reads every byte."""
+        """Return, as digests, the keys whose graph differs from its file digests; reads every byte."""
         wanted = {recipes.digest_of(key) for key in keys}
         with self._catalog.read() as connection:
             rows = connection.execute(select(graphs.c.key, graphs.c.group_id)).all()
@@ -182,7 +182,7 @@ class Graphs:
         return bool(self._arrays.problems(KIND, group_id, manifest(connection, group_id)))
 
     def groups(self) -> dict[str, str]:
-        """Return the scene of every graph by the graph's array group."""
+        """Return the scene of every graph, by array group."""
         query = select(graphs.c.group_id, graphs.c.scene)
         with self._catalog.read() as connection:
             return {row.group_id: row.scene for row in connection.execute(query)}

@@ -1,4 +1,4 @@
-"""Segments of the indexes of graphs and of views, and the candidates found for scenes; all of it can be recomputed."""
+"""Index segments of graphs and of views, and the candidates of scenes; all of this can be recomputed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class StoredSegment:
     _catalog: Catalog
 
     def lists(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (W,) int64 keys of the inverted lists, and (W + 1,) the row where each begins.
+        """Return the keys (W,) int64 of the inverted lists, and the first row (W + 1,) of each list.
 
         Raises:
             CorruptError: bytes on disk are missing or differ.
@@ -50,7 +50,7 @@ class StoredSegment:
         return found["keys"], found["starts"]
 
     def rows(self, start: int, stop: int) -> np.ndarray:
-        """Return (stop - start, B) uint8 nodes; raises as `lists` does."""
+        """Return the rows of nodes from ``start`` to ``stop``, uint8 (stop - start, B); raises as `lists` does."""
         return self._read(("nodes",), [(start, stop)])["nodes"]
 
     def _read(self, names: Sequence[str], rows: Sequence[tuple[int, int]] | None) -> dict[str, np.ndarray]:
@@ -98,7 +98,7 @@ class Indexes:
         instead_of: Collection[str],
         beside: Collection[str] = (),
     ) -> bool:
-        """Store a segment in place of others, whose arrays are deleted, as are segments of unused recipes.
+        """Store a segment in place of ``instead_of``; delete these segments, and segments of unused recipes.
 
         Args:
             key: of the recipe.
@@ -128,13 +128,13 @@ class Indexes:
         return True
 
     def forget(self, ids: Collection[str]) -> None:
-        """Delete segments; their scenes are indexed again by the next query."""
+        """Delete segments; the next query indexes their scenes again."""
         with self._catalog.write() as connection:
             dropped = self._unname(connection, ids)
         self._drop(dropped)
 
     def lookup_states(self) -> dict[str, tuple[str, int | None]]:
-        """Return by scene the key of its lookup and the number of candidates left (`Lookup.num_left`)."""
+        """Return, for each scene, the key of its lookup and the number of candidates left (`Lookup.num_left`)."""
         columns = (type_coerce(lookups.c.scene, Text), type_coerce(lookups.c.key, Text), lookups.c.num_left)
         with self._catalog.read() as connection:  # scenes and keys are only compared
             return {scene: (key, left) for scene, key, left in connection.execute(select(*columns)).all()}
@@ -146,7 +146,7 @@ class Indexes:
             return [_lookup(row) for row in connection.execute(query)]
 
     def save_lookups(self, found: Sequence[Lookup]) -> None:
-        """Store lookups, replacing earlier ones of the same scenes; deletes lookups of removed scenes."""
+        """Store lookups in place of earlier lookups of the same scenes, and delete lookups of removed scenes."""
         rows = [
             {
                 "scene": one.scene,
@@ -167,7 +167,7 @@ class Indexes:
                 connection.execute(insert(lookups), rows)
 
     def set_num_left(self, num_left: Mapping[str, int]) -> None:
-        """Update the numbers of candidates left where they changed."""
+        """Update the number of candidates left (`Lookup.num_left`) of lookups where it changed."""
         with self._catalog.write() as connection:
             query = select(lookups.c.scene, lookups.c.num_left).where(lookups.c.scene.in_(sorted(num_left)))
             for row in connection.execute(query).all():
@@ -187,14 +187,14 @@ class Indexes:
 
     @staticmethod
     def _unname(connection: Connection, ids: Collection[str]) -> set[str]:
-        """Delete segments and the rows of their groups."""
+        """Delete segments, and the rows that name their groups."""
         connection.execute(delete(index_segments).where(index_segments.c.group_id.in_(sorted(ids))))
         for group_id in ids:
             unname(connection, group_id)
         return set(ids)
 
     def _drop(self, group_ids: Collection[str]) -> None:
-        """Delete arrays that no row of any branch names; after a crash `prune` does so."""
+        """Delete those groups that no row of any branch names; after a crash, `prune` deletes them."""
         if not group_ids:
             return
         others = OtherCatalogs(self._arrays.root.parent, self._catalog.folder)

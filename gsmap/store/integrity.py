@@ -1,4 +1,4 @@
-"""Verify every byte of a map (`check`) and reclaim what no row names (`prune`)."""
+"""Verify every byte of a map (`check`), and reclaim arrays that no row names (`prune`)."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class PruneResult:
-    """Amount that `prune` reclaimed, or would reclaim.
+    """The data that `prune` reclaimed, or would reclaim.
 
     Args:
         scenes: names of removed scenes whose arrays were deleted.
@@ -156,7 +156,7 @@ def check(
 
 
 def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> PruneResult:
-    """Reclaim the arrays of removed scenes that no kept revision uses, their graphs, and leftovers of crashes.
+    """Reclaim arrays and graphs of removed scenes that no kept revision uses, and leftovers of crashes.
 
     What another branch or tag of the map names stays.
 
@@ -212,7 +212,7 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
 
 
 def _give_back(catalog: Catalog) -> int:
-    """Shrink the catalog file if enough of it is unused; a server does so by itself.
+    """Shrink the catalog file if enough of it is unused; a database server does this by itself.
 
     Returns:
         By how many bytes the file shrank.
@@ -233,7 +233,7 @@ def _give_back(catalog: Catalog) -> int:
 
 @dataclass(frozen=True)
 class ReclaimResult:
-    """Groups (kind, id) that no row of any catalog named, number of model copies, and bytes of all of these."""
+    """The reclaimed groups (kind, id), the number of reclaimed model copies, and the bytes of both."""
 
     groups: tuple[tuple[str, str], ...]
     num_models: int
@@ -241,7 +241,7 @@ class ReclaimResult:
 
 
 def verify_catalogs(catalog: Catalog, arrays: Arrays) -> OtherCatalogs:
-    """Verify every page of this and the other catalogs over the same arrays, and return the others.
+    """Verify every page of this catalog and of all other catalogs for the same arrays; return the other catalogs.
 
     Raises:
         CorruptError: a catalog is damaged, and may need arrays that it does not seem to name.
@@ -271,7 +271,7 @@ def _reclaim(
     dry_run: bool = False,
     besides: Collection[tuple[str, str]] = (),
 ) -> ReclaimResult:
-    """Reclaim as `reclaim` does, with verified catalogs.
+    """Reclaim like `reclaim`; the catalogs must be verified already.
 
     Args:
         dry_run: only compute the result.
@@ -364,7 +364,7 @@ def _drop_rows(catalog: Catalog, garbage: _Garbage) -> None:
 
 
 def _advice(connection: Connection, kind: str, group: str, location: str | None) -> str:
-    """Return advice for a damaged group: its purpose and how to recompute it; empty if the message has it already."""
+    """Return the purpose of a damaged group and how to recompute it; empty if the message states this already."""
     if kind == CHANGES:
         return _comparison_advice(connection, group, location)
     if kind == INDEXES:

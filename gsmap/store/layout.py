@@ -49,10 +49,10 @@ class FileReader(Protocol):
     """Access to the bytes of the files of one group, on disk or in an object store."""
 
     def read(self, file: str, start: int, stop: int) -> bytes:
-        """Read the bytes ``[start, stop)`` of a file; fewer if it is shorter."""
+        """Read the bytes ``[start, stop)`` of a file; return fewer bytes if the file is shorter."""
 
     def expect(self, file: str, ranges: Sequence[Range]) -> None:
-        """Announce ranges that are read next, so that they can be fetched in few requests."""
+        """Announce the ranges that will be read next, so that few requests can fetch them."""
 
 
 class GroupReader:
@@ -116,7 +116,7 @@ class GroupReader:
     def check_arrays(
         self, names: Collection[str], shapes: Mapping[str, Shape] | None = None, *, heads: bool = False
     ) -> dict[str, ArrayLayout]:
-        """Validate the layout of arrays and return it; reads hardly any data.
+        """Validate and return the layout of arrays, reading hardly any data.
 
         Args:
             names: of the arrays.
@@ -164,7 +164,7 @@ class GroupReader:
         if grid["name"] != "regular" or not all(_are_lengths(c, least=1) and c[1:] == rows for c in (outer, inner)):
             raise ValueError(f"its chunks {outer!r} are not rows")
         if inner[0] > CHUNK_ROWS or outer[0] > _SHARD_ROWS or outer[0] % inner[0]:
-            raise ValueError(f"its chunks {inner} in {outer} are not of the sizes that gsmap writes")
+            raise ValueError(f"its chunks {inner} in {outer} do not have the sizes that gsmap writes")
         out = ArrayLayout(tuple(shape), np.dtype(kind), inner[0], [])
         if not out.num_bytes:
             return out
@@ -185,7 +185,7 @@ class GroupReader:
         return out
 
     def _in_shard(self, span: ByteRange, used: int, count: int) -> list[ByteRange]:
-        """Return the frames of the first ``used`` of a shard's ``count`` chunks."""
+        """Return the zstd frames of the first ``used`` chunks of a shard, which has ``count`` chunks."""
         end = span.size - 16 * count - 4
         index = self._bytes(ByteRange(span.file, span.start + end, 16 * count)) if end > 0 else b""
         places = list(struct.iter_unpack("<QQ", index))[:used]
@@ -231,7 +231,7 @@ class ArrayLayout:
         return self.chunk_rows * math.prod(self.shape[1:]) * self.dtype.itemsize
 
     def chunks_of(self, rows: Sequence[Range] | None) -> list[int]:
-        """Return the numbers of the chunks that hold rows."""
+        """Return the numbers of the chunks that contain some rows."""
         if rows is None or not self.frames:
             return list(range(len(self.frames)))
         last = self.shape[0] - 1

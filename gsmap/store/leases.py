@@ -29,12 +29,14 @@ from gsmap.types.lock_owner import LockOwner, this_process
 _log = logging.getLogger("gsmap.leases")
 
 LEASE_S = 60.0
-"""Seconds until a lease expires unless it is renewed: the delay after which the work of a dead machine is taken over.
-Processes of this machine are seen to end at once."""
+"""Seconds after which a lease expires unless it is renewed, and others may take over the work of a dead machine. The
+end of a process on this machine is noticed at once.
+"""
 
 HEARTBEAT_S = 15.0
-"""Seconds between renewals of all leases of a process, in one small transaction: three may fail (a long writer, a
-server restart) before a lease expires."""
+"""Seconds between renewals of all leases of a process, in one small transaction. Three renewals may fail (a long
+writer, a server restart) before a lease expires.
+"""
 
 _AT_ONCE = 1000  # rows in one statement, within the limits on bound values
 _PATIENCE_S = 1.0  # wait for the writer lock to release leases; unreleased ones expire
@@ -42,7 +44,7 @@ _PATIENCE_S = 1.0  # wait for the writer lock to release leases; unreleased ones
 
 @dataclass(frozen=True)
 class Lease(LockOwner):
-    """A lease of a process on a piece of work.
+    """A time-limited right of a process to some work.
 
     Args:
         what: ``map``, ``poses``, ``graph KEY``, ``edge KEY`` or ``export FOLDER``.
@@ -92,7 +94,7 @@ class Leases:
 
     @contextmanager
     def announce(self, task: str, what: str = "map") -> Iterator[list[Lease]]:
-        """Announce work of this process that others may do, too; yields their leases on the same work.
+        """Announce work of this process that does not exclude other processes; yield their leases on the same work.
 
         Announces nothing for a map that was opened for reading.
         """
@@ -140,7 +142,7 @@ class Leases:
             self.release([what])
 
     def try_hold(self, what: str, task: str) -> bool:
-        """Try to get an exclusive lease, to be given back by `release`; returns False if another process holds it."""
+        """Try to get an exclusive lease, which `release` gives back; return False if another process has it."""
         return bool(self.acquire([what], task).ours)
 
     def acquire(
@@ -152,7 +154,7 @@ class Leases:
         done: Callable[[Collection[str]], Collection[str]] | None = None,
         give_back: Collection[str] = (),
     ) -> AcquiredLeases:
-        """Lease free work in one transaction.
+        """Acquire leases on work that no other process has leased, in one transaction.
 
         Args:
             work: what to lease, most wanted first.
@@ -213,7 +215,7 @@ class Leases:
             )
 
     def _insert(self, connection: Connection, work: list[str], task: str, now: datetime) -> list[str]:
-        """Insert leases and return those that no process on another machine inserted at the same moment."""
+        """Insert leases; return the leases that no process on another machine inserted at the same moment."""
         me = this_process(self._verb or task)
         row = {
             "token": self._token,
@@ -232,7 +234,7 @@ class Leases:
         return [what for what in work if what in ours]
 
     def _split_by_validity(self, connection: Connection, now: datetime) -> tuple[list[Lease], list[Lease]]:
-        """Return the valid leases and the expired ones."""
+        """Return the valid leases and the expired leases."""
         columns = ("task", "host", "process", "since", "what", "token", "expires_at")
         rows = connection.execute(select(leases).order_by(leases.c.since, leases.c.what))
         found = [Lease(*(str(getattr(row, column)) for column in columns)) for row in rows]
@@ -246,7 +248,7 @@ class Leases:
         return (leases.c.token == self._token) & leases.c.what.in_(sorted(work))
 
     def _now(self, connection: Connection) -> datetime:
-        """Return the time of the shared clock."""
+        """Return the time of the clock that all processes of the map share."""
         if self._catalog.is_sqlite:
             return datetime.now(UTC)
         found: datetime = connection.execute(select(func.clock_timestamp())).scalar_one()
@@ -285,5 +287,5 @@ def _text(time: datetime) -> str:
 
 
 def _without_token(what: str) -> str:
-    """Strip the token that tells apart announcements of the same work."""
+    """Strip the token that distinguishes announcements of the same work."""
     return what.partition(" #")[0]

@@ -1,4 +1,4 @@
-"""Exact conversion of poses and matrices to bytes or JSON and back."""
+"""Convert poses and matrices exactly to bytes or JSON, and back."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def covariances_of_bytes(values: Sequence[bytes]) -> np.ndarray:
 def _floats(values: Sequence[bytes], count: int) -> np.ndarray:
     """Convert bytes to (K, count) finite numbers."""
     if any(len(value) != count * _FLOAT.itemsize for value in values):
-        raise InputError(f"not {count} numbers", code="invalid_record")
+        raise InputError(f"the value does not have {count} numbers", code="invalid_record")
     found = np.frombuffer(b"".join(values), _FLOAT).reshape(-1, count)
     if not np.isfinite(found).all():
         raise InputError("NaN or infinity", code="not_finite")

@@ -63,8 +63,7 @@ class MergeResult:
 
 
 def merge(into: Store, source: Store) -> MergeResult:
-    """Merge another map into this one; the other map stays unchanged, nothing is computed, and repeating it adds
-    nothing.
+    """Merge another map into this map without computing anything; a repeated merge adds nothing.
 
     Scenes with equal content are the same scene. Revisions are copied as history (`revisions.origin` names the map that
     solved them), followed by one revision that joins the newest poses of both maps (`gsmap.store.pose_graph_join`).
@@ -90,7 +89,7 @@ def merge(into: Store, source: Store) -> MergeResult:
 
 
 def split(source: Store, out: Store, chosen: Collection[str]) -> MergeResult:
-    """Copy some scenes of a map, with all data of and among them, into a new and empty map.
+    """Copy some scenes of a map to a new and empty map, with all data about these scenes and their pairs.
 
     The newest poses are copied, restricted to these scenes, as revision 1.
 
@@ -119,7 +118,7 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> MergeResult:
 
 
 def import_scene(into: Store, source: Store, scene: str) -> MergeResult:
-    """Import one scene of another map (by id), its graphs, and its edges to scenes in this map.
+    """Import one scene of another map (by id), with its graphs and its edges to scenes of this map.
 
     Repairs damaged arrays of a scene that is already in this map.
 
@@ -150,7 +149,7 @@ def import_scene(into: Store, source: Store, scene: str) -> MergeResult:
 
 
 def _check_shared(transfer: Transfer, scene: str) -> None:
-    """Raise for a scene with damaged arrays if both catalogs share the same arrays."""
+    """Raise an error for a scene with damaged arrays if both catalogs share the arrays."""
     group = transfer.ours.execute(select(scenes.c.group_id).where(scenes.c.id == scene)).scalar_one()
     if group is None:
         return
@@ -178,8 +177,7 @@ def _merged(transfer: Transfer, revision: int | None) -> MergeResult:
 
 
 def _revisions(transfer: Transfer) -> int | None:
-    """Copy their revisions as history, then join the newest poses of both; returns the joint revision's number, or
-    None."""
+    """Copy the other map's revisions as history, and join the newest poses in a new revision; return its number."""
     ours, theirs = transfer.ours, transfer.theirs
     my_id, their_id = _id(ours), _id(theirs)
     mine, newest = newest_poses(ours), newest_poses(theirs)
@@ -214,15 +212,14 @@ def _append(transfer: Transfer, row: Row[Any], identity: Identity) -> None:
 
 
 def _identity(row: Row[Any], map_id: str) -> Identity:
-    """Return a map-independent identity of a revision: the map that solved it, its number there, and which part of
-    it."""
+    """Return an identity of a revision that all maps share: the map that solved it, its number there, and its part."""
     if row.origin is None:
         return map_id, row.number, None
     return str(row.origin["map"]), int(row.origin["number"]), row.origin.get("part")
 
 
 def _is_known(identity: Identity, known: Collection[Identity]) -> bool:
-    """Return True if a revision, or the whole of which it is a part, is among the known ones."""
+    """Return True if a revision is known, or if it is a part of a known revision."""
     return identity in known or (*identity[:2], None) in known
 
 
@@ -234,7 +231,7 @@ def _id(connection: Connection) -> str:
 
 
 def _compare_settings(into: Store, source: Store) -> list[str]:
-    """Return a note for each setting that differs; the settings of the target map are kept."""
+    """Return a note for each setting that differs between the maps; the target map keeps its settings."""
     mine, theirs = load(into.folder / FILE_NAME), load(source.folder / FILE_NAME)
     return [
         f"setting {name} stays {_format_setting(mine, name)} (in the other map: {_format_setting(theirs, name)}): "

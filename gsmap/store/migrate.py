@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def version(engine: Engine, folder: Path) -> str | None:
-    """Return the schema version of a database; None for an empty one."""
+    """Return the schema version of a database; None for an empty database."""
     with translate_errors(folder), engine.connect() as connection:
         return _version(connection)
 
@@ -30,7 +30,7 @@ def _version(connection: Connection) -> str | None:
 
 
 def require_current(catalog: Catalog) -> None:
-    """Raise unless a database has the current schema.
+    """Raise an error unless a database has the current schema.
 
     Raises:
         SchemaVersionError: the schema is newer (get a newer gsmap) or older (``gsmap migrate``).
@@ -60,7 +60,7 @@ def require_current(catalog: Catalog) -> None:
 
 
 def _require_tables(connection: Connection, folder: Path) -> None:
-    """Raise if the tables of a file differ from the schema.
+    """Raise an error if the tables of a file differ from the schema.
 
     Rows are trusted for their column types, and a trigger or a view would change what gsmap's statements do.
     """
@@ -90,7 +90,7 @@ def _not_ours(folder: Path, what: str) -> CorruptError:
 
 
 def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str | None]:
-    """Migrate the tables to a schema version in one transaction; returns the version before and after.
+    """Migrate the tables to a schema version in one transaction; return the versions before and after.
 
     An existing SQLite catalog is first copied to ``map.sqlite.VERSION.bak``.
 

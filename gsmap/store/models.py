@@ -71,7 +71,7 @@ class Models:
         options: Mapping[str, Any] | None = None,
         copy: bool = True,
     ) -> Model:
-        """Add a model, replacing the one with the same name.
+        """Add a model in place of any model with the same name.
 
         Args:
             copy: keep a copy in the map, so that it can be moved; otherwise store the path.
@@ -158,13 +158,13 @@ def model_path(folder: Path, row: Row[Any]) -> Path:
 
 
 def open_model(folder: Path, row: Row[Any]) -> int:
-    """Open a row's model for reading; follows a link outside the map, which the user may have made."""
+    """Open a row's model for reading; follow a link if the model lies outside the map, where the user may use links."""
     path = model_path(folder, row)
     return open_file(path if row.copied else path.resolve())
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy a file durably; it appears whole or not at all."""
+    """Copy a file durably; after an error, no partial copy remains."""
     refuse_links(target.parent.parent, FOLDER)
     target.parent.mkdir(exist_ok=True)
     with translate_errors(target.parent, NOT_KEPT):

@@ -1,4 +1,4 @@
-"""Array groups in an object store: objects ``arrays/KIND/ID/DIGEST-FILE`` of a remote map.
+"""Array groups of a remote map, stored as objects ``arrays/KIND/ID/DIGEST-FILE``.
 
 An object store has no rename and needs none: a group is valid only once a committed row of the catalog names it, so its
 files are written under their final names before that. A name holds the digest of the bytes, so that an existing object
@@ -195,7 +195,7 @@ class ObjectArrays(Arrays):
         return self._storage.get(self._key(kind, name, file))
 
     def _sha256(self, key: str) -> str | None:
-        """Return the digest of an object's bytes; None if there is no such object."""
+        """Return the digest of an object's bytes; None without such an object."""
         digest = hashlib.sha256()
         try:
             for chunk in self._storage.get(key):
@@ -285,7 +285,7 @@ class _ObjectReader:
         self._held[file] += [(start, content) for (start, _), content in zip(few, found, strict=True)]
 
     def dropped(self) -> bool:
-        """Delete this group's files from the cache; returns True if there were any."""
+        """Delete the group's files from the cache; return True if the cache had any."""
         kept = [self._files[path].sha256 for path, whole in self._whole.items() if whole is not None]
         for sha256 in kept:
             cache.drop(sha256)
@@ -293,7 +293,7 @@ class _ObjectReader:
 
 
 def merge_ranges(ranges: Sequence[layout.Range], at_most: int) -> list[layout.Range]:
-    """Merge ranges until at most ``at_most`` are left, closing the smallest gaps first."""
+    """Merge byte ranges to at most ``at_most`` ranges, closing the smallest gaps first."""
     out: list[layout.Range] = []
     for start, stop in sorted(ranges):
         if out and start <= out[-1][1]:

@@ -1,4 +1,4 @@
-"""Objects of the map: their numbers, facts about them, and the object sets computed for each component.
+"""Objects of the map: their numbers, their annotations, and the object sets computed for each component.
 
 An object keeps its number and facts when objects are computed again: it is recognized by its boxes in the captures' own
 frames, so that neither poses nor the order of captures matter. A new result replaces the previous one.
@@ -29,7 +29,7 @@ from gsmap.types.map_object import OBSERVATION_STATES
 from gsmap.types.plain import plain
 
 ObjectBoxes = Mapping[str, np.ndarray]
-"""Boxes of an object: (2, 3) bounds in the scene frame, by scene id."""
+"""Boxes (2, 3) of an object in the scene frame, by scene id."""
 
 # Minimum intersection over union of the boxes of one object in two computations, each padded by a fraction of the
 # larger one's diagonal because the box of a picture on a wall has almost no thickness.
@@ -107,7 +107,7 @@ class Objects:
         return [_read(row) for row in rows]
 
     def save(self, parts: Sequence[ComputedObjects]) -> list[ObjectSet]:
-        """Store object sets, replacing those that share a capture with them.
+        """Store object sets in place of stored sets that share a capture with them.
 
         No number is assigned twice in the map. If a component was split, an object keeps its number in the part where
         more captures show it; the other part gets a new object, see `split_objects`.
@@ -168,8 +168,8 @@ class Objects:
         return kept
 
     def _update_split_objects(self, connection: Connection, part: ComputedObjects, others: Collection[int]) -> None:
-        """Update the boxes of objects of other components that were one with an object here until their component was
-        split.
+        """Update the boxes of objects in other components that a split of a component separated from objects of this
+        set.
 
         Their boxes then stay equal, so that each keeps its number, and they merge again when the components do.
         """
@@ -184,13 +184,13 @@ class Objects:
                     connection.execute(update(object_places).where(same).values(box=box))
 
     def match_numbers(self, places: Sequence[ObjectBoxes]) -> list[int | None]:
-        """Return the numbers of objects by their boxes; None for unknown objects. Nothing is stored."""
+        """Find the numbers of objects by their boxes, without storing anything; None for unknown objects."""
         captures = {scene for one in places for scene in one}
         with self._catalog.read() as connection:
             return match_objects(connection, places, _numbers_in_use(connection, besides=captures))
 
     def split_objects(self, shown: Mapping[int, Iterable[str]]) -> dict[int, int]:
-        """Return pairs of objects that were one until their component was split: the other's number, by number.
+        """Return pairs of objects that were one before their component was split, as a mapping between their numbers.
 
         Args:
             shown: captures of the object's component, by object number.
@@ -224,7 +224,7 @@ class Objects:
         same_as: int | None = None,
         author: str = "",
     ) -> None:
-        """Add facts about an object; earlier ones stay in `facts`.
+        """Add facts about an object; earlier facts stay in `facts`.
 
         Args:
             name: unique among objects; empty to withdraw it.
@@ -271,8 +271,7 @@ class Objects:
                 connection.execute(insert(object_facts), rows)
 
     def annotations(self) -> dict[str, ObjectAnnotations]:
-        """Return the current name, label, note and identity of objects by id (``o12``); objects without any are left
-        out."""
+        """Return the current annotations of all annotated objects, by id (``o12``)."""
         with self._catalog.read() as connection:
             return {f"o{number}": words for number, words in current_annotations(connection).items()}
 
@@ -299,7 +298,7 @@ class Objects:
 def match_objects(
     connection: Connection, found: Sequence[ObjectBoxes], given: Collection[int] = ()
 ) -> list[int | None]:
-    """Assign the number of a stored object to each given object, None for new ones; each number is assigned once.
+    """Assign to each given object the number of a stored object, or None to a new object; no number is assigned twice.
 
     Pairs are matched by the number of captures with overlapping boxes; ties prefer the object all of whose boxes match,
     then the older one.
@@ -345,7 +344,7 @@ def _numbers_in_use(connection: Connection, besides: Iterable[str] = ()) -> set[
 
 
 def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Compute (N, M) intersection over union of padded boxes (N, 2, 3) and (M, 2, 3)."""
+    """Compute the intersection over union (N, M) of padded boxes (N, 2, 3) and (M, 2, 3)."""
     size = np.maximum(
         np.linalg.norm(a[:, 1] - a[:, 0], axis=1)[:, None], np.linalg.norm(b[:, 1] - b[:, 0], axis=1)[None]
     )
@@ -403,7 +402,7 @@ def _check_acyclic(annotations: Mapping[int, ObjectAnnotations], number: int, sa
 
 
 def forget_sets(connection: Connection, scenes: Iterable[str]) -> int:
-    """Delete the object sets with any of these captures; returns how many."""
+    """Delete the object sets that contain any of these captures; return their number."""
     gone = set(scenes)
     rows = connection.execute(select(object_sets.c.number, object_sets.c.poses)).all()
     numbers = [row.number for row in rows if gone & set(row.poses)]
@@ -412,7 +411,7 @@ def forget_sets(connection: Connection, scenes: Iterable[str]) -> int:
 
 
 def forget_scene(connection: Connection, scene: str) -> dict[str, int]:
-    """Delete the boxes of a capture, and facts of objects that no other capture shows; returns row counts by noun."""
+    """Delete the boxes of a capture, and facts about objects that no other capture shows; return row counts by noun."""
     dropped = {"object_sets": forget_sets(connection, [scene])}
     mine = object_places.c.scene == scene
     of_it = list(connection.execute(select(object_places.c.object).where(mine)).scalars())
@@ -424,7 +423,7 @@ def forget_scene(connection: Connection, scene: str) -> dict[str, int]:
 
 
 def inherit(connection: Connection, old: str, new: str) -> None:
-    """Move the object boxes of a capture to another one in the same frame."""
+    """Move the object boxes of a capture to another capture in the same frame."""
     has = set(connection.execute(select(object_places.c.object).where(object_places.c.scene == new)).scalars())
     moving = (object_places.c.scene == old) & object_places.c.object.not_in(has)
     connection.execute(update(object_places).where(moving).values(scene=new))

@@ -1,4 +1,4 @@
-"""``map.sqlite.digests``: a digest of every page of the catalog file, stored beside it.
+"""Keep ``map.sqlite.digests``, which has a digest of every page of the catalog file beside it.
 
 SQLite has no page checksums of its own. The file changes only in a checkpoint, under the writer lock, and its new
 content is in the write-ahead log. So the digests from before and after are written first, and until the checkpoint ends
@@ -25,7 +25,7 @@ from gsmap.store.wal import WalContent, read_log, wal_path
 _MAGIC = b"gsmap page digests 1\n"
 _SIZE = 16  # bytes of BLAKE2b: detects disk errors, not forgery
 WHOLE_BYTES = 256 << 20
-"""Size up to which a file is verified when it is opened or written; only ``gsmap check`` reads longer files whole."""
+"""Largest size of a file that is verified when it is opened or written; only ``gsmap check`` verifies longer files."""
 _BLOCK_BYTES = 1 << 20
 _HEADER = struct.Struct("<4I")
 _ENTRY = struct.Struct("<I16s")
@@ -61,12 +61,12 @@ def digests_path(file: Path) -> Path:
 
 
 def legacy_digest_path(file: Path) -> Path:
-    """Return the path of the digest of the whole file, written by gsmap before schema 0003."""
+    """Return the path of the digest of a whole database, as gsmap before schema 0003 wrote it."""
     return file.with_name(file.name + ".sha256")
 
 
 def load(file: Path) -> PageDigests | None:
-    """Load the digests of a database; None if there are none.
+    """Load the page digests of a database; None without page digests.
 
     Raises:
         CorruptError: the digests are damaged.
@@ -91,7 +91,7 @@ def load(file: Path) -> PageDigests | None:
 
 
 def save(file: Path, digests: PageDigests) -> None:
-    """Replace the digests of a database durably; removes the digest of older releases and leftovers of killed attempts.
+    """Replace the digests of a database durably; delete digests of older releases and leftovers of killed processes.
 
     Requires the writer lock, or a database that no other process uses yet.
     """
@@ -111,7 +111,7 @@ def write_digests(file: Path) -> None:
 
 
 def find_backup_digests(file: Path, handle: FileHandle) -> PageDigests | None:
-    """Return the digests of a ``*.bak`` file that was restored in place of the database; otherwise None."""
+    """Return the digests of the ``*.bak`` file that a person put in place of the database; None if there is none."""
     for path in sorted(file.parent.glob(f"{file.name}.*.bak.digests")):
         stored = load(path.with_suffix(""))
         if stored is not None and _digest_file(handle, stored).pages == stored.pages:
@@ -120,8 +120,7 @@ def find_backup_digests(file: Path, handle: FileHandle) -> PageDigests | None:
 
 
 def problems(file: Path, handle: FileHandle, stored: PageDigests | None, log: WalContent) -> list[str]:
-    """Return a message for each difference of a database file or log from its digests; empty for a file without
-    digests.
+    """Return a message for each difference between a database or its log and the digests; empty without digests.
 
     Args:
         log: content of the log. Pages in it may be torn in the file while a checkpoint is in progress.
@@ -130,7 +129,7 @@ def problems(file: Path, handle: FileHandle, stored: PageDigests | None, log: Wa
 
 
 def differing_pages(now: bytes, stored: PageDigests, in_wal: Collection[int] = ()) -> list[int]:
-    """Return numbers of the pages that match neither the digests from before nor those from after the checkpoint.
+    """Return the numbers of pages that match neither the digests before the checkpoint nor the digests after it.
 
     Args:
         now: digests of the file as it is.
@@ -160,14 +159,14 @@ def _problems(
 
 
 def accept(file: Path, handle: FileHandle) -> None:
-    """Write digests of a file without a log as it is; requires the writer lock."""
+    """Write digests of a file in its current state, which must have no log; the caller must hold the writer lock."""
     save(file, _digest_file(handle))
 
 
 def fold(
     file: Path, handle: FileHandle, begin: Callable[[], int], finish: Callable[[], bool], *, accept: bool = False
 ) -> None:
-    """Checkpoint the log while keeping the digests valid at every moment; requires the writer lock.
+    """Checkpoint the log while the digests stay valid at every moment; the caller must hold the writer lock.
 
     Args:
         begin: runs a passive checkpoint and returns the number of committed frames in the log; negative if another
@@ -218,7 +217,7 @@ def damage_message(file: Path, found: Iterable[str]) -> str:
 
 
 def format_pages(numbers: list[int]) -> str:
-    """Format page numbers, with ranges for runs."""
+    """Format page numbers, runs of consecutive numbers as ranges."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][1] + 1:
@@ -248,7 +247,7 @@ def _may_be_missing(stored: PageDigests, number: int, in_wal: Collection[int]) -
 
 
 def _digest_file(handle: FileHandle, stored: PageDigests | None = None) -> PageDigests:
-    """Compute the digests of a file as it is."""
+    """Compute the digests of a file in its current state."""
     size = stored.page_size if stored is not None else page_size(handle)
     many = max(1, _BLOCK_BYTES // size) * size
     digests: list[bytes] = []
@@ -271,8 +270,7 @@ def _update_digests(handle: FileHandle, stored: PageDigests, numbers: Iterable[i
 def _digests_after_checkpoint(
     handle: FileHandle, before: PageDigests, log: WalContent, changed: dict[int, bytes]
 ) -> PageDigests:
-    """Return the digests after the checkpoint, from the log where it has the page and otherwise from before or the
-    file."""
+    """Return the digests after the checkpoint: of pages in the log from there, others from ``before`` or the file."""
     count = log.num_pages or before.count
     digests = [before.page(i + 1) for i in range(min(count, before.count))] + [b""] * (count - before.count)
     for number, digest in changed.items():

@@ -1,4 +1,4 @@
-"""Photos that a map keeps as evidence (`LocalizedPhoto`), each with a small JPEG.
+"""Photos that a map keeps (`LocalizedPhoto`), each with a small JPEG.
 
 Rows are never overwritten: a removed photo keeps its row with the time of removal. A photo's pose is relative to the
 scene that supports it, whose newest pose transforms it to the map.
@@ -51,7 +51,7 @@ class Photos:
         self._arrays = arrays
 
     def add(self, sighting: LocalizedPhoto, jpeg: bytes) -> bool:
-        """Add a photo; returns False, and changes nothing, if the same one is in the map already.
+        """Add a photo; if the map has the same photo already, change nothing and return False.
 
         Raises:
             InputError: not a JPEG, a JPEG larger than `MAX_BYTES`, or an invalid date.
@@ -83,7 +83,8 @@ class Photos:
         return True
 
     def list(self) -> list[StoredPhoto]:
-        """Return the current photos of living scenes, oldest first, then those without a date in order of addition.
+        """Return the current photos of living scenes: dated photos, oldest first, then undated photos as they were
+        added.
 
         Raises:
             CorruptError: the catalog holds an invalid photo.
@@ -138,7 +139,7 @@ class Photos:
         return found[0]
 
     def remove(self, number: int) -> None:
-        """Remove a photo; its row stays with the time of removal, and prune reclaims its JPEG."""
+        """Remove a photo; its row keeps the time of removal, and `prune` reclaims its JPEG."""
         mine = photo_sightings.c.number == number
         with self._catalog.write() as connection:
             connection.execute(update(photo_sightings).where(mine, _is_current()).values(removed_at=now()))
@@ -148,13 +149,13 @@ _MIN_DIGEST_LENGTH = 6  # of a digest prefix
 
 
 def claimed_groups(connection: Connection, lost: set[str] | None = None) -> set[str]:
-    """Return the groups of current photos, without those of ``lost`` scenes."""
+    """Return the array groups of current photos, except photos of ``lost`` scenes."""
     rows = connection.execute(select(photo_sightings.c.group_id, photo_sightings.c.scene).where(_is_current()))
     return {row.group_id for row in rows if row.group_id is not None and row.scene not in (lost or ())}
 
 
 def inherit(connection: Connection, old: str, new: str) -> None:
-    """Move the photos of a scene to another one in the same frame."""
+    """Move the photos of a scene to another scene in the same frame."""
     mine = photo_sightings.c.scene == old
     connection.execute(update(photo_sightings).where(mine, _is_current()).values(scene=new))
 

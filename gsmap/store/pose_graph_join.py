@@ -1,4 +1,4 @@
-"""Join the newest pose graphs of two maps, aligned by shared scenes."""
+"""Join the newest pose graphs of two maps, which shared scenes align."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _QUANTILE = 0.999
 def join_pose_graphs(
     ours: PoseGraph, theirs: PoseGraph, living: Collection[str], bounds: Mapping[str, np.ndarray]
 ) -> PoseGraph:
-    """Join our poses with theirs of the scenes that only they have placed; nothing is optimized.
+    """Add to our pose graph the poses of scenes that only their pose graph places, without optimizing.
 
     A component of theirs that shares scenes with one of ours is moved to our frame by one similarity if all shared
     scenes then agree; otherwise it stays a separate component, with a note.
@@ -79,7 +79,7 @@ def join_pose_graphs(
 
 
 def restrict_pose_graph(graph: PoseGraph, scenes: Collection[str]) -> PoseGraph:
-    """Restrict a pose graph to some scenes and the edges among them."""
+    """Restrict a pose graph to some scenes and the edges between these scenes."""
     poses = {scene: pose for scene, pose in graph.poses.items() if scene in scenes}
     outcomes = {pair: outcome for pair, outcome in graph.outcomes.items() if set(pair) <= set(poses)}
     placed = _largest_first(poses)
@@ -88,7 +88,7 @@ def restrict_pose_graph(graph: PoseGraph, scenes: Collection[str]) -> PoseGraph:
 
 
 def _ties(graph: PoseGraph, placed: Mapping[str, ScenePose], before: Mapping[str, int]) -> tuple[Georeference, ...]:
-    """Return the world ties of components under their new numbers, with the residuals of scenes that are present.
+    """Return the georeferences of components under their new numbers, with the residuals of scenes that are present.
 
     Args:
         before: component of each scene of ``graph`` whose component keeps its frame.
@@ -137,7 +137,7 @@ def _agree(common: list[tuple[ScenePose, ScenePose]], S_ours_theirs: Sim3) -> bo
 
 
 def _largest_first(poses: Mapping[str, ScenePose]) -> dict[str, ScenePose]:
-    """Renumber components, the largest first; ties keep their order."""
+    """Renumber components, the largest first; equally large components keep their order."""
     sizes = Counter(pose.component for pose in poses.values())
     order = {component: i for i, component in enumerate(sorted(sizes, key=lambda k: (-sizes[k], k)))}
     return {scene: replace(pose, component=order[pose.component]) for scene, pose in poses.items()}

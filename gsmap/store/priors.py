@@ -1,4 +1,4 @@
-"""Pose priors: at most one current prior per scene; earlier ones are kept as history."""
+"""Pose priors: a scene has at most one current prior; earlier priors are kept as history."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Priors:
         self._catalog = catalog
 
     def set(self, prior: Prior) -> None:
-        """Set the pose prior of a scene, replacing the previous one."""
+        """Set the pose prior of a scene in place of the previous prior."""
         sigmas = np.asarray(prior.sigmas, np.float64)
         if sigmas.shape != (7,) or not (sigmas > 0).all():
             raise InputError(
@@ -54,7 +54,7 @@ class Priors:
         return tuple((row.number, _prior(row)) for row in rows)
 
     def of(self, scene: str) -> Prior | None:
-        """Return the current prior of a scene (id); None if it has none."""
+        """Return the current prior of a scene (id); None without a prior."""
         query = select(priors).where(priors.c.scene == scene, priors.c.removed_at.is_(None)).order_by(priors.c.number)
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()

@@ -141,8 +141,7 @@ def list_purges(store: Store) -> list[Purge]:
 
 
 def record_files(store: Store, purge: Purge, target: str, num_files: int) -> Purge:
-    """Record the number of files to delete in a folder (tiles, pages, reports, images) before they are deleted, since a
-    crash may leave none to count."""
+    """Record the number of files to delete in a folder before deleting them, as a crash may leave none to count."""
     pending = purge.receipt["pending"]
     known = pending.get("tiles", {})  # missing in purges begun by an older gsmap
     noted = {**known, target: max(num_files, known.get(target, 0))}
@@ -150,7 +149,7 @@ def record_files(store: Store, purge: Purge, target: str, num_files: int) -> Pur
 
 
 def finish(store: Store, purge: Purge, unreachable: Sequence[str]) -> Purge:
-    """Reclaim arrays, older catalog copies and deleted rows in the catalog file, and complete the receipt.
+    """Erase arrays, older copies of the catalog, and deleted rows in the catalog file; complete the receipt.
 
     Args:
         unreachable: export folders that could not be searched, with the reason, for the receipt.
@@ -189,7 +188,7 @@ def _save(store: Store, purge: Purge, receipt: dict[str, Any]) -> Purge:
 
 
 def update_receipts(store: Store) -> None:
-    """Update the other catalogs that hold the scene in all receipts."""
+    """Update, in all receipts, the list of other catalogs that still have the scene."""
     for one in list_purges(store):
         if not one.is_done or not one.receipt["branches"]:
             continue
@@ -199,7 +198,7 @@ def update_receipts(store: Store) -> None:
 
 
 def catalogs_with_scene(store: Store, scene: str) -> list[MapLocation]:
-    """Return the other catalogs of the map (itself, branches, tags) that hold a scene."""
+    """Return the other catalogs of the map (the map itself, branches, tags) that have a scene."""
     found = []
     for place in store.others():
         with Store.open(place.location, "r") as other, other.catalog.read() as connection:
@@ -209,7 +208,7 @@ def catalogs_with_scene(store: Store, scene: str) -> list[MapLocation]:
 
 
 def erase_deleted_rows(catalog: Catalog) -> None:
-    """Rewrite the catalog so that its files contain nothing of deleted rows.
+    """Rewrite the catalog so that its files contain no bytes of deleted rows.
 
     Raises:
         BusyError: a reader holds an older state.
@@ -232,7 +231,7 @@ def erase_deleted_rows(catalog: Catalog) -> None:
 
 
 def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], dict[str, int]]:
-    """Delete rows; returns counts by noun, and the size of each array group that lost its last referrer."""
+    """Delete the rows of a scene; return counts by noun, and the sizes of array groups that no row names any more."""
     scene = row.id
     counts: Counter[str] = Counter()
 
@@ -317,7 +316,7 @@ def _pattern(scene: str, names: Iterable[str]) -> re.Pattern[str]:
 
 
 def _scrub(connection: Connection, scene: str, names: set[str]) -> None:
-    """Remove the scene from texts that gsmap generated about other things."""
+    """Remove the scene from texts that gsmap generated about other scenes and objects."""
     pattern = _pattern(scene, names)
     for table, columns in _GENERATED_TEXTS:
         for line in connection.execute(select(table)).mappings().all():
@@ -349,7 +348,7 @@ def _replace_scene(value: Any, pattern: re.Pattern[str]) -> Any:
 
 
 def _mentions(connection: Connection, scene: str, names: set[str]) -> list[str]:
-    """Return the places where people wrote about the scene elsewhere, without its name."""
+    """Return the annotations of other scenes and objects that mention the scene, described without its name."""
     pattern = _pattern(scene, names)
     found = []
     for table, column, of in _USER_TEXTS:
@@ -363,7 +362,7 @@ def _mentions(connection: Connection, scene: str, names: set[str]) -> list[str]:
 
 
 def _backups_of_map(store: Store) -> list[tuple[str, str]]:
-    """Return (time, name) of each snapshot; the map itself records those made since a branch was made."""
+    """Return (time, name) of each snapshot, also of snapshots that only the map records since this branch was made."""
     with contextlib.ExitStack() as stack:
         catalogs = [store]
         if store.branch:
@@ -389,7 +388,7 @@ def _backups(connection: Connection, scene: Row[Any], of_map: Iterable[tuple[str
 
 
 def _linked_files(store: Store, connection: Connection, scene: str) -> int:
-    """Count its files that have other hard links on this disk: in another map or a clone."""
+    """Count the scene's files with other hard links on this disk, in another map or a clone."""
     with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
     of_scene = {
         "scenes": select(scenes.c.group_id).where(scenes.c.id == scene, scenes.c.group_id.is_not(None)),

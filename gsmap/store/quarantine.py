@@ -45,13 +45,13 @@ class Quarantine:
         self.encountered: dict[str, QuarantineRecord] = {}
 
     def list(self) -> list[QuarantineRecord]:
-        """Return all, oldest first."""
+        """Return all records, oldest first."""
         with self._catalog.read() as connection:
             rows = connection.execute(select(set_aside).order_by(set_aside.c.created_at, set_aside.c.what))
             return [QuarantineRecord(**row) for row in rows.mappings()]
 
     def add(self, what: str, about: str, reason: str) -> None:
-        """Quarantine a job or a capture, replacing one of the same kind about the same inputs (of an older recipe)."""
+        """Quarantine a job or a capture; replace a record of the same kind and inputs, even of an older recipe."""
         row = {"what": what, "about": about, "reason": reason, "created_at": now()}
         kind = what.partition(" ")[0]
         with self._catalog.write() as connection:
@@ -61,7 +61,7 @@ class Quarantine:
         self.encountered[what] = QuarantineRecord(**row)
 
     def forget(self, jobs: Collection[str]) -> None:
-        """Release jobs: they are to be tried again, are done, or are no longer needed."""
+        """Release jobs that are to be tried again, are done, or are no longer needed."""
         with self._catalog.write() as connection:
             connection.execute(delete(set_aside).where(set_aside.c.what.in_(sorted(jobs))))
         for what in jobs:

@@ -34,7 +34,7 @@ class Recipes:
         with self._catalog.read() as connection:
             row = connection.execute(select(recipes).where(recipes.c.digest == digest)).first()
         if row is None:
-            raise NotFoundError(f"this map has no result of a recipe {digest}", code="recipe_not_found")
+            raise NotFoundError(f"this map has no result of the recipe {digest}", code="recipe_not_found")
         return _recipe(row)
 
     def list(self) -> list[RecipeKey]:
@@ -60,7 +60,7 @@ def save_recipe(connection: Connection, recipe: RecipeKey | Mapping[str, Any] | 
 
 
 def digest_of(key: RecipeKey | str) -> str:
-    """Return the digest of a key."""
+    """Return the digest of a key, which may be a digest already."""
     return key.digest if isinstance(key, RecipeKey) else key
 
 
@@ -70,7 +70,7 @@ def stored_keys(
     keys: Iterable[RecipeKey | str],
     where: ColumnElement[bool] | None = None,
 ) -> set[str]:
-    """Return those of the keys (as digests) that a column holds, in rows that meet a condition."""
+    """Return, as digests, the keys that a column contains in rows that meet a condition."""
     some_of, found = {digest_of(key) for key in keys}, set()
     if len(some_of) > MAX_NAMED_KEYS:  # compared values need no validation (`gsmap.store.column_types`)
         query = select(type_coerce(column, Text)).where(true() if where is None else where)

@@ -41,7 +41,7 @@ from gsmap.types.plain import plain
 
 REVIEWS = ("confirm", "reject", "withdraw")
 MANUAL = "manual"
-"""`Registration.proposer` of a manual measurement."""
+"""The value of `Registration.proposer` for a manual measurement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +108,12 @@ class EdgeSummary(NamedTuple):  # created for every pair in every update: ten ti
 
     @property
     def is_specified(self) -> bool:
-        """Return True if a person measured or confirmed it."""
+        """Return True if a person measured or confirmed the registration."""
         return self.manual or self.review == "confirm"
 
     @property
     def keys(self) -> frozenset[str]:
-        """Return the keys of all computed registrations of the pair, as far as they were read."""
+        """Return the keys of those computed registrations of the pair that were read."""
         return frozenset((self.key,) if self.key else ()) if self.history_keys is None else self.history_keys
 
 
@@ -186,7 +186,7 @@ class Registrations:
             connection.execute(insert(registrations), rows)
 
     def adopt(self, number: int) -> StoredRegistration:
-        """Make an earlier registration the newest of its pair again, as if it had just been computed.
+        """Make an earlier registration the newest of its pair, as if it had just been computed.
 
         A map that returns to older settings so gets its older edges back. Writes nothing if it is the newest already.
 
@@ -199,7 +199,8 @@ class Registrations:
                 raise NotFoundError(f"this map has no registration {number}", code="registration_not_found")
             if row.proposer == MANUAL:
                 raise InputError(
-                    f"registration {number} is a manual one and cannot be computed again: save it again instead",
+                    f"registration {number} is a manual measurement and cannot be computed again: save it again "
+                    "instead",
                     code="registration_measured",
                 )
             pair = _rows_of(connection, row.pair)
@@ -318,7 +319,7 @@ class Registrations:
         return None if row is None else _stored_one(row, review)
 
     def newest_with_key(self, key: RecipeKey | str) -> StoredRegistration | None:
-        """Return the newest registration with a key (or its digest); None if there is none."""
+        """Return the newest registration with a key or digest; None without one."""
         digest = recipes.digest_of(key)
         if not digest:
             return None
@@ -331,8 +332,7 @@ class Registrations:
         return _stored_one(row, review)
 
     def newest_with_keys(self, keys: Iterable[RecipeKey | str]) -> list[Registration]:
-        """Return the newest registration with each of the keys (or their digests) that has one, in the order of the
-        keys."""
+        """Return the newest registration of each key (or digest) that has a registration, in the order of the keys."""
         wanted = list(dict.fromkeys(digest for key in keys if (digest := recipes.digest_of(key))))
         newest: dict[str, Row[Any]] = {}
         with self._catalog.read() as connection:
@@ -343,7 +343,7 @@ class Registrations:
         return [_stored_one(newest[digest], None).registration for digest in wanted if digest in newest]
 
     def stored_keys(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
-        """Return those of the keys (as digests) that have a registration with a number above ``after``."""
+        """Return, as digests, the keys that have a registration with a number above ``after``."""
         with self._catalog.read() as connection:
             return recipes.stored_keys(connection, registrations.c.key, keys, registrations.c.number > after)
 
@@ -380,7 +380,7 @@ class Registrations:
             ConfigError: an unknown review.
         """
         if review not in REVIEWS:
-            raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
+            raise ConfigError(f"a review must be one of {', '.join(REVIEWS)}, got {review!r}", code="invalid_choice")
         with self._catalog.write() as connection:
             found = self.get(a, b)
             first, second = scene_name(connection, a), scene_name(connection, b)
@@ -392,7 +392,7 @@ class Registrations:
             if review == "confirm" and found.registration.S_target_source is None:
                 raise InputError(
                     f"{first} and {second} have no pose to confirm: "
-                    f"{found.registration.reason or 'the registration found none'}",
+                    f"{found.registration.reason or 'the registration found no pose'}",
                     code="no_pose_of_pair",
                 )
             if review == "withdraw" and found.review is None and not found.manual:
@@ -424,7 +424,7 @@ class _CurrentRow(NamedTuple):
 
 
 def _find_current(rows: Sequence[Row[Any]], history: Iterable[Review]) -> tuple[Row[Any] | None, Review | None]:
-    """Return the current row of a pair and the review in force; see `Registrations`.
+    """Return the current row of a pair, and its review if one is in force; see `Registrations`.
 
     Args:
         rows: the pair's registrations, oldest first.
@@ -491,7 +491,7 @@ def _row_of(r: Registration, pair: str, key: RecipeKey | None, recipe: str | Non
 def _pair(connection: Connection, a: str, b: str) -> str:
     first, second = sorted((resolve(connection, a), resolve(connection, b)))
     if first == second:
-        raise InputError(f"{a} and {b} are the same scene: a pair needs two", code="same_scene")
+        raise InputError(f"{a} and {b} are the same scene: a pair needs two scenes", code="same_scene")
     return f"{first}:{second}"
 
 
@@ -566,7 +566,7 @@ def _unreviewed(columns: Sequence[ColumnElement[Any]]) -> Select[Any]:
 def _reviewed(
     connection: Connection, columns: Sequence[ColumnElement[Any]], wanted: ColumnElement[bool]
 ) -> list[tuple[int, _CurrentRow]]:
-    """Return the current row of every reviewed or measured pair with the number of the pair's first row."""
+    """Return the current row of every pair with a review or a manual measurement, with the number of its first row."""
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
     every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(_REVIEWED_PAIRS))).all()
     ordered_reviews = select(reviews).order_by(reviews.c.pair, reviews.c.number)
@@ -586,7 +586,7 @@ _ALL_SUMMARY_ROWS = select(*_SUMMARY_COLUMNS, _EVIDENCE).order_by(registrations.
 
 
 def _fingerprint(connection: Connection, upto: int) -> tuple[str, str] | None:
-    """Return values that tell apart registrations with the same number; None if there is no such row."""
+    """Return values that distinguish registrations with the same number; None without a row."""
     query = select(registrations.c.key, registrations.c.created_at).where(registrations.c.number == upto)
     row = connection.execute(query).first()
     return None if row is None else (row.key, row.created_at)
@@ -642,7 +642,7 @@ def _summary(row: tuple[Any, ...], review: Review | None, history_keys: Mapping[
 
 
 def _disagreement(evidence: str) -> float:
-    """Parse one number of the evidence, without decoding the rest of a flat JSON object."""
+    """Parse the disagreement in the evidence, without decoding the rest of the JSON object."""
     _, named, after = evidence.partition('"disagreement":')
     if named and evidence.count("{") == 1 and '"disagreement"' not in after:
         with suppress(ValueError):

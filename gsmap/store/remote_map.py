@@ -1,4 +1,4 @@
-"""Remote maps: arrays, models and settings in an object store, and the catalog in PostgreSQL.
+"""Remote maps, with arrays, models and settings in an object store and the catalog in PostgreSQL.
 
 Each remote map has a local mirror: a folder with copies of ``catalog.url``, ``settings.toml`` and models, updated
 whenever the map is opened. The mirror can be deleted without loss.

@@ -1,4 +1,4 @@
-"""Revisions: every pose graph from the optimizer, numbered from 1, immutable.
+"""Revisions: all pose graphs from the optimizer, immutable and numbered from 1.
 
 Rows shared by consecutive revisions are stored once: a row of `poses` and `edges` is valid from one revision up to
 another (`gsmap.store.schema`). The newest poses are the rows without an end; those of another revision are the rows
@@ -179,39 +179,39 @@ class Revisions:
         return None if row is None else _revision(row)
 
     def poses(self, *scenes: str) -> dict[str, ScenePose]:
-        """Return the newest poses of some scenes (ids), default: of all; reads no edges."""
+        """Return the newest poses of some scenes (ids) or of all scenes, without reading edges."""
         newest = poses.c.until.is_(None)
         with self._catalog.read() as connection:
             return _poses(connection, newest & poses.c.scene.in_(scenes) if scenes else newest)
 
     def world(self) -> tuple[Georeference, ...]:
-        """Return the world ties of the components of the newest revision, for components with observations."""
+        """Return the georeferences of the newest revision, for components with observations of the world."""
         with self._catalog.read() as connection:
             row = connection.execute(_NEWEST).first()
         return () if row is None else world_ties_of_json(row.world)
 
     def outcomes(self, *scenes: str) -> dict[tuple[str, str], EdgeOutcome]:
-        """Return the newest outcomes of the edges of some scenes (ids), default: of all."""
+        """Return the newest outcomes of the edges of some scenes (ids), or of all edges."""
         newest = edges.c.until.is_(None)
         mine = or_(edges.c.target.in_(scenes), edges.c.source.in_(scenes))
         with self._catalog.read() as connection:
             return _outcomes(connection, newest & mine if scenes else newest)
 
     def changed_after(self, number: int) -> tuple[set[str], set[tuple[str, str]]]:
-        """Return the scenes whose pose, and the (target, source) of edges whose outcome, changed after a revision."""
+        """Return scenes whose pose changed after a revision, and (target, source) of edges whose outcome changed."""
         with self._catalog.read() as connection:
             placed = connection.execute(select(poses.c.scene).where(poses.c.until.is_(None), poses.c.since > number))
             judged = select(edges.c.target, edges.c.source).where(edges.c.until.is_(None), edges.c.since > number)
             return set(placed.scalars()), {(row.target, row.source) for row in connection.execute(judged)}
 
     def tentative(self) -> tuple[tuple[str, str], ...]:
-        """Return (target, source) of the newest revision's edges that hold scenes though no cycle confirms them."""
+        """Return (target, source) of the newest revision's edges that place scenes although no cycle confirms them."""
         newest = edges.c.until.is_(None) & (edges.c.use == "tentative")
         with self._catalog.read() as connection:
             return tuple(_outcomes(connection, newest))
 
     def undecided(self, number: int | None = None) -> PairsByRevision:
-        """Return (target, source) of undecided edges by revision; of one revision or of all."""
+        """Return (target, source) of undecided edges by revision, for one revision or for all."""
         query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)
         query = query.order_by(edges.c.target, edges.c.source)
         if number is not None:
@@ -231,14 +231,14 @@ class Revisions:
 _NEWEST = select(revisions).order_by(revisions.c.number.desc()).limit(1)
 _ENDS: dict[str, tuple[str, ...]] = {"poses": ("scene",), "edges": ("target", "source")}
 RevisionRows = Mapping[str, Mapping[tuple[str, ...], tuple[Any, ...]]]
-"""Rows of one revision by table: the columns after ``until``, by scene, or by target and source."""
+"""Rows of one revision, by table: the columns after ``until``, by scene or by (target, source)."""
 RowSelection = Mapping[str, Collection[tuple[str, ...]]]
-"""Selected rows by table: the scene, or target and source, of each."""
+"""Selected rows, by table: the scene or (target, source) of each row."""
 _FEW = 1000  # scenes named in one query; for more, all rows are read
 
 
 def insert_revision(connection: Connection, row: Mapping[str, Any], lines: RevisionRows | None) -> None:
-    """Insert a revision, numbered after the newest, and only those of its rows that differ from the newest.
+    """Insert a revision after the newest, with only those rows that differ from the newest revision.
 
     Args:
         lines: None for a dropped revision, of which only its entry is left.
@@ -249,7 +249,7 @@ def insert_revision(connection: Connection, row: Mapping[str, Any], lines: Revis
 
 
 def _write(connection: Connection, number: int, lines: RevisionRows, among: RowSelection | None = None) -> None:
-    """End rows that are no longer valid from a revision on, and insert new ones.
+    """End the validity of rows that a revision replaces, and insert its new rows.
 
     Args:
         among: consider only these rows; default: all.
@@ -281,7 +281,7 @@ def _write(connection: Connection, number: int, lines: RevisionRows, among: RowS
 
 
 def _differing(graph: PoseGraph, before: PoseGraph) -> RowSelection:
-    """Return the poses and edges that are not identical objects in two pose graphs."""
+    """Return the poses and edges of a pose graph that are not the same Python objects in the other."""
     return {
         "poses": {
             (scene,)
@@ -323,7 +323,7 @@ def rows_of_graph(graph: PoseGraph, among: RowSelection | None = None) -> Revisi
 
 
 def stored_rows(connection: Connection, row: Row[Any]) -> RevisionRows | None:
-    """Return the stored rows of a revision; None for a dropped one."""
+    """Return the stored rows of a revision; None if they were dropped."""
     if is_dropped(connection, row):
         return None
     return {
@@ -336,7 +336,7 @@ def stored_rows(connection: Connection, row: Row[Any]) -> RevisionRows | None:
 
 
 def is_dropped(connection: Connection, row: Row[Any]) -> bool:
-    """Return True if `prune` deleted poses or edges of a revision; those of the newest always stay."""
+    """Return True if `prune` deleted poses or edges of a revision, which it never does for the newest revision."""
     if row.dropped_at is None or row.number == _newest(connection):
         return False
     left = [
@@ -360,7 +360,7 @@ def forget_dropped(connection: Connection) -> None:
 
 
 def holds_in_revision(table: Table) -> ColumnElement[bool]:
-    """Condition that a row of poses or edges is valid in a row of revisions."""
+    """Return the condition that a row of poses or edges is valid in a row of revisions."""
     return (revisions.c.number >= table.c.since) & or_(table.c.until.is_(None), revisions.c.number < table.c.until)
 
 
@@ -386,14 +386,14 @@ def _current_rows(
 def _rows(
     connection: Connection, table: Table, where: ColumnElement[bool]
 ) -> dict[tuple[str, ...], tuple[int, tuple[Any, ...]]]:
-    """Return `since` and undecoded values by scenes."""
+    """Return ``since`` and the undecoded values of rows, by scenes."""
     count = len(_ENDS[table.name])
     query = select(*map(_undecoded, table.columns)).where(where).order_by(*table.c[:count])
     return {tuple(row[:count]): (row[count], tuple(row[count + 2 :])) for row in map(tuple, connection.execute(query))}
 
 
 def _undecoded(column: Any) -> Any:
-    """Return a column whose bytes stay encoded; callers decode many rows at once, or none."""
+    """Return a column whose bytes are not decoded, as callers decode many rows at once or no row."""
     return type_coerce(column, LargeBinary).label(column.name) if isinstance(column.type, PackedNumbers) else column
 
 
@@ -408,7 +408,7 @@ def _counts(graph: PoseGraph) -> dict[str, int]:
 
 
 def _counted(placed: Sequence[tuple[bool, int]], judged: Sequence[tuple[str, int]]) -> dict[str, int]:
-    """Return the counts of a revision from (has pose, component) of its scenes and (use, undecided) of its edges."""
+    """Count scenes and edges of a revision, from (has pose, component) per scene and (use, undecided) per edge."""
     uses = Counter(use for use, _ in judged)
     counts = (
         len(placed),

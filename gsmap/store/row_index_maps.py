@@ -1,4 +1,4 @@
-"""Mapping between rows of a capture's Gaussians as ingested and as stored now.
+"""Map between rows of a capture's Gaussians as they were ingested and as they are stored now.
 
 Row sets that a map stores (of changes, of segments) refer to the Gaussians of the capture as ingested, so that neither
 thinning nor another ingest renumbers them. All readers and writers of stored row sets use `RowIndexMap`.
@@ -24,7 +24,7 @@ _GONE = -1
 
 @dataclass(frozen=True, eq=False)
 class RowIndexMap:
-    """Mapping between rows of a capture as ingested (``whole``) and as stored now (``kept``).
+    """A mapping between rows of a capture as ingested (``whole``) and as stored now (``kept``).
 
     Args:
         num_whole: number of Gaussians as ingested.
@@ -39,11 +39,11 @@ class RowIndexMap:
 
     @property
     def is_known(self) -> bool:
-        """Return True if rows can be converted."""
+        """Return True if the mapping is known, so that rows can be converted."""
         return self.rows is not None or self.num_whole == self.num_kept
 
     def kept(self, whole: np.ndarray) -> np.ndarray:
-        """Convert whole rows to kept rows, in order; rows that are no longer stored are left out.
+        """Convert whole rows to kept rows, in order, without rows that are no longer stored.
 
         Empty if the mapping is unknown.
         """
@@ -56,7 +56,7 @@ class RowIndexMap:
         return found
 
     def whole(self, rows: np.ndarray, counted: int | None = None) -> np.ndarray:
-        """Convert rows to whole rows; empty if the mapping is unknown.
+        """Convert kept (or whole) rows to whole rows; return no rows if the mapping is unknown.
 
         Args:
             counted: number of Gaussians of the capture that the rows refer to; default: as many as are kept.
@@ -78,7 +78,7 @@ class RowIndexMap:
         return out
 
     def values_of_kept(self, values: np.ndarray) -> np.ndarray | None:
-        """Select the values of the kept Gaussians from per-row values of either; None if the length matches neither."""
+        """Return the values of kept rows, from values of kept or of whole rows; None if the length fits neither."""
         if len(values) == self.num_kept:
             return values
         if len(values) != self.num_whole or self.rows is None:
@@ -87,8 +87,7 @@ class RowIndexMap:
         return found
 
     def values_of_whole(self, values: np.ndarray, missing: int) -> np.ndarray:
-        """Expand per-row values to the whole capture, ``missing`` for rows that are not kept; unchanged if the
-        mapping is unknown."""
+        """Expand values of kept rows to whole rows, with ``missing`` elsewhere; unchanged if the mapping is unknown."""
         if self.rows is None or len(values) != self.num_kept:
             return values
         out = np.full(self.num_whole, missing, values.dtype)

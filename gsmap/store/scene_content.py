@@ -1,4 +1,4 @@
-"""Conversion of scenes to catalog rows and arrays."""
+"""Convert scenes to catalog rows and arrays, and back."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class GaussianBlocks:
         }
 
     def boxes(self) -> np.ndarray:
-        """Return (C, 2, 3) boxes of the blocks, once all have been written."""
+        """Return the boxes (C, 2, 3) of the blocks, after all blocks have been written."""
         return np.array(self._boxes, dtype=np.float64).reshape(-1, 2, 3)
 
     def _of(self, name: str, start: int) -> np.ndarray:

@@ -35,7 +35,7 @@ def name_taken(connection: Connection, name: str) -> bool:
 
 
 def unused_name(connection: Connection, wanted: str) -> str:
-    """Return the name, or ``name-2`` and so on if living scenes use it."""
+    """Return the wanted name, or ``name-2`` and so on if a living scene has that name."""
     name, number = wanted, 2
     while name_taken(connection, name):
         name, number = f"{wanted}-{number}", number + 1
@@ -43,7 +43,7 @@ def unused_name(connection: Connection, wanted: str) -> str:
 
 
 def find_living(connection: Connection, ref: str) -> Row[Any]:
-    """Return the row of a referenced scene; raises NotFoundError if it was removed."""
+    """Return the row of a referenced scene; raise `NotFoundError` if the scene was removed."""
     row = find(connection, ref)
     if row.removed_at is not None:
         raise NotFoundError(f"scene {ref} was removed on {row.removed_at}", code="scene_removed")
@@ -93,5 +93,5 @@ def find_removed(connection: Connection, ref: str) -> Row[Any]:
 
 
 def by_id(connection: Connection, wanted: str) -> Row[Any] | None:
-    """Return the row with an id, living or removed; None if there is none."""
+    """Return the row of the scene with an id, living or removed; None without such a scene."""
     return connection.execute(select(scenes).where(scenes.c.id == wanted)).first()

@@ -1,4 +1,4 @@
-"""Transfer of data from a superseded scene to the one that replaces it."""
+"""Transfer the data of a superseded scene to the scene that replaces it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def inherit(store: Store, old: str, new: str) -> None:
         graph = store.revisions.get()
         if graph is not None and old in graph.poses:
             name = store.scenes.get(old).name
-            store.revisions.save(_in_place_of(graph, old, new), note=f"a new capture in the place of {name}")
+            store.revisions.save(_in_place_of(graph, old, new), note=f"a new capture replaces {name}")
 
 
 def _inherit_facts(connection: Connection, old: str, new: str) -> None:
@@ -62,7 +62,7 @@ def _inherit_comparisons(connection: Connection, old: str, new: str) -> None:
 
 
 def _in_place_of(graph: PoseGraph, old: str, new: str) -> PoseGraph:
-    """Replace a scene in a pose graph; edges of the old scene are dropped, since they are unknown for the new one."""
+    """Replace a scene in a pose graph; drop its edges, which are unknown for the new scene."""
     poses = {scene: pose for scene, pose in graph.poses.items() if scene != old}
     poses[new] = replace(graph.poses[old], scene=new)
     outcomes = {pair: outcome for pair, outcome in graph.outcomes.items() if old not in pair}

@@ -46,7 +46,7 @@ _SIGMAS = 3.0
 
 
 class SceneSummary(NamedTuple):  # created for all scenes several times per update: faster than a dataclass
-    """The fields of a scene that every update needs; the others of `Scene` take ten times as long to read."""
+    """The fields of a scene that every update needs; reading a whole `Scene` takes ten times as long."""
 
     id: str
     name: str
@@ -167,7 +167,7 @@ class Scenes:
         return scene, True
 
     def summaries(self) -> list[SceneSummary]:
-        """Return summaries of the living scenes in the order of their ingest."""
+        """Return summaries of the living scenes, in the order of ingest."""
         columns = (scenes.c.id, scenes.c.name, scenes.c.scale_policy, scenes.c.captured_at, scenes.c.thinned)
         query = select(*columns).where(scenes.c.removed_at.is_(None)).order_by(scenes.c.number)
         with self._catalog.read() as connection:
@@ -193,7 +193,7 @@ class Scenes:
             return {row.id: np.array(row.bounds, dtype=np.float64) for row in boxed}
 
     def list(self, *, removed: bool = False, among: Collection[str] | None = None) -> list[Scene]:
-        """Return the living scenes (or the removed ones) in the order of their ingest.
+        """Return the living scenes, or the removed scenes, in the order of ingest.
 
         Args:
             among: only scenes with these ids.
@@ -206,12 +206,12 @@ class Scenes:
             return [scene_of(row, tags.get(row.id, ())) for row in rows]
 
     def names(self) -> dict[str, str]:
-        """Return the name of every scene by its id, removed ones included."""
+        """Return the name of every scene by its id, including removed scenes."""
         with self._catalog.read() as connection:
             return {row[0]: row[1] for row in connection.execute(select(scenes.c.id, scenes.c.name)).all()}
 
     def get(self, ref: str) -> Scene:
-        """Return a scene by name, id or unique id prefix; a removed one by its id only.
+        """Return a scene by name, id or unique id prefix, and a removed scene by its full id only.
 
         Raises:
             NotFoundError: no scene matches, or several do.
@@ -279,12 +279,12 @@ class Scenes:
             return facts.list_facts(connection, find(connection, ref).id)
 
     def specified_metres(self) -> dict[str, float]:
-        """Return the specified metres per unit by scene id; scenes without a specified scale are left out."""
+        """Return the metres per unit, by scene id, of scenes with a specified scale."""
         with self._catalog.read() as connection:
             return {scene: float(value) for scene, value in facts.specified_metres(connection).items()}
 
     def latest_notes(self) -> dict[str, str]:
-        """Return the newest note of each scene by its id; scenes without one are left out."""
+        """Return the newest note, by scene id, of scenes that have notes."""
         with self._catalog.read() as connection:
             return facts.latest_notes(connection)
 
@@ -294,7 +294,7 @@ class Scenes:
             return tuple(find(connection, ref).notes)
 
     def removed_at(self, ref: str) -> str | None:
-        """Return when a scene was removed; None for a living one."""
+        """Return the time at which a scene was removed; None for a living scene."""
         with self._catalog.read() as connection:
             when: str | None = find(connection, ref).removed_at
             return when
@@ -331,7 +331,7 @@ class Scenes:
         return out if near.all() else out[near]
 
     def gaussians_within(self, ref: str, bounds: np.ndarray, without: np.ndarray | None = None) -> Gaussians:
-        """Read the Gaussians of a scene whose means lie in a box; of chunks without any, only means are read.
+        """Read the Gaussians of a scene whose means lie in a box; read only means of chunks without such Gaussians.
 
         Args:
             bounds: (2, 3) lowest and highest corner in the scene frame.
@@ -391,7 +391,7 @@ class Scenes:
     def _read(
         self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None
     ) -> Gaussians:
-        """Read the Gaussians in ranges of rows; default: all."""
+        """Read the Gaussians in ranges of rows, or all Gaussians."""
         shapes = shapes_of(row)
         if row.thinned is None:
             read = self._arrays.read(KIND, row.group_id, files, only=FIELDS, rows=ranges, shapes=shapes)
@@ -449,7 +449,7 @@ class Scenes:
             return _with_tags(connection, find(connection, row.id))
 
     def num_bytes(self, ref: str) -> int:
-        """Return the size of a scene's arrays, as written."""
+        """Return the size of a scene's arrays in bytes, as written."""
         with self._catalog.read() as connection:
             return num_bytes(connection, find(connection, ref).group_id)
 
@@ -476,15 +476,14 @@ class Scenes:
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
 
     def remove(self, ref: str) -> Scene:
-        """Remove a scene, leaving a tombstone: it disappears from lists and the next revision; its arrays stay until
-        they are pruned."""
+        """Remove a scene from lists and the next revision, leaving a tombstone; `prune` deletes its arrays later."""
         with self._catalog.write() as connection:
             row = find_living(connection, ref)
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=now()))
             return _with_tags(connection, row)
 
     def restore(self, ref: str) -> Scene:
-        """Restore a removed scene with all its data; if its name is in use now, it becomes ``name-2``.
+        """Restore a removed scene with all its data; append ``-2`` to its name if another scene has that name now.
 
         Args:
             ref: its id, an id prefix, or its last name.
@@ -517,7 +516,7 @@ class Scenes:
             return _with_tags(connection, find(connection, row.id))
 
     def find_any(self, ref: str) -> Scene:
-        """Return a scene by name, id or unique id prefix, living or otherwise removed.
+        """Return a scene by name, id or unique id prefix: a living scene, or else a removed scene.
 
         Raises:
             NotFoundError: no scene matches, or several do.
@@ -539,7 +538,7 @@ class Scenes:
     def _insert_scene(
         self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool, dated_by: str
     ) -> Scene:
-        """Insert or update the row of a new or returning scene under an unused name."""
+        """Insert the row of a new scene, or update that of a returning scene, under an unused name."""
         wanted, name = fields["name"], unused_name(connection, fields["name"])
         if name != wanted and not rename:
             raise InputError(

@@ -69,7 +69,7 @@ REVISION_COUNTS = (
     "num_unused",
     "num_undecided",
 )
-"""Columns counted when a revision is made, so that a list of revisions reads no poses."""
+"""Columns with counts that are stored with each revision, so that listing revisions reads no poses."""
 
 metadata = MetaData(
     naming_convention={
@@ -99,7 +99,7 @@ def _scene(name: str, **options: Any) -> Column[str]:
 
 
 def _recipe() -> Column[str]:
-    """Null in rows that schema 0001 wrote."""
+    """Return the column of a recipe, which is null in rows that schema 0001 wrote."""
     return Column("recipe", DigestText, ForeignKey("recipes.digest"))
 
 

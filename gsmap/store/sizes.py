@@ -1,4 +1,4 @@
-"""Disk use of a map by kind, from the manifests alone; only the catalog file is inspected."""
+"""Compute the disk use of a map by kind from manifests; the catalog is the only file that is inspected."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CATALOG, MODELS = "catalog", "models"
 
 @dataclass(frozen=True)
 class Size:
-    """Disk use of one kind.
+    """The disk use of one kind of data.
 
     Args:
         kind: of array groups (``scenes``, ``graphs``, ``changes``, ``indexes``), ``models`` or ``catalog``.
@@ -31,8 +31,7 @@ class Size:
 
 
 def sizes(store: Store) -> list[Size]:
-    """Return disk use by kind, largest first; includes removed but unpruned data, and excludes a catalog on a
-    server."""
+    """Return the disk use by kind, largest first; includes removed data until a prune, but no catalog on a server."""
     bytes_of = func.coalesce(func.sum(files.c.size_bytes), 0)
     query = select(groups.c.kind, func.count(groups.c.id.distinct()), bytes_of)
     query = query.outerjoin(files, files.c.group_id == groups.c.id).group_by(groups.c.kind)
@@ -49,7 +48,7 @@ def sizes(store: Store) -> list[Size]:
 
 
 def scene_sizes(store: Store) -> dict[str, int]:
-    """Return the size of the arrays of every living scene, as written, by id."""
+    """Return the size in bytes of the arrays of every living scene, as written, by id."""
     query = select(scenes.c.id, func.sum(files.c.size_bytes)).join(files, files.c.group_id == scenes.c.group_id)
     with store.catalog.read() as connection:
         rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).group_by(scenes.c.id))

@@ -1,4 +1,4 @@
-"""SQLite specifics: opening connections, starting transactions, checkpoints, backups and integrity checks."""
+"""Operate SQLite: open connections, start transactions, checkpoint, back up and check integrity."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _READERS_S = 1.0  # wait of a writer for readers before it leaves the rest of th
 
 
 class _EngineGuard:
-    """Resources that must outlive every connection of an engine: a file handle, and a read-only connection.
+    """The resources that must outlive every connection of an engine: a file handle, and a read-only connection.
 
     When the last connection closes, SQLite checkpoints the log by itself, bypassing the writer lock and the digests. It
     does not while another connection is open, and a read-only connection cannot.
@@ -61,7 +61,7 @@ class _EngineGuard:
             self._connections -= 1
 
     def release(self) -> bool:
-        """Close both; returns False as long as another thread has a connection, which then keeps them alive."""
+        """Close both resources; return False and keep them if another thread has a connection."""
         with self._lock:
             if self._connections:
                 return False
@@ -96,7 +96,7 @@ _GUARDS: WeakKeyDictionary[Engine, _EngineGuard] = WeakKeyDictionary()
 
 
 def engine(file: Path, *, writable: bool) -> Engine:
-    """Create an engine on one file: WAL, full synchronization, foreign keys, explicit transactions.
+    """Create an engine for one file, with WAL, full synchronization, foreign keys and explicit transactions.
 
     Write transactions (`gsmap_write` in the execution options) begin IMMEDIATE: a deferred one that becomes a writer
     fails at once if another process has written meanwhile, whatever the busy timeout. Any number of threads may use the
@@ -133,7 +133,7 @@ def engine(file: Path, *, writable: bool) -> Engine:
 
 
 def frozen_engine(file: Path) -> Engine:
-    """Create an engine that reads a database and its log without the index that SQLite creates for the log.
+    """Create an engine that reads a database and its log without creating the index that SQLite needs for the log.
 
     For a disk without space for that index; only while no process writes or checkpoints. A log with content is applied
     in memory.
@@ -161,7 +161,7 @@ def frozen_engine(file: Path) -> Engine:
 
 
 def needs_room(error: BaseException) -> bool:
-    """Return True if SQLite could not connect because of a write that it needs."""
+    """Return True if SQLite could not connect because it needs to write and cannot."""
     found: object = getattr(error, "orig", None) or error
     code = getattr(found, "sqlite_errorcode", 0) & 0xFF
     return code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
@@ -185,7 +185,7 @@ def dispose(engine: Engine, file: Path, *, tidy: bool) -> None:
 
 
 def create_file(file: Path) -> None:
-    """Create an empty database in WAL mode, which stays with the file.
+    """Create an empty database in WAL mode, a mode that the file keeps.
 
     Raises:
         OSError: the disk failed, so that SQLite silently kept another journal mode.
@@ -205,8 +205,7 @@ def has_log(file: Path) -> bool:
 
 
 def refuse_unexpected_files(file: Path) -> None:
-    """Raise for a database by which SQLite would access other files: a link instead of one of its own files, or a
-    rollback journal that names a super-journal, which SQLite would delete.
+    """Raise an error for a database that makes SQLite access other files, by a link or a journal with a super-journal.
 
     gsmap's databases are in WAL mode and never attached to one another, so it never makes such a journal.
     """
@@ -232,7 +231,7 @@ def refuse_unexpected_files(file: Path) -> None:
 
 
 def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
-    """Checkpoint a log of at least this size into the database, and update the page digests.
+    """Checkpoint the log to the database if it has at least ``at_bytes``, and update the page digests.
 
     Requires the writer lock: in SQLite before 3.51.3 a concurrent commit can corrupt the file.
 
@@ -248,7 +247,7 @@ def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
 
 
 def num_free_bytes(engine: Engine) -> int:
-    """Return the size of unused pages of the database."""
+    """Return the size of unused pages of the database in bytes."""
     with engine.connect() as connection:
         pages, size = (
             connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in ("freelist_count", "page_size")
@@ -257,7 +256,7 @@ def num_free_bytes(engine: Engine) -> int:
 
 
 def vacuum(engine: Engine, file: Path, *, erase: bool = False) -> bool:
-    """Rewrite the database without free pages, and checkpoint the log; requires the writer lock.
+    """Rewrite the database without free pages, and checkpoint the log; the caller must hold the writer lock.
 
     Args:
         erase: also overwrite freed content.
@@ -277,7 +276,7 @@ def vacuum(engine: Engine, file: Path, *, erase: bool = False) -> bool:
 
 
 def accept(engine: Engine, file: Path) -> None:
-    """Accept the pages as they are by writing new digests; requires the writer lock."""
+    """Accept the current pages by writing new digests; the caller must hold the writer lock."""
     if not has_log(file):  # changed by another program
         connection = engine.raw_connection()
         try:
@@ -298,7 +297,7 @@ def integrity_problems(connection: Connection) -> list[str]:
 
 
 def file_problems(file: Path) -> list[str]:
-    """Return structural problems of a file that no process has open; creates no files."""
+    """Return structural problems of a file that no process has open, without creating files."""
     try:
         with contextlib.closing(_connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1")) as connection:
             return _problems(connection.execute)
@@ -308,12 +307,12 @@ def file_problems(file: Path) -> list[str]:
 
 def _problems(execute: Callable[[str], Iterable[Any]]) -> list[str]:
     rows = [str(row[0]) for row in execute("PRAGMA integrity_check")]
-    missing = [f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in execute("PRAGMA foreign_key_check")]
+    missing = [f"row {r[1]} of {r[0]} refers to a missing {r[2]}" for r in execute("PRAGMA foreign_key_check")]
     return ([] if rows == ["ok"] else rows) + missing
 
 
 def damage(file: Path) -> list[str]:
-    """Return problems of a file by its page digests, or otherwise by SQLite's quick check; empty for a sound file."""
+    """Return problems that the page digests or, without digests, SQLite's quick check find; empty for a sound file."""
     with contextlib.suppress(OSError), contextlib.closing(FileHandle(file)) as opened:
         try:
             found = page_digests.problems(file, opened, page_digests.load(file), read_log(wal_path(file)))
@@ -325,7 +324,7 @@ def damage(file: Path) -> list[str]:
 
 
 def structure_damage(file: Path) -> list[str]:
-    """Return problems found by SQLite's quick check of the structure; also empty if the check cannot run."""
+    """Return problems that SQLite's quick check of the structure finds; empty also if the check cannot run."""
     if not file.is_file():
         return [f"{file} is missing"]
     try:
@@ -338,7 +337,7 @@ def structure_damage(file: Path) -> list[str]:
 
 
 def backup(engine: Engine, target: Path) -> None:
-    """Write a consistent copy of the catalog with its own digests, during concurrent access."""
+    """Write a consistent copy of the catalog with digests of its own, also while others access the catalog."""
     connection = engine.raw_connection()
     try:
         with contextlib.closing(sqlite3.connect(target)) as copy:
@@ -349,7 +348,7 @@ def backup(engine: Engine, target: Path) -> None:
 
 
 def _checkpoint_passive(engine: Engine) -> int:
-    """Run a passive checkpoint, without waiting for readers; returns the number of committed frames in the log."""
+    """Run a passive checkpoint, which waits for no reader; return the number of committed frames in the log."""
     connection = engine.raw_connection()
     try:
         return int(_driver(connection).execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()[1])
@@ -358,7 +357,7 @@ def _checkpoint_passive(engine: Engine) -> int:
 
 
 def _checkpoint_truncate(engine: Engine) -> bool:
-    """Run a truncating checkpoint outside any transaction; returns False if readers prevented it."""
+    """Run a truncating checkpoint outside any transaction; return False if readers prevented it."""
     connection = engine.raw_connection()
     try:
         driver = _driver(connection)

@@ -1,4 +1,4 @@
-"""Staging folders for new maps, and leftovers of killed processes."""
+"""Make staging folders for new maps, and find leftovers of killed processes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PART = re.compile(r"arrays|models|branches|lock|\.?(map\.sqlite|catalog\.url|se
 
 @contextlib.contextmanager
 def beside(folder: Path) -> Iterator[Path]:
-    """Yield a new locked folder beside ``folder``, to be renamed to it inside the block; otherwise it is removed.
+    """Yield a new locked folder beside ``folder``; remove it at the end unless the block renamed it to ``folder``.
 
     The lock lasts as long as this process, so that other processes can tell it from leftovers; leftovers of the same
     name are removed first.

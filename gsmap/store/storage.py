@@ -1,4 +1,4 @@
-"""Storage of backups and remote maps: a folder, or a bucket of an object store; objects appear whole or not at all."""
+"""Storage of backups and remote maps: a folder, or a bucket of an object store, in which no partial objects appear."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CHUNK_BYTES = 1 << 20  # read, hashed and written at a time
 
 
 def chunks_of(path: Path) -> Iterator[bytes]:
-    """Yield the bytes of a file; a link is not followed."""
+    """Yield the bytes of a file, without following a link."""
     with open(open_file(path), "rb") as file:
         while chunk := file.read(CHUNK_BYTES):
             yield chunk
@@ -48,37 +48,37 @@ _NAME = re.compile(r"[a-z0-9]+(/[0-9a-zA-Z._-]+){0,2}|gsmap-backup\.json")  # na
 
 @dataclass(frozen=True)
 class ObjectInfo:
-    """Size of an object, and when it was last written (seconds, by the clock of the storage)."""
+    """The size of an object, and the time of its last write (seconds, by the clock of the storage)."""
 
     size_bytes: int
     modified_s: float
 
 
 class Storage(Protocol):
-    """Named objects under one root; names contain slashes, and must be validated if they come from outside."""
+    """Named objects under one root. Names may contain slashes, and must be validated if they come from outside."""
 
     url: str  # shown to users and stored in the catalog, without secrets
 
     def list(self, prefix: str) -> dict[str, ObjectInfo]:
-        """Return all objects by name whose name begins with ``prefix`` (a folder with its slash, or empty)."""
+        """Return by name all objects whose name begins with ``prefix``, which is empty or a folder with its slash."""
 
     def first_name(self) -> str | None:
         """Return the name of any object; None if the storage is empty."""
 
     def size_bytes(self, name: str) -> int | None:
-        """Return the size of an object; None if there is none."""
+        """Return the size of an object in bytes; None if there is no such object."""
 
     def put(self, name: str, chunks: Iterable[bytes], size_bytes: int) -> None:
-        """Write or replace an object; durable when it returns, unchanged if ``chunks`` raises."""
+        """Write or replace an object durably; if ``chunks`` raises, leave the object unchanged."""
 
     def get(self, name: str) -> Iterator[bytes]:
-        """Yield the bytes of an object in order; raises NotFoundError if there is none."""
+        """Yield the bytes of an object in order; raise `NotFoundError` without such an object."""
 
     def delete(self, name: str) -> None:
         """Delete an object if it exists."""
 
     def drop_leftovers(self) -> None:
-        """Delete what killed writers left; only while no other process writes."""
+        """Delete leftovers of killed writers; no other process may write meanwhile."""
 
 
 def open_storage(target: str | os.PathLike[str]) -> Storage:
@@ -217,7 +217,7 @@ class FolderStorage:
 
     def _path(self, name: str) -> Path:
         if not _NAME.fullmatch(name) or "/." in name:
-            raise ValueError(f"not the name of an object: {name!r}")
+            raise ValueError(f"{name!r} is not a valid name of an object")
         folder = self.root
         for part in name.split("/")[:-1]:
             folder = folder / part
@@ -313,7 +313,7 @@ class BucketStorage:
             raise
 
     def put_if_absent(self, name: str, content: bytes) -> bool:
-        """Write an object unless one with this name exists; returns True if it was written."""
+        """Write an object unless one of this name exists; return True if it was written."""
         from obstore.exceptions import AlreadyExistsError
 
         with self._translate_errors("write"):
@@ -324,8 +324,7 @@ class BucketStorage:
         return True
 
     def get_ranges(self, name: str, ranges: Sequence[tuple[int, int]]) -> Sequence[bytes]:
-        """Return the bytes of ranges ``[start, stop)`` of an object, one request each; raises NotFoundError if there
-        is none."""
+        """Return the bytes of ranges ``[start, stop)`` of an object, one request per range; raises as `get`."""
         starts, ends = [start for start, _ in ranges], [stop for _, stop in ranges]
         with self._translate_errors("read"):
             try:

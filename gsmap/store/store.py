@@ -100,7 +100,7 @@ class Store:
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
-        """Create an empty map and open it for writing; it appears whole or not at all.
+        """Create an empty map and open it for writing; after an error, no partial map remains.
 
         Args:
             path: a folder that does not exist or is empty, or an empty ``s3://BUCKET/PREFIX``.
@@ -121,7 +121,7 @@ class Store:
             is_map = "is a map already" if branches.has_catalog(folder) else "is not empty"
             raise StoreError(f"{path} {is_map}: open it, or choose another name", code="already_exists")
         if folder.exists() and not folder.is_dir():
-            raise StoreError(f"{path} is a file, but a map is a folder: choose another name", code="not_a_folder")
+            raise StoreError(f"{path} is a file, but a map needs a folder: choose another name", code="not_a_folder")
         if not folder.parent.is_dir():
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist", code="folder_not_found")
         with translate_errors(folder, "no map was made"), staging.beside(folder) as staged:
@@ -178,7 +178,7 @@ class Store:
 
     @classmethod
     def open_writable(cls, path: str | os.PathLike[str]) -> Store:
-        """Open for writing, even a tag, for purges."""
+        """Open a map, a branch or even a tag for writing, as a purge needs it."""
         store = cls._connect(path, "w", None, allow_tags=True)
         try:
             migrate.require_current(store.catalog)
@@ -188,12 +188,12 @@ class Store:
         return store
 
     def others(self) -> list[MapLocation]:
-        """Return the locations of the other catalogs over the same arrays: the map, its branches and its tags."""
+        """Return the locations of all other catalogs for the same arrays: the map, its branches and its tags."""
         return branches.other_locations(self.home, self.folder)
 
     @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
-        """Migrate an older map, its branches and tags to the current schema; returns the versions before and after."""
+        """Migrate an older map, its branches and tags to the current schema; return the versions before and after."""
         with cls._connect(path, "w", None, allow_tags=True) as store:
             versions = migrate.upgrade(store.catalog)
         for place in branches.branch_locations(store.home) if not store.branch else ():
@@ -216,7 +216,7 @@ class Store:
 
     @classmethod
     def id_at(cls, path: str | os.PathLike[str], catalog_url: str) -> str:
-        """Return the id of the map whose catalog is at a URL, whatever its schema; raises as `open` does."""
+        """Return the id of the map whose catalog is at a URL, for any schema; raise the same errors as `open`."""
         with cls._connect(path, "r", catalog_url) as store:
             return store.id
 
@@ -270,7 +270,7 @@ class Store:
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
-        """Commit all changes inside the block together, or none. Keep it short: other writers wait."""
+        """Commit all changes of the block together, or none. Keep the block short, as other writers wait for it."""
         with self.catalog.write():
             yield
 
@@ -281,12 +281,12 @@ class Store:
 
     @property
     def id(self) -> str:
-        """Return the map's own random id."""
+        """Return the random id of the map."""
         with self.catalog.read() as connection:
             return str(connection.execute(select(schema.about.c.id)).scalar_one())
 
     def _check_id(self) -> None:
-        """Raise if the database holds another map than ``catalog.url`` names."""
+        """Raise an error if the database has another map than ``catalog.url`` names."""
         known = trust.read_address(self.folder).map_id if (self.folder / trust.URL_FILE).exists() else None
         if known is not None and known != self.id:
             raise CorruptError(
@@ -326,7 +326,7 @@ class Store:
         return found
 
     def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> PruneResult:
-        """Reclaim what no kept revision uses, and leftovers of crashes; see `gsmap.store.integrity.prune`."""
+        """Reclaim arrays that no kept revision uses, and leftovers of crashes; see `gsmap.store.integrity.prune`."""
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def reclaim(self) -> integrity.ReclaimResult:
@@ -348,7 +348,7 @@ class Store:
 
 
 def _refuse_unexpected_entries(folder: Path) -> None:
-    """Raise for a map with a link, which could redirect reads or writes, a pipe, or a device in it.
+    """Raise an error for a map that contains a link, which could redirect reads and writes, a pipe or a device.
 
     The folder itself may be a link. Deeper entries are checked when they are used.
     """

@@ -1,4 +1,4 @@
-"""Copy scenes with all their data from one map to another; nothing is computed."""
+"""Copy scenes with all their data from one map to another, without computing anything."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _MERGE = "merge"  # author of names that a merge assigned because the scene's ow
 def open_transfer(
     into: Store, source: Store, only: Collection[str] | None = None, *, mend: bool = False
 ) -> Iterator[Transfer]:
-    """Open one transaction on ``into`` for copying from a snapshot of ``source``; committed when the block ends.
+    """Open a transaction on ``into``, committed when the block ends, for copying from a snapshot read of ``source``.
 
     Arrays are linked or copied to the staging folder first, so that the transaction is short.
 
@@ -114,7 +114,7 @@ class Transfer:
     # --- scenes ------------------------------------------------------------------------------------------------------
 
     def scenes(self) -> None:
-        """Copy scenes, facts, arrays and chunk boxes; for a scene in both maps the later facts are in force."""
+        """Copy scenes, facts, arrays and chunk boxes; for a scene in both maps, the later facts are in force."""
         for scene in sorted(self._forgotten):
             self.notes.append(f"scene {scene} was purged from this map, so it is not copied")
         for row in self._rows:
@@ -138,7 +138,7 @@ class Transfer:
         self.counts["scenes" if row.removed_at is None else "removed"] += 1
 
     def _merge_scene(self, mine: Row[Any], row: Row[Any]) -> bool:
-        """Merge a scene that both maps have: the later of its ingests and removals decides whether it lives.
+        """Merge a scene that both maps have; its latest ingest or removal decides whether it is removed.
 
         Returns True if it is restored.
         """
@@ -255,7 +255,7 @@ class Transfer:
     # --- results and reviews -----------------------------------------------------------------------------------------
 
     def graphs(self) -> None:
-        """Copy scene graphs; if both maps have one with the same key, this map's stays."""
+        """Copy scene graphs; if both maps have a graph with the same key, keep the graph of this map."""
         here = {row.key: row.group_id for row in self.ours.execute(select(graphs.c.key, graphs.c.group_id))}
         for row in self.theirs.execute(select(graphs).order_by(graphs.c.created_at)).all():
             if row.scene not in self.wanted:
@@ -268,7 +268,7 @@ class Transfer:
                 self.counts["graphs"] += 1
 
     def recipe(self, digest: str | None) -> None:
-        """Copy the recipe that a row of theirs names."""
+        """Copy the recipe that a row of the other map names."""
         same = recipes.c.digest == digest
         if digest is not None and self.ours.execute(select(recipes.c.digest).where(same)).first() is None:
             self.ours.execute(insert(recipes), dict(self.theirs.execute(select(recipes).where(same)).one()._mapping))
@@ -329,7 +329,7 @@ class Transfer:
             self.ours.execute(insert(reviews), _content(row) | {"registration": number})
 
     def priors(self) -> None:
-        """Copy pose priors of the scenes; of two current ones the later one stays."""
+        """Copy pose priors of the scenes; if both maps have a current prior of a scene, keep the later prior."""
         query = select(priors).order_by(priors.c.number)
         mine: dict[str, dict[str, Row[Any]]] = {}
         for row in self.ours.execute(query):
@@ -357,7 +357,7 @@ class Transfer:
                 self.ours.execute(update(priors).where(earlier).values(removed_at=rows[-1].created_at))
 
     def observations(self) -> None:
-        """Copy world observations of these scenes, and the control points in their photos.
+        """Copy the world observations of the scenes, and the control points in their photos.
 
         Of two current observations with the same name the later one stays; this map's world frame stays if it has one.
         """
@@ -396,7 +396,7 @@ class Transfer:
                 self.ours.execute(update(observations).where(earlier).values(removed_at=rows[-1].created_at))
 
     def photos(self) -> None:
-        """Copy photos of these scenes; a photo that either map removed stays removed."""
+        """Copy the photos of the scenes; a photo that either map removed stays removed."""
         mine = {_identity(row, "removed_at", "group_id"): row for row in self.ours.execute(select(photo_sightings))}
         current = {row.digest for row in mine.values() if row.removed_at is None}
         for row in self.theirs.execute(select(photo_sightings).order_by(photo_sightings.c.number)).all():
@@ -413,7 +413,7 @@ class Transfer:
                 self.counts["photos"] += 1
 
     def models(self) -> None:
-        """Copy models whose names this map lacks; if both have one with the same name, this map's stays."""
+        """Copy models whose names this map lacks; if both maps have a model of a name, keep the model of this map."""
         here = self.ours.execute(select(models).order_by(models.c.number)).all()
         current = {row.name: row for row in here if row.removed_at is None}
         taken_back = {(row.name, row.sha256): row.removed_at for row in here if row.removed_at is not None}
@@ -441,7 +441,7 @@ class Transfer:
 def _missing_groups(
     into: Store, ours: Connection, theirs: Connection, only: Collection[str] | None, mend: bool
 ) -> dict[tuple[str, str], tuple[StoredFile, ...]]:
-    """Return manifests of the groups that the scenes need and this map lacks (or has damaged), by (kind, id)."""
+    """Return manifests, by (kind, id), of groups that the scenes need and that are missing or damaged in this map."""
     named = [(SCENES, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
     of_whole = graphs.join(scenes, scenes.c.id == graphs.c.scene)
     kept = select(graphs.c.key, graphs.c.group_id).select_from(of_whole).where(scenes.c.thinned.is_(None))
@@ -470,7 +470,7 @@ def _forgotten(connection: Connection) -> set[str]:
 
 
 def _content(row: Row[Any]) -> Content:
-    """Return a row without its number, which differs between maps."""
+    """Return the values of a row without its number, which differs between maps."""
     return {column: value for column, value in row._mapping.items() if column != "number"}
 
 
@@ -507,7 +507,7 @@ def merge_by_time(
 
 
 def timed(items: Iterable[Item], time: Callable[[Item], str]) -> list[tuple[str, Item]]:
-    """Return rows with their times, made non-decreasing where a clock went back."""
+    """Return rows with their times, which are made non-decreasing in case a clock was set back."""
     out, newest = [], ""
     for item in items:
         newest = max(newest, time(item))

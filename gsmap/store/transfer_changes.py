@@ -1,4 +1,4 @@
-"""Copy comparisons, changes and their reviews between maps; nothing is computed."""
+"""Copy comparisons, changes and their reviews between maps, without computing anything."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def transfer_comparisons(transfer: Transfer) -> None:
 
 
 def _same(row: Row[Any]) -> tuple[Any, ...]:
-    """Return conditions that a comparison is the same one in another map."""
+    """Return conditions by which the same comparison is found in another map."""
     return tuple(getattr(comparisons.c, name) == getattr(row, name) for name in ("older", "newer", "key", "created_at"))
 
 
@@ -72,7 +72,7 @@ def _lines(connection: Connection, comparison: int) -> list[Row[Any]]:
 
 
 def _first(line: Row[Any]) -> int:
-    """Return the number of the change of a row."""
+    """Return the number of a row's change."""
     return int(line.number if line.same_as is None else line.same_as)
 
 

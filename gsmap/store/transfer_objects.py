@@ -1,4 +1,4 @@
-"""Copy objects and facts about them between maps; nothing is computed."""
+"""Copy objects and facts about them between maps, without computing anything."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def transfer_objects(transfer: Transfer) -> None:
 
 
 def _join_facts(transfer: Transfer, numbers: Mapping[int, int]) -> None:
-    """Merge facts about objects from both maps, keeping the order of each.
+    """Merge the facts of both maps about objects, keeping the order within each map.
 
     Args:
         numbers: object numbers in this map, by those in the other map.

@@ -1,4 +1,4 @@
-"""Catalog servers that this user has named or trusted.
+"""Know the catalog servers that this user has named or trusted.
 
 A map may come from an untrusted source, and its ``catalog.url`` would make gsmap connect to any server with the user's
 password (``PGPASSWORD``, ``~/.pgpass``). So a stored URL is used only if the user created the map with it, ran ``gsmap
@@ -96,7 +96,7 @@ def write(folder: Path, url: str, map_id: str) -> None:
 
 
 def catalog_url(folder: Path) -> str:
-    """Return the URL of a map's catalog: from the environment, or the stored one if it is trusted.
+    """Return the URL of a map's catalog: from the environment, or the URL stored in the map if the user trusts it.
 
     Raises:
         StoreError: the user has neither named nor trusted it.
@@ -109,7 +109,7 @@ def catalog_url(folder: Path) -> str:
         return found.url
     raise StoreError(
         f"{display_name(folder)} would connect to {found.server} (database {found.database!r}, user {found.user!r}), "
-        f"which you have not trusted yet: run gsmap trust {display_name(folder)} if that is right, or name the "
+        f"which you have not trusted yet: run gsmap trust {display_name(folder)} if that is correct, or name the "
         f"catalog's URL in {ENVIRONMENT}",
         code="untrusted_catalog",
     )
@@ -125,7 +125,7 @@ def is_trusted(found: CatalogAddress) -> bool:
 
 
 def trusted_urls() -> dict[str, tuple[str, ...]]:
-    """Return the URLs (without password) that this user trusts, by map id, which a restored map shares.
+    """Return the URLs (without password) that this user trusts, by map id; a restored map has the id of its original.
 
     Raises:
         StoreError: the file of trusted URLs cannot be read.
@@ -136,7 +136,7 @@ def trusted_urls() -> dict[str, tuple[str, ...]]:
         # older files have one URL instead of a list
         known = {key: (urls,) if isinstance(urls, str) else tuple(urls) for key, urls in found.items()}
         if not all(isinstance(key, str) and all(isinstance(url, str) for url in known[key]) for key in known):
-            raise TypeError("expected an object that maps ids to URLs")
+            raise TypeError("it must be a JSON object that maps ids to URLs")
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

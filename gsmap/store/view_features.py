@@ -1,4 +1,4 @@
-"""Local features of the views of each scene (`SceneFeatures`), stored under their recipe and inputs.
+"""Local features of the views of each scene (`SceneFeatures`), which are stored under their recipe and inputs.
 
 Candidate views of a photo come from the index of views (`gsmap.store.indexes`). All of it can be recomputed.
 """
@@ -43,7 +43,7 @@ class ViewFeatures:
         self._arrays = arrays
 
     def save(self, found: SceneFeatures, key: RecipeKey) -> None:
-        """Store the features of a scene, replacing all earlier ones of that scene.
+        """Store the features of a scene in place of all earlier features of that scene.
 
         Args:
             key: its recipe; the scene must be among its inputs.
@@ -86,12 +86,12 @@ class ViewFeatures:
             connection.execute(insert(view_features), row | made)
 
     def stored_keys(self, keys: Iterable[RecipeKey | str]) -> set[str]:
-        """Return those of the keys (as digests) that have features."""
+        """Return, as digests, the keys that have features."""
         with self._catalog.read() as connection:
             return recipes.stored_keys(connection, view_features.c.key, keys)
 
     def load(self, scene: str, key: RecipeKey | str) -> SceneFeatures | None:
-        """Load the features of a scene; None if there are none with this key.
+        """Load the features of a scene with this key; None without such features.
 
         Raises:
             CorruptError: bytes on disk are missing, differ, or are not valid features.

@@ -1,4 +1,4 @@
-"""Reader of SQLite's write-ahead log that finds its pages and any lost commits.
+"""Read SQLite's write-ahead log; find its pages and any lost commits.
 
 https://www.sqlite.org/fileformat2.html#walformat. SQLite reads frames up to the first with a wrong checksum and
 silently drops the rest: right for the torn end that a power cut leaves, wrong for a flipped bit in the middle.
@@ -24,7 +24,7 @@ _INDEX_VERSION = 3_007_000
 
 @dataclass(frozen=True)
 class WalContent:
-    """Content of a write-ahead log.
+    """The content of a write-ahead log.
 
     Args:
         frames: offset of the newest committed content of each page in the log file, by page number (from 1).
@@ -39,7 +39,7 @@ class WalContent:
 
 @dataclass(frozen=True)
 class IndexHeader:
-    """Header of the log's index (``-shm``): number of committed frames of the log with this salt."""
+    """The header of the log's index (``-shm``): the number of committed frames of the log with some salt."""
 
     salt: bytes
     num_frames: int
@@ -139,7 +139,7 @@ def _read(handle: int, size: int, header: IndexHeader | None, at_most: int) -> W
 
 
 def _blocks(handle: int, size: int, page_size: int) -> Iterator[np.ndarray]:
-    """Yield the whole frames of a log in order, as rows of big-endian words."""
+    """Yield blocks of complete frames of a log in order, as rows of big-endian words."""
     step = _FRAME + page_size
     many = max(1, _BLOCK_BYTES // step)
     offset = _HEADER
@@ -153,20 +153,20 @@ def _blocks(handle: int, size: int, page_size: int) -> Iterator[np.ndarray]:
 
 
 def _summed(words: np.ndarray) -> np.ndarray:
-    """Compute (N, 2) checksums of N rows of words, each starting at 0."""
+    """Compute the checksums (N, 2) of N rows of words, each checksum starting at 0."""
     weights = _weights(words.shape[1] // 2)
     return np.stack([(words * weights[i]).sum(1, dtype=np.uint32) for i in range(2)], axis=1)
 
 
 def _advanced(seeds: np.ndarray, num_pairs: int) -> np.ndarray:
-    """Advance (N, 2) checksums by a number of zero pairs."""
+    """Advance checksums (N, 2) by a number of pairs of zero words."""
     (a, b), (c, d) = _power(num_pairs)
     return np.stack([seeds[:, 0] * a + seeds[:, 1] * b, seeds[:, 0] * c + seeds[:, 1] * d], axis=1)
 
 
 @lru_cache(maxsize=8)
 def _weights(num_pairs: int) -> np.ndarray:
-    """Compute (2, 2 * num_pairs) weights of each word in the two sums.
+    """Compute the weights (2, 2 * num_pairs) of each word in the two sums.
 
     A pair (x, y) turns the sums (s, t) into (s + t + x, s + 2 t + x + y), modulo 2**32; that is linear, so that all
     frames are summed at once instead of word by word.

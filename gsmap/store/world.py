@@ -40,7 +40,7 @@ class WorldObservations:
         self._catalog = catalog
 
     def add(self, items: Iterable[Observation]) -> int:
-        """Add observations, each replacing the current one with its name; returns how many are new or differ."""
+        """Add observations, each in place of the current observation of its name; return the number of changes."""
         count = 0
         with self._catalog.write() as connection:
             current = {_key(row): row for row in connection.execute(_current_rows())}
@@ -79,7 +79,7 @@ class WorldObservations:
         )
 
     def remove(self, names: Sequence[str] = (), *, kinds: Sequence[str] = (), scene: str | None = None) -> int:
-        """Remove observations; returns how many.
+        """Remove observations; return their number.
 
         Args:
             names: of points (with their photos), photos, fixes or bars; default: all.
@@ -113,7 +113,7 @@ class WorldObservations:
 
 
 def inherit(connection: Connection, old: str, new: str) -> None:
-    """Copy the observations of a scene to another one in the same frame."""
+    """Copy the observations of a scene to another scene in the same frame."""
     for row in connection.execute(_current_rows()).all():
         if old not in (row.scene, row.other):
             continue

@@ -1,4 +1,4 @@
-"""Conversion of world ties (poses of components in the world) to JSON and back."""
+"""Convert georeferences (poses of components in the world) to JSON, and back."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PAIRS = ("error_m", "sigma_m", "error_px")
 
 
 def world_tie_to_json(tie: Georeference) -> dict[str, Any]:
-    """Convert a world tie to JSON, exactly."""
+    """Convert a georeference exactly to JSON."""
     return {
         "component": int(tie.component),
         "S_world_map": from_pose(tie.S_world_map),
@@ -32,7 +32,7 @@ def world_tie_to_json(tie: Georeference) -> dict[str, Any]:
 
 
 def world_ties_of_json(values: list[dict[str, Any]]) -> tuple[Georeference, ...]:
-    """Convert JSON to world ties.
+    """Convert JSON to georeferences.
 
     Raises:
         CorruptError: not written by gsmap.

@@ -1,4 +1,4 @@
-"""Leases in a backup: those of processes that save, and that of the one that deletes unneeded objects.
+"""Leases in the storage of a backup, of processes that save and of the process that deletes unneeded objects.
 
 Every process first writes its lease and then reads those of the others. So if a saver and a sweeper start at the same
 time, at least one sees the other: a saver waits for the sweeper to end, and a sweeper gives up without deleting
@@ -58,7 +58,7 @@ class BackupLease:
             self._storage.delete(self.name)
 
     def require(self) -> None:
-        """Raise unless the lease was renewed recently, so that other processes can rely on it.
+        """Raise an error unless the lease was renewed recently, so that other processes can rely on it.
 
         Raises:
             StoreError: the lease could not be renewed, or this process was suspended for long.
@@ -70,7 +70,7 @@ class BackupLease:
             )
 
     def others(self, task: str = "") -> list[str]:
-        """Return the names of the valid leases of other processes, of one task or of all."""
+        """Return the names of the valid leases of other processes, for one task or for all tasks."""
         listed = self._storage.list(LEASES)
         if self.name not in listed:
             raise StoreError(
@@ -100,7 +100,7 @@ class BackupLease:
         return gone
 
     def wait_for_sweepers(self) -> None:
-        """Wait until no process is deleting.
+        """Wait until no process is deleting old snapshots and objects.
 
         Raises:
             BusyError: a process is still deleting after a long time.

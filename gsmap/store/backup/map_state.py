@@ -1,4 +1,4 @@
-"""Consistent states of a map for backups and clones: copies of its catalogs, and the files that they name."""
+"""Capture consistent states of a map for backups and clones: copies of its catalogs, and the files that they name."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class OutdatedStateError(Exception):
-    """A file that a state names was pruned or repaired since, so that the state must be captured again."""
+    """A file of a state was pruned or repaired meanwhile, so that the state must be captured again."""
 
 
 @dataclass(frozen=True)
 class MapState:
-    """The files of a map at one moment.
+    """The files of a map as of one moment.
 
     Args:
         map_id: of the map.
@@ -101,8 +101,7 @@ def capture_state(store: Store, folder: Path, *, branches: bool = True) -> MapSt
 
 @contextlib.contextmanager
 def pause_writers(store: Store) -> Iterator[None]:
-    """Keep all processes from writing to any catalog of a map, so that `capture_state` inside waits for no other
-    process."""
+    """Keep all processes from writing to any catalog of a map, so that `capture_state` need not wait."""
     with contextlib.ExitStack() as held:
         held.enter_context(store.catalog.pause_writers())
         for place in branch_locations(map_folder(store)):
@@ -111,7 +110,7 @@ def pause_writers(store: Store) -> Iterator[None]:
 
 
 def read_state(file: Path, created_at: str = "") -> MapState:
-    """List the files that a catalog names: a ``map.sqlite`` of any schema that no process writes to.
+    """List the files that a catalog names; the catalog is a ``map.sqlite`` of any schema that no process writes.
 
     Raises:
         CorruptError: the catalog cannot be read, or names a path outside the map.
@@ -155,7 +154,7 @@ def check_path(path: object) -> str:
         CorruptError: the path leads outside the map, or where a map keeps no files.
     """
     if not isinstance(path, str) or not path.isprintable() or "\\" in path:
-        raise CorruptError(f"not the path of a file in a map: {path!r}", code="invalid_stored_name")
+        raise CorruptError(f"{path!r} is not the path of a file in a map", code="invalid_stored_name")
     parts = path.split("/")
     sound = all(part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts)
     top, depth = parts[0], len(parts)
@@ -168,12 +167,12 @@ def check_path(path: object) -> str:
         or (parts[0] == ARRAYS and parts[1:2] not in (["staging"], []) and depth >= 4)
     )
     if not sound or not known or PurePosixPath(path).is_absolute():
-        raise CorruptError(f"not the path of a file in a map: {path!r}", code="invalid_stored_name")
+        raise CorruptError(f"{path!r} is not the path of a file in a map", code="invalid_stored_name")
     return path
 
 
 def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, None, None]:
-    """Yield the bytes of a file of a state, and verify its digest at the end.
+    """Yield the bytes of a state's file, and verify the file's digest at the end.
 
     Args:
         folder: where `capture_state` copied the catalogs to; other files are read from the map.
@@ -214,7 +213,7 @@ def _mend(file: StoredFile) -> str:
 
 
 def verify_chunks(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[bytes]:
-    """Yield the same bytes, and raise at the end if they do not match the digest.
+    """Yield the given bytes unchanged, and raise an error at the end if they do not match the file's digest.
 
     Raises:
         CorruptError: too many or too few bytes, or another digest.

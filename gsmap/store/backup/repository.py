@@ -1,4 +1,4 @@
-"""Layout of a backup, and reading it: everything is verified against its digest before use.
+"""The layout of a backup, and reading it; all content is verified against its digest before use.
 
 ::
 
@@ -69,7 +69,7 @@ class Snapshot:
         return _compact(self.created_at)
 
     def packed(self) -> tuple[str, bytes]:
-        """Return the name derived from its bytes, and the bytes."""
+        """Return the name of the snapshot's file, which follows from its bytes, and the bytes."""
         fields = {name: value for name, value in asdict(self).items() if name != "name"}
         text = json.dumps({"format": FORMAT, **fields}, indent=1).encode() + b"\n"
         return f"{self.time}Z-{hashlib.sha256(text).hexdigest()[:16]}", text
@@ -143,7 +143,7 @@ class Backup:
         return sorted(name for name in listed if _NAME.fullmatch(name))
 
     def time_of_next(self, now: str) -> str:
-        """Return the time of the next snapshot: ``now``, or the first time after the newest one if a clock was wrong.
+        """Return the time of the next snapshot: ``now``, or just after the newest snapshot if a clock was wrong.
 
         So the order of names is the order of creation, whatever the clocks.
 
@@ -260,7 +260,7 @@ class Backup:
 
 
 def format_file_list(files: list[StoredFile]) -> bytes:
-    """Format the list of files of a snapshot: a line each with digest, size and path."""
+    """Format the list of files of a snapshot, with one line per file: digest, size and path."""
     return "".join(f"{file.sha256} {file.size_bytes} {file.path}\n" for file in files).encode()
 
 

@@ -105,7 +105,7 @@ def save(
 
 
 def sweep(backup: Backup, keep: int, *, made: str = "") -> tuple[tuple[str, ...], int, tuple[str, ...]]:
-    """Delete all but the newest snapshots, then the objects that no remaining one names.
+    """Delete all snapshots except the newest, then all objects that no remaining snapshot names.
 
     Nothing is deleted while another process is working in the backup, since it may rely on objects that no snapshot
     names yet.
@@ -168,7 +168,7 @@ class _BackupRun:
         self._bad: set[str] = set()  # digests of damaged objects
 
     def save(self) -> Snapshot:
-        """Capture states until all files of one are sent."""
+        """Capture states of the map until all files of one state are sent."""
         for trial in range(_TRIES + 1):
             with contextlib.ExitStack() as until_sent, self._folder() as folder:
                 if trial == _TRIES:
@@ -189,7 +189,7 @@ class _BackupRun:
         )
 
     def verify(self) -> _VerifiedObjects:
-        """Read every object and compare it with its digest, and find missing ones."""
+        """Read every object and compare it with its digest; find damaged and missing objects."""
         there = {sha: about for name, about in self.backup.storage.list(OBJECTS).items() if (sha := digest_of(name))}
         damaged: dict[str, str] = {}
         needed: dict[str, tuple[StoredFile, list[str]]] = {}
@@ -221,7 +221,7 @@ class _BackupRun:
         return _VerifiedObjects(len(there), damaged, needed)
 
     def remaining_problems(self, found: _VerifiedObjects) -> tuple[str, ...]:
-        """Return the damage that is left in the backup after all files of the map were sent."""
+        """Return the damage that remains in the backup after all files of the map were sent."""
         out = []
         for name in self.backup.names():
             try:
@@ -242,7 +242,7 @@ class _BackupRun:
         return tuple(out)
 
     def note(self, snapshot: Snapshot) -> tuple[str, ...]:
-        """Record the backup in the map; returns notes."""
+        """Record the backup in the map; return notes."""
         target = self.backup.storage.url
         if not self.store.catalog.writable:
             return ("the map cannot be written, so it has no record of this backup",)
@@ -253,7 +253,7 @@ class _BackupRun:
         return ()
 
     def _send(self, state: MapState, folder: Path) -> None:
-        """Send all objects of a state that the storage lacks, each once, in any order."""
+        """Send all objects of a state that the storage lacks, each object once, in any order."""
         there = self._sound_sizes()
         missing = {f.sha256: f for f in state.files if there.get(f.sha256) != f.size_bytes}
 
@@ -275,7 +275,7 @@ class _BackupRun:
                 raise
 
     def _write(self, state: MapState) -> Snapshot:
-        """Write the list of files, check that all of them are present, and write the snapshot."""
+        """Write the list of files, check that the storage has all of them, and write the snapshot."""
         text = format_file_list(list(state.files))
         own = StoredFile("", len(text), hashlib.sha256(text).hexdigest())
         if self._sound_sizes().get(own.sha256) != own.size_bytes:
@@ -331,7 +331,7 @@ class _BackupRun:
 
     @contextlib.contextmanager
     def _folder(self) -> Iterator[Path]:
-        """Yield the folder for catalog copies: inside a folder backup, which has space for them, or a temporary one."""
+        """Yield a folder for copies of catalogs, in a backup that is a folder with space, or else a temporary one."""
         storage = self.backup.storage
         if isinstance(storage, FolderStorage):
             with storage.staging() as folder:
