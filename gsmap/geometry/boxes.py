@@ -1,4 +1,4 @@
-"""Compute axis-aligned boxes, (2, 3): lowest and highest corner."""
+"""Compute axis-aligned boxes (2, 3): the lowest and the highest corner."""
 
 from __future__ import annotations
 
@@ -8,29 +8,31 @@ import numpy as np
 
 from gsmap.types import Sim3
 
-_MAX_SAMPLE = 4_000  # points that suffice for the size of a place
+_MAX_SAMPLE = 4_000  # number of points that suffices for the size of a place
 
 
 def box_corners(bounds: np.ndarray) -> np.ndarray:
-    """Return the (8, 3) corners of a box; bits 0, 1, 2 of a corner's index are set where x, y, z is the high end."""
+    """Return the (8, 3) corners of a box; bit 0, 1 or 2 of a corner's index is set if its x, y or z is that of the high
+    end."""
     return np.array([[bounds[i >> axis & 1][axis] for axis in range(3)] for i in range(8)], dtype=np.float64)
 
 
 def box_around(points: np.ndarray) -> np.ndarray:
-    """Return the (2, 3) smallest box around points (N, 3), N > 0."""
+    """Return the smallest box (2, 3) around points (N, 3), N > 0."""
     columns = points.T  # twenty times as fast as min(0) and max(0) over rows of three
     return np.array([[column.min() for column in columns], [column.max() for column in columns]])
 
 
 def are_finite(points: np.ndarray) -> np.ndarray:
-    """Return the (N,) mask of points (N, 3) without NaN and infinity."""
+    """Return an (N,) mask of points (N, 3) without NaN and infinity."""
     x, y, z = (np.isfinite(column) for column in points.T)
     result: np.ndarray = x & y & z
     return result
 
 
 def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -> np.ndarray:
-    """Return the (N,) mask of points (N, 3) in bounds (2, 3) grown by a margin (``low <= x < high``); all if None."""
+    """Return an (N,) mask of points (N, 3) in bounds (2, 3) enlarged by a margin (``low <= x < high``); with None all
+    are inside."""
     if bounds is None:
         return np.ones(len(points), dtype=bool)
     low, high = bounds[0] - margin, bounds[1] + margin
@@ -40,16 +42,17 @@ def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -
 
 
 def moved_box(bounds: np.ndarray, S_a_b: Sim3) -> np.ndarray:
-    """Return the (2, 3) box of frame a around a box of frame b."""
+    """Return the box (2, 3) in frame a around a box in frame b."""
     return box_around(S_a_b.apply(box_corners(bounds)))
 
 
 def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: float = 0.01) -> np.ndarray:
-    """Return the (2, 3) box between two quantiles of points (N, 3), N > 0, along each axis, robust to outliers.
+    """Return the box (2, 3) between two quantiles of points (N, 3), N > 0, along each axis, which is robust to
+    outliers.
 
     Args:
-        weights: (N,); equal by default.
-        outside: share of the weight on each side of the box.
+        weights: (N,) weights of the points; equal by default.
+        outside: share of the weight beyond each side of the box.
     """
     weights = np.ones(len(points)) if weights is None else weights
     out = np.empty((2, 3))
@@ -62,7 +65,7 @@ def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: f
 
 
 def upright_size(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> tuple[float, float, float]:
-    """Return length, width and height of the upright box of smallest floor area around points (N, 3), N > 0.
+    """Return length, width and height of the upright box with the smallest floor area around points (N, 3), N > 0.
 
     Args:
         up: (3,) unit vector.
@@ -82,13 +85,13 @@ def upright_size(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> t
 
 
 def cube_around(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the centre (3,) and edge of the smallest cube around points (N, 3), N > 0."""
+    """Return the centre (3,) and the edge length of the smallest cube around points (N, 3), N > 0."""
     low, high = box_around(points).astype(np.float64)
     return (low + high) / 2, float(max((high - low).max(), 1e-6))
 
 
 def octants(points: np.ndarray, center: np.ndarray, side: float) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Yield the octants of a cube that hold any of the points (N, 3): number, mask (N,) and centre (3,)."""
+    """Yield the octants of a cube that contain any of the points (N, 3): number, mask (N,) and centre (3,)."""
     octant = ((points >= center) @ [1, 2, 4]).astype(int)
     for i in np.unique(octant).tolist():
         yield i, octant == i, center + side / 4 * np.where([i & 1, i & 2, i & 4], 1, -1)

@@ -10,20 +10,21 @@ from gsmap.types.source import gathered
 _POINTS = 20_000
 _PLACES = 256
 _GRID = 32
-_CLEARANCE = 0.03  # smallest distance of a position from all points, in diagonals
+_CLEARANCE = 0.03  # smallest distance of a position from all points, in diagonals of the scene
 _PANORAMA = (16, 32)  # bins of latitude and longitude
-_ENCLOSED = 0.6  # smallest share of directions that hit a surface, indoors; a room without a ceiling has more
-_TIE = 0.02  # bare walls look the same from both sides: positions indoors may see this share of the points less
-_MIN_GAIN = 0.002  # share of the points that a further position must add
+_ENCLOSED = 0.6  # indoors at least this share of directions hits a surface; in a room without a ceiling more do
+_TIE = 0.02  # positions indoors may see this share of the points less, as bare walls look the same from both sides
+_MIN_GAIN = 0.002  # smallest share of the points that a further position adds
 _SIDE_PX = 512
 
 
 def synthesise_cameras(gaussians: GaussianSource, *, num_positions: int = 16, seed: int = 0) -> Cameras:
     """Synthesize cameras in free space that together see a scene's surfaces.
 
-    Up to ``num_positions`` positions, each the one that sees most points not seen before, with views of 90 degrees
-    along the axes where there are points. Positions are indoors (most directions hit a surface) where such positions
-    see as much as those outside: true of rooms, not of hollow objects. The result is deterministic.
+    Up to ``num_positions`` positions are chosen one by one; each sees most points that no earlier position saw. From
+    each, views of 90 degrees look along those axes where there are points. Positions are indoors (most directions hit a
+    surface) if indoor positions together see as much as outdoor positions, which holds for rooms but not for hollow
+    objects. The result is deterministic.
 
     Returns:
         Cameras in the scene's frame with ``synthesised=True``.
@@ -48,7 +49,8 @@ def synthesise_cameras(gaussians: GaussianSource, *, num_positions: int = 16, se
 
 
 def _solid_points(gaussians: GaussianSource, rng: np.random.Generator) -> np.ndarray:
-    """Return (N, 3) centres of a sample of the opaque Gaussians that are not huge; of all where none is."""
+    """Return the (N, 3) centres of a sample of the opaque Gaussians that are not huge; of all Gaussians if none is
+    opaque."""
     widest = np.concatenate([log_scales.max(1) for log_scales in gaussians.columns("log_scales")])
     opaque = np.concatenate([logits > -0.85 for logits in gaussians.columns("logit_opacities")])
     solid = np.flatnonzero(opaque & (widest <= np.percentile(widest, 98)))
@@ -85,7 +87,7 @@ def _panorama(points: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarr
     rows, columns = _PANORAMA
     offset = points - position
     distance = np.linalg.norm(offset, axis=1)
-    # Equal steps of the sine of the latitude are equal solid angles.
+    # Equal steps of the sine of the latitude cover equal solid angles.
     sine = (offset[:, 2] / np.maximum(distance, 1e-12) + 1) / 2
     angle = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * np.pi) + 0.5
     row = np.minimum((sine * rows).astype(int), rows - 1)
@@ -116,7 +118,8 @@ def _coverage(seen: list[np.ndarray], places: list[int]) -> int:
 
 
 def _look_around(place: np.ndarray, visible: np.ndarray) -> list[np.ndarray]:
-    """Return poses at a position along those of the six axes with at least 2 % of the visible points."""
+    """Return poses at a position that look along those of the six axes in which at least 2 % of the visible points
+    lie."""
     offset = visible - place
     reach = np.abs(offset).max(1)
     poses = []
@@ -128,7 +131,8 @@ def _look_around(place: np.ndarray, visible: np.ndarray) -> list[np.ndarray]:
 
 
 def _look(place: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """Return the (4, 4) camera-to-frame pose (OpenCV axes) along a unit axis, image down along another axis."""
+    """Return the (4, 4) camera-to-frame pose (OpenCV axes) that looks along a unit axis; the image's down is another
+    axis."""
     down = np.array([0.0, 1, 0]) if forward[1] == 0 else np.array([0.0, 0, 1])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([np.cross(down, forward), down, forward], 1)

@@ -13,14 +13,15 @@ def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Label equal rows of integer cell coordinates (N, 3).
 
     Returns:
-        (N,) int64 labels from 0 in the order of the cells (x, then y, then z), and the number of rows per label.
+        The (N,) int64 labels, from 0 in the order of the cells (x, then y, then z), and the number of rows of each
+        label.
     """
     cells = np.asarray(cells).astype(np.int64)
     if not len(cells):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     low, high = box_around(cells)
     cells, sides = cells - low, high - low + 1
-    if np.prod(sides, dtype=np.float64) >= 2.0**62:  # extreme outliers: one integer per cell would overflow
+    if np.prod(sides, dtype=np.float64) >= 2.0**62:  # with extreme outliers one integer per cell would overflow
         _, label, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         return label.reshape(-1), counts
     key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
@@ -29,7 +30,7 @@ def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def group_means(values: np.ndarray, labels: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return (M, F) float64 means of the rows (N, F) of each of M labels; see `cell_labels`."""
+    """Return the (M, F) float64 means of the rows (N, F) of each of M labels; see `cell_labels`."""
     sums = [np.bincount(labels, column, len(counts)) for column in values.T]
     return np.stack(sums, axis=1) / counts[:, None] if len(values) else np.zeros((0, values.shape[1]))
 
@@ -41,13 +42,14 @@ def cell_means(
     weights: np.ndarray | None = None,
     origin: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Average points (N, 3) and values (N, 3) over the cells of a grid: (M, 3), (M, 3) and the cells' weights (M,).
+    """Average points (N, 3) and values (N, 3) over the cells of a grid; return both means (M, 3) and the weights (M,)
+    of the cells.
 
-    The same as `group_means` over `cell_labels`, in one pass without intermediate arrays.
+    The result equals `group_means` over `cell_labels`, but takes one pass without intermediate arrays.
 
     Args:
-        cell: side of the cells.
-        weights: (N,), 1 each by default.
+        cell: edge length of the cells.
+        weights: (N,) weights of the points, 1 by default.
         origin: (3,) corner of a cell, 0 by default.
     """
     origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)

@@ -8,9 +8,9 @@ import numpy as np
 
 
 def chi2_quantile(probability: float | np.ndarray, dof: int | np.ndarray) -> Any:
-    """Return the value that a chi-square variable of ``dof`` degrees of freedom stays below with this probability.
+    """Return the value below which a chi-square variable of ``dof`` degrees of freedom stays with this probability.
 
-    Equal to the last bit to ``scipy.stats.chi2.ppf``; broadcasts, and is a scalar where both arguments are.
+    The result is bitwise equal to ``scipy.stats.chi2.ppf``. Arguments are broadcast; two scalars give a scalar.
     """
     from scipy.special import gammaincinv
 
@@ -18,12 +18,12 @@ def chi2_quantile(probability: float | np.ndarray, dof: int | np.ndarray) -> Any
 
 
 def chi2_log_survival(value: float | np.ndarray, dof: int | np.ndarray) -> Any:
-    """Return the log of the probability that a chi-square variable exceeds a value; -inf where it underflows.
+    """Return the log of the probability that a chi-square variable exceeds a value; -inf if it underflows.
 
-    Equal to the last bit to ``scipy.stats.chi2.logsf``; broadcasts.
+    The result is bitwise equal to ``scipy.stats.chi2.logsf``. Arguments are broadcast.
     """
     from scipy.special import chdtr, chdtrc
 
     with np.errstate(divide="ignore"):
-        # Each tail where it keeps its digits.
+        # Compute the tail that keeps its digits.
         return np.where(value > chi2_quantile(0.5, dof), np.log(chdtrc(dof, value)), np.log1p(-chdtr(dof, value)))

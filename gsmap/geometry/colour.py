@@ -10,11 +10,11 @@ _XYZ_RGB = np.array(
 _WHITE_D65 = np.array([0.95047, 1.0, 1.08883])
 
 
-_BLOCK = 32_768  # colours at a time, so that intermediate arrays stay in the processor's cache
+_BLOCK = 32_768  # number of colours per block, so that intermediate arrays stay in the processor's cache
 
 
 def srgb_to_lab(rgb: np.ndarray) -> np.ndarray:
-    """Convert to CIE L*a*b* (..., 3) float32 from sRGB (..., 3) in [0, 1] (IEC 61966-2-1, white D65)."""
+    """Convert sRGB (..., 3) in [0, 1] to CIE L*a*b* (..., 3) float32 (IEC 61966-2-1, white point D65)."""
     rgb = np.asarray(rgb)
     if rgb.ndim == 2 and len(rgb) > _BLOCK:
         return np.concatenate([_lab(rgb[i : i + _BLOCK]) for i in range(0, len(rgb), _BLOCK)])

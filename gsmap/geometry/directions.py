@@ -1,4 +1,4 @@
-"""Compute rotations between directions, and directions spread over a sphere."""
+"""Compute rotations between directions, and directions that cover a sphere evenly."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """Return the shortest rotation (3, 3) that takes a unit vector (3,) to +z."""
+    """Return the shortest rotation (3, 3) that rotates a unit vector (3,) to +z."""
     x, y, z = up
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
@@ -16,10 +16,10 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the shortest rotation (3, 3) that takes the direction of ``a`` (3,) to that of the unit vector ``b`` (3,).
+    """Return the shortest rotation (3, 3) that rotates the direction of ``a`` (3,) to the unit vector ``b`` (3,).
 
-    By axis and angle, so that it is a rotation to the last bits near opposite directions too, where `rotation_to_z`
-    is not; the identity where ``a`` has no length.
+    It is computed from axis and angle. So it is an exact rotation even for nearly opposite directions, unlike
+    `rotation_to_z`. The result is the identity if ``a`` has length 0.
     """
     from scipy.spatial.transform import Rotation
 
@@ -31,7 +31,7 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     if sine < 1e-12:
         if cosine > 0:
             return np.eye(3)
-        # Half a turn about any axis at right angles.
+        # Rotate by half a turn about any perpendicular axis.
         least = int(np.argmin(np.abs(b)))
         side = np.eye(3)[least] - b[least] * b
         side /= np.linalg.norm(side)
@@ -41,7 +41,7 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """Return (count, 3) unit vectors spread evenly over the sphere (golden spiral), from +z down."""
+    """Return (count, 3) unit vectors spread evenly over the sphere (golden spiral), from +z downwards."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     turn = np.pi * (1 + np.sqrt(5)) * k
@@ -50,7 +50,8 @@ def fibonacci_sphere(count: int) -> np.ndarray:
 
 
 def level_frame(up: np.ndarray) -> np.ndarray:
-    """Return a rotation (3, 3) that takes ``up`` (3,) to +z; its rotation about z depends on ``up`` alone."""
+    """Return a rotation (3, 3) that rotates ``up`` (3,) to +z; the remaining rotation about z depends on ``up``
+    alone."""
     z = np.asarray(up, float) / np.linalg.norm(up)
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)

@@ -12,15 +12,15 @@ from gsmap.types import Gaussians, ScenePose, Sim3
 from gsmap.types.metric_scale import KnownBy, MetricScale
 
 PLAUSIBLE_M = (0.25, 4.0)
-"""Estimated metres per scene unit between which a scene's own unit may be the metre."""
+"""Range of estimated metres per scene unit in which the scene's unit may be the metre."""
 
-# Devices' metres are off by 1 to 3 percent, equally in all captures of a device, so the errors do not average out.
-_SPECIFIED_SIGMA = 0.01  # of a length that a person measured with a tape
-_MEASURED_SIGMA = 0.02  # of captures in metres
-_SURVEYED_SIGMA = 0.02  # largest one of a survey that precedes specified values
-_ASSUMED_SIGMA = 0.03  # of a unit that is assumed to be the metre
-_FACTOR = 2.0  # accuracy of an estimate from the content
-_AGREE = 5.0  # sigmas by which equal units may differ
+# The metres of a device are off by 1 to 3 percent, equally in all its captures, so the errors do not average out.
+_SPECIFIED_SIGMA = 0.01  # log sigma of a length that a person measured with a tape
+_MEASURED_SIGMA = 0.02  # log sigma of captures in metres
+_SURVEYED_SIGMA = 0.02  # largest log sigma of a survey that takes precedence over specified values
+_ASSUMED_SIGMA = 0.03  # log sigma of a unit that is assumed to be the metre
+_FACTOR = 2.0  # an estimate from the content is accurate to this factor
+_AGREE = 5.0  # largest difference of equal units, in sigmas
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,9 @@ class SceneUnit:
     """Unit of a scene.
 
     Args:
-        specified: metres per unit given by the user, or None.
+        specified: metres per unit specified by the user, or None.
         in_metres: the scene is in metres.
-        may_be_metres: the unit is not specified, and may be the metre by the scene's content.
+        may_be_metres: the unit is not specified, and by the scene's content it may be the metre.
         guess_m: metres per unit estimated from the content, or None.
     """
 
@@ -45,15 +45,16 @@ def estimate_metric_scale(
 ) -> MetricScale:
     """Estimate the metric scale of one component.
 
-    Specified values precede captures in metres, these precede assumed metres, and these precede estimates from the
-    content. Each scene gives metres per unit of the frame by its own unit and the scale of its pose, weighted by the
-    variances of both. A solved scale changes a little with every capture, so the result is rounded, and is 1 where that
-    is within its error: results in metres stay valid for insignificant digits.
+    Specified values take precedence over captures in metres, these over assumed metres, and these over estimates from
+    the content. The unit of each scene and the scale of its pose give metres per unit of the frame, weighted by the
+    variances of both. A solved scale changes a little with every capture. Therefore the result is rounded, and it is 1
+    if 1 is within its error, so that results in metres stay valid when only insignificant digits change.
 
     Args:
-        scenes: all of the component, each with its pose in it.
+        scenes: all scenes of the component, with their poses in it.
         surveyed: metres per unit of the frame and the standard deviation of the logarithm, from control points,
-            positions or scale bars; precedes all else unless its deviation exceeds ``_SURVEYED_SIGMA``.
+            positions or scale bars. It takes precedence over everything else unless the standard deviation exceeds
+            ``_SURVEYED_SIGMA``.
     """
     if surveyed is not None and surveyed[1] <= _SURVEYED_SIGMA:
         return _rounded(*surveyed)
@@ -70,7 +71,7 @@ def estimate_metric_scale(
         return _assumed(_combined([(1.0, pose) for pose in metric], _ASSUMED_SIGMA, "assumed"), guess)
     if guess is None:
         return MetricScale(note=f"its metric scale is unknown: {_SET_IT}")
-    # Steps of half an octave: another capture's guess does not move everything.
+    # Round to half an octave, so that the estimate from one more capture does not move everything.
     rounded = float(2.0 ** (np.round(2 * np.log2(guess)) / 2))
     note = f"its metric scale is estimated and may be off by a factor of {_FACTOR:g}: {_SET_IT}"
     return MetricScale(rounded, float(np.log(_FACTOR)), "guessed", note)
@@ -80,12 +81,12 @@ _SET_IT = "set it with gsmap edit MAP SCENE --metres-per-unit X"
 
 
 def _rounded(metres_per_unit: float, sigma: float) -> MetricScale:
-    """Round a surveyed metric scale to four digits, so that results in metres stay valid after another solve."""
+    """Round a surveyed metric scale to four digits, so that results in metres remain valid after another solve."""
     return MetricScale(float(f"{metres_per_unit:.4g}"), max(sigma, 5e-4), "surveyed", "")
 
 
 def _combined(units: Sequence[tuple[float, ScenePose]], own_sigma: float, known_by: KnownBy) -> MetricScale:
-    """Combine metres per unit of scenes, each with the standard deviation ``own_sigma``, to that of the frame."""
+    """Combine the metres per unit of scenes, each with the standard deviation ``own_sigma``, to that of the frame."""
     logs = np.log([metres / pose.S_map_scene.scale for metres, pose in units])
     sigmas = np.sqrt([own_sigma**2 + _scale_variance(pose) for _, pose in units])
     weights = sigmas**-2.0
@@ -97,27 +98,27 @@ def _combined(units: Sequence[tuple[float, ScenePose]], own_sigma: float, known_
         if np.abs((logs - log) / sigmas).max() > _AGREE / np.sqrt(2):
             note = f"metric scales of captures differ by {100 * float(np.ptp(logs)):.2g} %: {_SET_IT}"
     if len({metres for metres, _ in units}) == 1 and all(pose.S_map_scene.scale == 1.0 for _, pose in units):
-        return MetricScale(units[0][0], sigma, known_by, note)  # to the last digit
+        return MetricScale(units[0][0], sigma, known_by, note)  # exactly as specified
     if known_by != "told" and abs(log) <= sigma:
         return MetricScale(1.0, sigma, known_by, note)
     return MetricScale(float(f"{np.exp(log):.3g}"), sigma, known_by, note)
 
 
 def _assumed(metre: MetricScale, guess: float | None) -> MetricScale:
-    """Widen the deviation of an assumed metre where the estimate from the content disagrees."""
+    """Increase the standard deviation of an assumed metre if the estimate from the content disagrees."""
     off = 0.0 if guess is None else abs(float(np.log(guess / metre.metres_per_unit)))
     if guess is None or off <= np.log(_FACTOR):
         return metre
     note = (
-        f"its unit is assumed to be {metre.metres_per_unit:.3g} m, but its captures look as if it were about "
+        f"its unit is assumed to be {metre.metres_per_unit:.3g} m, but by the content of its captures it is about "
         f"{guess:.2g} m: {_SET_IT}"
     )
     return replace(metre, sigma=off, note=note)
 
 
 def _majority(poses: Sequence[ScenePose]) -> list[ScenePose]:
-    """Return the poses of scenes with one unit if these are the majority, else none: only one of several units can be
-    the metre."""
+    """Return the poses of scenes with the same unit if these are the majority, otherwise none: only one of several
+    units can be the metre."""
     if not poses:
         return []
     logs = np.log([pose.S_map_scene.scale for pose in poses])
@@ -127,8 +128,8 @@ def _majority(poses: Sequence[ScenePose]) -> list[ScenePose]:
         out: np.ndarray = _AGREE * np.sqrt(2 * _ASSUMED_SIGMA**2 + own[i] + of_other)
         return out
 
-    # Scales within the smallest tolerance agree whatever the variance, and those beyond the largest do not, so few
-    # pairs are tested one by one, and a map may have ten thousand scenes.
+    # Scales within the smallest tolerance agree whatever the variance, and scales beyond the largest do not. So few
+    # pairs are tested one by one; a map may have ten thousand scenes.
     order = np.argsort(logs, kind="stable")
     inside, maybe = (
         [np.searchsorted(logs[order], logs + sign * reach(slice(None), spread), side) for sign, side in _ENDS]
@@ -147,7 +148,7 @@ _ENDS: tuple[tuple[int, Literal["left", "right"]], ...] = ((-1, "left"), (1, "ri
 
 
 def _scale_variance(pose: ScenePose) -> float:
-    """Return the variance of the logarithm of a pose's scale; 0 where it is unknown."""
+    """Return the variance of the logarithm of a pose's scale; 0 if it is unknown."""
     return 0.0 if pose.covariance is None else max(0.0, float(pose.covariance[6, 6]))
 
 
@@ -155,14 +156,14 @@ def _scale_variance(pose: ScenePose) -> float:
 
 
 def in_metres(S_map_scene: Sim3, metres_per_unit: float) -> Sim3:
-    """Convert a scene's pose from the map's unit to metres: the same axes and origin."""
+    """Convert a scene's pose from the map's unit to metres; axes and origin do not change."""
     if metres_per_unit == 1.0:
         return S_map_scene
     return Sim3(S_map_scene.rotation, S_map_scene.translation * metres_per_unit, S_map_scene.scale * metres_per_unit)
 
 
 def scale_gaussians(gaussians: Gaussians, factor: float) -> Gaussians:
-    """Convert Gaussians to a unit of which ``factor`` make one old unit; unchanged where it is 1."""
+    """Multiply positions and sizes of Gaussians by ``factor``, the number of new units per old unit."""
     if factor == 1.0:
         return gaussians
     means = (gaussians.means.astype(np.float64) * factor).astype(np.float32)

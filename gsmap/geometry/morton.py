@@ -7,26 +7,26 @@ import numpy as np
 from gsmap.geometry.boxes import box_around
 
 BITS = 21
-"""Bits per axis; three axes fill 63 bits."""
+"""Number of bits per axis; three axes fill 63 bits."""
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """Return the (N,) permutation that sorts finite points (N, 3) stably along a Z-order curve of cubic cells."""
+    """Return the (N,) permutation that sorts finite points (N, 3) stably along a Z-order curve through cubic cells."""
     if not len(points):
         return np.zeros(0, np.int64)
     return np.argsort(morton_codes(points, box_around(points)), kind="stable")
 
 
 def morton_codes(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Return (N,) uint64 Morton codes of points (N, 3) in the smallest cube at the low corner of a box (2, 3) that
-    contains it."""
+    """Return the (N,) uint64 Morton codes of points (N, 3) in the smallest cube that contains a box (2, 3) and starts
+    at its low corner."""
     low, high = box.astype(np.float64)
     step = max((high - low).max(), np.finfo(np.float32).tiny) / ((1 << BITS) - 1)
     return codes_of_cells(((points - low) / step).astype(np.uint64))
 
 
 def codes_of_cells(cells: np.ndarray) -> np.ndarray:
-    """Return (N,) uint64 Morton codes of cells (N, 3) uint64, each of 21 bits."""
+    """Return the (N,) uint64 Morton codes of cells (N, 3) uint64, each of 21 bits."""
     code = np.zeros(len(cells), np.uint64)
     for axis in range(3):
         code |= _spread(cells[:, axis]) << np.uint64(2 - axis)
@@ -43,14 +43,14 @@ _SHIFTS = (32, 16, 8, 4, 2)
 
 
 def _spread(cell: np.ndarray) -> np.ndarray:
-    """Insert two zero bits before each of the low 21 bits."""
+    """Insert two zero bits before each of the low 21 bits of an integer."""
     for shift, mask in zip(_SHIFTS, _MASKS[1:], strict=True):
         cell = (cell | (cell << np.uint64(shift))) & np.uint64(mask)
     return cell
 
 
 def _gathered(code: np.ndarray) -> np.ndarray:
-    """Gather every third bit."""
+    """Gather every third bit of an integer; the inverse of `_spread`."""
     code = code & np.uint64(_MASKS[-1])
     for shift, mask in zip(_SHIFTS[::-1], _MASKS[-2::-1], strict=True):
         code = (code | (code >> np.uint64(shift))) & np.uint64(mask)

@@ -10,12 +10,13 @@ from gsmap._native import PointTree
 from gsmap.geometry.boxes import box_around
 from gsmap.geometry.cells import cell_labels
 
-_ACROSS = 64  # grid cells along the longest side, by whose order points are visited
-_CHUNK = 100_000  # points per query, to bound memory
+_ACROSS = 64  # number of cells along the longest side of the grid in whose order points are visited
+_CHUNK = 100_000  # number of points per query, which bounds memory
 
 
 def spatial_order(points: np.ndarray, across: int) -> np.ndarray:
-    """Return rows of the points (N, 3) sorted by the cells of a grid with ``across`` cells along the longest side."""
+    """Return the rows of the points (N, 3) sorted by the cells of a grid with ``across`` cells along the longest
+    side."""
     low, high = box_around(points) if len(points) else np.zeros((2, 3))
     span = float((high - low).max())
     if span <= 0:
@@ -24,12 +25,12 @@ def spatial_order(points: np.ndarray, across: int) -> np.ndarray:
 
 
 def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield rows (M,) of the points (N, 3), and distances and rows (M, k) of the nearest of all points to each, itself
-    first; every row once. Where there are fewer than k points, distances are infinite and rows N, as in a k-d tree.
+    """Yield rows (M,) of points (N, 3) with the distances and rows (M, k) of the points nearest to each, itself first.
+    Every row is yielded once. With fewer than k points, distances are infinite and rows N, as in a k-d tree.
 
     Points are queried in the order of a grid's cells, which is twice as fast.
     """
-    from scipy.spatial import cKDTree  # naming a recipe does without
+    from scipy.spatial import cKDTree  # imported here, as the recipe key does not need it
 
     order = spatial_order(points, _ACROSS)
     ordered, row_of = points[order], np.append(order, len(points))
@@ -40,15 +41,17 @@ def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarra
 
 
 def nearest_neighbours(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances and rows (N, k) of the nearest of the points (N, 3) to each; see `chunks_of_neighbours`."""
+    """Return the distances and rows (N, k) of the points nearest to each of the points (N, 3); see
+    `chunks_of_neighbours`."""
     found: tuple[np.ndarray, np.ndarray] = PointTree(np.ascontiguousarray(points, np.float64)).neighbours(k)
     return found
 
 
 def neighbours_of(points: np.ndarray, at: np.ndarray, k: int, radius: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances and rows (M, k) of the points (N, 3) nearest to each query (M, 3) within a radius.
+    """Return the distances and rows (M, k) of the points (N, 3) nearest to each query (M, 3) within a radius.
 
-    inf and N where there are fewer. Queries in the order of a space-filling curve take half the time.
+    With fewer points within the radius, distances are inf and rows N. Queries in the order of a space-filling curve
+    take half the time.
     """
     tree = PointTree(np.ascontiguousarray(points, np.float64))
     found: tuple[np.ndarray, np.ndarray] = tree.neighbours(k, np.ascontiguousarray(at, np.float64), radius)
@@ -56,7 +59,8 @@ def neighbours_of(points: np.ndarray, at: np.ndarray, k: int, radius: float = np
 
 
 def nearest_of(points: np.ndarray, at: np.ndarray, radius: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances to and rows (M,) of the points (N, 3) nearest to queries (M, 3); inf and 0 beyond the radius."""
+    """Return the distance and row (M,) of the point (N, 3) nearest to each query (M, 3); inf and 0 beyond the
+    radius."""
     tree = PointTree(np.ascontiguousarray(points, np.float64))
     found: tuple[np.ndarray, np.ndarray] = tree.nearest(np.ascontiguousarray(at, np.float64), radius)
     return found

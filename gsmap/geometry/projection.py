@@ -1,4 +1,4 @@
-"""Project points to pixels by a pinhole camera."""
+"""Project points to pixels with a pinhole camera."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ def project(points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.nd
     """Project points to an image.
 
     Args:
-        points: (N, 3), in any floating type, which the result has as well.
-        T_camera_frame: (4, 4) frame-to-camera (OpenCV axes: x right, y down, z forward).
+        points: (N, 3) points of any floating type; the result has the same type.
+        T_camera_frame: (4, 4) transform from frame to camera (OpenCV axes: x right, y down, z forward).
         intrinsics_px: (4,) ``fx fy cx cy``.
 
     Returns:
-        (N, 2) pixel coordinates ``column row`` (the first pixel's centre is 0.5 0.5), undefined where the
-        depth is not positive; and (N,) depth along the camera's axis.
+        The (N, 2) pixel coordinates ``column row`` (the centre of the first pixel is 0.5 0.5), undefined if the depth
+        is not positive; and the (N,) depths along the camera's axis.
     """
     column, row, z = project_all(points, T_camera_frame, intrinsics_px)
     return np.stack([column, row], axis=1), z
@@ -24,11 +24,12 @@ def project(points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.nd
 def project_all(
     points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return columns, rows and depths (..., N) of points (N, 3), as `project`, in one image or in many at once.
+    """Return the columns, rows and depths (..., N) of points (N, 3), as `project` does, in one image or in many at
+    once.
 
     Args:
-        T_camera_frame: (..., 4, 4).
-        intrinsics_px: (..., 4).
+        T_camera_frame: (..., 4, 4) transforms from frame to camera.
+        intrinsics_px: (..., 4) ``fx fy cx cy``.
     """
     view = np.asarray(T_camera_frame).astype(points.dtype, copy=False)
     fx, fy, cx, cy = np.moveaxis(np.asarray(intrinsics_px).astype(points.dtype)[..., None], -2, 0)
@@ -39,7 +40,8 @@ def project_all(
 
 
 def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: float = 0.0) -> np.ndarray:
-    """Return the (N,) mask of points beyond ``near`` and inside an image of ``size_px`` = ``width height``."""
+    """Return an (N,) mask of points that are farther than ``near`` and inside an image of ``size_px`` =
+    ``width height``."""
     (column, row), (width, height) = pixels.T, np.asarray(size_px)
     with np.errstate(invalid="ignore"):
         inside: np.ndarray = (depth > near) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -49,16 +51,16 @@ def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: f
 def on_surface(
     points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray, depth: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Select the points on the surface of a depth image.
+    """Select the points that lie on the surface of a depth image.
 
     Args:
         points, T_camera_frame, intrinsics_px: as in `project`.
-        depth: (H, W) camera-space z, the points' unit, 0 where nothing is seen.
-        tolerance: largest difference of depths, as a share of the surface's; inf selects points behind
-            and before the surface as well.
+        depth: (H, W) camera-space z in the unit of the points, 0 without a surface.
+        tolerance: largest difference of depths, as a share of the surface's depth; inf selects points behind and in
+            front of the surface as well.
 
     Returns:
-        (n,) rows of the points, and the pixels (n, 2) int64 ``column row`` they fall on.
+        The (n,) rows of the selected points, and their pixels (n, 2) int64 ``column row``.
     """
     column, row, z = project_all(points, T_camera_frame, intrinsics_px)
     height, width = depth.shape

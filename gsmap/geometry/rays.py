@@ -7,7 +7,7 @@ import numpy as np
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.types import Gaussians
 
-_LEAST = 1 / 255  # of opacity, as in the rasterizer
+_LEAST = 1 / 255  # smallest opacity, as in the rasterizer
 _NEAR = 0.01
 _ALPHA_MAX = 0.99
 
@@ -15,19 +15,21 @@ _ALPHA_MAX = 0.99
 def surface_along(
     gaussians: Gaussians, origin: np.ndarray, direction: np.ndarray, min_opacity: float = 0.5
 ) -> tuple[float, float] | None:
-    """Return the distance of the surface along a ray, and its thickness; None where the ray meets too little.
+    """Return the distance of the surface along a ray and the thickness of the surface; None if the ray meets too little
+    opacity.
 
     Every Gaussian absorbs light at its peak along the ray, with its opacity there; the surface is where half of the
-    total absorption has happened. A rendered depth averages the Gaussians' centres instead, which lie beside the ray,
-    and has an error of their size at a slant.
+    total absorption has happened. A rendered depth instead averages the centres of Gaussians, which lie beside the ray;
+    on a slanted surface its error is as large as the Gaussians.
 
     Args:
-        gaussians: in the ray's frame.
-        origin, direction: (3,); distances are in lengths of the direction.
-        min_opacity: of all Gaussians along the ray together.
+        gaussians: Gaussians in the frame of the ray.
+        origin, direction: (3,) origin and direction of the ray; distances are in lengths of the direction.
+        min_opacity: smallest opacity of all Gaussians along the ray together.
 
     Returns:
-        Distance, and half of the distance between the points where 16 % and 84 % of the absorption have happened.
+        The distance; and, as thickness, half of the distance between the points where 16 % and 84 % of the absorption
+        have happened.
     """
     o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
     to_centre = gaussians.means.astype(np.float64) - o
@@ -37,7 +39,7 @@ def surface_along(
     rows = np.flatnonzero(beside < reach)
     if not len(rows):
         return None
-    # In each Gaussian's own axes, in units of its standard deviations.
+    # Work in the axes of each Gaussian, in units of its standard deviations.
     turn = quats_to_matrices(gaussians.quats[rows].astype(np.float64))
     shrink = np.exp(-gaussians.log_scales[rows].astype(np.float64))
     p = np.einsum("nji,nj->ni", turn, to_centre[rows]) * shrink

@@ -1,4 +1,4 @@
-"""Convert rotations between quaternions (``wxyz``) and matrices; SO(3) and Sim(3) exponentials."""
+"""Convert rotations between quaternions (``wxyz``) and matrices, and compute exponentials on SO(3) and Sim(3)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from gsmap.types import Sim3
 
 
 def quats_to_matrices(quats: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) ``wxyz``, normalised first; zero is identity."""
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) ``wxyz``, which are normalized first; zero gives
+    the identity."""
     q = np.asarray(quats, dtype=np.float64)
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     q = np.where(norm > 0, q / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
@@ -27,10 +28,10 @@ def quats_to_matrices(quats: np.ndarray) -> np.ndarray:
 
 
 def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
-    """Quaternions (..., 4) ``wxyz`` with w >= 0 of rotation matrices (..., 3, 3)."""
+    """Return the quaternions (..., 4) ``wxyz`` with w >= 0 of rotation matrices (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    # A copy, here and below: which arrays that cannot be written scipy takes has changed from release to release.
+    # Pass a copy, here and below, because not every release of scipy accepts read-only arrays.
     matrices = np.array(matrices, dtype=np.float64)
     xyzw = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
     wxyz = xyzw[:, [3, 0, 1, 2]]
@@ -40,9 +41,10 @@ def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
 
 
 def rotation_vector(matrix: np.ndarray) -> np.ndarray:
-    """Return (3,) axis times angle, in radians of [0, pi], of one rotation matrix; SciPy is not imported.
+    """Return the rotation vector (3,), axis times angle in [0, pi] radians, of one rotation matrix, without importing
+    SciPy.
 
-    The quaternion is the eigenvector that belongs to the largest eigenvalue (Bar-Itzhack, 2000), at any angle.
+    The quaternion is the eigenvector of the largest eigenvalue (Bar-Itzhack 2000), which holds for any angle.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64)
     K = np.array(
@@ -66,7 +68,7 @@ def conjugate_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product (..., 4) of ``wxyz`` quaternions: rotating by b, then by a."""
+    """Return the Hamilton product (..., 4) of ``wxyz`` quaternions: the rotation by b followed by that by a."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)
     return np.stack(
@@ -81,7 +83,7 @@ def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def skew(vectors: np.ndarray) -> np.ndarray:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     v = np.asarray(vectors, dtype=np.float64)
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
@@ -90,13 +92,13 @@ def skew(vectors: np.ndarray) -> np.ndarray:
 
 
 def angle_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle of ``a^T b`` in radians, exact for small angles (via the chord, not the arc cosine)."""
+    """Return the angle of ``a^T b`` in radians; it is exact for small angles (from the chord, not the arc cosine)."""
     chord = np.linalg.norm(np.asarray(a) - np.asarray(b)) / np.sqrt(8.0)
     return float(2.0 * np.arcsin(min(1.0, chord)))
 
 
 def exp_so3(omega: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) of a rotation vector (3,) in radians."""
+    """Return the rotation (3, 3) of a rotation vector (3,) in radians."""
     from scipy.spatial.transform import Rotation
 
     matrix: np.ndarray = Rotation.from_rotvec(np.array(omega, dtype=np.float64)).as_matrix()
@@ -104,9 +106,11 @@ def exp_so3(omega: np.ndarray) -> np.ndarray:
 
 
 def retract(pose: Sim3, xi: np.ndarray) -> Sim3:
-    """``pose * Exp(xi)`` with xi = [rot_rad (3), trans (3), log_scale], first order in the coupling of the three.
+    """Return ``pose * Exp(xi)`` for xi = [rot_rad (3), trans (3), log_scale], to first order in the coupling of the
+    three parts.
 
-    The step is applied in the source frame, as gtsam does; exact where only one of the three parts is non-zero.
+    The step is applied in the source frame, as in GTSAM. The result is exact if only one of the three parts is
+    non-zero.
     """
     xi = np.asarray(xi, dtype=np.float64)
     scale = float(np.exp(xi[6])) if len(xi) > 6 else 1.0

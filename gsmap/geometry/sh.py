@@ -9,10 +9,10 @@ SH_C0 = 0.28209479177387814
 
 
 def rgb_of_sh0(sh0: np.ndarray) -> np.ndarray:
-    """Return (..., 3) colours of degree-0 coefficients (..., 3), in their precision; not clipped."""
+    """Return the (..., 3) colours of degree-0 coefficients (..., 3), in the same precision and not clipped."""
     return sh0 * SH_C0 + 0.5
 
 
 def sh0_of_rgb(rgb: np.ndarray) -> np.ndarray:
-    """Return (..., 3) degree-0 coefficients of colours (..., 3), in their precision."""
+    """Return the (..., 3) degree-0 coefficients of colours (..., 3), in the same precision."""
     return (rgb - 0.5) / SH_C0

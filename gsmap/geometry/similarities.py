@@ -1,9 +1,10 @@
-"""Compute with arrays of similarities: composition, exact exponential and logarithm of Sim(3), and adjoint.
+"""Compute with arrays of similarities: composition, exact exponential and logarithm on Sim(3), and adjoint.
 
 A tangent is ``xi = [rot_rad (3), trans (3), log_scale]``, rotation first. ``Exp(xi)`` is the matrix exponential of
-``[[skew(rot) + log_scale I, trans], [0, 0]]`` read as ``[sR t; 0 1]``: the same map as gtsam's ``Similarity3.Expmap``
-(which stores ``t / s``) and, with a log scale of zero, as ``Pose3.Expmap``. A perturbation on the source side is
-``S_a_b = S_hat_a_b * Exp(xi)``: it moves points in frame b before they are mapped, so its translation is in b's unit.
+``[[skew(rot) + log_scale I, trans], [0, 0]]`` interpreted as ``[sR t; 0
+1]``. It is the same map as GTSAM's ``Similarity3.Expmap`` (which stores ``t /
+s``) and, with a log scale of zero, as ``Pose3.Expmap``. A perturbation on the source side is ``S_a_b = S_hat_a_b *
+Exp(xi)``: it moves points in frame b before they are mapped, so its translation is in b's unit.
 """
 
 from __future__ import annotations
@@ -68,31 +69,31 @@ class Similarities:
         return Similarities(rotations, translations, -self.log_scales)
 
     def __matmul__(self, other: Similarities) -> Similarities:
-        """Row by row ``S_a_c = S_a_b @ S_b_c``."""
+        """Return ``S_a_c = S_a_b @ S_b_c`` row by row."""
         moved = np.einsum("nij,nj->ni", self.rotations, other.translations) * np.exp(self.log_scales)[:, None]
         return Similarities(
             self.rotations @ other.rotations, moved + self.translations, self.log_scales + other.log_scales
         )
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Map one point (N, 3) by each similarity."""
+        """Map one point of (N, 3) by each similarity."""
         moved: np.ndarray = np.einsum("nij,nj->ni", self.rotations, points) * np.exp(self.log_scales)[:, None]
         moved = moved + self.translations
         return moved
 
     def orthonormalised(self) -> Similarities:
-        """Project rotations to SO(3), from which long products drift."""
+        """Project the rotations to SO(3), because long products drift away from it."""
         u, _, vt = np.linalg.svd(self.rotations)
         return Similarities(u @ vt, self.translations, self.log_scales)
 
     def log(self) -> np.ndarray:
-        """Return (N, 7) tangents with ``Exp(log) == self``."""
+        """Return the (N, 7) tangents for which ``Exp(log) == self``."""
         omega = rotation_vectors(self.rotations)
         trans = np.linalg.solve(_left_factor(omega, self.log_scales), self.translations[:, :, None])[:, :, 0]
         return np.concatenate([omega, trans, self.log_scales[:, None]], axis=1)
 
     def adjoint(self) -> np.ndarray:
-        """Return (N, 7, 7) ``Ad`` with ``S Exp(xi) S^-1 = Exp(Ad xi)``."""
+        """Return the (N, 7, 7) adjoints ``Ad`` for which ``S Exp(xi) S^-1 = Exp(Ad xi)``."""
         out = np.zeros((len(self), 7, 7))
         out[:, :3, :3] = self.rotations
         out[:, 3:6, :3] = skew(self.translations) @ self.rotations
@@ -103,7 +104,7 @@ class Similarities:
 
 
 def exp(xi: np.ndarray) -> Similarities:
-    """``Exp`` of tangents (N, 7), or (N, 6) for rigid ones."""
+    """Return ``Exp`` of tangents (N, 7), or of (N, 6) for rigid transforms."""
     xi = np.asarray(xi, dtype=np.float64)
     log_scales = xi[:, 6] if xi.shape[1] > 6 else np.zeros(len(xi))
     translations = np.einsum("nij,nj->ni", _left_factor(xi[:, :3], log_scales), xi[:, 3:6])
@@ -111,7 +112,7 @@ def exp(xi: np.ndarray) -> Similarities:
 
 
 def commutator(xi: np.ndarray) -> np.ndarray:
-    """Return (N, 7, 7) ``ad`` of tangents (N, 7): the derivative of the adjoint."""
+    """Return the (N, 7, 7) ``ad`` of tangents (N, 7), the derivative of the adjoint."""
     out = np.zeros((len(xi), 7, 7))
     out[:, :3, :3] = skew(xi[:, :3])
     out[:, 3:6, :3] = skew(xi[:, 3:6])
@@ -121,7 +122,7 @@ def commutator(xi: np.ndarray) -> np.ndarray:
 
 
 def rotations_of(omega: np.ndarray) -> np.ndarray:
-    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), by Rodrigues' formula."""
+    """Return the rotation matrices (N, 3, 3) of rotation vectors (N, 3), by Rodrigues' formula."""
     theta = np.linalg.norm(omega, axis=1)
     a = np.sinc(theta / np.pi)
     b = 0.5 * np.sinc(theta / (2 * np.pi)) ** 2
@@ -131,7 +132,7 @@ def rotations_of(omega: np.ndarray) -> np.ndarray:
 
 
 def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
-    """Rotation vectors (N, 3) in radians, length at most pi, of rotation matrices (N, 3, 3)."""
+    """Return the rotation vectors (N, 3) in radians, of length at most pi, of rotation matrices (N, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     out: np.ndarray = Rotation.from_matrix(np.array(matrices, dtype=np.float64).reshape(-1, 3, 3)).as_rotvec()
@@ -139,9 +140,9 @@ def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
 
 
 def without_scale(information: np.ndarray) -> np.ndarray:
-    """Marginalize the scale out of (..., 7, 7) information: (..., 6, 6) on rotation and translation.
+    """Marginalize the scale out of information (..., 7, 7); return (..., 6, 6) on rotation and translation.
 
-    The Schur complement.
+    The result is the Schur complement.
     """
     coupling = information[..., :6, 6]
     out: np.ndarray = (
@@ -151,7 +152,8 @@ def without_scale(information: np.ndarray) -> np.ndarray:
 
 
 def _left_factor(omega: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) ``V`` with ``t = V trans``: the integral of ``exp(tau (skew(omega) + log_scale I))`` over [0, 1]."""
+    """Return the (N, 3, 3) ``V`` for which ``t = V trans``: the integral of ``exp(tau (skew(omega) + log_scale I))``
+    over [0, 1]."""
     theta = np.linalg.norm(omega, axis=1)[:, None]
     growth = np.exp(log_scales[:, None] * _NODES) * _WEIGHTS
     identity = growth.sum(1)

@@ -1,4 +1,4 @@
-"""Transform Gaussians, spherical harmonics included, and cameras to another frame."""
+"""Transform Gaussians (with their spherical harmonics) and cameras to another frame."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _MAX_SH_DEGREE = 3
 def transform_gaussians(gaussians: Gaussians, S_a_b: Sim3) -> Gaussians:
     """Transform Gaussians from frame b to frame a.
 
-    Exact: ``mean' = s R mean + t``, ``covariance' = s^2 R covariance R^T``, opacity unchanged, and spherical
-    harmonics rotated band by band: the colour along ``R d`` is the former colour along ``d``. The origin of the
-    Gaussians is transformed as well.
+    The transform is exact: ``mean' = s R mean + t``, ``covariance' = s^2 R covariance R^T``, opacity unchanged, and
+    spherical harmonics rotated band by band, so that the colour along ``R d`` is the former colour along ``d``. The
+    origin of the Gaussians is transformed as well.
     """
     quat = matrices_to_quats(S_a_b.rotation)
     origin = np.zeros(3)
@@ -39,13 +39,14 @@ def transform_gaussians(gaussians: Gaussians, S_a_b: Sim3) -> Gaussians:
 
 
 def transform_with_origin(gaussians: Gaussians, S_a_b: Sim3) -> Gaussians:
-    """Transform Gaussians, with an origin where float32 cannot represent positions in frame a."""
+    """Transform Gaussians, and give them an origin if float32 cannot represent their positions in frame a."""
     means, origin = centred(S_a_b.apply(gaussians.positions))
     return replace(transform_gaussians(gaussians, S_a_b), means=means, origin=origin)
 
 
 def transform_cameras(cameras: Cameras, S_a_b: Sim3) -> Cameras:
-    """Transform cameras from frame b to frame a; images and intrinsics stay, depths grow by the scale."""
+    """Transform cameras from frame b to frame a; images and intrinsics do not change, depths are multiplied by the
+    scale."""
     T_a_camera = transform_poses(cameras.T_frame_camera, S_a_b)
     return Cameras(T_a_camera, cameras.intrinsics_px, cameras.sizes_px, cameras.names, cameras.synthesised)
 
@@ -59,7 +60,7 @@ def transform_poses(T_b_c: np.ndarray, S_a_b: Sim3) -> np.ndarray:
 
 
 def rotate_sh(sh: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Rotate functions with spherical harmonics (N, K, 3) float32 by ``rotation`` (3, 3)."""
+    """Rotate the functions with spherical harmonics (N, K, 3) float32 by ``rotation`` (3, 3)."""
     sh = np.ascontiguousarray(sh, dtype=np.float32)
     n, k, _ = sh.shape
     if k == 1:
@@ -70,7 +71,8 @@ def rotate_sh(sh: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def sh_rotation_matrix(rotation: np.ndarray, degree: int) -> np.ndarray:
-    """Return the real Wigner matrix M (K, K) float64, block diagonal: ``f(R^T d) = Y(d) @ M @ c`` for ``f = Y @ c``.
+    """Return the real Wigner matrix M (K, K) float64, block diagonal, for which ``f(R^T d) = Y(d) @ M @ c`` if
+    ``f = Y @ c``.
 
     Each band is closed under rotation, so its block follows exactly from the basis at a set of fixed directions and at
     the same directions rotated back.
@@ -86,9 +88,9 @@ def sh_rotation_matrix(rotation: np.ndarray, degree: int) -> np.ndarray:
 
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """Evaluate real spherical harmonics (N, (degree + 1)^2) float64 at unit directions (N, 3).
+    """Evaluate the real spherical harmonics (N, (degree + 1)^2) float64 at unit directions (N, 3).
 
-    In the order and with the signs of 3DGS trainers (degree 1 is ``-y, z, -x``).
+    Order and signs are those of 3DGS trainers (degree 1 is ``-y, z, -x``).
     """
     if not 0 <= degree <= _MAX_SH_DEGREE:
         raise InputError(f"SH degree must be 0 to {_MAX_SH_DEGREE}, got {degree}", code="unsupported_sh_degree")

@@ -13,22 +13,22 @@ def umeyama(
 ) -> Sim3:
     """Return ``S_target_source`` that minimizes the weighted squared distance between corresponding points.
 
-    Umeyama 1991 (eqs. 34-43); with ``with_scale=False`` it is the SVD solution of Arun/Kabsch. Always a proper
-    rotation: for a mirrored set the best proper one is returned, and its residual shows it.
+    This is Umeyama 1991 (eqs. 34-43); with ``with_scale=False`` it is the SVD solution of Arun/Kabsch. The rotation is
+    always proper: for a mirrored set the best proper rotation is returned, with a large residual.
 
     Args:
         target, source: (N, 3) points in their own frames, N >= 3.
         with_scale: estimate the scale too.
-        weights: (N,) non-negative.
+        weights: (N,) non-negative weights.
 
     Raises:
-        InputError: fewer than 3 points, shapes that differ, or source points that all coincide.
+        InputError: there are fewer than 3 points, shapes differ, or all source points coincide.
     """
     target = np.asarray(target, dtype=np.float64)
     source = np.asarray(source, dtype=np.float64)
     if target.shape != source.shape or target.ndim != 2 or target.shape[1] != 3 or len(target) < 3:
         raise InputError(
-            f"umeyama needs two (N, 3) sets of corresponding points, N >= 3; got {target.shape}, {source.shape}",
+            f"umeyama needs two sets (N, 3) of corresponding points with N >= 3, got {target.shape}, {source.shape}",
             code="degenerate_points",
         )
     w = np.full(len(target), 1.0 / len(target)) if weights is None else np.asarray(weights, float) / np.sum(weights)

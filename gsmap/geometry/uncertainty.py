@@ -9,14 +9,14 @@ from gsmap.types import ScenePose
 
 
 def middle_covariance_m2(pose: ScenePose, middle: np.ndarray, metres_per_unit: float) -> np.ndarray | None:
-    """Return the (3, 3) covariance in square metres, in the component's axes, of a point that is fixed to a scene.
+    """Return the (3, 3) covariance, in square metres along the component's axes, of a point that is fixed to a scene.
 
-    To first order, ``S Exp(xi) m = S (m + rot x m + trans + log_scale m)`` of a tangent on the scene side
-    (`gsmap.types.ScenePose`), so that the point moves by ``s R [-skew(m) | I | m] xi``.
+    To first order, ``S Exp(xi) m = S (m + rot x m + trans + log_scale m)`` for a tangent on the scene side
+    (`gsmap.types.ScenePose`), so the point moves by ``s R [-skew(m) | I | m] xi``.
 
     Args:
-        middle: (3,) the point, scene frame and unit.
-        metres_per_unit: of the component's frame.
+        middle: (3,) the point, in the scene's frame and unit.
+        metres_per_unit: metres per unit of the component's frame.
     """
     if pose.covariance is None:
         return None

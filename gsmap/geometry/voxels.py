@@ -1,4 +1,4 @@
-"""Group points by voxel, and merge groups of Gaussians with their moments."""
+"""Group points by voxel, and merge groups of Gaussians while keeping their moments."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.types import Gaussians
 
-_MAX_OPACITY = 0.9999  # an optical depth of 9.2: finite, and opaque to any renderer
+_MAX_OPACITY = 0.9999  # an optical depth of 9.2: finite, and opaque in any renderer
 _THOMSEN = 1.6075  # exponent of Thomsen's ellipsoid surface formula, error below 1.1 %
 
 
 def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Return the (N,) int64 voxel of each point (N, 3), in a grid through the frame's origin.
+    """Return the (N,) int64 voxel of each point (N, 3), in a grid aligned with the frame's origin.
 
     Labels count from 0 in the order of the cells (x, then y, then z), whatever the order of the points.
 
     Raises:
-        ConfigError: a voxel size that is not positive.
-        InputError: outliers so far out that voxels cannot be numbered.
+        ConfigError: the voxel size is not positive.
+        InputError: outliers are so far out that voxels cannot be numbered.
     """
     if not voxel_size > 0:
         raise ConfigError(f"voxel size must be positive, got {voxel_size}", code="out_of_range")
@@ -43,18 +43,19 @@ def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:
-    """Return (N, 3, 3) float64 covariance matrices, in the frame's unit squared."""
+    """Return the (N, 3, 3) float64 covariance matrices, in squared units of the frame."""
     axes = quats_to_matrices(gaussians.quats) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     out: np.ndarray = axes @ axes.transpose(0, 2, 1)
     return out
 
 
 def axis_deviations(gaussians: Gaussians) -> np.ndarray:
-    """Return (N, 3) float64 standard deviations along the frame's axes (roots of the diagonals of `covariances`)."""
+    """Return the (N, 3) float64 standard deviations along the frame's axes (square roots of the diagonals of
+    `covariances`)."""
     w, x, y, z = np.ascontiguousarray(gaussians.quats.T, dtype=np.float64)
     squared = w * w + x * x + y * y + z * z
     with np.errstate(divide="ignore"):
-        twice = np.where(squared > 0, 2.0 / squared, 0.0)  # a quaternion of zero is the identity, as everywhere
+        twice = np.where(squared > 0, 2.0 / squared, 0.0)  # a zero quaternion means the identity, as everywhere
     a, b, c = np.exp(2 * np.ascontiguousarray(gaussians.log_scales.T, dtype=np.float64))
     xx, yy, zz, xy, xz, yz = x * x * twice, y * y * twice, z * z * twice, x * y * twice, x * z * twice, y * z * twice
     wx, wy, wz = w * x * twice, w * y * twice, w * z * twice
@@ -68,13 +69,14 @@ def axis_deviations(gaussians: Gaussians) -> np.ndarray:
 
 
 def reached_box(gaussians: Gaussians, sigmas: float) -> np.ndarray:
-    """Return the (2, 3) float64 box around Gaussians, each extended by ``sigmas`` of its `axis_deviations`."""
+    """Return the (2, 3) float64 box around Gaussians, each extended by ``sigmas`` times its `axis_deviations`."""
     out: np.ndarray = native_box(gaussians.means, gaussians.quats, gaussians.log_scales, sigmas)
     return out
 
 
 def projected_areas(scales: np.ndarray) -> np.ndarray:
-    """Return (N,) mean projected areas of ellipsoids with semi-axes (N, 3): surface / 4 (Cauchy; Thomsen)."""
+    """Return the (N,) mean projected areas of ellipsoids with semi-axes (N, 3): a quarter of the surface (Cauchy;
+    Thomsen)."""
     a, b, c = np.asarray(scales, dtype=np.float64).T
     mean_power = ((a * b) ** _THOMSEN + (a * c) ** _THOMSEN + (b * c) ** _THOMSEN) / 3
     areas: np.ndarray = np.pi * mean_power ** (1 / _THOMSEN)
@@ -82,19 +84,21 @@ def projected_areas(scales: np.ndarray) -> np.ndarray:
 
 
 def optical_depths(gaussians: Gaussians) -> np.ndarray:
-    """Return (N,) float64 optical depths ``-ln(1 - opacity)``, which add along a ray."""
+    """Return the (N,) float64 optical depths ``-ln(1 - opacity)``, which add up along a ray."""
     return -np.log1p(-np.minimum(gaussians.opacities.astype(np.float64), _MAX_OPACITY))
 
 
 def merge_groups(gaussians: Gaussians, labels: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Merge the Gaussians of each label with their moments and transmittance; also return (M,) rows of the heaviest.
+    """Merge the Gaussians of each label, keeping moments and transmittance; also return the (M,) rows of the heaviest
+    members.
 
-    A member's mass is its optical depth times its mean projected area: the light it stops. The group's Gaussian has
-    the mass-weighted mean, the full covariance of the mixture (members' own and their spread), the mass-weighted SH,
-    and the optical depth that stops the same light with its area. Gaussians alone in their group pass untouched.
+    The mass of a member is its optical depth times its mean projected area, that is, the light that it stops. The
+    merged Gaussian has the mass-weighted mean, the full covariance of the mixture (the members' covariances and the
+    spread of their means), the mass-weighted SH, and the optical depth at which its area stops the same light. A
+    Gaussian that is alone in its group does not change.
 
     Args:
-        labels: (N,) integers in [0, M), each used at least once; the result is in their order.
+        labels: (N,) integers in [0, M), each used at least once; the result is in the order of the labels.
     """
     labels = np.ascontiguousarray(labels, dtype=np.int64)
     if len(labels) != len(gaussians):
