@@ -13,9 +13,9 @@ from gsmap.types import Sim3
 from gsmap.types.rows import NeesRow
 
 SURE_LOG_SCALE = 1e-6
-"""Standard deviation that a rigid pose claims for its scale, which its covariance leaves open."""
+"""Standard deviation that is assumed for the scale of a rigid pose, because its covariance leaves the scale open."""
 _SAME_SCALE = 1e-9
-_THREE_SIGMA = 0.9973002039367398  # of a normal distribution
+_THREE_SIGMA = 0.9973002039367398  # share of a normal distribution within three standard deviations
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,9 @@ class Nees:
     """Normalized estimation error squared.
 
     Args:
-        value: follows a chi-square distribution with ``dof`` degrees of freedom if the covariance is right.
-        dof: 7, or 6 where both the pose and the truth are rigid.
+        value: the NEES; it follows a chi-square distribution with ``dof`` degrees of freedom if the covariance is
+            correct.
+        dof: 7, or 6 if both the pose and the truth are rigid.
     """
 
     value: float
@@ -32,11 +33,13 @@ class Nees:
 
 
 def truth_covariance(sigma_rad: float, sigma: float, centroid: np.ndarray) -> np.ndarray:
-    """Return the (7, 7) covariance on the source side of a true ``S_target_source`` from the errors of both truths.
+    """Return the (7, 7) covariance of a true ``S_target_source`` on the source side, from the errors of both true
+    poses.
 
     Args:
-        sigma_rad, sigma: standard deviations of each scene's rotation and translation (source's unit) about ...
-        centroid: (3,) ... the centroid of the source, in its own frame.
+        sigma_rad, sigma: standard deviations of each scene's rotation and translation (in the source's unit) about
+            ``centroid``.
+        centroid: (3,) centroid of the source, in its own frame.
     """
     variances = 2.0 * np.r_[np.full(3, sigma_rad**2), np.full(3, sigma**2), 0.0]
     carry = Similarities.stack([Sim3(np.eye(3), np.asarray(centroid, dtype=np.float64))]).adjoint()[0]
@@ -45,12 +48,12 @@ def truth_covariance(sigma_rad: float, sigma: float, centroid: np.ndarray) -> np
 
 
 def nees_of_edge(estimated: Sim3, information: np.ndarray, true: Sim3, of_truth: np.ndarray | None = None) -> Nees:
-    """Return the NEES of ``S_target_source`` from its (7, 7) information on the source side.
+    """Return the NEES of ``S_target_source``, given its (7, 7) information on the source side.
 
-    The scale of a rigid edge counts where the true scale is not 1.
+    The scale of a rigid edge counts if the true scale is not 1.
 
     Args:
-        of_truth: (7, 7) covariance of the truth itself (`truth_covariance`); exact where None.
+        of_truth: (7, 7) covariance of the truth itself (`truth_covariance`); None if the truth is exact.
     """
     error, dof = _error(estimated, true), 7
     if estimated.is_rigid and _is_one(true.scale):
@@ -65,7 +68,7 @@ def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3, of_truth: 
 
     Args:
         covariance: (7, 7) relative to the anchor (`relative_covariance`), on the scene's side.
-        of_truth: as in `nees_of_edge`.
+        of_truth: see `nees_of_edge`.
     """
     covariance = np.array(covariance, dtype=np.float64)
     error = _error(estimated, true)
@@ -81,12 +84,13 @@ def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3, of_truth: 
 
 
 def relative_covariance(estimated: Sim3, covariance: np.ndarray, of_anchor: np.ndarray) -> np.ndarray | None:
-    """Return the (7, 7) covariance of ``S_anchor_scene`` on the scene's side, from those of the scene and its anchor.
+    """Return the (7, 7) covariance of ``S_anchor_scene`` on the scene's side, from the covariances of the scene and its
+    anchor.
 
     The optimizer fixes an anchor by a slightly soft prior, which every other scene's covariance contains.
 
     Returns:
-        None where the anchor is not fixed so: where pose priors fix the frame, scenes share an error of unknown size.
+        None if no such prior fixes the anchor: if pose priors fix the frame, scenes share an error of unknown size.
     """
     if not _is_anchor_prior(of_anchor):
         return None
@@ -97,7 +101,7 @@ def relative_covariance(estimated: Sim3, covariance: np.ndarray, of_anchor: np.n
 
 
 def _is_anchor_prior(covariance: np.ndarray) -> bool:
-    """Return whether a covariance is that of an anchor's prior: isotropic and uncorrelated."""
+    """Return whether a covariance is that of the anchor's prior: isotropic and uncorrelated."""
     variances = np.diag(covariance)
     off = covariance - np.diag(variances)
     small = np.abs(off) <= 1e-3 * np.sqrt(np.outer(variances, variances)) + 1e-15
@@ -107,7 +111,7 @@ def _is_anchor_prior(covariance: np.ndarray) -> bool:
 
 
 def nees_rows(of: str, found: Sequence[Nees]) -> tuple[NeesRow, ...]:
-    """Return one row per number of degrees of freedom: measured statistics and their expected values."""
+    """Return one row for each number of degrees of freedom: measured statistics and their expected values."""
     rows = []
     for dof in sorted({one.dof for one in found}):
         values = np.array([one.value for one in found if one.dof == dof])

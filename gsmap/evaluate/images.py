@@ -15,19 +15,20 @@ _SSIM_RADIUS_PX = 5
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio in dB of images (H, W, 3) in [0, 1]; infinite for equal ones."""
+    """Return the peak signal-to-noise ratio in dB of two images (H, W, 3) in [0, 1]; infinite for equal images."""
     image, reference = _pair(image, reference)
     error = np.mean((image - reference) ** 2)
     return float(-10 * np.log10(error)) if error > 0 else float("inf")
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Return the structural similarity of images (H, W, 3) in [0, 1], averaged over channels and pixels.
+    """Return the structural similarity of two images (H, W, 3) in [0, 1], averaged over channels and pixels.
 
-    Wang et al. 2004: an 11 x 11 Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03, only where the window fits.
+    As in Wang et al. 2004: an 11 x 11 Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03, only where the window fits into
+    the image.
 
     Raises:
-        InputError: images smaller than the window.
+        InputError: the images are smaller than the window.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -52,16 +53,17 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 class Lpips:
-    """Learned perceptual distance (Zhang et al. 2018) by a network that the user supplies; 0 for equal images.
+    """Learned perceptual distance (Zhang et al. 2018), computed by a network that the user supplies; 0 for equal
+    images.
 
     Args:
         path: an ONNX file with two image inputs (1, 3, H, W), RGB in [-1, 1], whose first output is the distance.
-        limits: of memory and time.
+        limits: limits of memory and time.
 
     Raises:
-        MissingDependencyError: no file was given; gsmap does not ship the weights.
-        NotFoundError: there is no such file.
-        InputError: the file is no such network, or exceeds the limits.
+        MissingDependencyError: no file was specified; gsmap does not ship the weights.
+        NotFoundError: the file does not exist.
+        InputError: the file is not an LPIPS network, or it exceeds the limits.
     """
 
     def __init__(self, path: str | Path | None, limits: ModelLimits | None = None) -> None:
@@ -70,17 +72,17 @@ class Lpips:
                 "LPIPS needs network weights that gsmap does not ship: pass lpips.LPIPS exported to ONNX"
             )
         if not Path(path).is_file():
-            raise NotFoundError(f"no LPIPS network at {path}", code="file_not_found")
+            raise NotFoundError(f"there is no LPIPS network {path}", code="file_not_found")
         refuse_external_data(Path(path))
         self._model = ModelProcess(str(path), limits or ModelLimits())
         self._inputs = [tensor.name for tensor in self._model.inputs]
         if len(self._inputs) != 2:
             raise InputError(
-                f"{path} takes {len(self._inputs)} inputs, an LPIPS network takes two images", code="model_misfit"
+                f"{path} takes {len(self._inputs)} inputs, but an LPIPS network takes two images", code="model_misfit"
             )
 
     def __call__(self, image: np.ndarray, reference: np.ndarray) -> float:
-        """Return the distance of images (H, W, 3) with values in [0, 1]."""
+        """Return the distance between two images (H, W, 3) with values in [0, 1]."""
         pair = [np.ascontiguousarray(v.transpose(2, 0, 1)[None] * 2 - 1, np.float32) for v in _pair(image, reference)]
         try:
             return float(np.mean(self._model.run(None, dict(zip(self._inputs, pair, strict=True)))[0]))

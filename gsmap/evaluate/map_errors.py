@@ -1,4 +1,4 @@
-"""Evaluate a map's edges and poses against the truth."""
+"""Evaluate the edges and poses of a map against the truth."""
 
 from __future__ import annotations
 
@@ -61,14 +61,13 @@ class Params:
     def __post_init__(self) -> None:
         if not (self.max_rre_deg > 0 and self.max_rte_m > 0):
             raise ConfigError(
-                "an edge is wrong beyond a positive angle and distance, "
-                f"got {self.max_rre_deg} deg, {self.max_rte_m} m",
+                f"max_rre_deg and max_rte_m must be positive, got {self.max_rre_deg} and {self.max_rte_m}",
                 code="out_of_range",
             )
         if not (0 <= self.truth_sigma_deg < np.inf and 0 <= self.truth_sigma_m < np.inf):
             raise ConfigError(
-                "standard deviations of the truth must not be negative, got "
-                f"{self.truth_sigma_deg} deg, {self.truth_sigma_m} m",
+                f"truth_sigma_deg and truth_sigma_m must not be negative, got {self.truth_sigma_deg} and "
+                f"{self.truth_sigma_m}",
                 code="out_of_range",
             )
 
@@ -78,10 +77,10 @@ class EvaluatedScene:
     """A scene of the map with its truth.
 
     Args:
-        id, name: of the scene.
-        S_scene_world: true pose, metres in the world; None if unknown.
-        centroid: (3,) at which errors are measured, scene frame; arbitrary without a true pose.
-        centers: (C, 3) of its cameras, scene frame; arbitrary without a true pose.
+        id, name: id and name of the scene.
+        S_scene_world: true pose, with the world in metres; None if unknown.
+        centroid: (3,) point at which errors are measured, in the scene's frame; arbitrary without a true pose.
+        centers: (C, 3) camera centres in the scene's frame; arbitrary without a true pose.
     """
 
     id: str
@@ -104,9 +103,9 @@ def evaluate_map(
     Args:
         scenes: all scenes, in the map's order.
         edges: the current edge of every registered pair.
-        graph: the newest poses; None before the first.
+        graph: the newest poses; None if the map has no poses yet.
         overlaps: true overlap of all pairs of scenes with a true pose.
-        metres: metric scale of each component; not evaluated where None.
+        metres: metric scale of each component; None if it is not to be evaluated.
     """
     return _MapErrors(scenes, edges, graph, overlaps, params or Params(), metres or {}).report()
 
@@ -133,7 +132,7 @@ class _MapErrors:
         for pose in poses.values():
             if pose.status != "isolated":
                 sizes[pose.component] = sizes.get(pose.component, 0) + 1
-        # A scene whose neighbours were all removed since is isolated.
+        # A scene is isolated if all its neighbours were removed since the last solve.
         self.connected = {
             s: poses[s]
             for s in self.scenes
@@ -190,7 +189,7 @@ class _MapErrors:
         return self.truth[target] @ self.truth[source].inverse()
 
     def _truth_covariance(self, source: str) -> np.ndarray | None:
-        """Return the (7, 7) covariance of the truth of a pair on the source's side; None where it is exact."""
+        """Return the (7, 7) covariance of a pair's true pose on the source's side; None if the truth is exact."""
         params, scene = self.params, self.scenes[source]
         if not (params.truth_sigma_deg or params.truth_sigma_m):
             return None
@@ -227,7 +226,7 @@ class _MapErrors:
         )
 
     def _bands(self, edges: Sequence[EdgeErrorRow]) -> tuple[BandRow, ...]:
-        """Compute recall and precision by bands of true overlap, each with its lower end."""
+        """Compute recall and precision by bands of true overlap; each band includes its lower end."""
         ends = (0.0, *self.params.bands, 1.0)
         pairs = np.array([self.overlaps[frozenset(pair)] for pair in combinations(self.truth, 2)])
         pair_band = np.searchsorted(self.params.bands, pairs, side="right")
@@ -254,7 +253,7 @@ class _MapErrors:
 
     def _component(self, component: int, members: Sequence[str]) -> ComponentErrorRow:
         known = [s for s in members if s in self.truth]
-        # Where captures are truly in metres the map must be, too, so a wrong scale counts as an error.
+        # If the captures are truly in metres, the map must be in metres as well, so a wrong scale counts as an error.
         metric = all(abs(self.truth[s].scale - 1) < _METRIC for s in known)
         alignment = "rigid" if metric else "similarity"
         reason, ate_m = "", None
@@ -262,9 +261,9 @@ class _MapErrors:
         true_logs = [-float(np.log(self.truth[s].scale * self.connected[s].S_map_scene.scale)) for s in known]
         count = sum(len(self.scenes[s].centers) for s in known)
         if len(known) < 2:
-            reason = f"{len(known)} of its {len(members)} scenes have a true pose: two are needed"
+            reason = f"{len(known)} of its {len(members)} scenes have a true pose, but two are needed"
         elif count < 3:
-            reason = f"{count} cameras fix no alignment: three are needed"
+            reason = f"{count} cameras do not determine an alignment; three are needed"
         else:
             estimated = [self.connected[s].S_map_scene.apply(self.scenes[s].centers) for s in known]
             true = [self.truth[s].inverse().apply(self.scenes[s].centers) for s in known]
@@ -283,7 +282,7 @@ class _MapErrors:
         )
 
     def _ate(self, components: Sequence[ComponentErrorRow]) -> tuple[float | None, str]:
-        """Return the ATE over all components that have one, and the reason if none has."""
+        """Return the ATE over all components that have one, and the reason if none has one."""
         found = [(row.num_cameras, row.ate_m) for row in components if row.ate_m is not None]
         if found:
             squares = sum(count * ate_m**2 for count, ate_m in found)
@@ -300,7 +299,8 @@ class _MapErrors:
         return (*nees_rows("edges", of_edges), *nees_rows("poses", of_poses))
 
     def _nees_of_component(self, component: int) -> list[Nees] | None:
-        """Return the NEES of each scene relative to the anchor of its component; None without usable covariances."""
+        """Return the NEES of each scene relative to the anchor of its component; None if covariances are missing or
+        unusable."""
         known = {
             s: covariance
             for s in self.components[component]
@@ -323,16 +323,16 @@ class _MapErrors:
         notes = []
         lacking = [scene.name for scene in self.scenes.values() if scene.id not in self.truth]
         if lacking:
-            notes.append(f"not evaluated, as they have no true pose: {_join_names(lacking)}")
+            notes.append(f"scenes without a true pose are not evaluated: {_join_names(lacking)}")
         if self.graph is not None:
             new = [scene.name for scene in self.scenes.values() if scene.id not in self.graph.poses]
             if new:
-                notes.append(f"newer than the newest poses: {_join_names(new)}; run gsmap optimize")
+                notes.append(f"scenes newer than the newest poses: {_join_names(new)}; run gsmap optimize")
         without_nees = [str(component) for component, found in self.nees.items() if found is None]
         if without_nees:
             notes.append(
                 f"no NEES of poses in component {_join_names(without_nees)}: covariances or true poses are missing, or "
-                "priors hold its frame"
+                "priors fix its frame"
             )
         stale = [edge.pair for edge in self.all_edges if edge.used and edge.status != "accepted"]
         if stale:
@@ -347,7 +347,7 @@ def _join_names(names: Sequence[str], most: int = 10) -> str:
 
 
 def _summary(of: str, rows: Sequence[PoseErrorRow]) -> dict[str, Any]:
-    """Return medians and worst values of some rows; None without rows."""
+    """Return medians and worst values of the given rows; None without rows."""
 
     def over(function: Callable[[list[float]], Any], name: str) -> float | None:
         return float(function([getattr(row, name) for row in rows])) if rows else None

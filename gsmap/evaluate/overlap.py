@@ -14,7 +14,7 @@ _CACHED_TREES = 32
 
 
 RADIUS_M = 0.08  # a Gaussian coincides with a capture that has a Gaussian within this distance
-_MIN_OPACITY = 0.3  # of surface Gaussians ...
+_MIN_OPACITY = 0.3  # smallest opacity of surface Gaussians ...
 _MAX_SCALE_M = 0.3  # ... and their largest standard deviation
 
 
@@ -28,15 +28,15 @@ def solid_centres(gaussians: Gaussians, S_scene_world: Sim3) -> np.ndarray:
 def true_overlaps(
     scenes: Sequence[str], centres: Callable[[str], np.ndarray], radius_m: float = RADIUS_M
 ) -> dict[frozenset[str], float]:
-    """Return the true overlap of each pair: the share of centres that coincide with the other capture, the smaller of
-    both directions.
+    """Return the true overlap of each pair of scenes: the share of centres that coincide with the other capture; the
+    smaller of both directions.
 
-    Only pairs whose boxes intersect are searched.
+    Only pairs whose boxes intersect are computed.
 
     Args:
-        scenes: their ids.
-        centres: returns `solid_centres` of one scene.
-        radius_m: within which Gaussians coincide.
+        scenes: ids of the scenes.
+        centres: function that returns the `solid_centres` of one scene.
+        radius_m: largest distance between Gaussians that coincide.
     """
     from scipy.spatial import cKDTree
 
@@ -44,7 +44,7 @@ def true_overlaps(
     def tree_of(scene: str) -> Any:
         return cKDTree(centres(scene))
 
-    boxes = np.full((len(scenes), 2, 3), np.nan)  # scenes without surface overlap nothing
+    boxes = np.full((len(scenes), 2, 3), np.nan)  # scenes without a surface overlap with no scene
     for row, scene in enumerate(scenes):
         points = tree_of(scene).data
         if len(points):
@@ -62,7 +62,7 @@ def true_overlaps(
 
 
 def _share(tree: Any, other: Any, radius_m: float) -> float:
-    """Return the share of one capture's points within the radius of a point of the other."""
+    """Return the share of one capture's points that are within the radius of a point of the other capture."""
     points, low, high = tree.data, other.mins - radius_m, other.maxes + radius_m
     inside = points[((points >= low) & (points <= high)).all(1)]
     distance, _ = other.query(inside, distance_upper_bound=radius_m)

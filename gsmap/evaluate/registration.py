@@ -16,15 +16,15 @@ from gsmap.types import Gaussians, Sim3
 
 @dataclass(frozen=True)
 class PoseError:
-    """Errors of one ``S_target_source``.
+    """Errors of one estimated ``S_target_source``.
 
     Args:
         rre_deg: relative rotation error, the angle of ``R^T R_hat``.
-        rte: relative translation error as GaussReg defines it, ``|t/s - t_hat/s_hat| / |t/s|``; it depends on
-            the distance of the frames' origins.
+        rte: relative translation error as GaussReg defines it, ``|t/s - t_hat/s_hat| / |t/s|``; it depends on the
+            distance between the origins of both frames.
         rse: relative scale error ``|s - s_hat| / s``.
-        centroid_m: distance between the source's centroid under both poses, in the target's unit; it does not depend
-            on the frames' origins.
+        centroid_m: distance between the source's centroid under the estimated and under the true pose, in the target's
+            unit; it does not depend on the origins of the frames.
     """
 
     rre_deg: float
@@ -34,11 +34,12 @@ class PoseError:
 
 
 def scene_centroid(gaussians: Gaussians, min_opacity: float = 0.3) -> np.ndarray:
-    """Return the (3,) median of the opaque Gaussians' centres, at which translation errors are measured."""
+    """Return the (3,) median of the centres of opaque Gaussians, at which translation errors are measured."""
     opaque = gaussians.means[gaussians.opacities > min_opacity]
     if not len(opaque):
         raise InputError(
-            "the scene has no opaque Gaussian, so no centroid: measure at another point", code="no_opaque_gaussians"
+            "the scene has no opaque Gaussians and so no centroid: measure errors at another point",
+            code="no_opaque_gaussians",
         )
     return np.median(opaque.astype(np.float64), axis=0)
 
@@ -63,8 +64,8 @@ class RegistrationSummary:
     Args:
         num_pairs: pairs with a true pose.
         num_estimated: pairs with an estimated pose.
-        mean_rre_deg, mean_rte, mean_rse: plain means over the estimated pairs, bad ones included (GaussReg).
-        median_rre_deg, median_centroid_m, worst_rre_deg, worst_centroid_m: over the estimated pairs.
+        mean_rre_deg, mean_rte, mean_rse: plain means over all estimated pairs, including failures (as in GaussReg).
+        median_rre_deg, median_centroid_m, worst_rre_deg, worst_centroid_m: medians and maxima over the estimated pairs.
         recall: share of all pairs within each threshold; pairs without an estimate count as missed.
     """
 
@@ -81,10 +82,10 @@ class RegistrationSummary:
 
 
 def summarise(errors: Sequence[PoseError | None]) -> RegistrationSummary:
-    """Compute means, medians and recall of many pairs; None stands for a pair without an estimate.
+    """Compute means, medians and recall of many pairs; None represents a pair without an estimate.
 
-    Recall at RRE 5 and 10 degrees, RTE 0.1 and 0.2, RSE 0.1 and 0.2 (GaussReg), and for both angle and metres at once:
-    ``coarse`` (5 degrees, 0.3 m), ``fine`` (1 degree, 5 cm).
+    Recall is computed at RRE 5 and 10 degrees, RTE 0.1 and 0.2, and RSE 0.1 and 0.2 (as in GaussReg), and for angle and
+    distance together: ``coarse`` (5 degrees, 0.3 m) and ``fine`` (1 degree, 5 cm).
     """
     found = [e for e in errors if e is not None]
     columns = np.array([[e.rre_deg, e.rte, e.rse, e.centroid_m] for e in found]).reshape(-1, 4)
@@ -122,19 +123,22 @@ def summarise(errors: Sequence[PoseError | None]) -> RegistrationSummary:
 def absolute_trajectory_error(
     estimated: np.ndarray, true: np.ndarray, *, align: str = "rigid", segments: Sequence[np.ndarray] | None = None
 ) -> float:
-    """Return the absolute trajectory error (ATE): root mean square distance of aligned estimated and true positions.
+    """Return the absolute trajectory error (ATE): the root mean square distance between aligned estimated and true
+    positions.
 
-    As Sturm et al. 2012; Graph-GSReg reports ATE without a definition.
+    This is the ATE of Sturm et al. 2012; Graph-GSReg reports an ATE without a definition.
 
     Args:
         estimated, true: (N, 3) positions in their own frames.
         align: ``rigid``, ``similarity`` or ``none``.
-        segments: index arrays of the positions to align together (components share no frame); default: all.
+        segments: index arrays of positions that are aligned together, because components have different frames; by
+            default all.
     """
     estimated, true = np.asarray(estimated, float), np.asarray(true, float)
     if estimated.shape != true.shape or estimated.ndim != 2 or estimated.shape[1] != 3 or not len(true):
         raise InputError(
-            f"ATE needs two (N, 3) trajectories, N >= 1; got {estimated.shape} and {true.shape}", code="shape_mismatch"
+            f"the ATE needs two trajectories (N, 3) with N >= 1, got {estimated.shape} and {true.shape}",
+            code="shape_mismatch",
         )
     squares = np.empty(len(true))
     for rows in segments if segments is not None else [np.arange(len(true))]:
@@ -146,6 +150,6 @@ def absolute_trajectory_error(
 
 
 def _align(true: np.ndarray, estimated: np.ndarray, with_scale: bool) -> np.ndarray:
-    if len(true) < 3:  # Fewer than three points fix no rotation, so only their centroids are aligned.
+    if len(true) < 3:  # Fewer than three points determine no rotation, so only centroids are aligned.
         return estimated - estimated.mean(0) + true.mean(0)
     return umeyama(true, estimated, with_scale=with_scale).apply(estimated)

@@ -28,7 +28,8 @@ class ImageScores:
     lpips: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def means(self) -> dict[str, float]:
-        """Return the means ``{"psnr_db", "ssim", "lpips", "num_images"}``; lpips only where it was measured."""
+        """Return the means ``{"psnr_db", "ssim", "lpips", "num_images"}``; ``lpips`` is present only if it was
+        measured."""
         out: dict[str, float] = {"num_images": len(self.names)}
         if self.names:
             out |= {"psnr_db": float(self.psnr_db.mean()), "ssim": float(self.ssim.mean())}
@@ -38,15 +39,16 @@ class ImageScores:
 
 
 def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, Path]:
-    """Find the images of cameras by name in a folder and its subfolders, by camera index; suffixes may differ.
+    """Find the images of cameras by name in a folder and its subfolders; return paths by camera index. Suffixes may
+    differ.
 
     Raises:
-        NotFoundError: no such folder, or no image in it has the name of a camera.
+        NotFoundError: the folder does not exist, or no image in it has the name of a camera.
         InputError: two images match one camera.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise NotFoundError(f"no folder of images at {folder}", code="folder_not_found")
+        raise NotFoundError(f"there is no folder of images {folder}", code="folder_not_found")
     index = {_stem(name): i for i, name in enumerate(cameras.names)}
     found: dict[int, Path] = {}
     for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file()):
@@ -60,7 +62,7 @@ def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, P
         found[at] = path
     if not found:
         raise NotFoundError(
-            f"no image in {folder} is named like a camera (such as {', '.join(cameras.names[:3])})",
+            f"no image in {folder} has the name of a camera (such as {', '.join(cameras.names[:3])})",
             code="image_not_found",
         )
     return found
@@ -80,16 +82,16 @@ def compare_renders(
     lpips: Callable[[np.ndarray, np.ndarray], float] | None = None,
     progress: Progress | None = None,
 ) -> ImageScores:
-    """Render Gaussians by cameras and compare the renders with images.
+    """Render Gaussians from cameras and compare the renders with images.
 
     Args:
-        gaussians, cameras: in one frame.
-        images: by camera index, (H, W, 3) in [0, 1] or paths; an image of another size than its camera's is compared
-            at its own size, if the aspect ratio agrees.
-        lpips: such as `gsmap.evaluate.images.Lpips`.
+        gaussians, cameras: Gaussians and cameras in one frame.
+        images: images by camera index, as arrays (H, W, 3) in [0, 1] or as paths. An image of another size than its
+            camera is compared at its own size if the aspect ratios agree.
+        lpips: function that measures LPIPS, such as `gsmap.evaluate.images.Lpips`.
 
     Raises:
-        InputError: an image whose aspect ratio is not its camera's.
+        InputError: the aspect ratio of an image differs from that of its camera.
     """
     from gsmap.render import ChunkIndex, render
 
@@ -109,13 +111,13 @@ def compare_renders(
 
 
 def _at_size(camera: Cameras, width: int, height: int) -> Cameras:
-    """Return the camera for an image resampled to a size."""
+    """Return the camera of an image that was resampled to a size."""
     old = camera.sizes_px[0]
     ratio = np.array([width, height]) / old
     if abs(old[0] * ratio[1] - width) > 2:
         raise InputError(
-            f"image of camera {camera.names[0]} is {width} x {height}, its camera has {old[0]} x {old[1]}: "
-            "the aspect ratios differ",
+            f"image of camera {camera.names[0]} has {width} x {height} pixels, its camera {old[0]} x {old[1]}: the "
+            "aspect ratios differ",
             code="size_mismatch",
         )
     return Cameras(

@@ -165,7 +165,7 @@ def test_what_has_no_truth_is_not_judged_and_said() -> None:
     poses = graph(("a", at(0), 0, "placed"), ("b", at(-5), 0, "placed"))
     report = evaluate_map(scenes, edges, poses, overlaps(scenes, ab=0.6))
     assert (len(report.edges), report.edges_without_truth) == (1, 1)
-    assert report.notes[0] == "not evaluated, as they have no true pose: c"
+    assert report.notes[0] == "scenes without a true pose are not evaluated: c"
     assert report.notes[1] == "newer than the newest poses: c; run gsmap optimize"
 
 
@@ -238,12 +238,14 @@ def test_a_component_that_the_truth_cannot_judge_says_why() -> None:
     scenes = [scene("a", at(0)), scene("b", None)]
     poses = graph(("a", at(0), 0, "placed"), ("b", at(5), 0, "placed"))
     report = evaluate_map(scenes, [], poses, {})
-    assert report.components[0].ate_reason == "1 of its 2 scenes have a true pose: two are needed"
-    assert report.verdict == "2 of 2 placed, no ATE: component 0: 1 of its 2 scenes have a true pose: two are needed"
+    assert report.components[0].ate_reason == "1 of its 2 scenes have a true pose, but two are needed"
+    assert (
+        report.verdict == "2 of 2 placed, no ATE: component 0: 1 of its 2 scenes have a true pose, but two are needed"
+    )
     few = [EvaluatedScene(f"id-{n}", n, at(0), np.zeros(3), CENTERS[:1]) for n in "ab"]
     report = evaluate_map(few, [], poses, overlaps(few))
     assert report.ate_m is None
-    assert report.ate_reason == "component 0: 2 cameras fix no alignment: three are needed"
+    assert report.ate_reason == "component 0: 2 cameras do not determine an alignment; three are needed"
 
 
 # --- covariances ----------------------------------------------------------------------------------------------------
@@ -334,7 +336,7 @@ def test_poses_whose_frame_priors_hold_are_not_judged() -> None:
     poses = graph(("a", at(0), 0, "placed"), ("b", at(-5), 0, "placed"), covariances=covariances)
     report = evaluate_map(scenes, [], poses, overlaps(scenes))
     assert report.nees == ()
-    assert "priors hold its frame" in report.notes[-1]
+    assert "priors fix its frame" in report.notes[-1]
     assert relative_covariance(at(1), covariances["b"], covariances["a"]) is None
 
 
