@@ -1,4 +1,4 @@
-"""Coordinate reference systems by PROJ: parse, check, and convert to geodetic coordinates and back."""
+"""Parse and check coordinate reference systems with PROJ, and convert coordinates to geodetic ones and back."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Crs:
 
     @cached_property
     def named(self) -> Any:
-        """The specified system as a pyproj CRS."""
+        """The specified system, as a pyproj CRS."""
         from pyproj import CRS
         from pyproj.exceptions import CRSError
 
@@ -35,37 +35,38 @@ class Crs:
             found = CRS.from_user_input(self.text)
         except CRSError as error:
             raise ConfigError(
-                f"no coordinate reference system is called {_short(self.text)}: name one such as EPSG:25832, "
+                f"PROJ knows no coordinate reference system {_short(self.text)}: pass one such as EPSG:25832, "
                 "EPSG:25832+7837 (with its height system) or EPSG:4326",
                 code="invalid_crs",
             ) from error
         horizontal = found.sub_crs_list[0] if found.is_compound else found
         if not (horizontal.is_projected or horizontal.is_geographic or horizontal.is_geocentric):
             raise ConfigError(
-                f"{_short(self.text)} is no system of places on the Earth ({found.type_name}): a height alone, or a "
-                "site's own grid, cannot tie a map to the world",
+                f"{_short(self.text)} has no horizontal positions on the Earth ({found.type_name}): a system of "
+                "heights alone, or the local grid of a site, cannot georeference a map",
                 code="unsupported_crs",
             )
         if horizontal.geodetic_crs is None:
-            raise ConfigError(f"{_short(self.text)} does not say which datum it is on", code="unsupported_crs")
+            raise ConfigError(f"{_short(self.text)} does not specify a datum", code="unsupported_crs")
         return found
 
     @cached_property
     def full(self) -> Any:
-        """The system with heights, ellipsoidal in metres if it has none of its own; see `z_to_full`."""
+        """The system with heights: ellipsoidal heights in metres if it has none of its own; see `z_to_full`."""
         return self.named.to_3d()
 
     @cached_property
     def geodetic(self) -> Any:
-        """Longitude, latitude (deg) and ellipsoidal height (m) on the system's own datum and prime meridian."""
+        """The geodetic system on the same datum and prime meridian: longitude, latitude (deg) and ellipsoidal height
+        (m)."""
         from pyproj import CRS
 
-        if self.named.is_geocentric:  # PROJ gives no geographic system of its datum
+        if self.named.is_geocentric:  # PROJ has no geographic system for the datum of such a system
             return CRS.from_user_input(WGS84) if self.named.to_epsg() == 4978 else self._bare
         found = self.named.geodetic_crs.to_3d()
         if [axis.unit_name for axis in found.axis_info] == ["degree", "degree", "metre"]:
             return found
-        # Systems in grads (NTF Paris) or feet (+vunits): the same datum in degrees and metres.
+        # Convert systems in grads (NTF Paris) or feet (+vunits) to degrees and metres on the same datum.
         system = CRS.from_user_input(WGS84).to_json_dict()["coordinate_system"]
         json = found.to_json_dict() | {"coordinate_system": system}
         json.pop("id", None)
@@ -74,7 +75,7 @@ class Crs:
     @cached_property
     def _bare(self) -> Any:
         raise ConfigError(
-            f"{_short(self.text)} is Earth-centred on a datum of its own: use {ECEF} or a projected one",
+            f"{_short(self.text)} is an Earth-centred system on a datum of its own: use {ECEF} or a projected system",
             code="unsupported_crs",
         )
 
@@ -85,7 +86,7 @@ class Crs:
 
     @property
     def has_own_heights(self) -> bool:
-        """True if heights are in a system of the CRS (a geoid, a tide), not on the ellipsoid."""
+        """True if heights are in a system of the CRS (a geoid, a tide) rather than above the ellipsoid."""
         return bool(self.named.is_compound or self.named.is_vertical)
 
     @property
@@ -102,22 +103,22 @@ class Crs:
 
     @cached_property
     def z_to_full(self) -> float:
-        """Factor from specified heights to those of `full`.
+        """Factor from the specified heights to the heights of `full`.
 
-        Heights of a projected system without a vertical axis are in the unit of its plan, as surveyors use them, for
-        example in feet; PROJ would take them as metres.
+        Heights of a projected system without a vertical axis are in the unit of its horizontal axes (for example feet),
+        as surveyors use them; PROJ would interpret them as metres.
         """
         plan_only = len(self.named.axis_info) == 2 and self.named.is_projected
         return float(self.named.axis_info[0].unit_conversion_factor) if plan_only else 1.0
 
     @property
     def height_unit_m(self) -> float:
-        """Metres per unit of height."""
+        """Metres per unit of specified heights."""
         return float(self.full.axis_info[2].unit_conversion_factor) * self.z_to_full
 
     @property
     def heights(self) -> str:
-        """Unit and zero of heights as text: ``US survey feet (0.3048006 m) above the ellipsoid (GRS 1980)``."""
+        """Unit and zero of heights as text, such as ``US survey feet (0.3048006 m) above the ellipsoid (GRS 1980)``."""
         axis = self.named.axis_info[0] if self.z_to_full != 1 else self.full.axis_info[2]
         unit = axis.unit_name.replace("foot", "feet") if "foot" in axis.unit_name else f"{axis.unit_name}s"
         if axis.unit_conversion_factor != 1:
@@ -126,15 +127,15 @@ class Crs:
             return f"none: X, Y, Z in {unit} from the Earth's centre"
         if self.has_own_heights:
             side = "below" if axis.direction == "down" else "above"
-            return f"{unit} {side} the geoid, as {self.full.sub_crs_list[-1].name} has it"
+            return f"{unit} {side} the geoid of {self.full.sub_crs_list[-1].name}"
         return f"{unit} above the ellipsoid ({self.geodetic.ellipsoid.name})"
 
     def to_geodetic(self, points: np.ndarray) -> np.ndarray:
-        """Return longitude, latitude (deg) and ellipsoidal height (m) on the system's datum, of (N, 3) coordinates.
+        """Convert (N, 3) coordinates to longitude, latitude (deg) and ellipsoidal height (m) on the system's datum.
 
         Raises:
             InputError: a coordinate is outside the projection's domain.
-            ConfigError: the height system needs a grid that PROJ does not have here.
+            ConfigError: the height system needs a grid file that is not installed.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3) * [1.0, 1.0, self.z_to_full]
         return _through(self.full, self.geodetic, points, self.text)
@@ -144,7 +145,7 @@ class Crs:
         return _through(self.geodetic, self.full, points, self.text) / [1.0, 1.0, self.z_to_full]
 
     def check_area(self, points: np.ndarray, names: list[str], margin_deg: float) -> None:
-        """Raise `InputError` for the first of (N, 3) coordinates outside the system's area of use."""
+        """Raise `InputError` for the first of (N, 3) coordinates that is outside the system's area of use."""
         area = self._horizontal.area_of_use or self.named.area_of_use
         lonlat = self.to_geodetic(points)[:, :2]
         if area is None:
@@ -159,8 +160,8 @@ class Crs:
         if len(off):
             lon, lat = lonlat[off[0]]
             raise InputError(
-                f"{names[off[0]]} lies at {lat:.4f} N {lon:.4f} E, outside of where {_short(self.text)} ({self.name}) "
-                f"is meant for ({area.name.split(':')[0]}): are the axes swapped, or is it another system?",
+                f"{names[off[0]]} lies at {lat:.4f} N {lon:.4f} E, outside the area of use of {_short(self.text)} "
+                f"({self.name}, {area.name.split(':')[0]}): are the axes swapped, or is it another system?",
                 code="outside_crs",
             )
 
@@ -173,17 +174,18 @@ def crs(text: str) -> Crs:
         ConfigError: PROJ does not know the system, or it has no horizontal coordinates.
     """
     if not isinstance(text, str) or not text.strip() or len(text) > 20_000:
-        raise ConfigError("a coordinate reference system is EPSG:N, a PROJ string or WKT", code="invalid_crs")
+        raise ConfigError("a coordinate reference system must be EPSG:N, a PROJ string or WKT", code="invalid_crs")
     found = Crs(text.strip())
-    found.named  # noqa: B018  # refuse here
+    found.named  # noqa: B018  # raises for an invalid system
     return found
 
 
 def transform_datum(source: Crs, target: Crs, points: np.ndarray) -> np.ndarray:
-    """Transform (N, 3) geodetic coordinates (`Crs.to_geodetic`) from the datum of one system to that of another.
+    """Transform (N, 3) geodetic coordinates (`Crs.to_geodetic`) from the datum of one system to the datum of another.
 
     Raises:
-        ConfigError: PROJ knows no transformation, or lacks its grid; less accurate ones are never used instead.
+        ConfigError: PROJ knows no transformation, or its grid file is not installed; less accurate transformations are
+            never used instead.
     """
     if source.geodetic == target.geodetic:
         return np.array(points, dtype=np.float64)
@@ -223,13 +225,15 @@ def _through(source: Any, target: Any, points: np.ndarray, text: str) -> np.ndar
             raise _needs(text, grid)
         where = ", ".join(f"{x:.10g}" for x in points[int(np.argmax(bad))])
         raise InputError(
-            f"{where} is no place in {_short(text)}: are the axes swapped, or is it another system?", code="outside_crs"
+            f"{where} has no valid coordinates in {_short(text)}: are the axes swapped, or is it another system?",
+            code="outside_crs",
         )
     return found
 
 
 def _missing_grid(source: Any, target: Any) -> str | None:
-    """A grid of the best way between two systems, where PROJ has the grids of none of the ways."""
+    """Return a missing grid file of the best transformation between two systems, if no transformation has all its grid
+    files."""
     from pyproj.transformer import TransformerGroup
 
     with warnings.catch_warnings():
@@ -243,13 +247,13 @@ def _no_way(text: str, error: Exception) -> ConfigError:
     message = str(error)
     if "Grid " in message:
         return _needs(text, message.split("Grid ", 1)[1].split(" ", 1)[0])
-    return ConfigError(f"PROJ knows no exact way from {_short(text)}: {message}", code="no_exact_transform")
+    return ConfigError(f"PROJ knows no exact transformation from {_short(text)}: {message}", code="no_exact_transform")
 
 
 def _needs(text: str, grid: str) -> ConfigError:
     return ConfigError(
-        f"{_short(text)} needs the grid {grid}, which PROJ does not have here: run pyproj sync --file {grid}, or name "
-        "the system without its heights if they are ellipsoidal",
+        f"{_short(text)} needs the grid file {grid}, which is not installed: run pyproj sync --file {grid} or, if "
+        "heights are ellipsoidal, name the system without its heights",
         code="grid_missing",
     )
 

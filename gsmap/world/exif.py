@@ -13,9 +13,9 @@ from gsmap.world.params import Params
 
 _GPS = 0x8825
 _LATITUDE, _LONGITUDE, _ALTITUDE, _ERROR, _DATUM = 2, 4, 6, 31, 18
-_HEIGHT_FACTOR = 2.0  # heights by satellites are so many times less accurate than horizontal positions
-_SEA_LEVEL_SIGMA_M = 40.0  # of the height of the geoid above the ellipsoid, one value for a map
-_CORRECTED_SIGMA_M = 0.5  # receivers with corrections report less; it covers the common error as well
+_HEIGHT_FACTOR = 2.0  # satellite heights are less accurate than horizontal positions by this factor
+_SEA_LEVEL_SIGMA_M = 40.0  # of the geoid's height above the ellipsoid, an error that a whole map shares
+_CORRECTED_SIGMA_M = 0.5  # receivers with corrections report less, including their common error
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 
 
@@ -25,8 +25,8 @@ class PhotoPosition:
 
     Args:
         image: path of the photo.
-        longitude_deg, latitude_deg: on WGS 84.
-        height_m: as in EXIF, or None.
+        longitude_deg, latitude_deg: position on WGS 84.
+        height_m: height as in EXIF, or None.
         above_ellipsoid: the height is above the ellipsoid (EXIF 3), not above sea level.
         sigma_m: horizontal positioning error of the receiver, or None.
     """
@@ -39,8 +39,8 @@ class PhotoPosition:
     sigma_m: float | None
 
     def sigmas(self, params: Params) -> tuple[tuple[float, float], tuple[float, float], float]:
-        """Return standard deviations (horizontal, vertical) of this photo alone, of the error common to the capture,
-        and of the sea level."""
+        """Return three standard deviations: (horizontal, vertical) of this photo alone, (horizontal, vertical) of the
+        error that the capture's photos share, and that of the sea level."""
         own = self.sigma_m or params.gnss_sigma_m
         common = max(params.gnss_common_sigma_m, self.sigma_m or 0.0)
         if self.sigma_m is not None and self.sigma_m < _CORRECTED_SIGMA_M:
@@ -50,25 +50,23 @@ class PhotoPosition:
 
 
 def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | None]:
-    """Read the positions of all photos below a folder by path, sorted; None for photos without one.
+    """Read the positions of all photos below a folder, sorted by path; None for photos without a position.
 
     Raises:
         InputError: the folder does not exist, or no photo in it has a position.
     """
-    folder = Path(os.path.abspath(folder))  # absolute, for folder names may name a scene
+    folder = Path(os.path.abspath(folder))  # absolute, because the name of a folder may name a scene
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder of photos", code="folder_not_found")
+        raise InputError(f"there is no folder of photos {folder}", code="folder_not_found")
     photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
     found = {path.as_posix(): read(path) for path in photos}
     if not any(found.values()):
-        raise InputError(
-            f"none of the {len(photos)} photos in {folder} says where it was taken (EXIF GPS)", code="no_gnss"
-        )
+        raise InputError(f"none of the {len(photos)} photos in {folder} has a position (EXIF GPS)", code="no_gnss")
     return found
 
 
 def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
-    """Read the position of a photo; None if EXIF has none, or an invalid one."""
+    """Read the position of a photo; return None if EXIF has no position or an invalid one."""
     try:
         with open_picture(path) as picture:
             gps = picture.getexif().get_ifd(_GPS)
@@ -92,7 +90,7 @@ def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
 
 
 def _degrees(value: Any, reference: Any, letters: str) -> float | None:
-    """Parse degrees, minutes and seconds with their hemisphere."""
+    """Convert degrees, minutes and seconds with their hemisphere to degrees; return None if they are invalid."""
     try:
         parts = [float(part) for part in value]
         letter = str(reference).strip("\0 ").upper()[:1]

@@ -1,8 +1,8 @@
 """Convert coordinates of a CRS to the world frame (east, north, up in metres at an origin) and back.
 
-The world frame is Euclidean: a point is converted from a CRS to geodetic coordinates, to Earth-centred coordinates of
-the same ellipsoid, and by a rigid transform to the frame, each exactly. Grid convergence, scale factor and the Earth's
-curvature thus do not distort the map; over 10 km of UTM they amount to metres.
+The world frame is Euclidean. A point is converted exactly from a CRS to geodetic coordinates, then to Earth-centred
+coordinates on the same ellipsoid, and then by a rigid transform to the frame. So grid convergence, scale factor and the
+Earth's curvature do not distort the map; over 10 km of UTM they amount to metres.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from gsmap.world.crs import ECEF, crs, transform_datum
 
 
 def frame_at(crs_text: str, points: np.ndarray) -> WorldFrame:
-    """Return a frame whose origin is the rounded median of (N, 3) coordinates of a CRS."""
+    """Return a frame whose origin is the rounded median of coordinates (N, 3) of a CRS."""
     system = crs(crs_text)
     lon, lat, height = np.median(system.to_geodetic(points), axis=0)
     return WorldFrame(system.text, float(np.round(lat, 4)), float(np.round(lon, 4)), float(np.round(height)))
 
 
 def to_frame(frame: WorldFrame, points: np.ndarray, crs_text: str | None = None) -> np.ndarray:
-    """Convert (N, 3) coordinates of a CRS (by default the frame's own) to east, north, up in metres."""
+    """Convert coordinates (N, 3) of a CRS (by default that of the frame) to east, north, up in metres."""
     system, own = crs(crs_text or frame.crs), crs(frame.crs)
     geodetic = transform_datum(system, own, system.to_geodetic(points))
     out: np.ndarray = (_ecef(frame, geodetic) - _origin(frame)) @ _axes(frame)
@@ -37,29 +37,31 @@ def from_frame(frame: WorldFrame, points: np.ndarray, crs_text: str | None = Non
 
 
 def T_ecef_frame(frame: WorldFrame) -> Sim3:
-    """Return the transform from the frame to Earth-centred, Earth-fixed metres on WGS 84 (EPSG:4978), as for 3D Tiles.
+    """Return the transform from the frame to Earth-centred, Earth-fixed metres on WGS 84 (EPSG:4978), as 3D Tiles need
+    it.
 
-    Exact for datums that are rigid transforms of WGS 84 (all modern ones nearly are); else valid near the origin.
+    It is exact for datums that are rigid transforms of WGS 84 (all modern datums nearly are); otherwise it is valid
+    near the origin.
     """
     corners = np.array([[0.0, 0, 0], [1000, 0, 0], [0, 1000, 0], [0, 0, 1000]])
     return _rigid(from_frame(frame, corners, ECEF), corners)
 
 
 def _rigid(target: np.ndarray, corners: np.ndarray) -> Sim3:
-    """Fit a rigid transform to axes of a kilometre, which other datums skew and stretch slightly."""
+    """Fit a rigid transform to axes of a kilometre, which other datums shear and stretch slightly."""
     u, _, vt = np.linalg.svd((target[1:] - target[0]).T @ (corners[1:] - corners[0]))
     return Sim3(u @ vt, target[0])
 
 
 def _ellipsoid(frame: WorldFrame) -> tuple[float, float]:
-    """Return the semi-major axis in metres and the squared eccentricity."""
+    """Return the semi-major axis of the ellipsoid in metres, and its squared eccentricity."""
     ellipsoid = crs(frame.crs).geodetic.ellipsoid
     a, b = ellipsoid.semi_major_metre, ellipsoid.semi_minor_metre
     return float(a), float(1 - (b / a) ** 2)
 
 
 def _axes(frame: WorldFrame) -> np.ndarray:
-    """Return (3, 3) columns east, north and up in Earth-centred axes."""
+    """Return the (3, 3) columns east, north and up in Earth-centred axes."""
     lat, lon = np.radians([frame.latitude_deg, frame.longitude_deg])
     return np.array(
         [
@@ -77,7 +79,7 @@ def _origin(frame: WorldFrame) -> np.ndarray:
 
 
 def _ecef(frame: WorldFrame, geodetic: np.ndarray) -> np.ndarray:
-    """Return (N, 3) Earth-centred metres on the frame's datum, of longitude, latitude (deg) and ellipsoidal height."""
+    """Convert longitude, latitude (deg) and ellipsoidal height to (N, 3) Earth-centred metres on the frame's datum."""
     a, e2 = _ellipsoid(frame)
     lon, lat = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
     n = a / np.sqrt(1 - e2 * np.sin(lat) ** 2)
@@ -86,7 +88,7 @@ def _ecef(frame: WorldFrame, geodetic: np.ndarray) -> np.ndarray:
 
 
 def _geodetic(frame: WorldFrame, ecef: np.ndarray) -> np.ndarray:
-    """Invert `_ecef` (Bowring 1976, then Newton), to 1e-9 m within thousands of kilometres of the ellipsoid."""
+    """Invert `_ecef` (Bowring 1976, then Newton), to 1e-9 m up to thousands of kilometres from the ellipsoid."""
     a, e2 = _ellipsoid(frame)
     across = np.hypot(ecef[:, 0], ecef[:, 1])
     lat = np.arctan2(ecef[:, 2], across * (1 - e2))

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from gsmap.errors import ConfigError
 
 PIXEL_SIGMA_PX = 1.0
-"""Standard deviation of a control point in a photo, of picking it and of the camera."""
+"""Standard deviation in pixels of a control point in a photo, due to picking and to the camera."""
 
 DEPTH_SIGMA_FRACTION = 0.005
-"""Standard deviation of a rendered depth, per depth: splats lie around surfaces."""
+"""Standard deviation of a rendered depth, relative to the depth: splats are scattered around surfaces."""
 
 BAR_SIGMA_FRACTION = 0.002
-"""Standard deviation of a scale bar without a given one, per length."""
+"""Standard deviation of a scale bar without a specified one, relative to its length."""
 
 
 @dataclass(frozen=True)

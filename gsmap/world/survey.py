@@ -17,7 +17,7 @@ _T = TypeVar("_T", ControlPoint, PositionFix)
 
 
 def in_frame(survey: Survey) -> Survey:
-    """Convert all positions to east, north, up of the world frame, for the solver.
+    """Convert the positions of all observations to east, north, up in the world frame, for the solver.
 
     Raises:
         ConfigError, InputError: PROJ cannot convert a coordinate reference system or a coordinate.
@@ -41,7 +41,7 @@ def frame_for(crs_text: str, survey: Survey) -> WorldFrame:
         found.append(own.to_geodetic(np.array([one.position for one in group])))
     if not found:
         raise InputError(
-            f"nothing lies in {system.text} yet: give control points, photos with GNSS, or a position",
+            f"the map has no positions in {system.text} yet: add control points, photos with GNSS, or a scene position",
             code="not_georeferenced",
         )
     # Rounded to four digits of a degree, so the shift between datums does not matter.
@@ -50,7 +50,7 @@ def frame_for(crs_text: str, survey: Survey) -> WorldFrame:
 
 
 def check_area(items: Sequence[ControlPoint | PositionFix], margin_deg: float) -> None:
-    """Raise `InputError` for the first observation outside its system's area of use."""
+    """Raise `InputError` for the first observation outside the area of use of its CRS."""
     for group in _by_crs(items).values():
         names = [f"control point {one.name}" if isinstance(one, ControlPoint) else one.name for one in group]
         crs(group[0].crs).check_area(np.array([one.position for one in group]), names, margin_deg)
