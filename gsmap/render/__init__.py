@@ -1,4 +1,4 @@
-"""Rendering of Gaussians: colour, depth, alpha and dominant Gaussian, differentiable, on the CPU or on CUDA."""
+"""Render Gaussians: colour, depth, alpha and dominant Gaussian, differentiably, on the CPU or on CUDA."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Adam (Kingma & Ba 2015) on the GPU, each Gaussian with a count of its own updates."""
+"""Adam (Kingma & Ba 2015) on the GPU, where each Gaussian counts its own updates."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _ROWS = 64
 
 
 class Corrections:
-    """Bias corrections by the number of updates: (T, 2), of the mean and of the root of the mean square."""
+    """Bias corrections by number of updates: (T, 2), for the mean and for the square root of the mean square."""
 
     def __init__(self, betas: tuple[float, float], device: torch.device) -> None:
         self.betas, self._device, self._steps = betas, device, 0
@@ -25,7 +25,7 @@ class Corrections:
         return torch.stack([1 / (1 - beta1**t), 1 / (1 - beta2**t).sqrt()], 1).float().to(self._device)
 
     def next(self) -> torch.Tensor:
-        """Return the table for one more step: no Gaussian was updated more often than there were steps."""
+        """Return the table for one more step: no Gaussian has more updates than there were steps."""
         self._steps += 1
         if self._steps >= len(self._table):
             self._table = self._upto(2 * len(self._table))
@@ -33,7 +33,7 @@ class Corrections:
 
 
 def touched(gradients: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Find Gaussians (N,) whose gradient is not zero; of colours the mean is tested."""
+    """Return an (N,) mask of Gaussians whose gradient is not zero; of colours only the mean colour is tested."""
     means, quats, scales, opacities, sh = gradients
     found = (means != 0).any(1) | (quats != 0).any(1) | (scales != 0).any(1) | (opacities != 0)
     return found | (sh[:, 0] != 0).any(1)
@@ -55,10 +55,10 @@ def step(
     """Step every Gaussian that has a gradient and is not frozen, in place.
 
     Args:
-        values: means, quats, log_scales, logit_opacities, sh.
-        gradients: with respect to means, quats, ``scales``, ``opacities`` and sh.
-        moments: two lists, as the values.
-        updates: (N,) int32, how often each was stepped; counted on.
+        values: means, quats, log_scales, logit_opacities and sh.
+        gradients: gradients with respect to means, quats, ``scales``, ``opacities`` and sh.
+        moments: two lists of moments, each in the order of the values.
+        updates: (N,) int32 number of updates of each Gaussian, which is increased.
     """
     table = corrections.next()
     by = _by_triton if values[0].is_cuda and has_triton() else _by_torch
@@ -84,7 +84,7 @@ def _by_torch(
     sh_rate = torch.full((values[4].shape[1], 1), rates.sh_rest, device=values[4].device)
     sh_rate[0] = rates.sh_base
     steps = (rates.means, rates.quats, rates.log_scales, rates.logit_opacities, sh_rate)
-    chain = (None, None, scales, opacities * (1 - opacities), None)  # to logarithms and logits
+    chain = (None, None, scales, opacities * (1 - opacities), None)  # chain rule to logarithms and logits
     for value, gradient, m, v, rate, inner in zip(values, gradients, *moments, steps, chain, strict=True):
         g = gradient[rows] if inner is None else gradient[rows] * inner[rows]
         mean, square = torch.lerp(g, m[rows], betas[0]), torch.lerp(g.square(), v[rows], betas[1])
@@ -106,7 +106,7 @@ def _by_triton(
     betas: tuple[float, float],
     epsilon: float,
 ) -> None:
-    """Compute `_by_torch` in one launch."""
+    """Compute `_by_torch` in one kernel launch."""
     from gsmap.render.triton_kernels import adam_rows
 
     n, columns = len(values[0]), 3 * values[4].shape[1]

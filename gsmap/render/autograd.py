@@ -1,4 +1,4 @@
-"""Rendering on the CPU as a torch operation."""
+"""Rendering on the CPU as a differentiable torch operation."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ def render_tensors(
 
 
 class _Render(torch.autograd.Function):
-    """Keeps one native view per camera for the backward pass: about 64 bytes per visible Gaussian and view."""
+    """Torch function that keeps one native view per camera for the backward pass: about 64 bytes per visible Gaussian
+    and view."""
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[torch.Tensor | None, ...]:
@@ -68,7 +69,7 @@ class _Render(torch.autograd.Function):
         *tensors, pose, colour, alpha = ctx.saved_tensors[:8]
         depth = ctx.saved_tensors[8].numpy() if len(ctx.saved_tensors) > 8 else None
         arrays = tuple(t.detach().contiguous().numpy() for t in tensors)
-        # Where only the pose is to be optimised, the Gaussians' gradients are not even allocated.
+        # If only the pose is optimized, gradients of the Gaussians are not even allocated.
         out = [np.zeros_like(a) for a in arrays] if any(ctx.needs_input_grad[:5]) else None
         g_pose = np.zeros((len(pose), 4, 4)) if ctx.needs_input_grad[5] else None
         if not (g_colour is None and g_alpha is None and g_depth is None):

@@ -1,4 +1,4 @@
-"""Choice of the renderer: the native kernel on the CPU, or gsplat on CUDA."""
+"""Choose the renderer: the native kernel on the CPU, or gsplat on CUDA."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gsmap.errors import ConfigError
 def backend(name: str = "auto") -> Literal["native", "gsplat"]:
     """Resolve the name of a backend to ``native`` or ``gsplat``.
 
-    The two do not give the same bits, so the answer belongs to the recipe of whatever is rendered. torch is imported
-    only where gsplat and NVIDIA's driver are installed.
+    Both backends give slightly different results, so the backend is part of the recipe of every rendered result. torch
+    is imported only if gsplat and NVIDIA's driver are installed.
 
     Args:
-        name: ``native``, ``gsplat``, or ``auto``: gsplat where it is installed and torch finds a GPU, otherwise native.
+        name: ``native``, ``gsplat``, or ``auto`` (gsplat if it is installed and torch finds a GPU, otherwise native).
 
     Raises:
-        ConfigError: an unknown name.
+        ConfigError: the name is unknown.
     """
     if name not in ("auto", "native", "gsplat"):
         raise ConfigError(f"backend must be auto, native or gsplat, got {name!r}", code="invalid_choice")
@@ -32,8 +32,8 @@ def backend(name: str = "auto") -> Literal["native", "gsplat"]:
 
 @functools.cache
 def gsplat_available() -> bool:
-    """Return True if gsplat is installed and torch finds a GPU."""
-    # torch is slow to import, and naming a recipe can do without it where there is no gsplat or no driver.
+    """Return whether gsplat is installed and torch finds a GPU."""
+    # torch is slow to import, and the recipe key does not need it without gsplat or a driver.
     if importlib.util.find_spec("gsplat") is None or not _has_driver():
         return False
     import torch
@@ -43,12 +43,12 @@ def gsplat_available() -> bool:
 
 @functools.cache
 def has_triton() -> bool:
-    """Return True if Triton is installed; without it torch runs the same operations, more slowly."""
+    """Return whether Triton is installed; without it torch runs the same operations, more slowly."""
     return importlib.util.find_spec("triton") is not None
 
 
 def _has_driver() -> bool:
-    """Return True if NVIDIA's driver is installed."""
+    """Return whether NVIDIA's driver is installed."""
     try:
         ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
     except OSError:

@@ -1,7 +1,8 @@
-"""Blending weights behind gsplat's images: the dominant Gaussian of every pixel, the largest weight of every Gaussian.
+"""Compute blending weights of images rendered by gsplat: the dominant Gaussian of each pixel, and the largest weight of
+each Gaussian.
 
-gsplat returns neither. Its tile lists hold the Gaussians that a pixel is blended from, near to far; both are found by
-blending them once more, by a Triton kernel where Triton is installed, else by torch.
+gsplat returns neither. Its tile lists name the Gaussians that are blended into a pixel, from near to far. Blending
+these once more gives both; a Triton kernel does it if Triton is installed, otherwise torch.
 """
 
 from __future__ import annotations
@@ -14,19 +15,20 @@ from gsmap.render.backends import has_triton
 
 TILE_PX = 16
 MIN_ALPHA = 1 / 255
-MAX_ALPHA = 0.999  # gsplat's, from 1.5
+MAX_ALPHA = 0.999  # the limit of gsplat, from version 1.5 on
 MIN_TRANSMITTANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """Lists of Gaussians by tile from which gsplat blended C images.
+    """Lists of Gaussians by tile, from which gsplat blended C images.
 
     Args:
-        means2d, conics, opacities: (C, N, 2), (C, N, 3), (C, N); or packed, a row for each Gaussian and image.
-        gaussian: (M,) Gaussian of each packed row; None where they are not packed.
-        starts: (C, tiles down, tiles across) int32, where the list of each tile starts.
-        listed: rows, tile by tile, near to far; of an image that is not packed, counted through all images.
+        means2d, conics, opacities: (C, N, 2), (C, N, 3) and (C, N); or packed, with one row for each visible Gaussian
+            of each image.
+        gaussian: (M,) Gaussian of each packed row; None if rows are not packed.
+        starts: (C, tiles down, tiles across) int32 start of the list of each tile.
+        listed: rows, tile by tile, from near to far; if rows are not packed they are counted through all images.
     """
 
     means2d: torch.Tensor
@@ -41,15 +43,15 @@ class TileLists:
 def blending_weights(
     lists: TileLists, height: int, width: int, num_gaussians: int, max_weight: bool
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Blend the Gaussians that gsplat projected once more, to get their blending weights.
+    """Blend the projected Gaussians of gsplat once more to get their blending weights.
 
     Args:
-        num_gaussians: N, of what was rasterised.
-        max_weight: whether to find the largest weights.
+        num_gaussians: N, the number of rasterized Gaussians.
+        max_weight: also compute the largest weights.
 
     Returns:
-        (C, H, W) int32 Gaussian with the largest weight in each pixel, -1 where nothing was drawn; (N,) float32 largest
-        weight of each Gaussian in any pixel of any view, or None.
+        The (C, H, W) int32 Gaussian with the largest weight in each pixel, -1 where nothing was drawn; and the (N,)
+        float32 largest weight of each Gaussian in any pixel of any view, or None.
     """
     views = len(lists.starts)
     means2d = lists.means2d.detach().reshape(-1, 2)
@@ -85,9 +87,8 @@ def _by_torch(
     size: int,
     max_weight: bool,
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Blend all tiles in parallel, the k-th Gaussian of each at once: (C, H, W) int64 row shown, and (M,) largest
-    weights.
-    """
+    """Blend all tiles in parallel, the k-th Gaussian of each tile at once; return the (C, H, W) int64 dominant row, and
+    the (M,) largest weights."""
     views, height, width = shape
     where = means2d.device
     down, across = -(-height // size), -(-width // size)

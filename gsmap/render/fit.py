@@ -1,4 +1,4 @@
-"""Choice of the fitter of a backend, and the fallback where a GPU cannot hold a fit."""
+"""Choose the fitter of a backend, and fall back to the CPU if the GPU has too little memory for a fit."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def make_fitter(
     """Create the fitter of a backend; see `Fitter`.
 
     Args:
-        backend: as for `gsmap.render.render`. The native one gives the same bits for any number of threads; gsplat adds
-            gradients up in another order in every run.
+        backend: see `gsmap.render.render`. The native fitter gives the same bits for any number of threads; gsplat adds
+            gradients in another order in every run.
 
     Raises:
-        ConfigError: an unknown backend.
-        InputError: arrays that do not fit together.
-        MissingDependencyError: gsplat is requested and not installed.
+        ConfigError: the backend is unknown.
+        InputError: the shapes of the arrays do not agree.
+        MissingDependencyError: gsplat is requested but not installed.
     """
     if resolved(backend) == "gsplat":
         from gsmap.render.gsplat_fit import GsplatFitter
@@ -46,10 +46,10 @@ def make_fitter(
 
 
 def with_enough_memory(fit: Callable[[str], Fitted], backend: str = "auto") -> Fitted:
-    """Run a fit on a backend; where the GPU's memory runs out, run it once more on the CPU, with a warning.
+    """Run a fit on a backend; if the GPU's memory runs out, repeat it on the CPU, with a warning.
 
     Args:
-        fit: given the name of a backend, makes a fitter, steps it and returns what was wanted.
+        fit: function that takes the name of a backend, creates a fitter, steps it and returns the result.
     """
     chosen = resolved(backend)
     if chosen == "native":
@@ -59,6 +59,6 @@ def with_enough_memory(fit: Callable[[str], Fitted], backend: str = "auto") -> F
     try:
         return fit(chosen)
     except torch.cuda.OutOfMemoryError as error:
-        logger.warning("the GPU's memory cannot hold an optimization; it runs on the CPU: %s", error)
+        logger.warning("the GPU has too little memory for the optimization, which runs on the CPU instead: %s", error)
     torch.cuda.empty_cache()
     return fit("native")

@@ -14,7 +14,8 @@ from gsmap.types import Cameras, Gaussians
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step size per attribute (the usual ones of 3DGS training; ``means`` is in the frame's unit)."""
+    """Step sizes of Adam for each attribute; the defaults are usual in 3DGS training. ``means`` is in the frame's
+    unit."""
 
     means: float = 1.6e-4
     quats: float = 1e-3
@@ -29,11 +30,11 @@ class FitOptions:
     """Options of the optimization steps of a fitter.
 
     Args:
-        ssim_weight: share of ``1 - SSIM`` in the loss; the rest is Huber's of the colours.
-        huber_delta: differences of colours below this count by their square (Huber's loss); 0 is L1.
-        background: colour behind everything.
-        statistics: also keep what a densifier or pruner needs (about a tenth slower): see `Statistics`.
-        betas, epsilon: Adam's (Kingma & Ba 2015).
+        ssim_weight: share of ``1 - SSIM`` in the loss; the rest is Huber's loss of the colours.
+        huber_delta: differences of colours below this count by their square (Huber's loss); 0 gives the L1 loss.
+        background: colour behind all Gaussians.
+        statistics: also keep the `Statistics` that densification and pruning need, which is about a tenth slower.
+        betas, epsilon: parameters of Adam (Kingma & Ba 2015).
     """
 
     ssim_weight: float = 0.0
@@ -49,9 +50,9 @@ class Statistics:
     """Statistics of N Gaussians for densification and pruning.
 
     Args:
-        gradient_norm: (N,) float32, sum over views of the norm of dL/d(projected centre), in halves of the image's
-            sides as 3DGS counts it (its threshold is 2e-4 per view).
-        seen: (N,) int32, views in which the Gaussian had a gradient.
+        gradient_norm: (N,) float32 sum over views of the norm of dL/d(projected centre), in halves of the image's sides
+            as in 3DGS (whose threshold is 2e-4 per view).
+        seen: (N,) int32 number of views in which the Gaussian had a gradient.
         max_weight: (N,) float32, largest blending weight in any pixel.
     """
 
@@ -70,17 +71,18 @@ class Fitter(ABC):
             loss = fitter.step(cameras[i], images[i : i + 1])
         result = fitter.gaussians()
 
-    Each Gaussian counts its own Adam updates: one that contributes to no pixel of a step's images is not moved by that
-    step (stale momentum does not carry it away unseen); where all are seen every step this is `torch.optim.Adam`.
+    Each Gaussian counts its own Adam updates. A step does not move a Gaussian that contributes to no pixel of its
+    images, so old momentum does not carry away unseen Gaussians. If all Gaussians are seen in every step, this is
+    `torch.optim.Adam`.
 
     Args:
-        gaussians: where to start; copied.
-        learning_rates: may be replaced between steps (``fitter.learning_rates = ...``).
-        frozen: (N,) bool, Gaussians that are rendered but never changed.
-        options: losses and Adam.
+        gaussians: initial Gaussians, which are copied.
+        learning_rates: step sizes; they may be replaced between steps (``fitter.learning_rates = ...``).
+        frozen: (N,) mask of Gaussians that are rendered but never changed.
+        options: options of the loss and of Adam.
 
     Raises:
-        InputError: arrays that do not fit together.
+        InputError: the shapes of the arrays do not agree.
     """
 
     def __init__(
@@ -99,42 +101,43 @@ class Fitter(ABC):
 
     @abstractmethod
     def gaussians(self) -> Gaussians:
-        """Return the current Gaussians (a copy)."""
+        """Return a copy of the current Gaussians."""
 
     @abstractmethod
     def step(self, cameras: Cameras, images: Any, masks: Any = None) -> Any:
-        """Render, compare, step; returns the loss before the step (its mean over the views).
+        """Render, compare with the images and take a step; return the loss before the step, its mean over the views.
 
-        The loss is a number, or becomes one by ``float``, which waits for the GPU.
+        The loss is a number or can be converted to one by ``float``, which waits for the GPU.
 
         Args:
             cameras: V views of one size, usually one; memory grows by 64 bytes per visible Gaussian and view.
-            images: (V, H, W, 3) float32 in [0, 1], or uint8; or what `load` made of them.
-            masks: (V, H, W) weights of the pixels, bool, float32 or uint8; a view without any weight adds nothing.
+            images: (V, H, W, 3) float32 in [0, 1], or uint8; or the result of `load` for them.
+            masks: (V, H, W) weights of the pixels, bool, float32 or uint8; a view whose weights are all 0 adds nothing.
 
         Raises:
-            InputError: shapes that differ from the cameras'.
+            InputError: the shapes do not agree with the cameras.
         """
 
     def load(self, array: np.ndarray) -> Any:
-        """Move images or masks of many steps to where the fitter computes, as long as there is memory for them."""
+        """Move images or masks that are used in many steps to the device of the fitter, as long as there is memory for
+        them."""
         return array
 
     @abstractmethod
     def keep(self, rows: np.ndarray) -> None:
-        """Keep only these Gaussians (boolean mask or indices), with their optimiser state."""
+        """Keep only the given Gaussians (a mask or indices), with their optimizer state."""
 
     @abstractmethod
     def append(self, gaussians: Gaussians, frozen: np.ndarray | None = None) -> None:
-        """Add Gaussians behind the others, with fresh optimiser state.
+        """Append Gaussians, with fresh optimizer state.
 
         Raises:
-            InputError: another SH degree.
+            InputError: the SH degree differs.
         """
 
     @abstractmethod
     def reset_statistics(self) -> None:
-        """Start counting `Statistics` anew; a change of N does so too."""
+        """Reset `Statistics` to zero; a change of N does so too."""
 
     @abstractmethod
     def statistics(self) -> Statistics:
@@ -142,7 +145,7 @@ class Fitter(ABC):
 
 
 def checked_mask(mask: np.ndarray | None, n: int) -> np.ndarray | None:
-    """Validate ``frozen``: (N,) bool, or None."""
+    """Check ``frozen``, an (N,) mask or None, and return it."""
     if mask is None:
         return None
     mask = np.ascontiguousarray(mask, dtype=bool)
@@ -152,15 +155,15 @@ def checked_mask(mask: np.ndarray | None, n: int) -> np.ndarray | None:
 
 
 def check_pixels(values: Any, shape: tuple[int, ...], name: str) -> None:
-    """Raise InputError where images or masks differ from the cameras' shape."""
+    """Raise InputError if images or masks do not have the shape of the cameras."""
     if tuple(values.shape) != shape:
         raise InputError(
-            f"{name} must have the cameras' shape {shape}, got {tuple(values.shape)}", code="shape_mismatch"
+            f"{name} must have the shape {shape} of the cameras, got {tuple(values.shape)}", code="shape_mismatch"
         )
 
 
 def check_appended(gaussians: Gaussians, num_sh: int) -> None:
-    """Raise InputError where Gaussians to be appended have another SH degree."""
+    """Raise InputError if Gaussians to be appended have another SH degree."""
     if gaussians.sh.shape[1] != num_sh:
         raise InputError(
             f"appended Gaussians have {gaussians.sh.shape[1]} SH coefficients, not {num_sh}", code="shape_mismatch"

@@ -26,23 +26,24 @@ logger = logging.getLogger(__name__)
 NEAR_PLANE = 0.01
 DILATION_PX2 = 0.3
 
-# A batch of cameras is as large as fits into this; more gains nothing, for a batch fills the GPU long before.
+# Largest memory of a batch of cameras; a larger batch gains nothing, because it fills the GPU long before.
 _BATCH_BYTES = 1 << 31
-_BYTES_PER_PIXEL, _BYTES_PER_GAUSSIAN = 64, 48  # of a view: images, projections and tile lists, measured on rooms
+# Memory of a view (images, projections and tile lists), measured on rooms.
+_BYTES_PER_PIXEL, _BYTES_PER_GAUSSIAN = 64, 48
 
 
 class DeviceMemoryError(Exception):
-    """One view needs more memory than the GPU has left."""
+    """Raised if one view needs more memory than the GPU has left."""
 
 
 def device() -> torch.device:
-    """Return the device that gsplat renders on."""
+    """Return the device on which gsplat renders."""
     return torch.device("cuda")
 
 
 @functools.cache
 def load() -> Any:
-    """Import the package, with its kernels.
+    """Import gsplat with its kernels.
 
     Raises:
         MissingDependencyError: gsplat or its CUDA kernels are missing.
@@ -62,7 +63,7 @@ def load() -> Any:
 
 @dataclass(frozen=True, eq=False)
 class DrawableGaussians:
-    """Gaussians on the GPU with activated attributes, without those that cannot be drawn.
+    """Gaussians on the GPU with activated attributes; Gaussians that cannot be drawn are left out.
 
     Args:
         means: (M, 3).
@@ -70,8 +71,8 @@ class DrawableGaussians:
         scales: (M, 3) standard deviations.
         opacities: (M,) in [0, 1].
         sh: (M, K, 3).
-        rows: (M,) index of each among all N, or None where all can be drawn.
-        num_all: N.
+        rows: (M,) index of each Gaussian among all N, or None if all can be drawn.
+        num_all: N, the number of all Gaussians.
     """
 
     means: torch.Tensor
@@ -84,10 +85,10 @@ class DrawableGaussians:
 
     @classmethod
     def of(cls, tensors: GaussianTensors) -> DrawableGaussians:
-        """Activate tensors that lie on the GPU; differentiable."""
+        """Activate the attributes of tensors on the GPU, differentiably."""
         means, quats, log_scales, logits, sh = tensors.tensors()
         n = len(means)
-        # gsplat has no word for a Gaussian that cannot be drawn; the native backend leaves it out.
+        # gsplat does not handle Gaussians that cannot be drawn; the native backend leaves them out.
         sound = drawable(tensors.tensors())
         rows = None if bool(sound.all()) else torch.nonzero(sound)[:, 0]
         if rows is not None:
@@ -118,7 +119,8 @@ class DeviceViews:
 
     @classmethod
     def of(cls, cameras: Cameras, T_camera_frame: torch.Tensor | None = None) -> DeviceViews:
-        """Move cameras to the GPU, in one copy; a pose that is given takes the place of theirs, differentiable."""
+        """Move cameras to the GPU in one copy; ``T_camera_frame``, if given, replaces their poses and is
+        differentiable."""
         width, height = image_size(cameras)
         count = len(cameras)
         parts = (cameras.T_camera_frame, cameras.K, cameras.centers)
@@ -132,7 +134,8 @@ class DeviceViews:
 
 
 def drawable(values: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Find Gaussians (N,) whose means, quats, log_scales, logit_opacities and sh are numbers that float32 can draw."""
+    """Return an (N,) mask of Gaussians whose means, quats, log_scales, logit_opacities and sh are numbers that float32
+    can draw."""
     means, quats, log_scales, logits, sh = values
     sound = torch.isfinite(means).all(1) & torch.isfinite(quats).all(1) & torch.isfinite(sh).flatten(1).all(1)
     return sound & ~(torch.isnan(log_scales) | (log_scales >= 80)).any(1) & ~torch.isnan(logits)
@@ -145,14 +148,14 @@ def without_zeros(quats: torch.Tensor) -> torch.Tensor:
 
 
 class _DeviceCache:
-    """Cache of recently rendered Gaussians on the GPU: a scene is rendered through many cameras, one after another.
+    """Cache of recently rendered Gaussians on the GPU, because a scene is rendered from many cameras one after another.
 
-    The key is the `Gaussians` object, which is not changed in place after it was rendered.
+    The key is the `Gaussians` object, which must not be changed in place after it was rendered.
     """
 
     def __init__(self) -> None:
         self._entries: OrderedDict[int, tuple[weakref.ref[Gaussians], DrawableGaussians]] = OrderedDict()
-        self._lock = threading.RLock()  # pages are drawn by several threads
+        self._lock = threading.RLock()  # several threads of a page's server render at the same time
 
     def get(self, gaussians: Gaussians) -> DrawableGaussians:
         key = id(gaussians)
@@ -181,12 +184,12 @@ def _cache_bytes() -> int:
 
 @torch.no_grad()
 def render_numpy(gaussians: Gaussians, cameras: Cameras, background: np.ndarray, images: dict[str, Any]) -> None:
-    """Render numpy Gaussians on the GPU into arrays as `gsmap.render.native.allocate` makes them.
+    """Render numpy Gaussians on the GPU into arrays from `gsmap.render.native.allocate`.
 
-    Cameras are rendered in batches, smaller ones where memory is short.
+    Cameras are rendered in batches; with little memory batches are smaller.
 
     Raises:
-        DeviceMemoryError: a single view does not fit.
+        DeviceMemoryError: a single view does not fit into the memory.
     """
     load()
     views, height, width = images["alpha"].shape
@@ -214,10 +217,11 @@ def render_numpy(gaussians: Gaussians, cameras: Cameras, background: np.ndarray,
 
 
 def in_batches(count: int, size: int, do: Callable[[int, int], None]) -> None:
-    """Call ``do(first, last)`` for ranges that cover ``count``, halved where the GPU's memory is exhausted.
+    """Call ``do(first, last)`` for ranges that together cover ``count``; ranges are halved if the GPU's memory is
+    exhausted.
 
     Raises:
-        DeviceMemoryError: one at a time does not fit.
+        DeviceMemoryError: even a range of one does not fit into the memory.
     """
     first = 0
     while first < count:
@@ -244,7 +248,7 @@ def render_tensors(
     dominant_id: bool,
     max_weight: bool,
 ) -> Rendering:
-    """Run `gsmap.render.render` for tensors; tensors on the CPU are moved to the GPU and the result back."""
+    """Run `gsmap.render.render` for tensors; tensors on the CPU are moved to the GPU, and the result is moved back."""
     load()
     width, height = image_size(cameras)
     home = gaussians.means.device
@@ -265,7 +269,7 @@ def _draw(
     dominant_id: bool,
     max_weight: bool,
 ) -> Rendering:
-    """Render on the GPU; every tensor of the answer lies there."""
+    """Render on the GPU; all tensors of the result are on the GPU."""
     colour, alpha, depths, lists = rasterize(scene, views, depth)
     if background.any():
         colour = colour + (1 - alpha) * torch.tensor(background, device=alpha.device)
@@ -282,13 +286,13 @@ def _draw(
 def rasterize(
     scene: DrawableGaussians, views: DeviceViews, depth: bool
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, TileLists]:
-    """Project, sort into tiles and blend, by gsplat's functions; differentiable.
+    """Project, sort into tiles and blend Gaussians with gsplat's functions, differentiably.
 
-    What `gsplat.rasterization` does, less what a call of it costs the CPU: inverted matrices, checks, concatenations.
-    Several views are packed: each then takes memory for what it sees, not for the whole scene.
+    This is `gsplat.rasterization` without its cost on the CPU: inverted matrices, checks and concatenations. Several
+    views are packed, so that each takes memory only for the Gaussians that it sees.
 
     Returns:
-        Colour (C, H, W, 3), alpha (C, H, W, 1), expected depth (C, H, W) or None, and what was blended.
+        Colour (C, H, W, 3), alpha (C, H, W, 1), expected depth (C, H, W) or None, and the lists of blended Gaussians.
     """
     gs = load()
     count, width, height = len(views.T_camera_frame), views.width, views.height

@@ -1,4 +1,4 @@
-"""The fitter on a GPU: gsplat renders and differentiates, the loss and Adam are a kernel each."""
+"""The fitter on the GPU: gsplat renders and differentiates; the loss and Adam are one kernel each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gsmap.types import Cameras, Gaussians
 
 
 class GsplatFitter(Fitter):
-    """See `gsmap.render.fitter.Fitter`. Gradients are added up in another order in every run."""
+    """See `gsmap.render.fitter.Fitter`. Gradients are added in another order in every run, so results vary slightly."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class GsplatFitter(Fitter):
     ) -> None:
         self._values, self._moments, self._updates, self._frozen = values, moments, updates, frozen
         hidden = ~gsplat.drawable(values)
-        # Those that cannot be drawn stay as they are, and are drawn as something that no pixel shows.
+        # Gaussians that cannot be drawn do not change; in their place something that no pixel shows is drawn.
         self._hidden = hidden if bool(hidden.any()) else None
         self.reset_statistics()
 
@@ -86,7 +86,7 @@ class GsplatFitter(Fitter):
         try:
             return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
         except torch.cuda.OutOfMemoryError:
-            return array  # it is sent at every step
+            return array  # the array is then sent to the GPU at every step
 
     def step(self, cameras: Cameras, images: Any, masks: Any = None) -> torch.Tensor | float:
         width, height = image_size(cameras)
@@ -124,7 +124,7 @@ class GsplatFitter(Fitter):
 
     @torch.no_grad()
     def _drawn(self) -> gsplat.DrawableGaussians:
-        """Return the Gaussians as drawn; leaves of a new graph."""
+        """Return the Gaussians as they are drawn, as leaves of a new graph."""
         means, quats, log_scales, logits, sh = self._values
         scales, opacities = log_scales.exp(), torch.sigmoid(logits)
         if self._hidden is not None:
@@ -142,14 +142,14 @@ class GsplatFitter(Fitter):
         )
 
     def _seen_from(self, cameras: Cameras) -> gsplat.DeviceViews:
-        """Return the cameras on the GPU, cached: a schedule uses the same ones many times."""
+        """Return the cameras on the GPU; they are cached, because a schedule uses the same cameras many times."""
         if cameras not in self._views:
             self._views[cameras] = gsplat.DeviceViews.of(cameras)
         return self._views[cameras]
 
     @torch.no_grad()
     def _count(self, gradients: list[torch.Tensor], lists: TileLists, width: int, height: int) -> None:
-        """Add a step's views to the statistics."""
+        """Add the views of a step to the statistics."""
         _, weights = blending_weights(lists, height, width, len(self), max_weight=True)
         assert weights is not None
         self._max_weight = torch.maximum(self._max_weight, weights)
@@ -158,7 +158,7 @@ class GsplatFitter(Fitter):
         norm = (gradient * gradient.new_tensor([width / 2, height / 2])).norm(dim=-1)
         if lists.gaussian is None:
             seen, norm = adam.touched(gradients).int(), norm[0]
-        else:  # packed: a row for each Gaussian and view
+        else:  # packed: one row for each visible Gaussian of each view
             owner = lists.gaussian.long()
             seen = self._seen.new_zeros(len(self)).index_add(0, owner, (norm > 0).int())
             norm = norm.new_zeros(len(self)).index_add(0, owner, norm)

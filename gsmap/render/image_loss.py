@@ -1,4 +1,4 @@
-"""The loss of images and its gradient in torch, the same as the native kernel's (`gsmap/native/fit.cpp`)."""
+"""The image loss and its gradient in torch, equal to those of the native kernel (`gsmap/native/fit.cpp`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from gsmap.render.backends import has_triton
 
-# Wang et al. 2004: a Gaussian of sigma 1.5 and 11 taps; outside the image all is zero.
+# Wang et al. 2004: a Gaussian with sigma 1.5 and 11 taps; values outside the image are zero.
 _REACH = 5
 _HALF = (0.00102838, 0.00759876, 0.03600077, 0.10936069, 0.21300554)
 _WINDOW = (*_HALF, 0.26601173, *_HALF[::-1])
@@ -27,13 +27,13 @@ def image_loss(
     """Compute ``(1 - s) * Huber + s * (1 - SSIM)`` of images, each a mean over its pixels weighted by a mask.
 
     Args:
-        images: (V, H, W, 3) float32.
-        targets: (V, H, W, 3) float32, or uint8 of [0, 1].
-        masks: (V, H, W) weights, float32 or uint8 of [0, 1], or None; a view without any weight has no loss.
-        huber_delta: differences below this count by their square; 0 is L1.
+        images: (V, H, W, 3) float32 images.
+        targets: (V, H, W, 3) float32 in [0, 1], or uint8.
+        masks: (V, H, W) weights, float32 in [0, 1] or uint8, or None; a view whose weights are all 0 has no loss.
+        huber_delta: differences below this count by their square; 0 gives the L1 loss.
 
     Returns:
-        (V,) losses, and the gradient (V, H, W, 3) of their mean with respect to the images.
+        The (V,) losses, and the gradient (V, H, W, 3) of their mean with respect to the images.
     """
     if images.is_cuda and has_triton():
         return _by_triton(images.contiguous(), targets, masks, ssim_weight, huber_delta)
@@ -83,7 +83,7 @@ def _by_triton(
     ssim_weight: float,
     huber_delta: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute `_by_torch` in four launches per view."""
+    """Compute `_by_torch` in four kernel launches per view."""
     from gsmap.render.triton_kernels import loss_gradient, slope_columns, ssim_columns, ssim_rows
 
     views, height, width, _ = images.shape
@@ -146,9 +146,8 @@ def _structural_similarity(
 
 
 def _blurred(maps: torch.Tensor) -> torch.Tensor:
-    """Blur maps (V, C, H, W) by the window, in full float32: a variance is the difference of two nearly equal
-    numbers.
-    """
+    """Blur maps (V, C, H, W) by the window, in full float32 precision, because a variance is the difference of two
+    nearly equal numbers."""
     channels = maps.shape[1]
     window = torch.tensor(_WINDOW, dtype=maps.dtype, device=maps.device)
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):

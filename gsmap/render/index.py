@@ -1,4 +1,4 @@
-"""Bounding boxes of chunks of Gaussians, so that a camera only touches the chunks that it sees."""
+"""Bounding boxes of chunks of Gaussians, so that a camera processes only the chunks that it sees."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.types import Gaussians
 
-MAX_SIGMAS = 3.3290429  # sqrt(2 ln 255): nothing is drawn farther out
+MAX_SIGMAS = 3.3290429  # sqrt(2 ln 255): no Gaussian is drawn farther from its centre
 
 
 @dataclass(frozen=True, eq=False)
 class ChunkIndex:
-    """Bounding boxes of consecutive runs of Gaussians; tight where the Gaussians are in Morton order.
+    """Bounding boxes of consecutive runs of Gaussians; they are tight if the Gaussians are in Morton order.
 
     Args:
-        starts: (M + 1,) int64 first Gaussian of each chunk, and the number of Gaussians.
-        low, high: (M, 3) float64 box of the chunk's centres.
+        starts: (M + 1,) int64 first Gaussian of each chunk, followed by the number of Gaussians.
+        low, high: (M, 3) float64 box around the centres of the chunk's Gaussians.
         radius: (M,) float64 largest scale in the chunk (one standard deviation).
     """
 
@@ -29,9 +29,9 @@ class ChunkIndex:
 
     @classmethod
     def build(cls, gaussians: Gaussians, chunk: int = 4096) -> ChunkIndex:
-        """Compute the boxes of runs of ``chunk`` Gaussians, in stored order.
+        """Compute the boxes of runs of ``chunk`` Gaussians in stored order.
 
-        Sort scattered Gaussians first (`gsmap.geometry.morton`); scenes from the store are sorted.
+        Sort scattered Gaussians first (`gsmap.geometry.morton`); scenes from the store are sorted already.
         """
         n = len(gaussians)
         starts = np.append(np.arange(0, n, chunk, dtype=np.int64), n)
@@ -39,7 +39,7 @@ class ChunkIndex:
             return cls(starts, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         first = starts[:-1]
         with np.errstate(over="ignore"):
-            x, y, z = gaussians.log_scales.T  # column by column: `max` along rows is far slower
+            x, y, z = gaussians.log_scales.T  # column by column, because `max` along rows is far slower
             radius = np.exp(np.fmax.reduceat(np.maximum(np.maximum(x, y), z).astype(np.float64), first))
         return cls(
             starts,
@@ -52,7 +52,8 @@ class ChunkIndex:
         m = len(self.starts) - 1
         if self.low.shape != (m, 3) or self.high.shape != (m, 3) or self.radius.shape != (m,):
             raise InputError(
-                f"ChunkIndex of {m} chunks has boxes {self.low.shape}, {self.high.shape}, {self.radius.shape}",
+                f"ChunkIndex of {m} chunks needs low (M, 3), high (M, 3) and radius (M,), got {self.low.shape}, "
+                f"{self.high.shape}, {self.radius.shape}",
                 code="shape_mismatch",
             )
 
@@ -61,27 +62,29 @@ class ChunkIndex:
         return int(self.starts[-1])
 
     def visible_ranges(self, pose: np.ndarray, intrinsics_px: np.ndarray, width: int, height: int) -> np.ndarray:
-        """Find ranges (R, 2) int64 of Gaussians that a camera may see; none that it draws is left out.
+        """Return ranges (R, 2) int64 of Gaussians that a camera may see; every Gaussian that the camera draws is in a
+        range.
 
         Args:
-            pose: (3, 4) or (4, 4) frame-to-camera.
+            pose: (3, 4) or (4, 4) transform from frame to camera.
             intrinsics_px: ``fx fy cx cy``.
         """
         rotation, translation = pose[:3, :3], pose[:3, 3]
         center = rotation @ ((self.low + self.high).T / 2) + translation[:, None]
         half = (self.high - self.low) / 2
         fx, fy, cx, cy = intrinsics_px
-        # Each side of the frustum is a half-space n . x >= 0 in camera space; a box is outside when even its nearest
-        # corner, grown by what a Gaussian on it can cover, is. A Gaussian reaches MAX_SIGMAS standard deviations, but
-        # its footprint is that of the projection linearised at its centre, which overshoots the true outline towards
-        # the image's border: there, dilation and the skewed Jacobian together stay below the factor used here.
-        # Linearised at u = x/z, a sphere of radius r spans (r/z) sqrt(1 + u^2) on the plane z = 1. Outside the plane
-        # of the border u_b that is a distance (u - u_b) z <= r sqrt(1 + u_c^2) with u_c the clamp of the Jacobian.
+        # Each side of the frustum is a half-space n . x >= 0 in camera space; a box is outside if even its nearest
+        # corner, extended by the reach of a Gaussian there, is outside. A Gaussian reaches MAX_SIGMAS standard
+        # deviations, but its footprint is that of the projection linearized at its centre, which exceeds the true
+        # outline near the image's border. There, dilation and the skewed Jacobian together stay below the factor used
+        # here. Linearized at u = x/z, a sphere of radius r spans (r/z) sqrt(1 + u^2) on the plane z = 1. Outside the
+        # plane of the border u_b that is a distance (u - u_b) z <= r sqrt(1 + u_c^2) with u_c the clamp of the
+        # Jacobian.
         visible = np.ones(len(half), bool)
         reach = MAX_SIGMAS * self.radius
         nearest_z = center[2] + half @ np.abs(rotation[2])
         visible &= nearest_z > 0.01
-        margin = 3.0  # pixels: sqrt(0.3) dilation times MAX_SIGMAS, and rounding
+        margin = 3.0  # in pixels: sqrt(0.3) of dilation times MAX_SIGMAS, and rounding
         for axis, focal, principal, size in ((0, fx, cx, width), (1, fy, cy, height)):
             clamp = max(principal / focal, (size - principal) / focal) + 0.15 * size / focal
             grow = reach * np.sqrt(1 + clamp**2)
@@ -93,7 +96,7 @@ class ChunkIndex:
         chunks = np.flatnonzero(visible)
         if len(chunks) == 0:
             return np.zeros((0, 2), np.int64)
-        # Neighbouring chunks become one range.
+        # Merge neighbouring chunks into one range.
         breaks = np.flatnonzero(np.diff(chunks) > 1)
         first = chunks[np.append(0, breaks + 1)]
         last = chunks[np.append(breaks, len(chunks) - 1)]

@@ -1,4 +1,4 @@
-"""The CPU kernel as numpy calls: allocation, argument checks, one view at a time."""
+"""Call the CPU kernel with numpy arrays: allocation, argument checks, one view at a time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ __all__ = [
 
 
 def set_num_threads(count: int | None = None) -> None:
-    """Set the number of render threads; None uses every core this process may use, or OMP_NUM_THREADS where set."""
+    """Set the number of render threads; None uses every core that this process may use, or OMP_NUM_THREADS if it is
+    set."""
     if count is None:
         try:
             count = int(os.environ.get("OMP_NUM_THREADS", ""))
@@ -42,17 +43,18 @@ def set_num_threads(count: int | None = None) -> None:
 
 
 def arrays_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
-    """Return the five arrays in the kernel's order."""
+    """Return the five arrays of Gaussians in the order of the kernel."""
     return gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh
 
 
 _kept = threading.local()
-_KEPT_BYTES = 1 << 27  # largest view memory to keep: enough for a room, not for a street
+_KEPT_BYTES = 1 << 27  # largest memory of a view that is kept for reuse: enough for a room, not for a street
 
 
 @contextmanager
 def workspace() -> Iterator[Any]:
-    """Return a view with reused memory of this thread: clearing new memory takes a tenth of a small image's time."""
+    """Return a view that reuses the memory of this thread: clearing new memory takes a tenth of a small image's
+    time."""
     view = _kept.__dict__.pop("view", None) or View()
     yield view
     if view.workspace_bytes <= _KEPT_BYTES:
@@ -62,7 +64,7 @@ def workspace() -> Iterator[Any]:
 def allocate(
     views: int, height: int, width: int, num_gaussians: int, depth: bool, dominant_id: bool, max_weight: bool
 ) -> dict[str, Any]:
-    """Allocate output arrays of `Rendering` by field name; None where one is not requested."""
+    """Allocate the output arrays of `Rendering` by field name; None for outputs that are not requested."""
     shape = (views, height, width)
     return {
         "colour": np.empty((*shape, 3), np.float32),
@@ -86,7 +88,7 @@ def forward(
 ) -> None:
     """Render view ``i`` into ``images``; ``view`` keeps the state of its backward pass.
 
-    Where no pixel of ``looked_at`` (H, W) in reach of SSIM's windows differs from 0, nothing need be drawn.
+    Pixels are drawn only if ``looked_at`` (H, W) is not 0 somewhere within reach of the SSIM window.
     """
     height, width = images["alpha"].shape[1:]
     pose = np.ascontiguousarray(T_camera_frame[:3], dtype=np.float64)
@@ -94,7 +96,7 @@ def forward(
     if index is not None:
         if index.num_gaussians != len(arrays[0]):
             raise InputError(
-                f"the index is of {index.num_gaussians} Gaussians, rendered are {len(arrays[0])}: rebuild it",
+                f"the index has {index.num_gaussians} Gaussians, but {len(arrays[0])} are rendered: rebuild the index",
                 code="shape_mismatch",
             )
         ranges = index.visible_ranges(pose, intrinsics_px, width, height)

@@ -1,4 +1,4 @@
-"""The fitter on the CPU: render, loss, backward pass and Adam, all native."""
+"""The fitter on the CPU: rendering, loss, backward pass and Adam are all native."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from gsmap.types import Cameras, Gaussians
 class NativeFitter(Fitter):
     """See `gsmap.render.fitter.Fitter`; the same inputs give the same bits for any number of threads.
 
-    The arrays ``means quats log_scales logit_opacities sh`` are live and may be edited in place between steps.
+    The arrays ``means quats log_scales logit_opacities sh`` are the fitter's own and may be edited in place between
+    steps.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class NativeFitter(Fitter):
         for i in range(count):
             pose, intrinsics = cameras.T_camera_frame[i], cameras.intrinsics_px[i]
             mask = None if masks is None else masks[i]
-            looked_at = None if options.statistics else mask  # statistics are of whole pictures
+            looked_at = None if options.statistics else mask  # statistics need whole images
             native.forward(self._views[i], arrays, pose, intrinsics, self._background, out, i, None, looked_at)
             colour = out["colour"][i]
             loss += image_loss(colour, images[i], mask, options.ssim_weight, options.huber_delta, gradient[i]) / count

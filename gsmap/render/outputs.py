@@ -1,4 +1,4 @@
-"""Images of a rendering, and the size that they share."""
+"""Images of a rendering, and their common size."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmap.types import Cameras
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """Images of C cameras; numpy arrays or torch tensors, like the Gaussians.
+    """Images of C cameras, as numpy arrays or torch tensors, like the Gaussians.
 
     Args:
         colour: (C, H, W, 3) float32, not clamped above.
@@ -29,10 +29,11 @@ class Rendering:
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:
-    """Return the ``(width, height)`` that all cameras share.
+    """Return the ``(width, height)`` that all cameras have in common.
 
     Raises:
-        InputError: not `Cameras`, several sizes, or larger than the rasteriser's 65,535 tiles of 32 pixels a side.
+        InputError: the argument is not `Cameras`, sizes differ, or an image is larger than the 65,535 tiles of 32
+            pixels that the rasterizer allows on a side.
     """
     if not isinstance(cameras, Cameras):
         raise InputError(f"render needs gsmap.types.Cameras, got {type(cameras).__name__}", code="wrong_type")

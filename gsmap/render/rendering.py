@@ -1,4 +1,4 @@
-"""Rendering of Gaussians: one function for all backends, numpy and torch."""
+"""Render Gaussians: one function for all backends, numpy and torch."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ def render(
     T_camera_frame: torch.Tensor | None = None,
     backend: str = "auto",
 ) -> Rendering:
-    """Render Gaussians through cameras that share one image size.
+    """Render Gaussians from cameras that share one image size.
 
-    `Gaussians` in, numpy out. `GaussianTensors` in, torch out, differentiable with respect to every tensor in it and to
-    ``T_camera_frame``. Conventions are gsplat's (+0.3 px^2 dilation, pixel centres at +0.5, alpha cut at 1/255 and
-    clamped to 0.99, near plane 0.01, a pixel stops before its transmittance falls to 1e-4); the result is the same
-    bits for any number of threads. A Gaussian with NaN, or too large for float32, is not drawn.
+    `Gaussians` give numpy arrays. `GaussianTensors` give torch tensors, which are differentiable with respect to every
+    input tensor and to ``T_camera_frame``. Conventions are those of gsplat (+0.3 px^2 dilation, pixel centres at +0.5,
+    alpha cut at 1/255 and clamped to 0.99, near plane 0.01, a pixel stops before its transmittance falls to 1e-4). The
+    result is bitwise equal for any number of threads. A Gaussian with NaN, or too large for float32, is not drawn.
 
     Args:
-        gaussians: what to render; quaternions need not be normalised.
-        cameras: from the same frame; all of one size (group cameras of several sizes into several calls).
-        background: linear colour behind everything.
-        depth, dominant_id, max_weight: which outputs besides colour and alpha to make. Leave out what is not needed
-            in an optimisation: depth costs about a twentieth, the other two a tenth each.
-        index: boxes of chunks of the Gaussians, to skip what no camera sees (see `ChunkIndex`).
-        T_camera_frame: (C, 4, 4) tensor of view matrices that replaces the cameras' poses, where the pose is to be
-            optimised. The viewing direction is taken from the centre ``-R^T t``.
-        backend: ``native`` (CPU), ``gsplat`` (CUDA; gradients are not the same bits in every run), or ``auto``: gsplat
-            where it is installed and torch finds a GPU, otherwise native. What the GPU's memory cannot hold is rendered
-            in batches of fewer cameras, at last on the CPU with a warning.
+        gaussians: Gaussians to render; quaternions need not be normalized.
+        cameras: cameras in the same frame, all of one size (use one call for each size).
+        background: linear colour behind all Gaussians.
+        depth, dominant_id, max_weight: outputs to compute besides colour and alpha. In an optimization leave out unused
+            outputs: depth takes about a twentieth of the time, each of the other two a tenth.
+        index: boxes of chunks of the Gaussians, used to skip chunks that no camera sees (see `ChunkIndex`).
+        T_camera_frame: (C, 4, 4) tensor of view matrices that replaces the poses of the cameras, to optimize poses. The
+            viewing direction is computed from the centre ``-R^T t``.
+        backend: ``native`` (CPU), ``gsplat`` (CUDA; gradients are not the same bits in every run), or ``auto`` (gsplat
+            if it is installed and torch finds a GPU, otherwise native). If the GPU has too little memory, cameras are
+            rendered in smaller batches, and finally on the CPU with a warning.
 
     Raises:
-        InputError: shapes or dtypes that do not fit, cameras of several sizes, a view matrix with NaN.
-        ConfigError: an unknown backend, or one that cannot take these inputs.
-        MissingDependencyError: gsplat is requested and not installed.
+        InputError: shapes or dtypes do not agree, camera sizes differ, or a view matrix has NaN.
+        ConfigError: the backend is unknown or cannot render these inputs.
+        MissingDependencyError: gsplat is requested but not installed.
     """
     chosen = backends.backend(backend)
     width, height = image_size(cameras)
@@ -67,7 +67,7 @@ def render(
     if isinstance(gaussians, Gaussians):
         if T_camera_frame is not None:
             raise InputError(
-                "T_camera_frame needs GaussianTensors; for numpy Gaussians, set the pose of the cameras",
+                "T_camera_frame needs GaussianTensors; for numpy Gaussians, set the poses of the cameras",
                 code="invalid_pose",
             )
         images = native.allocate(len(cameras), height, width, len(gaussians), depth, dominant_id, max_weight)
@@ -79,7 +79,8 @@ def render(
                 return Rendering(**images)
             except gsplat.DeviceMemoryError as error:
                 logger.warning(
-                    "the GPU's memory cannot hold a view of %d Gaussians at %d x %d pixels; rendering on the CPU: %s",
+                    "the GPU has too little memory for a view of %d Gaussians at %d x %d pixels; rendering on the "
+                    "CPU: %s",
                     *(len(gaussians), width, height, error),
                 )
                 if max_weight:
@@ -98,14 +99,14 @@ def render(
             f"render needs Gaussians or GaussianTensors, got {type(gaussians).__name__}", code="wrong_type"
         )
     pose = _view_matrices(cameras, T_camera_frame)
-    # Tensors that lie on the GPU are rendered there, even where gsplat is missing, for its error names the reason.
+    # Tensors on the GPU are rendered there, even if gsplat is missing, because its error names the reason.
     if chosen == "gsplat" or (backend == "auto" and gaussians.means.device.type == "cuda"):
         return gsplat.render_tensors(gaussians, cameras, pose, colour, depth, dominant_id, max_weight)
     return autograd.render_tensors(gaussians, cameras, pose, colour, depth, dominant_id, max_weight, index)
 
 
 def _view_matrices(cameras: Cameras, T_camera_frame: torch.Tensor | None) -> torch.Tensor:
-    """Return view matrices (C, 4, 4): the given ones, or the cameras' own."""
+    """Return the view matrices (C, 4, 4): ``T_camera_frame`` if given, otherwise those of the cameras."""
     import torch
 
     if T_camera_frame is None:

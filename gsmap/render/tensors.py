@@ -52,7 +52,7 @@ class GaussianTensors:
 
     @classmethod
     def of(cls, gaussians: Gaussians, device: str = "cpu", requires_grad: bool = False) -> GaussianTensors:
-        """Copy numpy Gaussians to tensors."""
+        """Copy numpy Gaussians to torch tensors."""
         tensors = (torch.tensor(a, device=device, requires_grad=requires_grad) for a in native.arrays_of(gaussians))
         return cls(*tensors)
 

@@ -1,7 +1,7 @@
-"""Triton kernels of the CUDA backend: blending weights, image loss, Adam. Imported only where they run.
+"""Triton kernels of the CUDA backend: blending weights, image loss and Adam. They are imported only if they can run.
 
-Each does what a function in torch beside its caller does, in one launch where that takes dozens. Sizes are not
-specialised: every picture of another size would be compiled for anew.
+Each kernel computes the same as a torch function beside its caller, in one launch instead of dozens. Kernels are not
+specialized on image sizes, because every new size would be compiled again.
 """
 
 import triton
@@ -113,8 +113,8 @@ def adam_rows(
 ):
     """Apply one Adam step of all attributes to the rows that have a gradient and are not frozen.
 
-    Gradients are with respect to scales and opacities as they are drawn; the chain rule to their logarithms and logits
-    is applied here.
+    Gradients are with respect to the activated scales and opacities; the kernel applies the chain rule to logarithms
+    and logits.
     """
     row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     free = (row < n) & (tl.load(frozen + row, mask=row < n, other=1) == 0)
@@ -125,7 +125,7 @@ def adam_rows(
         touched = touched | (tl.load(g_sh + row.to(tl.int64) * SH + j, mask=free, other=0.0) != 0)
     for j in tl.static_range(4):
         touched = touched | (tl.load(g_quats + row.to(tl.int64) * 4 + j, mask=free, other=0.0) != 0)
-    # Not counted in place: several threads hold a row, and one might read what another has written.
+    # Do not count in place: several threads process a row, and one might read a value that another has written.
     count = tl.load(updates + row, mask=row < n, other=0) + touched.to(tl.int32)
     tl.store(counted + row, count, mask=row < n)
     first = tl.load(corrections + 2 * count, mask=touched, other=1.0)
@@ -241,7 +241,7 @@ def _adam_part(
     SCALED: tl.constexpr,
     ROWS: tl.constexpr,
 ):
-    """Apply `adam_rows` to one attribute of several columns; the first three columns of SH have a rate of their own."""
+    """Apply `adam_rows` to one attribute with several columns; the first three columns of SH have their own rate."""
     column = tl.arange(0, PADDED)
     at = row.to(tl.int64)[:, None] * COLUMNS + column[None, :]
     mask = touched[:, None] & (column < COLUMNS)[None, :]
@@ -311,7 +311,8 @@ def ssim_rows(
     SSIM: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Finish the blur along rows; SSIM and its slopes by the three blurred maps; sums of both losses and of weights."""
+    """Finish the blur along rows; compute SSIM and its slopes from the three blurred maps, and the sums of both losses
+    and of weights."""
     y = tl.program_id(0)
     x = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside = x < width3
@@ -413,13 +414,13 @@ def loss_gradient(
     SSIM: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Compute the gradient of the loss of one view times its share, and, once, the loss."""
+    """Compute the gradient of the loss of one view, multiplied by its share; also store the loss once."""
     y = tl.program_id(0)
     x = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside = x < width3
     at = y * width3 + x
     size = height * width3
-    total = tl.load(sums + 2)  # of three channels
+    total = tl.load(sums + 2)  # sum over three channels
     scale = tl.where(total > 0, 1.0 / tl.maximum(total, 1e-30), 0.0)
     w = tl.where(inside, 1.0, 0.0)
     if MASKED:
