@@ -50,7 +50,7 @@ def read_clip(
 
     path, lens, params = Path(path), lens or Lens(), params or Params()
     if not path.is_file():
-        raise NotFoundError(f"the clip {path} does not exist", code="file_not_found")
+        raise NotFoundError(f"there is no video clip {path}", code="file_not_found")
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:

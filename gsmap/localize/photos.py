@@ -57,7 +57,7 @@ def read_photo(
 
     path, lens = Path(path), lens or Lens()
     if not path.is_file():
-        raise NotFoundError(f"the photo {path} does not exist", code="file_not_found")
+        raise NotFoundError(f"there is no photo {path}", code="file_not_found")
 
     with open_picture(path) as picture:
         focal_35mm = picture.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
@@ -79,7 +79,7 @@ def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_
     """
     folder, name = Path(masks), Path(path)
     if not folder.is_dir():
-        raise NotFoundError(f"the folder of masks {folder} does not exist", code="folder_not_found")
+        raise NotFoundError(f"there is no folder of masks {folder}", code="folder_not_found")
     offered = [folder / f"{name.name}.png", folder / f"{name.stem}.png"]
     found = next((one for one in offered if one.is_file()), None)
     if found is None:

@@ -85,7 +85,7 @@ def check_model(
     mean, std = parse_preset(preset)
     path = Path(path)
     if not path.is_file():
-        raise NotFoundError(f"the model file {path} does not exist", code="file_not_found")
+        raise NotFoundError(f"there is no model file {path}", code="file_not_found")
     if kind == text.TOKENIZER:
         return text.check_tokenizer(path)
     refuse_external_data(path)
