@@ -95,17 +95,21 @@ class _Reach:
         self.starts: set[str] = set()
         self.failed: set[str] = set()
 
-    def measure(self, items: list[pytest.Item], room: Path) -> None:
+    def measure(self, items: list[pytest.Item], room: Path, most_s: float) -> None:
+        """Run each test; one that takes more than ``most_s`` of CPU fails."""
         from coverage import Coverage
 
         sys.addaudithook(lambda event, _: self.starts.add(self.key) if event in _STARTS_A_PROCESS else None)
         self.coverage = Coverage(data_file=None, include=[f"{room}/*"], config_file=False)
         self.coverage.start()
+        signal.signal(signal.SIGPROF, _stop)
         for item, after in zip(items, [*items[1:], None], strict=True):
             began = _cpu_s()
             self._switch(item.nodeid)
+            signal.setitimer(signal.ITIMER_PROF, most_s)
             item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
             self.took[item.nodeid] += _cpu_s() - began
+        signal.setitimer(signal.ITIMER_PROF, 0)
         self.coverage.stop()
         data = self.coverage.get_data()
         for file in data.measured_files():
@@ -154,7 +158,7 @@ class _Session:
         reach = self._reach(session)
         failed = [item.nodeid for item in session.items if item.nodeid in reach.failed]
         if failed:
-            print("left out, since they fail without a mutant:", *failed, sep="\n", file=sys.stderr)
+            print("left out, since without a mutant they fail or take too long:", *failed, sep="\n", file=sys.stderr)
         tests = [(*reach.of(item), item) for item in session.items if item.nodeid not in reach.failed]
         print(f"{len(tests)} tests of {sum(took for took, *_ in tests):.0f} s", file=sys.stderr, flush=True)
         tests.sort(key=lambda test: test[0])
@@ -182,7 +186,7 @@ class _Session:
 
         def run() -> int:
             session.config.pluginmanager.register(reach)
-            reach.measure(session.items, self.room)
+            reach.measure(session.items, self.room, self.most_s)
             kept.write_bytes(pickle.dumps((reach.lines, reach.took, reach.starts, reach.failed)))
             return 0
 
@@ -261,7 +265,7 @@ def _run(tests: list[tuple[float, pytest.Item]], changed: dict[CodeType, CodeTyp
         if isinstance(function, FunctionType) and function.__code__ in changed:
             function.__code__ = changed[function.__code__]
     for (took, item), after in zip(tests, [*(item for _, item in tests[1:]), None], strict=True):
-        signal.setitimer(signal.ITIMER_PROF, 10 + 10 * took)  # ends this process
+        signal.setitimer(signal.ITIMER_PROF, 5 + 10 * took)  # ends this process
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
         if item.session.testsfailed:
             return 1
@@ -294,6 +298,10 @@ def _in_a_fork(run: Callable[[], int], limit_s: float) -> bool:
             os.killpg(child, signal.SIGKILL)  # with what it has started
         with suppress(ChildProcessError):
             os.waitpid(child, 0)
+
+
+def _stop(*_: object) -> None:
+    raise TimeoutError
 
 
 def _cpu_s() -> float:
