@@ -13,6 +13,7 @@ from gsmap.register import pose_selection
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.params import Params
 from gsmap.register.pose_selection import EvaluatedPose, is_same_pose, select_pose
+from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Sim3
 from gsmap.types.registration import Proposal
 
@@ -127,3 +128,41 @@ def test_a_rejected_pose_is_shown_only_where_chance_does_not_explain_it(log_nfa:
     assert (found.S_target_source is not None) == (status == "rejected")
     assert found.information is None
     assert found.reason_code == {"rejected": "free_space_violation", "no_match": "not_significant"}[status]
+
+
+@pytest.mark.guards("answers")
+@pytest.mark.parametrize("chances", [(0.8,), (0.8, 0.5), (0.97, 0.9, 0.3)])
+def test_the_probability_is_that_one_of_the_poses_alone_is_correct(
+    monkeypatch: pytest.MonkeyPatch, chances: tuple[float, ...]
+) -> None:
+    """Counted out over which of the independent poses are correct, given that at most one is."""
+    by_nfa = {-60.0 - k: chance for k, chance in enumerate(chances)}
+    monkeypatch.setattr(pose_selection, "probability", lambda proposal, *_: by_nfa[proposal.log_nfa])
+    poses = [evaluated(shifted(5.0 * k), log_nfa=nfa) for k, nfa in enumerate(by_nfa)]
+    p = np.array(chances)
+    alone = p * np.prod(1 - p) / (1 - p)
+    wanted = alone[0] / (alone.sum() + np.prod(1 - p))
+    assert select(*poses).evidence["probability"] == pytest.approx(wanted, rel=1e-12)
+
+
+@pytest.mark.guards("answers")
+def test_of_rejected_poses_the_one_with_most_evidence_is_shown() -> None:
+    flaw = "free-space violation 40%, allowed 18%"
+    by_evidence = [
+        evaluated(shifted(x), flaw=flaw, evidence=replace(SURE, num_coinciding=n, colour_correlation=c))
+        for x, n, c in ((1.0, 4000, 0.3), (2.0, 2000, 0.7), (3.0, 1000, 0.9))
+    ]
+    assert select(*by_evidence).S_target_source.translation[0] == 2.0
+    by_nfa = [evaluated(shifted(x), flaw=flaw, log_nfa=nfa) for x, nfa in ((1.0, -20.0), (2.0, -90.0), (3.0, -40.0))]
+    assert select(*by_nfa).S_target_source.translation[0] == 2.0
+
+
+@pytest.mark.guards("answers")
+def test_the_scale_is_stored_as_decided_or_as_the_covariance_has_it() -> None:
+    pose = evaluated(Sim3(np.eye(3), np.zeros(3), 1.25))
+    found = select(pose).evidence
+    assert (found["log_scale"], found["log_scale_sigma"]) == (pytest.approx(np.log(1.25)), pytest.approx(np.sqrt(7e-6)))
+    decided = ScaleDecision(rigid=False, log_scale=0.2, measured_sigma=0.003, log_scale_sigma=0.004)
+    found = select(replace(pose, decision=decided)).evidence
+    assert (found["log_scale"], found["log_scale_sigma"]) == (0.2, 0.003)
+    assert np.isnan(select(replace(pose, covariance=None, flaw="free-space violation 40%")).evidence["log_scale"])

@@ -60,3 +60,23 @@ def test_no_pose_is_beyond_what_was_ever_counted():
 
 def test_what_lacks_most_is_named_first():
     assert shortfalls(PROPOSAL, replace(EVIDENCE, colour_correlation=0.0))[0] == "colour_correlation"
+
+
+def test_pieces_of_evidence_are_measured_in_decades():
+    proposal = replace(PROPOSAL, log_nfa=-500.0, runner_up=0.3)
+    evidence = PoseEvidence(0.09, 990, 0.099, 2000, 0.5, 100.0, disagreement=0.999, seen_m2=30.0)
+    assert evidence_of(proposal, evidence) == pytest.approx(
+        {
+            "log_nfa": -300.0,
+            "runner_up": 0.3,
+            "free_space_violation": -1.0,
+            "disagreement": 0.0,
+            "overlap": -1.0,
+            "num_coinciding": 3.0,
+            "colour_correlation": 0.5,
+            "colour_t": 2.0,
+        }
+    )
+    weak = evidence_of(replace(proposal, log_nfa=50.0), replace(evidence, colour_t=0.2, num_seen=1))
+    assert (weak["log_nfa"], weak["colour_t"], weak["colour_correlation"]) == (30.0, 0.0, 0.5)
+    assert np.isnan(evidence_of(replace(proposal, log_nfa=np.nan), evidence)["log_nfa"])
