@@ -9,7 +9,7 @@ import typer
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 if TYPE_CHECKING:
-    from gsmap.types.rows import BranchRow
+    from gsmap.types.rows.map_operations import BranchRow
 
 
 def command(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gsmap.map import Map
     from gsmap.store.quarantine import QuarantineRecord
     from gsmap.types.progress import StageProgress
-    from gsmap.types.rows import Row
+    from gsmap.types.rows.base import Row
 
 MapPath = Annotated[
     str,
@@ -110,7 +110,7 @@ def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: s
         print_json(json_object(verb, rows))
         return
     from gsmap.cli.objects import OBJECTS
-    from gsmap.types.rows import Row
+    from gsmap.types.rows.base import Row
 
     many = [] if rows is None else [rows] if isinstance(rows, Row) else list(rows)
     print_table(title or verb, OBJECTS[verb].type.columns, many)
@@ -128,7 +128,7 @@ def print_json(data: dict[str, Any]) -> None:
 
 def print_json_error(code: str, message: str) -> None:
     """Print the JSON object of a failed command, unless the command has already printed its own object."""
-    from gsmap.types.rows import SCHEMA
+    from gsmap.types.rows.base import SCHEMA
 
     if not _has_printed_json:
         print_json({"schema": SCHEMA, "error": {"code": code, "message": message}})
@@ -143,7 +143,7 @@ def expect_json() -> None:
 def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
     """Return the object that a verb prints with ``--json``."""
     from gsmap.cli.objects import OBJECTS, ManyRows, OptionalRow
-    from gsmap.types.rows import SCHEMA, Row
+    from gsmap.types.rows.base import SCHEMA, Row
 
     shape = OBJECTS[verb]
     for row in [rows] if isinstance(rows, Row) else rows or ():

@@ -30,7 +30,7 @@ def command(
 
     from gsmap import formats
     from gsmap.formats.precision import rounded_to
-    from gsmap.types.rows import ConvertReport
+    from gsmap.types.rows.maps import ConvertReport
 
     gaussians = formats.read(source)
     offset = gaussians.origin if local else np.zeros(3)

@@ -26,7 +26,7 @@ def command(
     """
     import gsmap.map
     from gsmap.cli.update import print_map
-    from gsmap.types.rows import DemoReport
+    from gsmap.types.rows.demo import DemoReport
 
     synthetic = _synthetic()
     root = Path(folder)

@@ -181,7 +181,7 @@ def _write_page(
 ) -> None:
     """Write the page with the unmerged captures of the map as one file."""
     from gsmap.errors import ConfigError
-    from gsmap.types.rows import ExportReport
+    from gsmap.types.rows.exports import ExportReport
 
     if useless := [option for option, value in asked.items() if value is not None]:
         raise ConfigError(

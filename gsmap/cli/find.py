@@ -42,7 +42,7 @@ def command(
 
     Example: `gsmap find site.gsmap --like monday:12 --pictures found`
     """
-    from gsmap.types.rows import FindHit
+    from gsmap.types.rows.find import FindHit
 
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         report = m.find(text, picture=picture, like=like, at=_point(at), top=top, pictures=pictures)

@@ -9,7 +9,7 @@ import typer
 from gsmap.cli.console import AsJson, MapPath, Sets, opened, print_facts, print_rows, print_table, say
 
 if TYPE_CHECKING:
-    from gsmap.types.rows import WorldReport
+    from gsmap.types.rows.world import WorldReport
 
 
 def command(
@@ -128,7 +128,7 @@ def command(
 
 
 def _print(map: str, report: WorldReport) -> None:
-    from gsmap.types.rows import GeoreferenceRow, ResidualRow
+    from gsmap.types.rows.world import GeoreferenceRow, ResidualRow
 
     origin = None
     if report.origin is not None:

@@ -25,7 +25,7 @@ def command(
     Example: `gsmap graph site.gsmap site.graphml`
     """
     from gsmap.errors import ConfigError
-    from gsmap.types.rows import ObjectRow, RelationRow, RoomRow
+    from gsmap.types.rows.objects import ObjectRow, RelationRow, RoomRow
 
     if format is not None and out is None:
         raise ConfigError(

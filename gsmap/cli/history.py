@@ -29,7 +29,7 @@ def command(
 
     Example: `gsmap history site.gsmap 1.5,0.2,0.8`
     """
-    from gsmap.types.rows import ObjectFactRow, ObjectObservationRow, ObjectRow
+    from gsmap.types.rows.objects import ObjectFactRow, ObjectObservationRow, ObjectRow
 
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         report = m.history(place, box=box)

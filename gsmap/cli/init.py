@@ -27,7 +27,7 @@ def command(
     """
     import gsmap.map
     from gsmap.store.catalog import url_without_password
-    from gsmap.types.rows import InitReport
+    from gsmap.types.rows.maps import InitReport
 
     gsmap.map.create(map, catalog_url=catalog).close()
     say(f"created an empty map at {map}; next: gsmap update {map} CAPTURES...")

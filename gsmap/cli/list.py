@@ -12,7 +12,7 @@ from gsmap.cli.console import AsJson, AsOf, MapPath, opened, print_rows, say, sa
 
 if TYPE_CHECKING:
     from gsmap.map import Map
-    from gsmap.types.rows import Row
+    from gsmap.types.rows.base import Row
 
 
 class ListKind(StrEnum):

@@ -21,7 +21,7 @@ from gsmap.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from gsmap.types.rows import LocalizeReport
+    from gsmap.types.rows.localize import LocalizeReport
 
 
 def command(

@@ -32,7 +32,7 @@ def command(
 
     Example: `gsmap measure site.gsmap monday:1.2,0.4,2.0 monday:0007.jpg@812,410`
     """
-    from gsmap.types.rows import PointRow
+    from gsmap.types.rows.world import PointRow
 
     with opened(map) as m:
         report = m.measure(a, b, component=component, crs=crs)

@@ -11,7 +11,7 @@ def command(map: MapPath, json: AsJson = False) -> None:
     Example: `gsmap migrate site.gsmap`
     """
     import gsmap.map
-    from gsmap.types.rows import MigrateReport
+    from gsmap.types.rows.maps import MigrateReport
 
     before, after = gsmap.map.migrate(map)
     say(f"{map} is at schema {after}" + ("" if before == after else f" (was {before or 'empty'})"))

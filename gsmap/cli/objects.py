@@ -2,97 +2,112 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 
-from gsmap.types import rows
-from gsmap.types.rows import Row
+from gsmap.types.rows.base import Row
+
+RowType = type[Row]
+
+
+def _row_type(row: str) -> RowType:
+    """Import a row by module and class in `gsmap.types.rows`: a verb loads those alone that it prints."""
+    module, name = row.split(".")
+    found: RowType = getattr(importlib.import_module(f"gsmap.types.rows.{module}"), name)
+    return found
 
 
 @dataclass(frozen=True)
 class OneRow:
     """The fields of one row or report beside ``schema``."""
 
-    type: type[Row]
+    row: str
+
+    @property
+    def type(self) -> RowType:
+        return _row_type(self.row)
 
 
 @dataclass(frozen=True)
-class ManyRows:
+class _KeyedRow:
+    key: str
+    row: str
+
+    @property
+    def type(self) -> RowType:
+        return _row_type(self.row)
+
+
+class ManyRows(_KeyedRow):
     """A list of rows under a key beside ``schema``."""
 
-    key: str
-    type: type[Row]
 
-
-@dataclass(frozen=True)
-class OptionalRow:
+class OptionalRow(_KeyedRow):
     """A row, or null, under a key beside ``schema``."""
-
-    key: str
-    type: type[Row]
 
 
 Object = OneRow | ManyRows | OptionalRow
 
 OBJECTS: dict[str, Object] = {
-    "init": OneRow(rows.InitReport),
-    "ingest": ManyRows("ingested", rows.IngestRow),
-    "describe": ManyRows("graphs", rows.GraphRow),
-    "register": ManyRows("edges", rows.EdgeRow),
-    "optimize": OneRow(rows.RevisionRow),
-    "update": OneRow(rows.UpdateReport),
-    "status": OneRow(rows.MapStatus),
-    "confirm": OneRow(rows.EdgeRow),
-    "reject": OneRow(rows.EdgeRow),
-    "confirm CHANGE": OneRow(rows.ChangeRow),
-    "reject CHANGE": OneRow(rows.ChangeRow),
-    "edge": OneRow(rows.EdgeRow),
-    "prior": OptionalRow("prior", rows.PriorRow),
-    "changes": OneRow(rows.ChangesReport),
-    "graph": OneRow(rows.ObjectsReport),
-    "history": OneRow(rows.HistoryReport),
-    "localize": OneRow(rows.LocalizeReport),
-    "find": OneRow(rows.FindReport),
-    "edit": OneRow(rows.SceneRow),
-    "edit OBJECT": OneRow(rows.ObjectRow),
-    "export": OneRow(rows.ExportReport),
-    "export --for": OneRow(rows.SmallMapReport),
-    "list scenes": ManyRows("scenes", rows.SceneRow),
-    "list edges": ManyRows("edges", rows.EdgeRow),
-    "list revisions": ManyRows("revisions", rows.RevisionRow),
-    "list tiles": ManyRows("tiles", rows.TileRow),
-    "list photos": ManyRows("photos", rows.PhotoRow),
-    "show SCENE": OneRow(rows.SceneReport),
-    "show A:B": OneRow(rows.PairReport),
-    "show CHANGE": OneRow(rows.ChangeDetail),
-    "why A:B": OneRow(rows.PairExplanation),
-    "diff": ManyRows("scenes", rows.PoseChangeRow),
-    "poses": ManyRows("poses", rows.PoseRow),
-    "georeference": OneRow(rows.WorldReport),
-    "measure": OneRow(rows.MeasureReport),
-    "settings": ManyRows("settings", rows.SettingRow),
-    "convert": OneRow(rows.ConvertReport),
-    "models add": OneRow(rows.ModelRow),
-    "models list": ManyRows("models", rows.ModelRow),
-    "evaluate": OneRow(rows.EvaluationReport),
-    "branch": ManyRows("branches", rows.BranchRow),
-    "tag": ManyRows("tags", rows.BranchRow),
-    "merge": OneRow(rows.MergeReport),
-    "split": OneRow(rows.SplitReport),
-    "remove": OneRow(rows.SceneRow),
-    "remove --purge": OneRow(rows.PurgeReport),
-    "remove --photo": OneRow(rows.PhotoRow),
-    "restore-scene": OneRow(rows.SceneRow),
-    "check": OneRow(rows.CheckReport),
-    "prune": OneRow(rows.PruneReport),
-    "thin": OneRow(rows.ThinReport),
-    "migrate": OneRow(rows.MigrateReport),
-    "backup": OneRow(rows.BackupReport),
-    "backup --list": ManyRows("snapshots", rows.SnapshotRow),
-    "restore": OneRow(rows.RestoreReport),
-    "clone": OneRow(rows.CloneReport),
-    "report": OneRow(rows.WrittenReport),
-    "trust": OneRow(rows.TrustReport),
-    "view": OneRow(rows.ViewReport),
-    "demo": OneRow(rows.DemoReport),
+    "init": OneRow("maps.InitReport"),
+    "ingest": ManyRows("ingested", "scenes.IngestRow"),
+    "describe": ManyRows("graphs", "scenes.GraphRow"),
+    "register": ManyRows("edges", "pairs.EdgeRow"),
+    "optimize": OneRow("revisions.RevisionRow"),
+    "update": OneRow("revisions.UpdateReport"),
+    "status": OneRow("maps.MapStatus"),
+    "confirm": OneRow("pairs.EdgeRow"),
+    "reject": OneRow("pairs.EdgeRow"),
+    "confirm CHANGE": OneRow("changes.ChangeRow"),
+    "reject CHANGE": OneRow("changes.ChangeRow"),
+    "edge": OneRow("pairs.EdgeRow"),
+    "prior": OptionalRow("prior", "scenes.PriorRow"),
+    "changes": OneRow("changes.ChangesReport"),
+    "graph": OneRow("objects.ObjectsReport"),
+    "history": OneRow("objects.HistoryReport"),
+    "localize": OneRow("localize.LocalizeReport"),
+    "find": OneRow("find.FindReport"),
+    "edit": OneRow("scenes.SceneRow"),
+    "edit OBJECT": OneRow("objects.ObjectRow"),
+    "export": OneRow("exports.ExportReport"),
+    "export --for": OneRow("exports.SmallMapReport"),
+    "list scenes": ManyRows("scenes", "scenes.SceneRow"),
+    "list edges": ManyRows("edges", "pairs.EdgeRow"),
+    "list revisions": ManyRows("revisions", "revisions.RevisionRow"),
+    "list tiles": ManyRows("tiles", "exports.TileRow"),
+    "list photos": ManyRows("photos", "localize.PhotoRow"),
+    "show SCENE": OneRow("scenes.SceneReport"),
+    "show A:B": OneRow("pairs.PairReport"),
+    "show CHANGE": OneRow("changes.ChangeDetail"),
+    "why A:B": OneRow("pairs.PairExplanation"),
+    "diff": ManyRows("scenes", "revisions.PoseChangeRow"),
+    "poses": ManyRows("poses", "scenes.PoseRow"),
+    "georeference": OneRow("world.WorldReport"),
+    "measure": OneRow("world.MeasureReport"),
+    "settings": ManyRows("settings", "maps.SettingRow"),
+    "convert": OneRow("maps.ConvertReport"),
+    "models add": OneRow("maps.ModelRow"),
+    "models list": ManyRows("models", "maps.ModelRow"),
+    "evaluate": OneRow("evaluation.EvaluationReport"),
+    "branch": ManyRows("branches", "map_operations.BranchRow"),
+    "tag": ManyRows("tags", "map_operations.BranchRow"),
+    "merge": OneRow("map_operations.MergeReport"),
+    "split": OneRow("map_operations.SplitReport"),
+    "remove": OneRow("scenes.SceneRow"),
+    "remove --purge": OneRow("map_operations.PurgeReport"),
+    "remove --photo": OneRow("localize.PhotoRow"),
+    "restore-scene": OneRow("scenes.SceneRow"),
+    "check": OneRow("maps.CheckReport"),
+    "prune": OneRow("maps.PruneReport"),
+    "thin": OneRow("thinning.ThinReport"),
+    "migrate": OneRow("maps.MigrateReport"),
+    "backup": OneRow("backups.BackupReport"),
+    "backup --list": ManyRows("snapshots", "backups.SnapshotRow"),
+    "restore": OneRow("backups.RestoreReport"),
+    "clone": OneRow("backups.CloneReport"),
+    "report": OneRow("reports.WrittenReport"),
+    "trust": OneRow("trust.TrustReport"),
+    "view": OneRow("maps.ViewReport"),
+    "demo": OneRow("demo.DemoReport"),
 }
 """JSON object by verb; verbs with several forms have one entry per form."""

@@ -27,7 +27,7 @@ def command(
 
     Example: `gsmap reject site.gsmap monday:tuesday`
     """
-    from gsmap.types.rows import ChangeRow
+    from gsmap.types.rows.changes import ChangeRow
 
     with opened(map) as m:
         row = m.reject(what, note=note, withdraw=withdraw)

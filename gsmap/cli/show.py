@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from gsmap.map import Map
     from gsmap.types import Sim3
     from gsmap.types.metric_scale import MetricScale
-    from gsmap.types.rows import ChangeDetail, PairReport, SceneReport
+    from gsmap.types.rows.changes import ChangeDetail
+    from gsmap.types.rows.pairs import PairReport
+    from gsmap.types.rows.scenes import SceneReport
 
 _SHOWN = 8  # maximum number of edges, notes and events, so that everything fits a screen
 
@@ -42,7 +44,9 @@ def command(
 
     Example: `gsmap show site.gsmap monday --picture monday.png`
     """
-    from gsmap.types.rows import ChangeDetail, PairReport, SceneReport
+    from gsmap.types.rows.changes import ChangeDetail
+    from gsmap.types.rows.pairs import PairReport
+    from gsmap.types.rows.scenes import SceneReport
 
     with opened(map) as m:
         report = _report(m, thing)

@@ -12,7 +12,8 @@ from gsmap.cli.ingest import CapturedAt, NoCreate, makes_map, refuse_capture_as_
 from gsmap.texts import escaped
 
 if TYPE_CHECKING:
-    from gsmap.types.rows import EdgeRow, SceneRow
+    from gsmap.types.rows.pairs import EdgeRow
+    from gsmap.types.rows.scenes import SceneRow
 
 
 def command(

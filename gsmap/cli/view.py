@@ -39,7 +39,7 @@ def command(
 
     Example: `gsmap view site.gsmap`
     """
-    from gsmap.types.rows import ViewReport
+    from gsmap.types.rows.maps import ViewReport
 
     if export is not None:
         with opened(map, bars=True) as m:

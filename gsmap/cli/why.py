@@ -24,7 +24,7 @@ def command(
 
     Example: `gsmap why site.gsmap monday:tuesday --pictures why`
     """
-    from gsmap.types.rows import ExplanationStep
+    from gsmap.types.rows.pairs import ExplanationStep
 
     with opened(map) as m:
         report = m.why(pair, pictures=pictures)

@@ -10,7 +10,7 @@ import numpy as np
 from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities, without_scale
 from gsmap.types import Sim3
-from gsmap.types.rows import NeesRow
+from gsmap.types.rows.evaluation import NeesRow
 
 SURE_LOG_SCALE = 1e-6
 """Standard deviation that is assumed for the scale of a rigid pose, because its covariance leaves the scale open."""

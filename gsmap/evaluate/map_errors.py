@@ -21,16 +21,15 @@ from gsmap.evaluate.calibration import (
 from gsmap.evaluate.registration import absolute_trajectory_error, pose_error
 from gsmap.types import PoseGraph, Sim3
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import (
+from gsmap.types.rows.evaluation import (
     BandRow,
     ComponentErrorRow,
     EdgeErrorRow,
-    EdgeRow,
     EvaluationReport,
     NeesRow,
-    PairRef,
     PoseErrorRow,
 )
+from gsmap.types.rows.pairs import EdgeRow, PairRef
 
 _METRIC = 1e-6  # largest log scale of a true pose of a scene in metres
 

@@ -11,7 +11,7 @@ from gsmap.store import Store, schema
 from gsmap.store import backup as _backup
 from gsmap.store.storage import open_storage
 from gsmap.types.progress import Progress, silent
-from gsmap.types.rows import BackupReport, CloneReport, RestoreReport, SnapshotRow
+from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 
 
 def save(

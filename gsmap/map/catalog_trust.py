@@ -9,7 +9,7 @@ from gsmap.errors import ConfigError, NotFoundError
 from gsmap.store import Store, remote_map
 from gsmap.store import trust as trusting
 from gsmap.store.error_translation import display_name
-from gsmap.types.rows import TrustReport
+from gsmap.types.rows.trust import TrustReport
 
 
 def catalog_of(path: str | os.PathLike[str]) -> TrustReport:

@@ -21,7 +21,8 @@ from gsmap.store import Store
 from gsmap.store.change_rows import Comparison, StoredChange
 from gsmap.types import Change, PoseGraph, Scene
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow, PairEventRow
+from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
+from gsmap.types.rows.pairs import PairEventRow
 
 if TYPE_CHECKING:
     from gsmap.map.stages.change import ComparisonPlan

@@ -25,7 +25,7 @@ from gsmap.register.view_cache import ViewCache
 from gsmap.store import Store
 from gsmap.types import Cameras, PosedScene, Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import ChangeRow
+from gsmap.types.rows.changes import ChangeRow
 
 _log = logging.getLogger("gsmap.map")
 FILE_NAME = "changes.json"

@@ -28,7 +28,7 @@ from gsmap.types import Cameras, Gaussians, Scene, ScenePose, Sim3, Tile
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.model import ModelLimits
 from gsmap.types.progress import Progress
-from gsmap.types.rows import EvaluationReport, ImageErrorRow
+from gsmap.types.rows.evaluation import EvaluationReport, ImageErrorRow
 
 _TILES_KEPT = 8  # in memory at once, for the scene that has a part in them and the next one
 

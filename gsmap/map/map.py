@@ -15,7 +15,6 @@ import numpy as np
 from gsmap.engine import WorkerSession
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.map import map_operations as as_values
 from gsmap.map import reports
 from gsmap.map.metric_scales import metres_at
 from gsmap.map.progress_logging import log_progress
@@ -24,53 +23,7 @@ from gsmap.store import Store
 from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import (
-    BackupReport,
-    BranchRow,
-    ChangeDetail,
-    ChangeRow,
-    ChangesReport,
-    CheckReport,
-    CloneReport,
-    EdgeRow,
-    EvaluationReport,
-    ExportReport,
-    FindReport,
-    GraphRow,
-    HistoryReport,
-    IngestRow,
-    LocalizeReport,
-    MapStatus,
-    MeasureReport,
-    MergeReport,
-    ModelRow,
-    ObjectRow,
-    ObjectsReport,
-    PairExplanation,
-    PairReport,
-    PhotoRow,
-    PoseChangeRow,
-    PoseRow,
-    PriorRow,
-    PruneReport,
-    PurgeReport,
-    RestoreReport,
-    RevisionRow,
-    SceneReport,
-    SceneRow,
-    SettingRow,
-    SmallMapReport,
-    SnapshotRow,
-    SplitReport,
-    Table,
-    ThinReport,
-    TileRow,
-    UpdateReport,
-    ViewReport,
-    WorldReport,
-    WrittenReport,
-)
-from gsmap.types.rows.localize_scan import ScanRow
+from gsmap.types.rows.base import Table
 
 if TYPE_CHECKING:
     from gsmap.map.objects import MapObjects
@@ -78,6 +31,22 @@ if TYPE_CHECKING:
     from gsmap.map.settings import Settings
     from gsmap.map.stages.georeference import Request
     from gsmap.map.stages.register import Pairs
+    from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
+    from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport
+    from gsmap.types.rows.evaluation import EvaluationReport
+    from gsmap.types.rows.exports import ExportReport, SmallMapReport, TileRow
+    from gsmap.types.rows.find import FindReport
+    from gsmap.types.rows.localize import LocalizeReport, PhotoRow
+    from gsmap.types.rows.localize_scan import ScanRow
+    from gsmap.types.rows.map_operations import BranchRow, MergeReport, PurgeReport, SplitReport
+    from gsmap.types.rows.maps import CheckReport, MapStatus, ModelRow, PruneReport, SettingRow, ViewReport
+    from gsmap.types.rows.objects import HistoryReport, ObjectRow, ObjectsReport
+    from gsmap.types.rows.pairs import EdgeRow, PairExplanation, PairReport
+    from gsmap.types.rows.reports import WrittenReport
+    from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow, UpdateReport
+    from gsmap.types.rows.scenes import GraphRow, IngestRow, PoseRow, PriorRow, SceneReport, SceneRow
+    from gsmap.types.rows.thinning import ThinReport
+    from gsmap.types.rows.world import MeasureReport, WorldReport
     from gsmap.view import ViewServer
 
 
@@ -1178,15 +1147,21 @@ class Map(AbstractContextManager["Map"]):
     def branch(self, name: str) -> BranchRow:
         """Make a branch (``gsmap branch MAP NAME``): another catalog over the same arrays; `open` it as
         ``MAP@NAME``."""
-        return as_values.branch_row(self.store.branches.make(name))
+        from gsmap.map.map_operations import branch_row
+
+        return branch_row(self.store.branches.make(name))
 
     def tag(self, name: str) -> BranchRow:
         """Make a tag (``gsmap tag MAP NAME``): the current state, read-only; `open` it as ``MAP@NAME``."""
-        return as_values.branch_row(self.store.branches.make(name, tag=True))
+        from gsmap.map.map_operations import branch_row
+
+        return branch_row(self.store.branches.make(name, tag=True))
 
     def branches(self, kind: str | None = None) -> Table[BranchRow]:
         """List branches and tags, or those of one kind (``branch``, ``tag``)."""
-        rows = [as_values.branch_row(branch) for branch in self.store.branches.list()]
+        from gsmap.map.map_operations import branch_row
+
+        rows = [branch_row(branch) for branch in self.store.branches.list()]
         return Table(row for row in rows if kind in (None, row.kind))
 
     def delete_branch(self, name: str, kind: str | None = None) -> BranchRow:
@@ -1195,7 +1170,9 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: none of that kind is called so.
         """
-        row = as_values.branch_row(self.store.branches.get(name))
+        from gsmap.map.map_operations import branch_row
+
+        row = branch_row(self.store.branches.get(name))
         if kind not in (None, row.kind):
             raise NotFoundError(
                 f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete",
@@ -1206,7 +1183,9 @@ class Map(AbstractContextManager["Map"]):
 
     def merge(self, source: str | os.PathLike[str]) -> MergeReport:
         """Merge another map, branch or tag into this map (``gsmap merge MAP SOURCE``); nothing is computed."""
-        return as_values.merge(self.store, source)
+        from gsmap.map import map_operations
+
+        return map_operations.merge(self.store, source)
 
     def split(
         self,
@@ -1224,7 +1203,9 @@ class Map(AbstractContextManager["Map"]):
                 (default: 0).
             scenes: names of the scenes.
         """
-        return as_values.split(self.store, out, as_values.chosen(self.store, island, box, scenes))
+        from gsmap.map import map_operations
+
+        return map_operations.split(self.store, out, map_operations.chosen(self.store, island, box, scenes))
 
     def purge(self, ref: str, *, branches: bool = False) -> PurgeReport:
         """Delete a scene for good (``gsmap remove MAP SCENE --purge``): rows, arrays, and tiles made with it.
@@ -1232,16 +1213,19 @@ class Map(AbstractContextManager["Map"]):
         Args:
             branches: also purge the map's other branches and tags; else they are listed.
         """
+        from gsmap.map.map_operations import purge_report
         from gsmap.map.stages.purge import purge
 
-        return as_values.purge_report(purge(self.store, ref, branches=branches))
+        return purge_report(purge(self.store, ref, branches=branches))
 
     def restore_scene(self, ref: str, source: str | os.PathLike[str] | None = None) -> SceneRow:
         """Restore a removed scene (``gsmap restore-scene MAP SCENE``), or copy one from another map (``source``).
 
         With ``source``, arrays of it that are here and damaged are mended.
         """
-        return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source), self.metres())
+        from gsmap.map import map_operations
+
+        return reports.scene_row(self.store, map_operations.restore_scene(self.store, ref, source), self.metres())
 
     def check(self) -> CheckReport:
         """Check every byte of the map against its digest."""

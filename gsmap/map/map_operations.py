@@ -17,7 +17,7 @@ from gsmap.store import Store, merging, staging
 from gsmap.store.branches import Branch
 from gsmap.store.purging import Purge
 from gsmap.types import Scene
-from gsmap.types.rows import BranchRow, MergeReport, PurgeReport, SplitReport
+from gsmap.types.rows.map_operations import BranchRow, MergeReport, PurgeReport, SplitReport
 
 
 def branch_row(branch: Branch) -> BranchRow:

@@ -28,8 +28,8 @@ from gsmap.store.objects import ComputedObjects, number_of
 from gsmap.texts import few
 from gsmap.types import MapObject, Room, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import (
-    SCHEMA,
+from gsmap.types.rows.base import SCHEMA
+from gsmap.types.rows.objects import (
     HistoryReport,
     ObjectFactRow,
     ObjectObservationRow,

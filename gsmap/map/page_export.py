@@ -34,7 +34,7 @@ from gsmap.map.settings import Settings
 from gsmap.report import owner_of
 from gsmap.store import Store
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import ViewReport
+from gsmap.types.rows.maps import ViewReport
 from gsmap.version import __version__
 from gsmap.view import site
 from gsmap.view.built import built_page

@@ -11,7 +11,7 @@ from gsmap.map.pair_explanation import explain_pair
 from gsmap.map.reports import pair_report
 from gsmap.store import Store
 from gsmap.types import NodeLayer, Scene, SceneGraph, Sim3
-from gsmap.types.rows import ExplanationStep
+from gsmap.types.rows.pairs import ExplanationStep
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings

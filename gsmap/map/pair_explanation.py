@@ -18,7 +18,7 @@ from gsmap.register import verdict
 from gsmap.retrieve import PairSchedule, neighbours
 from gsmap.store import Store
 from gsmap.types import Scene
-from gsmap.types.rows import ExplanationStep, PairExplanation, PairReport
+from gsmap.types.rows.pairs import ExplanationStep, PairExplanation, PairReport
 
 
 @snapshot_read

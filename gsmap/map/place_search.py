@@ -21,7 +21,7 @@ from gsmap.map.stages.thin import THINGS
 from gsmap.store import Store
 from gsmap.types import MapObject, ObjectObservation, PoseGraph, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import FindHit, FindReport
+from gsmap.types.rows.find import FindHit, FindReport
 
 _NEAR_M = 0.3  # a node, or a point that was picked, lies in the thing whose nearest sample is so near
 _SAME_PLACE_M = 0.5  # nodes of no object that are nearer than this are one place

@@ -23,7 +23,7 @@ from gsmap.store import Store
 from gsmap.texts import few
 from gsmap.types import Cameras, Edge, Scene, ScenePose, Sim3
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import SCHEMA
+from gsmap.types.rows.base import SCHEMA
 
 FORMATS = ("tum", "g2o", "colmap", "nerfstudio", "json")
 

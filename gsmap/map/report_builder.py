@@ -59,7 +59,12 @@ from gsmap.store.sizes import scene_sizes, sizes
 from gsmap.types import Gaussians, PoseGraph, Scene, ScenePose
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, ObjectsReport, RevisionRow, WrittenReport
+from gsmap.types.rows.changes import ChangesReport
+from gsmap.types.rows.maps import MapStatus
+from gsmap.types.rows.objects import ObjectsReport
+from gsmap.types.rows.pairs import EdgeRow
+from gsmap.types.rows.reports import WrittenReport
+from gsmap.types.rows.revisions import RevisionRow
 from gsmap.version import __version__
 
 _SUFFIXES = (".html", ".htm")

@@ -19,8 +19,8 @@ from gsmap.store.leases import Lease
 from gsmap.store.quarantine import CAPTURE
 from gsmap.types import PoseGraph
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import LeaseRow, MapStatus, MetricScaleRow, TodoRow
-from gsmap.types.rows.maps import TodoKind
+from gsmap.types.rows.leases import LeaseRow
+from gsmap.types.rows.maps import MapStatus, MetricScaleRow, TodoKind, TodoRow
 
 
 @snapshot_read

@@ -92,13 +92,13 @@ class Family:
         return {name: f"{self.folder}.{name}" for name in _modules_in(places)}
 
     def _added(self) -> dict[str, EntryPoint]:
-        return {point.name: point for point in _entry_points(self.group, tuple(sys.path))}
+        return {point.name: point for point in _entry_points(tuple(sys.path)).select(group=self.group)}
 
     def _load(self, name: str) -> Any:
-        built_in, added = self._built_in(), self._added()
+        built_in = self._built_in()
         if name in built_in:
             method = importlib.import_module(built_in[name])
-        elif name in added:
+        elif name in (added := self._added()):
             try:
                 method = added[name].load()
             except (Exception, SystemExit) as error:  # another package's code may fail in any way
@@ -205,9 +205,9 @@ def _modules_in(places: tuple[str, ...]) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=64)
-def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """List the entry points of other packages; the answer is cached per search path."""
-    return tuple(entry_points(group=group))
+def _entry_points(path: tuple[str, ...]) -> Any:
+    """Return the entry points of all packages, of which a file each is read; the answer is cached per search path."""
+    return entry_points()
 
 
 @lru_cache(maxsize=64)

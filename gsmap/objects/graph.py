@@ -9,7 +9,7 @@ from typing import Any
 from gsmap.objects.persistence import estimate_persistence
 from gsmap.objects.relations import relations
 from gsmap.types import MapObject
-from gsmap.types.rows import RoomRow
+from gsmap.types.rows.objects import RoomRow
 
 
 def object_graph(

@@ -10,7 +10,12 @@ import numpy as np
 from gsmap.report.params import Params
 from gsmap.report.plan import Plan
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, ObjectsReport, PoseChangeRow, RevisionRow, SceneRow
+from gsmap.types.rows.changes import ChangesReport
+from gsmap.types.rows.maps import MapStatus
+from gsmap.types.rows.objects import ObjectsReport
+from gsmap.types.rows.pairs import EdgeRow
+from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow
+from gsmap.types.rows.scenes import SceneRow
 
 CHI2_DOF = 7
 """Degrees of freedom of an edge: three of rotation, three of translation, one of scale."""

@@ -11,7 +11,7 @@ from gsmap.report.content import CHI2_95, CHI2_999, CHI2_DOF, EdgeEntry, SceneEn
 from gsmap.report.markup import Markup, joined, tag
 from gsmap.report.svg import Axis, Frame
 from gsmap.report.words import NOT_PULLED, cut, cut_pair, length, number
-from gsmap.types.rows import RevisionRow
+from gsmap.types.rows.revisions import RevisionRow
 
 MAX_BARS = 24  # maximum number of bars in a plot
 _ROW = 17.0

@@ -15,9 +15,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from itertools import islice
+from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, delete, func, select, update
-from sqlalchemy.dialects import postgresql
 from sqlalchemy.dialects import sqlite as sqlite_dialect
 
 from gsmap.errors import BusyError, GsmapError, StoreError
@@ -225,7 +225,11 @@ class Leases:
             "since": _text(now),
             "expires_at": _text(now + timedelta(seconds=self._lease_s)),
         }
-        insert = sqlite_dialect.insert if self._catalog.is_sqlite else postgresql.insert
+        insert: Any = sqlite_dialect.insert
+        if not self._catalog.is_sqlite:
+            from sqlalchemy.dialects import postgresql  # 20 modules that the other maps do without
+
+            insert = postgresql.insert
         # Sorted, so that concurrent inserts on a server cannot deadlock.
         ordered, ours = [{"what": what, **row} for what in sorted(work)], set[str]()
         for start in range(0, len(ordered), _AT_ONCE):

@@ -151,8 +151,7 @@ Index(
     "uq_scenes_living_name",
     scenes.c.name,
     unique=True,
-    sqlite_where=text("removed_at IS NULL"),
-    postgresql_where=text("removed_at IS NULL"),
+    sqlite_where=text("removed_at IS NULL"),  # on PostgreSQL too (migrations); naming it here would load that dialect
 )
 
 # Facts about a scene since its ingest, never overwritten. `scenes` holds the newest name and date.
@@ -438,8 +437,7 @@ Index(
     "uq_models_living_name",
     models.c.name,
     unique=True,
-    sqlite_where=text("removed_at IS NULL"),
-    postgresql_where=text("removed_at IS NULL"),
+    sqlite_where=text("removed_at IS NULL"),  # on PostgreSQL too (migrations); naming it here would load that dialect
 )
 
 exports = _table(

@@ -16,7 +16,7 @@ import pytest
 from gsmap.cli.console import json_object, print_facts, print_rows, print_table
 from gsmap.texts import shown
 from gsmap.types import Sim3, rows
-from gsmap.types.rows import Row
+from gsmap.types.rows.base import Row
 from tools.make import json_docs as TOOL
 
 ROOT = Path(__file__).resolve().parents[2]

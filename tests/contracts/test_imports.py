@@ -230,12 +230,12 @@ def one_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("verb", "most"),
     [
-        ("list MAP scenes", 200),
-        ("list MAP edges", 170),
-        ("poses MAP", 170),
-        ("show MAP hall", 215),
-        ("edit MAP hall --note wet", 215),
-        ("status MAP", 290),
+        ("list MAP scenes", 150),
+        ("list MAP edges", 150),
+        ("poses MAP", 150),
+        ("show MAP hall", 195),
+        ("edit MAP hall --note wet", 165),
+        ("status MAP", 270),
     ],
 )
 def test_verbs_that_only_read_start_quickly(one_scene: Path, verb: str, most: int) -> None:

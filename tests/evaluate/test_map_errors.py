@@ -16,7 +16,8 @@ from gsmap.evaluate.map_errors import EvaluatedScene, Params, evaluate_map
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities, exp
 from gsmap.types import PoseGraph, ScenePose, Sim3
-from gsmap.types.rows import EdgeRow, EvaluationReport
+from gsmap.types.rows.evaluation import EvaluationReport
+from gsmap.types.rows.pairs import EdgeRow
 
 CENTERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
 SIGMAS = np.array([0.001] * 3 + [0.01] * 3 + [0.002])

@@ -14,7 +14,7 @@ import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map import Map
 from gsmap.map.comparison_pictures import PictureFolder
-from gsmap.types.rows import FindHit, FindReport
+from gsmap.types.rows.find import FindHit, FindReport
 from tools.make.tiny_encoder import image_encoder
 from tools.make.tiny_text import text_tower, tokenizer
 

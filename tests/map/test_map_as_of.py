@@ -14,7 +14,7 @@ import gsmap.map
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map import Map
 from gsmap.types import Cameras, Gaussians, PoseGraph, ScenePose, Sim3
-from gsmap.types.rows import ExportReport
+from gsmap.types.rows.exports import ExportReport
 
 DATES = {"may": "2026-05-31T15:00:00Z", "june": "2026-06-30", "july": "2026-07-31", "some": None}
 

@@ -19,7 +19,7 @@ from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.export.manifest import FILE_NAME
 from gsmap.types import Prior, Sim3
-from gsmap.types.rows import GraphRow
+from gsmap.types.rows.scenes import GraphRow
 from gsmap_synthetic import make_captures, write_captures
 from tools.make.tiny_encoder import image_encoder
 

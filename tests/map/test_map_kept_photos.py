@@ -17,7 +17,7 @@ from gsmap.map import Map
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PoseGraph, ScenePose, Sim3
 from gsmap.types.localized_photo import LocalizedPhoto
-from gsmap.types.rows import ExportReport
+from gsmap.types.rows.exports import ExportReport
 
 LENS, SIZE = np.array([120.0, 120, 48, 36]), (96, 72)
 POSE = np.eye(4)

@@ -16,7 +16,7 @@ import gsmap
 import gsmap.map
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.types import Sim3
-from gsmap.types.rows import EdgeRow
+from gsmap.types.rows.pairs import EdgeRow
 from gsmap_synthetic import DemoCapture, make_captures
 
 PAIR = "capture_a:capture_b"

@@ -10,8 +10,10 @@ import pytest
 from gsmap.report import EdgeEntry, Island, Report, SceneEntry, page
 from gsmap.report.words import angle, chi_square, cut_pair, length, number, probability, size, some, verdict
 from gsmap.types.metric_scale import KNOWN_BY, KnownBy, MetricScale
-from gsmap.types.rows import EdgeRow, MapStatus, RevisionRow, SceneRow, TodoRow
-from gsmap.types.rows.maps import TodoKind
+from gsmap.types.rows.maps import MapStatus, TodoKind, TodoRow
+from gsmap.types.rows.pairs import EdgeRow
+from gsmap.types.rows.revisions import RevisionRow
+from gsmap.types.rows.scenes import SceneRow
 
 
 def scene(name: str, status: str = "placed", component: int | None = 0) -> SceneEntry:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.types import Scene
 from gsmap.types.notebook import html_facts
-from gsmap.types.rows import Row, Table
+from gsmap.types.rows.base import Row, Table
 
 HOSTILE = "<img src=x onerror=alert(1)>\x1b[31m & 'so' \"on\""
 

@@ -21,7 +21,10 @@ from gsmap.report import (
     page,
 )
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import EdgeRow, MapStatus, RevisionRow, SceneRow, TodoRow
+from gsmap.types.rows.maps import MapStatus, TodoRow
+from gsmap.types.rows.pairs import EdgeRow
+from gsmap.types.rows.revisions import RevisionRow
+from gsmap.types.rows.scenes import SceneRow
 
 HOSTILE = "<img src=//evil.example/x onerror=alert(1)>\"'"
 

@@ -16,7 +16,6 @@ CPU seconds are those of a whole call.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from collections import defaultdict
@@ -33,6 +32,7 @@ from gsmap.map import Map
 from gsmap.types.rows.localize_scan import ScanRow
 from gsmap_synthetic import Place, film, make_captures, make_place, walk
 from gsmap_synthetic.capture import Frames
+from tools.harness import argument_parser
 
 _DEG, _M = 1.0, 0.05
 _LOOSE_DEG, _LOOSE_M = 2.0, 0.08
@@ -80,7 +80,7 @@ class Tally:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--kitchen", type=Path, nargs=2, metavar=("FRAMES", "SPLATS"))
     parser.add_argument("--made", type=int, default=0, help="how many flats")
     parser.add_argument("--first", type=int, default=500, help="seed of the first")

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import argparse
 import types
 import typing
 from collections.abc import Mapping
@@ -19,8 +18,9 @@ import numpy as np
 from gsmap.cli.objects import OBJECTS, ManyRows, Object, OptionalRow
 from gsmap.reason_codes import ERRORS, REASONS
 from gsmap.settings import field_docs
-from gsmap.types.rows import SCHEMA, Row
+from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.sim3 import Sim3
+from tools.harness import argument_parser
 
 
 def page() -> str:
@@ -132,7 +132,7 @@ def _first(row: type[Row]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--out", type=Path, help="file to write; default: standard output")
     out = parser.parse_args().out
     if out:

@@ -238,7 +238,7 @@ def _chosen(methods: Family, name: str, models: Mapping[str, ModelSpec]) -> str:
     if name != "auto":
         methods.get(name)
         return name
-    for candidate in methods.usable():
+    for candidate in methods.usable() if models else ():
         needs = methods.get(candidate).MODELS
         if needs and all(kind in models for kind in needs):
             return candidate

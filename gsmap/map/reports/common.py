@@ -9,7 +9,7 @@ from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.types import Scene
-from gsmap.types.rows import SceneRef
+from gsmap.types.rows.scenes import SceneRef
 
 
 @snapshot_read

@@ -7,7 +7,8 @@ from pathlib import PurePosixPath
 
 from gsmap.store import Store
 from gsmap.types.notebook import html_facts, html_table
-from gsmap.types.rows import MapStatus, SceneRow, TodoRow
+from gsmap.types.rows.maps import MapStatus, TodoRow
+from gsmap.types.rows.scenes import SceneRow
 
 
 def map_html(store: Store, status: MapStatus, scenes: Sequence[SceneRow]) -> str:

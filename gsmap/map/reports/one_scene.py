@@ -13,7 +13,7 @@ from gsmap.methods import RecipeKey
 from gsmap.store import Store
 from gsmap.types import Scene, SceneGraph, ScenePose
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import FactRow, GraphRow, LayerRow, NodeRow, PriorRow, SceneEdgeRow, SceneReport
+from gsmap.types.rows.scenes import FactRow, GraphRow, LayerRow, NodeRow, PriorRow, SceneEdgeRow, SceneReport
 
 
 @snapshot_read

@@ -13,7 +13,7 @@ from gsmap.reason_codes import reason, reason_code
 from gsmap.store import Store
 from gsmap.store.registrations import StoredRegistration
 from gsmap.types import EdgeOutcome, Registration, Scene
-from gsmap.types.rows import EdgeRow, PairEventRow, PairReport
+from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairReport
 
 Outcomes = Mapping[tuple[str, str], EdgeOutcome]
 _FEW = 1000  # scenes that one query names; beyond, all outcomes are read

@@ -14,7 +14,9 @@ from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import IngestRow, PairRef, PoseChangeRow, RevisionRow, UpdateReport
+from gsmap.types.rows.pairs import PairRef
+from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow, UpdateReport
+from gsmap.types.rows.scenes import IngestRow
 
 
 @snapshot_read

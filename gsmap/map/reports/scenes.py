@@ -13,7 +13,7 @@ from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.types import Scene, ScenePose, Sim3
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.rows import IngestRow, PoseRow, SceneRow
+from gsmap.types.rows.scenes import IngestRow, PoseRow, SceneRow
 
 SCENE_STATUSES = ("ingested", "described", "placed", "tentative", "isolated")
 

@@ -12,7 +12,8 @@ from gsmap.settings import leaves
 from gsmap.store import Store
 from gsmap.store.integrity import CheckResult, PruneResult
 from gsmap.types import Tile
-from gsmap.types.rows import CheckReport, ExportReport, ModelRow, PruneReport, SettingRow, TileRow
+from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.maps import CheckReport, ModelRow, PruneReport, SettingRow
 
 if TYPE_CHECKING:
     from gsmap.export import ExportResult

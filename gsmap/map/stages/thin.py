@@ -19,7 +19,7 @@ from gsmap.store import Store, compact
 from gsmap.thin import find_visible, measure_fidelity_db, observed_fraction, render_views
 from gsmap.types import PosedScene, PoseGraph, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import ThinReport, ThinRow
+from gsmap.types.rows.thinning import ThinReport, ThinRow
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from gsmap.types.rows.base import Row
-from gsmap.types.rows.evaluation import EvaluationReport
-from gsmap.types.rows.exports import TileRow
 from gsmap.types.rows.leases import LeaseRow
-from gsmap.types.rows.pairs import EdgeRow
-from gsmap.types.rows.scenes import SceneRow
 
 TodoKind = Literal[
     "undescribed",
@@ -316,26 +312,3 @@ class ViewReport(Row):
     num_bytes: int | None = None
     num_scenes: int | None = None
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DemoReport(Row):
-    """The result of the demo.
-
-    Args:
-        map: folder of the map.
-        picture: image of the map.
-        scenes: the captures.
-        edges: the edges.
-        tiles: the merged tiles.
-        truth: errors against the ground truth.
-    """
-
-    columns: ClassVar[Mapping[str, str]] = {"map": "map", "picture": "picture"}
-
-    map: str
-    picture: str
-    scenes: tuple[SceneRow, ...]
-    edges: tuple[EdgeRow, ...]
-    tiles: tuple[TileRow, ...]
-    truth: EvaluationReport
