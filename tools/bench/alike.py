@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -30,6 +29,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.stages.optimize import pose_inputs
 from gsmap.optimize import optimize
 from gsmap.types import PoseGraph, Sim3
+from tools.harness import argument_parser, say
 
 FOLDED_M = 1.0
 
@@ -54,7 +54,7 @@ class Street:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--cache", type=Path, required=True, help="keep streets and their maps here")
     parser.add_argument("--seed", type=int, default=31, help="7 is the street that settings were chosen on")
     parser.add_argument("--repeats", default="decoration", choices=("decoration", "room", "nothing"))
@@ -160,10 +160,6 @@ def spread(values: list[float]) -> str:
         return "-"
     low, middle, high = np.quantile(values, [0, 0.5, 1])
     return f"{low:.3f} to {high:.3f}, median {middle:.3f}"
-
-
-def say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

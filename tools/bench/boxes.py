@@ -11,19 +11,18 @@ What Gaussians reach beyond their means is not counted; `tools/bench/store.py --
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
 from gsmap.geometry.morton import morton_order
 from gsmap_synthetic.city import PER_BLOCK, City
+from tools.harness import argument_parser
 
 COUNT, IN_BOX, MOST, BOXES = 1_000_000, 26_000, 5, 12
 _BITS = 16
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--rows", type=int, nargs="+", default=[16_384, 4096, 1024, 512], help="of a chunk")
     options = parser.parse_args()
     rng = np.random.default_rng(5)

@@ -16,14 +16,13 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, say, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import itertools
 import json
-import sys
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -73,7 +72,7 @@ class Capture:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--cameras", default=",".join(KINDS), help="which of " + ", ".join(KINDS))
     parser.add_argument("--count", type=int, default=10, help="how many cameras few are")
@@ -88,14 +87,13 @@ def main() -> None:
         answers: Counter[tuple[int, str]] = Counter()
         seconds = []
         for (a, b), share in overlaps.items():
-            start = time.process_time()
-            found = register_pair(views[a], views[b])
-            seconds.append(time.process_time() - start)
+            found, took = timed(register_pair, views[a], views[b])
+            seconds.append(took)
             said, text = judged(a, b, found)
             band = next(i for i, (low, high) in enumerate(BANDS) if low <= share < high)
             answers[band, said] += 1
             if options.verbose:
-                print(f"{kind:7s}{a.name}-{b.name} {share:.2f} {said}: {text}", file=sys.stderr, flush=True)
+                say(f"{kind:7s}{a.name}-{b.name} {share:.2f} {said}: {text}")
         cells = [
             " ".join(f"{answers[i, said]} {said}" for said in ("right", "wrong", "refused")) for i in range(len(BANDS))
         ]

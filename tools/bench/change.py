@@ -19,11 +19,9 @@ import argparse
 import inspect
 import itertools
 import json
-import resource
 import shutil
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,6 +34,7 @@ from gsmap import map as maps
 from gsmap.errors import ConfigError
 from gsmap.types import Gaussians, PosedScene, Sim3
 from tools.bench import change_scores as scores
+from tools.harness import argument_parser, cpu_s, say, timed
 
 PARTS = ("register", "merge", "changes", "as-of")
 PREFER = "merge.mergers.tto.prefer"
@@ -44,7 +43,7 @@ COUNTS += ("moved_symmetric_right", "moved_symmetric_said", "moved_claimed", "mo
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path, nargs="+")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--times", nargs="+", help="only these captures of every place")
@@ -143,12 +142,6 @@ class Place:
         return Gaussians.concatenate(parts), self.place_map(S_map_newest), cpu_s() - began
 
 
-def cpu_s() -> float:
-    """CPU seconds of this process and those it started."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(u.ru_utime + u.ru_stime for u in used)
-
-
 def register(place: Place, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     with place.map() as m:
         scenes = {row.name: row for row in m.scene_rows()}
@@ -177,7 +170,7 @@ def merge(place: Place, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         else:
             made = place.exported(way)
         if made is None:
-            print(f"{truth.folder.name}: this gsmap does not merge with {way} preferred", file=sys.stderr)
+            say(f"{truth.folder.name}: this gsmap does not merge with {way} preferred")
             continue
         merged, S_place_map, seconds = made
         row = {"way": way, "cpu_s": round(seconds, 1), **scores.score_merge(truth, newest, older, merged, S_place_map)}
@@ -203,16 +196,15 @@ def changes(place: Place, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     try:
         from gsmap.change import compare
     except ImportError:
-        print("this gsmap has no gsmap.change", file=sys.stderr)
+        say("this gsmap has no gsmap.change")
         return
     poses, times = place.poses(), place.times
     pairs = [(times[0], t) for t in times[1:]]
     if place.changed:
         pairs = sorted({*itertools.pairwise(times), (times[0], times[-1])})
     for a, b in pairs:
-        began = time.process_time()
-        report = compare(place.placed(a, poses[a]), place.placed(b, poses[b]))
-        row = {"pair": f"{a}:{b}", "cpu_s": round(time.process_time() - began, 1)}
+        report, took = timed(compare, place.placed(a, poses[a]), place.placed(b, poses[b]))
+        row = {"pair": f"{a}:{b}", "cpu_s": round(took, 1)}
         found = scores.claims_of(report.changes, Sim3.identity())
         yield row | scores.score_changes(place.truth, a, b, found)
 
@@ -223,7 +215,7 @@ def as_of(place: Place, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         return
     made = place.exported("as-of", as_of=truth.captured_at(first))
     if made is None:
-        print("this gsmap exports no map as of a date", file=sys.stderr)
+        say("this gsmap exports no map as of a date")
         return
     kinds, held = scores.masks(truth, first, later), truth.held_out(first)
     cameras, photographs = truth.cameras(first), truth.photographs(first)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import shutil
 import subprocess
 import sys
@@ -26,12 +25,13 @@ from gsmap import formats
 from gsmap.map import open_or_create
 from gsmap.types import PoseGraph, ScenePose, Sim3
 from gsmap_synthetic.city import BLOCK_M, PER_BLOCK, City
+from tools.harness import argument_parser, cpu_s, peak_mb
 
 STEPS = ("make", "ingest", "tiles", "unchanged", "one-more", "tiles again")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--millions", type=float, default=100.0, help="Gaussians of the city")
     parser.add_argument("--sh-degree", type=int, default=0)
     parser.add_argument("--merge", default="union")
@@ -93,18 +93,9 @@ def run_step(arguments: argparse.Namespace) -> dict:
     return {
         "wall_s": time.perf_counter() - wall,
         "cpu_s": cpu_s() - cpu,
-        "peak_mb": max(usage.ru_maxrss for usage in used()) / 1024,
+        "peak_mb": peak_mb(),
         "what": what,
     }
-
-
-def used() -> list[resource.struct_rusage]:
-    """Of this process, and of the largest of its workers."""
-    return [resource.getrusage(whom) for whom in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-
-
-def cpu_s() -> float:
-    return sum(usage.ru_utime + usage.ru_stime for usage in used())
 
 
 if __name__ == "__main__":

@@ -20,10 +20,11 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -164,7 +165,7 @@ def say(name: str, answers: Sequence[Answer], seconds: float) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--set", default="test", choices=("fit", "test"))

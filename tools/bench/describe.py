@@ -16,13 +16,11 @@ to 1.15, gamma .9 to 1.15).
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import multiprocessing
 import resource
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +33,7 @@ from gsmap.describe.cloud import surface_cloud
 from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.types import Cameras, Gaussians, Sim3
+from tools.harness import argument_parser, timed
 
 
 def exposed(gaussians: Gaussians, gain: float, gamma: float) -> Gaussians:
@@ -120,9 +119,8 @@ def print_costs(files: list[Path]) -> None:
 def _cost(path: Path, policy: str) -> None:
     gaussians, cameras = formats.read(path), formats.read_cameras(path.with_suffix(".cameras.json"))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    start = time.process_time()
-    graph = describe(path.stem, gaussians, cameras, scale_policy=policy)
-    seconds, peak = time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    graph, took = timed(describe, path.stem, gaussians, cameras, scale_policy=policy)
+    seconds, peak = took, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
         f"{path.stem:12s} {policy:6s} {len(gaussians)} Gaussians, {graph.num_nodes} nodes in {len(graph.layers)} "
         f"layers: {seconds:.1f} CPU s, peak {peak / 1e6:.2f} GB ({before / 1e6:.2f} GB before)",
@@ -131,7 +129,7 @@ def _cost(path: Path, policy: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="*")
     parser.add_argument("--cost", action="store_true", help="print CPU seconds and peak memory alone")
     parser.add_argument("--json", type=Path)
@@ -150,9 +148,7 @@ def main() -> None:
         if options.gain:
             gaussians = exposed(gaussians, rng.uniform(0.85, 1.15), rng.uniform(0.9, 1.15))
         record = json.loads((folder / "truth" / f"{path.stem}.json").read_text())
-        start = time.process_time()
-        graph = describe(path.stem, gaussians, cameras, scale_policy="known")
-        seconds = time.process_time() - start
+        graph, seconds = timed(describe, path.stem, gaussians, cameras, scale_policy="known")
         layer = graph.layers["landmarks"]
         print(f"{path.stem}: {len(gaussians)} Gaussians, {len(layer)} landmarks, {seconds:.1f} CPU s")
         truth = Sim3.from_matrix(np.array(record["T_scene_world"]))

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.engine.executors import local
+from tools.harness import argument_parser
 
 
 def burn(index: int, seconds: float, begun: str = "", wait: bool = False) -> tuple[int, float]:
@@ -45,7 +46,7 @@ def burn(index: int, seconds: float, begun: str = "", wait: bool = False) -> tup
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--jobs", type=int, default=100)
     parser.add_argument("--job-s", type=float, default=1.0)

@@ -25,10 +25,11 @@ import gsmap
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import read_captures
 from gsmap.types import PoseGraph, ScenePose, Sim3
+from tools.harness import argument_parser
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--millions", type=float, default=10.0, help="Gaussians in the map")
     parser.add_argument("--method", default="voxel")

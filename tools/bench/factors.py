@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import argparse
 import itertools
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,7 +45,7 @@ HONEST = float(chi2.ppf(0.5, 7))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--factors", nargs="+", type=float, default=FACTORS)
     parser.add_argument("--describe", action="store_true", help="describe each enlarged capture anew")
@@ -107,9 +108,8 @@ def run(name: str, pairs: list[tuple[Capture, Capture]]) -> None:
     """Register the pairs and print one line for each, and one for all."""
     rows, seconds = [], []
     for a, b in pairs:
-        start = time.process_time()
-        found = register_pair(a.view, b.view)
-        seconds.append(time.process_time() - start)
+        found, took = timed(register_pair, a.view, b.view)
+        seconds.append(took)
         said = f"  {a.name}-{b.name} {found.status}"
         if found.status == "accepted":
             truth = a.S_scene_world @ b.S_scene_world.inverse()

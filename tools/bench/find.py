@@ -12,7 +12,6 @@ objects    `Map.find --like` on the map of the captures, whose hits stand for th
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections import defaultdict
@@ -24,11 +23,12 @@ import gsmap
 from gsmap.find import SimilarityModel
 from gsmap.map.objects import compute_objects
 from tools.bench.find_scores import QUERIES, average_precisions, by_cosine, by_model, items_of, precision
+from tools.harness import argument_parser
 from tools.make import find_places
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=int, nargs=2, default=(300, 306), metavar=("FIRST", "END"))
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--maps", type=int, default=1, help="of so many places a map is made, too")

@@ -10,7 +10,6 @@ of all that comes before them. The shipped steps were chosen by this on the plac
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,6 +30,7 @@ from gsmap.render import render
 from gsmap.types import Gaussians, Sim3
 from gsmap_synthetic import make_captures
 from gsmap_synthetic.make import DemoCapture
+from tools.harness import argument_parser
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Begun:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--seed", type=int, default=72)
     parser.add_argument(
         "--vary-exposure", action="store_true", help="captures that disagree in colour, as real ones do"

@@ -12,14 +12,11 @@ back against FILE itself, over five views that gsmap renders.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
-import resource
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,10 +24,11 @@ import numpy as np
 
 from gsmap import formats
 from gsmap.types import Gaussians
+from tools.harness import argument_parser, timed
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("file", nargs="?")
     parser.add_argument("--cameras")
     parser.add_argument("--count", type=int, default=1_000_000)
@@ -49,7 +47,7 @@ def main() -> None:
         for name, by, write, read in ways(g, Path(folder), args.file if args.peers else None):
             if args.only not in name:
                 continue
-            (write_s, _), (read_s, back) = timed(write), timed(read)
+            (_, write_s), (back, read_s) = (timed(call) if call else (None, None) for call in (write, read))
             row = {
                 "format": name,
                 "by": by,
@@ -118,21 +116,6 @@ def splat_transform(source: str, target: Path) -> None:
     home = Path(os.environ.get("NPM_VALIDATORS", Path.home() / ".cache" / "gsmap" / "validators"))
     program = home / "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
     subprocess.run(["node", program, "-q", "-w", "-g", "cpu", "--max-workers", "0", source, target], check=True)
-
-
-def timed(call: Callable[[], object] | None) -> tuple[float | None, object]:
-    """CPU seconds of a call, and what it returned."""
-    if call is None:
-        return None, None
-    start = cpu_s()
-    back = call()
-    return cpu_s() - start, back
-
-
-def cpu_s() -> float:
-    """Of this process and of those that it started and that ended."""
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def renderer(path: str) -> Callable[[Gaussians], np.ndarray]:

@@ -15,13 +15,14 @@ judged poses, and their errors on fronts left out.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+
+from tools.harness import argument_parser
 
 os.environ.setdefault("GSMAP_WORKERS", "1")
 
@@ -70,7 +71,7 @@ class Front:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--cache", type=Path, required=True, help="maps of fronts are kept here")
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--fit", action="store_true", help="print weights instead")

@@ -50,13 +50,14 @@ from gsmap.render import (
     set_num_threads,
 )
 from gsmap.types import Cameras, Gaussians, PosedScene, Sim3
+from tools.harness import argument_parser
 
 PARTS = ("kernels", "fit", "merge", "describe", "pairs", "tile", "memory")
 BACKENDS = ("native", "gsplat")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("captures", type=Path)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--json", type=Path)

@@ -8,17 +8,16 @@ left out). A second table has the bytes of each array of all graphs together, pa
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import time
 from collections import Counter
 from pathlib import Path
 
 from gsmap.store import Store, array_archive
+from tools.harness import argument_parser, timed
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("maps", nargs="+", type=Path)
     parser.add_argument("--repeat", type=int, default=20)
     options = parser.parse_args()
@@ -41,11 +40,7 @@ def _row(store: Store, name: str, repeat: int) -> None:
     if graph is None:
         print(f"{name:14} has no graph")
         return
-    times = []
-    for _ in range(repeat):
-        start = time.process_time()
-        store.graphs.load(name)
-        times.append(time.process_time() - start)
+    times = [timed(store.graphs.load, name)[1] for _ in range(repeat)]
     scene = store.scenes.get(name)
     folders = [store.home / "arrays" / "scenes" / scene.id]
     with store.catalog.read() as connection:

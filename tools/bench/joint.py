@@ -20,6 +20,8 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -82,7 +84,7 @@ class Place:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--cache", type=Path, required=True, help="keep overlaps here")
     parser.add_argument("--least-overlap", type=float, default=0.1)
@@ -91,9 +93,7 @@ def main() -> None:
     options.cache.mkdir(parents=True, exist_ok=True)
     print("errors: median and most of pairs in use | of all pairs of placed captures; NEES of poses (5.3 expected)")
     for folder in options.folders:
-        began = time.process_time()
-        place = read_place(folder, options)
-        registered = time.process_time() - began
+        place, registered = timed(read_place, folder, options)
         if not place.pairs:
             print(f"{place.name}: no pair is accepted", flush=True)
             continue
@@ -104,9 +104,8 @@ def main() -> None:
         show("pairs alone", place, None, None, 0.0)
         show("pose graph", place, graph, covariances, time.process_time() - began)
         for name, refine in VARIANTS.items():
-            began = time.process_time()
-            poses = refine(place, graph)
-            show(name, place, poses, covariances, time.process_time() - began)
+            poses, took = timed(refine, place, graph)
+            show(name, place, poses, covariances, took)
 
 
 def read_place(folder: Path, options: argparse.Namespace) -> Place:

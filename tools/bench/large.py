@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -49,7 +51,7 @@ GICP_RADII_M = (0.15, 0.3, 0.6)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--seeds", nargs="+", type=int, default=[501, 502])
     parser.add_argument("--captures", type=int, default=6)
     parser.add_argument("--steps", type=int, default=150)

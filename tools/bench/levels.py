@@ -14,14 +14,12 @@ included, as an export of 3D Tiles makes them. What makes the tiles is not count
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
 import shlex
 import subprocess
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -34,13 +32,14 @@ from gsmap.geometry.decimate import decimate
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, Sim3, Tile
+from tools.harness import argument_parser, cpu_s
 
 LEVELS = ((0.25, 2), (0.06, 4))
 """Share of the Gaussians, and how many times smaller the pictures are."""
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--tree", type=int, metavar="COUNT")
     parser.add_argument("--splat-transform", default="", metavar="COMMAND")
@@ -168,11 +167,6 @@ def theirs(command: str, path: Path, way: str, share: float) -> Gaussians:
         words = [*shlex.split(command), "-q", "-w", path, f"--{way}", f"{share:.0%}", out]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
         return formats.read(out)
-
-
-def cpu_s() -> float:
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 if __name__ == "__main__":

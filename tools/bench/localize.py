@@ -33,10 +33,11 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import json
 import shutil
 import sys
@@ -208,9 +209,8 @@ def world(data: Path, work: Path, names: list[str]) -> World:
         began = time.process_time()
         m.update(*(data / f"{name}.ply" for name in names))
         print(f"{path.name}: {time.process_time() - began:.0f} CPU s in this process")
-    began = time.process_time()
-    localizer = Localizer(m.store, m.settings, log_progress(None))
-    print(f"{len(localizer.scenes)} scenes, {time.process_time() - began:.1f} CPU s here")
+    localizer, took = timed(Localizer, m.store, m.settings, log_progress(None))
+    print(f"{len(localizer.scenes)} scenes, {took:.1f} CPU s here")
     truth, ids = {}, {}
     for scene in localizer.scenes.values():
         told = json.loads((data / "truth" / f"{scene.name}.json").read_text())
@@ -568,7 +568,7 @@ def say(name: str, rows: list[dict], deg: float, metres: float) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--only", nargs="+", default=["c0", "c1", "c2", "c3"])

@@ -10,7 +10,6 @@ from the same files estimated. Seconds are wall and CPU of the merge alone. MB i
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
@@ -27,10 +26,11 @@ from gsmap.ingest import Capture, read_captures
 from gsmap.merge import default_params, merge, methods, reach_m
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.types import Gaussians, MergeResult, PosedScene, Sim3
+from tools.harness import argument_parser
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("captures", type=Path)
     parser.add_argument("--scenes", nargs="+", default=["c0", "c1"], help="names of captures to merge")
     parser.add_argument("--images", type=Path, help="folder of pictures, CAPTURES/frames else")

@@ -7,7 +7,6 @@ Prints the median of wall and the mean of CPU milliseconds of each, both process
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import time
@@ -18,10 +17,11 @@ import onnxruntime
 
 from gsmap.networks import ModelProcess
 from gsmap.types.model import ModelLimits
+from tools.harness import argument_parser
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("model")
     parser.add_argument("--runs", type=int, default=200)
     args = parser.parse_args()

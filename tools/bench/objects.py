@@ -17,7 +17,6 @@ false     what stayed and is called absent, or was not seen and is.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from pathlib import Path
@@ -32,6 +31,7 @@ from gsmap.describe.gravity import estimate_up
 from gsmap.describe.objects.segments import find_segments
 from gsmap.objects import RenderedViews, SegmentedScene, find_changed_segment, make_objects, render_views
 from gsmap.types import MapObject, PosedScene, Segments
+from tools.harness import argument_parser, timed
 from tools.make.change_truth import Truth, owners
 
 _SHOWN = 60  # Gaussians of a piece that a capture shows, or else it says little of it
@@ -40,7 +40,7 @@ _KINDS = {"furniture": "furniture", "small": "furniture", "picture": "pictures"}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path, nargs="+")
     parser.add_argument("--changes", action="store_true", help="ask what changed, too, for what moved or left")
     args = parser.parse_args()
@@ -76,9 +76,8 @@ def score(truth: Truth, with_changes: bool) -> Counter[str]:
         return render_views(gaussians, formats.read_cameras(truth.folder / f"{capture.scene}.cameras.json"))
 
     moved, parted = _told(truth, captures) if with_changes else ([], [])
-    started = time.process_time()
-    objects = make_objects(captures, 0, eyes, moved=moved, parted=parted)
-    counts["objects ms"] += round(1000 * (time.process_time() - started))
+    objects, took = timed(make_objects, captures, 0, eyes, moved=moved, parted=parted)
+    counts["objects ms"] += round(1000 * took)
     _followed(counts, truth, captures, whose, objects)
     return counts
 

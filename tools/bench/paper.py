@@ -26,6 +26,8 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -79,7 +81,7 @@ class Stages:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--made", type=int, default=0, metavar="N", help="also N generated places")
     parser.add_argument("--captures", type=int, default=3, metavar="N", help="of each generated place")
@@ -203,9 +205,7 @@ def as_gsmap(target: Capture, source: Capture, settings: Settings) -> Stages:
     """gsmap's clique, and the pose that it stands by after refinement and verdict."""
     unknown = "unknown" in (target.view.scale_policy, source.view.scale_policy)
     out = clique_stages(target, source, settings.register.proposers["graph"], with_scale=unknown)
-    start = time.process_time()
-    answer = register_pair(target.view, source.view, settings.register)
-    out.cpu_s = time.process_time() - start
+    answer, out.cpu_s = timed(register_pair, target.view, source.view, settings.register)
     out.refined = answer.S_target_source if answer.status == "accepted" else None
     return out
 
@@ -242,9 +242,8 @@ def measured(name: str, captures: list[Capture], run, settings: Settings, descri
     for i, a in enumerate(captures):
         for b in captures[i + 1 :]:
             overlap = true_overlap(a, b)
-            start = time.process_time()
-            out = run(a, b, settings)
-            out.cpu_s = out.cpu_s or time.process_time() - start
+            out, took = timed(run, a, b, settings)
+            out.cpu_s = out.cpu_s or took
             if a.place == b.place:
                 truth, centre = a.S_scene_world @ b.S_scene_world.inverse(), scene_centroid(b.view.gaussians)
                 for stage in ("posed", "refined"):
@@ -361,9 +360,7 @@ def merging(options: argparse.Namespace, folder: Path, found: dict[str, dict]) -
         for c in captures:
             placed = transform_gaussians(c.gaussians, S[c.name]), transform_cameras(c.cameras, S[c.name])
             scenes.append(PosedScene(*placed, c.name, c.captured_at))
-        start = time.process_time()
-        result = merge(scenes, method, params)
-        seconds = time.process_time() - start
+        result, seconds = timed(merge, scenes, method, params)
         parts = [
             compare_renders(result.gaussians, scene.cameras, find_images(c.cameras, images), lpips=lpips)
             for scene, c in zip(scenes, captures, strict=True)

@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import contextlib
 import json
 import sys
@@ -53,7 +54,7 @@ TEXEL_M = 0.012
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--set", choices=SETS, required=True)

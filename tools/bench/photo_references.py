@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -121,9 +121,7 @@ def measure(
     ]
     for share in shares:
         params = replace(default_params("tto"), photo_weight=share)
-        began = time.process_time()
-        merged = merge(given, "tto", params)
-        seconds = time.process_time() - began
+        merged, seconds = timed(merge, given, "tto", params)
         of_kept, of_others = (
             float(np.mean([psnr_db(merged.gaussians, one, gained=gained) for one in them])) for them in (kept, others)
         )
@@ -137,7 +135,7 @@ def measure(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", nargs="+", default=["c0", "c1"])
     parser.add_argument("--made", metavar="SET", help="the folder holds sets of made places: those of this one")

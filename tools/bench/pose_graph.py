@@ -25,13 +25,15 @@ from pathlib import Path
 
 import numpy as np
 
+from tools.harness import argument_parser, timed
+
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "optimize")]
 METHODS = ("gsmap", "lm", "lm+cauchy", "gnc", "pcm", "oracle")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[100, 1000])
     parser.add_argument("--wrong", type=float, nargs="+", default=[0.1, 0.3, 0.5])
     parser.add_argument("--seeds", type=int, default=3)
@@ -209,9 +211,8 @@ def run_place(task: dict) -> dict:
     for count in range(1001, len(world.ids) + 1):
         ids.add(world.ids[count - 1])
         edges = [e for e in world.edges if e.target in ids and e.source in ids]
-        begin = time.process_time()
-        answer = optimize(world.ids[:count], edges, previous=answer)
-        seconds.append(time.process_time() - begin)
+        answer, took = timed(optimize, world.ids[:count], edges, previous=answer)
+        seconds.append(took)
         full += answer.provenance.method == "batch"
     return {
         "median_ms": 1e3 * float(np.median(seconds)),
@@ -272,9 +273,7 @@ def run_g2o(task: dict) -> dict:
     from gsmap.optimize.measurements import measurements
 
     graph = read_graph(task["file"])
-    begin = time.process_time()
-    answer = optimize(list(graph.poses), graph.edges, params=Params(marginals=False))
-    seconds = time.process_time() - begin
+    answer, seconds = timed(optimize, list(graph.poses), graph.edges, params=Params(marginals=False))
     poses = Similarities.stack([p.S_map_scene for p in answer.poses.values()])
     return {"error": objective(measurements(list(graph.poses), graph.edges), poses), "cpu_s": seconds}
 

@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -80,7 +82,7 @@ class Row:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--cache", type=Path, required=True, help="keep overlaps and what GICP answered here")
     parser.add_argument("--least-overlap", type=float, default=0.1)
@@ -137,9 +139,7 @@ def run(folder: Path, a: Capture, b: Capture, overlap: float, options: argparse.
     check_pose(a.view, b.view, proposal)
     cold = time.process_time() - began
     with stages() as seconds:
-        began = time.process_time()
-        found = check_pose(a.view, b.view, proposal)
-        seconds["all"] = time.process_time() - began
+        found, seconds["all"] = timed(check_pose, a.view, b.view, proposal)
     poses = {"start": start, "gsmap": found.S_target_source, **seconds.pop("poses")}
     if not options.no_gicp:
         poses |= gicp(folder, a, b, start, options.cache, seconds)
@@ -174,9 +174,8 @@ def stages() -> Iterator[dict[str, Any]]:
         def call(*args, **more):
             scaled = more.get("with_scale")
             label = name if scaled is None else f"{name} {'scaled' if scaled else 'rigid'}"
-            began = time.process_time()
-            out = inner(*args, **more)
-            seconds[label] += time.process_time() - began
+            out, took = timed(inner, *args, **more)
+            seconds[label] += took
             if isinstance(out, Sim3):
                 pair = args[0]
                 seconds["poses"][label] = pair.to_scene_units(out)
@@ -222,9 +221,7 @@ def hopeless_s(a: Capture, b: Capture) -> float:
     pose = Sim3(turn, a.view.centre - turn @ b.view.centre)
     proposal = Proposal("bench", pose, False, 5, log_nfa=0.0)
     check_pose(a.view, b.view, proposal)
-    began = time.process_time()
-    check_pose(a.view, b.view, proposal)
-    return time.process_time() - began
+    return timed(check_pose, a.view, b.view, proposal)[1]
 
 
 # --- the tables ----------------------------------------------------------------------------------------------------

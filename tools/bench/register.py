@@ -22,13 +22,14 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, say, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import argparse
 import itertools
 import json
-import sys
 import tempfile
 import time
 from dataclasses import asdict, replace
@@ -57,7 +58,7 @@ GATE = 0.999  # of the optimiser
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--made", type=int, default=0, metavar="N", help="also N generated places")
     parser.add_argument("--captures", type=int, default=1, metavar="N", help="of each generated place")
@@ -74,7 +75,7 @@ def main() -> None:
     groups = {"all": [*METHODS], "ablations": [*ABLATIONS], "none": []}
     names = groups.get(options.methods) if options.methods in groups else options.methods.split(",")
     if "splatreg" in names and not _installed("splatreg"):
-        _say("splatreg is not installed: left out")
+        say("splatreg is not installed: left out")
         names.remove("splatreg")
     with tempfile.TemporaryDirectory() as temporary:
         pairs = read_pairs(options, options.cache or Path(temporary)) if names else []
@@ -132,7 +133,7 @@ def described(m, name: str, place: str, gaussians: Gaussians, cameras: Cameras, 
     start = time.process_time()
     m.describe(scene.id)
     graph = m.store.graphs.load(scene.id, graph_keys(m.store, [scene], m.settings)[scene.id])
-    _say(f"{name}: {graph.num_nodes} nodes" + (f", {time.process_time() - start:.1f} CPU s" if new else ""))
+    say(f"{name}: {graph.num_nodes} nodes" + (f", {time.process_time() - start:.1f} CPU s" if new else ""))
     gaussians, cameras = m.store.scenes.gaussians(scene.id), m.store.scenes.cameras(scene.id)
     return Capture(name, place, SceneView(scene.id, gaussians, cameras, graph, policy), S)
 
@@ -142,7 +143,7 @@ def make_place(cache: Path, seed: int, count: int) -> Path:
 
     folder = cache / f"made_{seed}_{count}"
     if not folder.exists():
-        _say(f"making place {seed}")
+        say(f"making place {seed}")
         made = make_captures(seed, count, num_frames=40, num_gaussians=40_000, size_px=(240, 180))
         write_captures(folder, made)
     return folder
@@ -170,9 +171,8 @@ def measure(name: str, method: Method, pairs: list[tuple[Capture, Capture, float
     """One row of the table: every pair by one method."""
     records, seconds = [], []
     for a, b, overlap in pairs:
-        start = time.process_time()
-        answer = method(a, b)
-        seconds.append(time.process_time() - start + answer.shared_s)
+        answer, took = timed(method, a, b)
+        seconds.append(took + answer.shared_s)
         error = None
         if answer.pose is not None and a.place == b.place:
             error = pose_error(answer.pose, _truth(a, b), scene_centroid(b.view.gaussians))
@@ -180,7 +180,7 @@ def measure(name: str, method: Method, pairs: list[tuple[Capture, Capture, float
         records.append((a, b, overlap, answer, error))
         if verbose:
             said = "no pose" if answer.pose is None else "pose" if error is None else _text(error)
-            _say(f"{name:14s} {a.name}-{b.name} overlap {overlap:.2f} {seconds[-1]:5.2f} s  {said}  {answer.note}")
+            say(f"{name:14s} {a.name}-{b.name} overlap {overlap:.2f} {seconds[-1]:5.2f} s  {said}  {answer.note}")
     wanted = [r for r in records if r[2] >= OVERLAPPING]
     places = {a.place: [] for a, *_ in wanted}
     for a, *_, e in wanted:
@@ -321,10 +321,6 @@ def _installed(package: str) -> bool:
     from importlib.util import find_spec
 
     return find_spec(package) is not None
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

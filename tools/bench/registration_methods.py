@@ -5,7 +5,6 @@ A method takes two captures (target, source) and gives an `Answer`.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -26,6 +25,7 @@ from gsmap.register.pose import fit_pose
 from gsmap.register.proposers import graph, kiss_matcher
 from gsmap.register.refiners import gicp
 from gsmap.types import NodeLayer, SceneGraph, Sim3
+from tools.harness import timed
 
 FPFH_SIGMA_M = 0.05
 STEP_LIMIT = 5_000_000
@@ -49,9 +49,8 @@ class Capture:
     def once(self, key: Any, make: Callable[[], Any]) -> tuple[Any, float]:
         """Something of this capture alone, made once, and the CPU seconds that took."""
         if key not in self.kept:
-            start = time.process_time()
-            made = make()
-            self.kept[key] = made, time.process_time() - start
+            made, took = timed(make)
+            self.kept[key] = made, took
         return self.kept[key]
 
 

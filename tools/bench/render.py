@@ -11,7 +11,6 @@ contiguous depths (under current torch it would sort by the wrong numbers). Peer
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -24,6 +23,7 @@ from gsmap import _native
 from gsmap.render import ChunkIndex, LearningRates, native, num_threads, render, set_num_threads
 from gsmap.render.native_fit import NativeFitter
 from gsmap.types import Cameras, Gaussians
+from tools.harness import argument_parser, timed
 
 BLACK = np.zeros(3, np.float32)
 
@@ -167,9 +167,8 @@ def site(n: int, repeats: int) -> dict:
     log_scales = np.full((n, 3), np.log(0.02), np.float32) + rng.normal(0, 0.5, (n, 3)).astype(np.float32)
     quats = rng.normal(size=(n, 4)).astype(np.float32)
     gaussians = Gaussians(means, quats, log_scales, rng.normal(size=n), rng.normal(size=(n, 1, 3)))
-    start = time.process_time()
-    index = ChunkIndex.build(gaussians)
-    built = 1e3 * (time.process_time() - start)
+    index, took = timed(ChunkIndex.build, gaussians)
+    built = 1e3 * took
     T = np.eye(4)
     side = 2.0 * cells
     T[:3, 3] = [side / 2, 1.5, side * 0.72]  # near one edge, looking out over it
@@ -205,7 +204,7 @@ def read_capture(ply: Path, cameras_json: Path) -> tuple[Gaussians, Cameras]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     house = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "house"
     parser.add_argument("--quick", action="store_true", help="300k Gaussians at 640x480 and the capture only")
     parser.add_argument("--json", type=Path)

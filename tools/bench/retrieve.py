@@ -29,6 +29,8 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -55,7 +57,7 @@ A_FLOOR = ROOMS - 1
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--cache", type=Path, required=True, help="keep described captures here")
     parser.add_argument("--scenes", type=int, nargs="*", default=[30, 60, 120, 300])
     parser.add_argument("--cost", type=int, nargs="*", default=[])
@@ -145,9 +147,8 @@ def report(graphs: Sequence[SceneGraph], voters: Sequence[SceneNodes], params: P
     }
     say("all at once", names, pairs, seconds)
     if older:
-        begin = time.process_time()
-        pairs = votes_of_all(graphs)
-        say("all for all", names, pairs, (time.process_time() - begin) / len(names))
+        pairs, took = timed(votes_of_all, graphs)
+        say("all for all", names, pairs, took / len(names))
 
 
 def say(what: str, names: Sequence[str], pairs: set[frozenset[str]], seconds: float) -> None:

@@ -14,9 +14,7 @@ doors   pairs of found rooms joined by a door that a capture passed, of how many
 
 from __future__ import annotations
 
-import argparse
 import json
-import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations, pairwise
@@ -29,11 +27,12 @@ from gsmap.objects import find_rooms
 from gsmap.types import Room
 from gsmap_synthetic.capture import default_routes, unused_doors
 from gsmap_synthetic.initialise import from_depth
+from tools.harness import argument_parser, timed
 from tools.make.change_truth import Truth
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path, nargs="*", default=[])
     parser.add_argument("--made", type=int, nargs="+", default=[], help="seeds of flats to make")
     parser.add_argument("--rooms", type=int, default=5, help="how many rooms these have")
@@ -55,9 +54,8 @@ def score(truth: Truth, only: str | None = None) -> Counter[str]:
     times = truth.times if only is None else [only]
     captures = [truth.gaussians(when) for when in times]
     eyes = np.concatenate([truth.cameras(when).centers for when in times])
-    started = time.process_time()
-    found = find_rooms(captures, eyes)
-    counts: Counter[str] = Counter({"ms": round(1000 * (time.process_time() - started))})
+    found, took = timed(find_rooms, captures, eyes)
+    counts: Counter[str] = Counter({"ms": round(1000 * took)})
     routes = [json.loads((truth.folder / "truth" / f"{when}.json").read_text())["route"] for when in times]
     floors = {s["room"]: np.array(s["box_m"])[:, :2] for s in truth.states(times[0]) if s["name"] == "floor"}
     return counts + compared(found, floors, routes)
@@ -72,9 +70,8 @@ def score_made(seed: int, rooms: int) -> Counter[str]:
         frames = synthetic.film(place, poses, size_px=(160, 120), shut=unused_doors(place, route))
         captures.append(from_depth(frames, 12_000, seed=seed))
         eyes.append(poses[:, :3, 3])
-    started = time.process_time()
-    found = find_rooms(captures, np.concatenate(eyes))
-    counts: Counter[str] = Counter({"ms": round(1000 * (time.process_time() - started))})
+    found, took = timed(find_rooms, captures, np.concatenate(eyes))
+    counts: Counter[str] = Counter({"ms": round(1000 * took)})
     floors = {i: room.rect_m.reshape(2, 2) for i, room in enumerate(place.rooms)}
     return counts + compared(found, floors, routes)
 

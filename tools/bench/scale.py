@@ -19,6 +19,8 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GSMAP_WORKERS"):
     os.environ[_name] = "1"
 
@@ -45,7 +47,7 @@ from tools.make.large_maps import TRIED, Filled, Pattern, filled, kept, pattern
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--scenes", nargs="+", type=int, default=[10, 100, 1000])
     parser.add_argument(
         "--updates", type=int, default=20, help="one-scene updates before the catalog is weighed, 0: not"
@@ -200,9 +202,7 @@ def _diagonal(i: int) -> list[float]:
 def planning(num: int, place: Callable[[int], list[float]]) -> float:
     poses = {f"s{i:05d}": Sim3(exp_so3([0, 0, 0.1 * i]), place(i)) for i in range(num)}
     bounds = dict.fromkeys(poses, np.array([[-4.0, -4, -1], [4, 4, 3]]))
-    start = time.process_time()
-    plan_tiles(poses, bounds, tile_size_m=10.0, reach_m=11.0)
-    return time.process_time() - start
+    return timed(plan_tiles, poses, bounds, tile_size_m=10.0, reach_m=11.0)[1]
 
 
 def exporting(num: int) -> None:
@@ -218,9 +218,7 @@ def exporting(num: int) -> None:
             poses[scene.id] = ScenePose(scene.id, Sim3(exp_so3([0, 0, 0.1 * i]), _diagonal(i)), 0, "placed")
         m.store.revisions.save(PoseGraph(poses))
         for again in (False, True):
-            start = time.process_time()
-            report = m.export(Path(scratch) / "tiles", merge="union", tile_size_m=10.0)
-            spent_s = time.process_time() - start
+            report, spent_s = timed(m.export, Path(scratch) / "tiles", merge="union", tile_size_m=10.0)
             held = sum(tile.num_gaussians for tile in report.tiles)
             print(
                 f"{'again' if again else 'at once'}: {num} scenes over {4e-3 * num:.1f} km, {len(report.tiles)} tiles, "

@@ -5,11 +5,12 @@ python -m tools.bench.start [--runs 11]
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import subprocess
 import sys
 import time
+
+from tools.harness import argument_parser
 
 COMMANDS = {
     "python -c pass": ["-c", "pass"],
@@ -19,7 +20,7 @@ COMMANDS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argument_parser(__doc__)
     parser.add_argument("--runs", type=int, default=11)
     runs = parser.parse_args().runs
     print(f"{'command':<16} {'median ms':>10} {'min ms':>8}")

@@ -16,7 +16,6 @@ making objects.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections import Counter
@@ -31,6 +30,7 @@ from gsmap import formats
 from gsmap.map import static_filter
 from gsmap.map.static_filter import DynamicContent
 from gsmap.types import PoseGraph, ScenePose
+from tools.harness import argument_parser
 from tools.make.change_truth import Truth, owners
 
 _THINGS = ("furniture", "small", "picture", "lamp", "rug")
@@ -40,7 +40,7 @@ WAYS = ("both", "objects", "changes")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path, nargs="+")
     total: dict[str, Counter[str]] = {way: Counter() for way in WAYS}
     for folder in parser.parse_args().places:

@@ -14,11 +14,9 @@ wide and high; --city takes a made city (walls, roofs and streets) in place of r
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
@@ -30,12 +28,13 @@ from gsmap.store import Store, array_archive, arrays
 from gsmap.store.object_arrays import MAX_REQUESTS, merge_ranges
 from gsmap.types import Cameras, Gaussians
 from gsmap_synthetic.city import PER_BLOCK, City
+from tools.harness import argument_parser, timed
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("file", type=Path, nargs="?")
     parser.add_argument("--gaussians", type=int, default=1_000_000)
     parser.add_argument("--degree", type=int, default=3)
@@ -205,12 +204,7 @@ def damage(folder: Path, read: Callable[[], object]) -> str:
 
 
 def best(call: Callable[[], object], repeat: int) -> float:
-    times = []
-    for _ in range(repeat):
-        start = time.process_time()
-        call()
-        times.append(time.process_time() - start)
-    return min(times)
+    return min(timed(call)[1] for _ in range(repeat))
 
 
 def one_camera() -> Cameras:

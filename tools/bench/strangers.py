@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator
@@ -105,7 +106,7 @@ def report(name: str, rows: list[tuple[str, LocalizationResult, float]], seconds
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--count", type=int, default=0)
@@ -127,9 +128,8 @@ def main() -> int:
         held, rows, seconds = Map(load_place(folder, args.work / "features", params), params), [], 0.0
         rng = np.random.default_rng(STREET_SEED)
         for k, (image, told, differs) in enumerate(photographs_alike(place, DECORATIONS, args.alike, rng)):
-            began = time.process_time()
-            said = held.ask(image, told["intrinsics"], f"photo {k}")
-            seconds += time.process_time() - began
+            said, took = timed(held.ask, image, told["intrinsics"], f"photo {k}")
+            seconds += took
             rows.append((f"photo {k}", said, differs))
         share = np.array([differs for _, _, differs in rows])
         for low, high in ((0, 0.05), (0.05, 0.15), (0.15, 0.3), (0.3, 1.01)):

@@ -25,6 +25,8 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, say
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GSMAP_WORKERS"):
     os.environ[_name] = "1"
 
@@ -32,7 +34,6 @@ import argparse
 import gc
 import json
 import resource
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -69,7 +70,7 @@ Walk = tuple[tuple[int, int], tuple[int, int]]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--cache", type=Path, required=True, help="the map, and what was measured, are kept here")
     parser.add_argument("--captures", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=97, help="of the street")
@@ -203,7 +204,7 @@ def grow(args: argparse.Namespace) -> None:
             row["peak MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             print(json.dumps(row), file=file, flush=True)
             if (number + 1) % 25 == 0:
-                print(f"{number + 1} captures", file=sys.stderr, flush=True)
+                say(f"{number + 1} captures")
 
 
 def measured(folder: Path) -> list[dict[str, Any]]:

@@ -12,7 +12,6 @@ be named, and without control points nothing can tell which group is right.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,6 +22,7 @@ import numpy as np
 from gsmap.optimize import optimize
 from gsmap.types.world import LOCAL, ControlPoint, Georeference, ImagePoint, PositionFix, ScaleBar, Survey, WorldFrame
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
+from tools.harness import argument_parser
 
 FEET = 0.3048
 PHONE = ((1.5, 3.0), (3.0, 6.0), 40.0)
@@ -353,7 +353,7 @@ def run(name: str, mixture: Mixture, seed: int, tally: Tally, *, verbose: bool =
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--each", type=int, default=3, help="mixtures on each site")

@@ -28,12 +28,13 @@ from gsmap.render import render
 from gsmap.types import Gaussians, Sim3
 from gsmap_synthetic.capture import default_routes
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
+from tools.harness import argument_parser, say, timed
 
 HOLD_OUT = 6
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--visits", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--steps", type=int, default=300, help="of training, a visit")
@@ -42,16 +43,14 @@ def main() -> int:
     began = time.process_time()
     place = synthetic.make_place(args.seed)
     visits = [make_visit(args, place, k) for k in range(args.visits)]
-    print(f"{len(visits)} visits made in {time.process_time() - began:.0f} CPU s", file=sys.stderr)
+    say(f"{len(visits)} visits made in {time.process_time() - began:.0f} CPU s")
     with tempfile.TemporaryDirectory() as folder:
         one = bytes_of(ingested(Path(folder) / "one.gsmap", visits[-1:]))
         path = ingested(Path(folder) / "all.gsmap", visits)
         every = bytes_of(path)
         with gsmap.map.open(path) as m:
             before = scores(m, visits, Path(folder) / "before")
-            began = time.process_time()
-            report = m.thin(keep_days=200, now=date(args.visits - 1))
-            cpu = time.process_time() - began
+            report, cpu = timed(m.thin, keep_days=200, now=date(args.visits - 1))
             after = scores(m, visits, Path(folder) / "after")
         thinned = bytes_of(path)
     print(f"thinned {sum(row.thinned for row in report.scenes)} of {len(report.scenes)} in {cpu:.1f} CPU s")

@@ -9,10 +9,8 @@ rendered from the captures' cameras, against the photographs.
 
 from __future__ import annotations
 
-import argparse
 import cProfile
 import pstats
-import resource
 import tempfile
 import time
 from pathlib import Path
@@ -23,10 +21,11 @@ from gsmap.ingest import Capture, read_captures
 from gsmap.settings import parse
 from gsmap.types import Gaussians, PoseGraph, ScenePose
 from tools.bench.merge import likeness, true_pose
+from tools.harness import argument_parser, cpu_s, peak_mb
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("captures", type=Path)
     parser.add_argument("--scenes", nargs="+", default=["c0", "c1", "c2", "c3", "c5"])
     parser.add_argument("--tile-size", type=float, default=5.0)
@@ -76,17 +75,6 @@ def fill(house: gsmap.map.Map, captures: list[Capture], poses: dict, revisits: i
             scene, _ = house.store.scenes.add(gaussians, capture.cameras, name=f"{capture.name}-{visit}")
             graph[scene.id] = ScenePose(scene.id, poses[capture.name], 0, "placed")
     house.store.revisions.save(PoseGraph(graph))
-
-
-def cpu_s() -> float:
-    """Of this process and of those of its children that have ended."""
-    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
-
-
-def peak_mb() -> float:
-    """Of the largest of this process and its children."""
-    return max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +35,7 @@ from gsmap.map import Map
 from gsmap.merge import methods
 from gsmap.types import Gaussians, Sim3
 from gsmap_synthetic import make_captures, write_captures
+from tools.harness import argument_parser, timed
 
 HOW = ("told", "measured", "auto", "guess")
 _ONLY_THE_GUESS = {"describe.landmarks": False, "describe.objects": False, "describe.things": False}
@@ -52,7 +52,7 @@ class Place:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("captures", type=Path, nargs="?")
     parser.add_argument("--scenes", nargs="+", help="names of captures; all else")
     parser.add_argument("--made", type=int, metavar="SEED", help="a made place in place of a folder")
@@ -153,9 +153,7 @@ def true_metres(m: Map, place: Place) -> float:
 
 def exported(m: Map, place: Place, true_m: float, out: Path, method: str, tile_size_m: float) -> dict:
     """One export, looked at in true metres, so that rendering is the same."""
-    start = time.process_time()
-    result = m.export(out, merge=method, tile_size_m=tile_size_m)
-    cpu_s = time.process_time() - start
+    result, cpu_s = timed(m.export, out, merge=method, tile_size_m=tile_size_m)
     files = [formats.read(out / tile.path) for tile in result.tiles if tile.path]
     merged = scale_gaussians(Gaussians.concatenate(files), true_m)
     parts = []

@@ -8,7 +8,6 @@ find them; how many jobs it would start is counted without running any.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Iterator
@@ -25,10 +24,11 @@ from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.types import Cameras, EdgeOutcome, Gaussians, PoseGraph, Registration, SceneGraph, ScenePose, Sim3
+from tools.harness import argument_parser, timed
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--scenes", type=int, default=50, help="in each of the two maps")
     parser.add_argument("--gaussians", type=int, default=300, help="in each scene")
     arguments = parser.parse_args()
@@ -58,9 +58,8 @@ def run(folder: Path, scenes: int, gaussians: int) -> Iterator[str]:
         branch = a.branch("what-if")
         took = time.process_time() - started
         yield f"a branch: {took:.2f} s of CPU, {branch.num_bytes / 1e6:.2f} MB of catalog, 0 bytes of arrays"
-        started = time.process_time()
-        back = a.merge(f"{folder / 'a'}@what-if")
-        yield f"merged back: {back.num_scenes} scenes are new, {time.process_time() - started:.2f} s of CPU"
+        back, took = timed(a.merge, f"{folder / 'a'}@what-if")
+        yield f"merged back: {back.num_scenes} scenes are new, {took:.2f} s of CPU"
 
 
 def make_map(path: Path, scenes: int, gaussians: int, seed: int) -> None:

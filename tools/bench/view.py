@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from tools.harness import argument_parser
+
 ROOT = Path(__file__).resolve().parents[2]
 for folder in ("", "tests/view"):
     sys.path.insert(0, str(ROOT / folder))
@@ -279,7 +281,7 @@ def report(what: str, said: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("what", choices=["fidelity", "large", "trees", "catalog"])
     parser.add_argument("map", nargs="?", help="of fidelity")
     parser.add_argument("--scenes", type=int, default=500)

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import sys
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,9 +89,8 @@ def say(name: str, asked: list[tuple[Asked, ViewIndex]], params: Params) -> None
     """One line: scenes and views that were found, and what it costs."""
     first, good, seconds = [], 0, []
     for one, index in asked:
-        began = time.process_time()
-        views = retrieve_views(index, one.found, one.picture.intrinsics_px, params.max_views)
-        seconds.append(time.process_time() - began)
+        views, took = timed(retrieve_views, index, one.found, one.picture.intrinsics_px, params.max_views)
+        seconds.append(took)
         own = {scene for scene, _ in one.right}
         scenes = list(dict.fromkeys(scene for scene, _ in views))
         first.append(next((k for k, scene in enumerate(scenes) if scene in own), len(scenes) + 99))
@@ -105,7 +104,7 @@ def say(name: str, asked: list[tuple[Asked, ViewIndex]], params: Params) -> None
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path)
     parser.add_argument("--cache", type=Path, required=True)
     parser.add_argument("--only", nargs="+", help="photographs of these test places (seeds) alone")

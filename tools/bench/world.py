@@ -9,7 +9,6 @@ survey, which has errors of its own. CPU seconds are of one thread.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
@@ -33,6 +32,7 @@ from gsmap.world.crs import ECEF
 from gsmap.world.frame import from_frame, to_frame
 from gsmap.world.survey import in_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, ground, surveyed_site
+from tools.harness import argument_parser, timed
 
 
 def survey_of(site: Site, sigma_m: float = 0.01, sigma_px: float = 0.5) -> Survey:
@@ -70,9 +70,8 @@ def check_points(sites: int, params: SiteParams, what: str) -> None:
     for seed in range(sites):
         site = surveyed_site(seed, params)
         survey = survey_of(site)
-        start = time.process_time()
-        answer = optimize(site.names, site.edges, survey=survey)
-        seconds.append(time.process_time() - start)
+        answer, took = timed(optimize, site.names, site.edges, survey=survey)
+        seconds.append(took)
         off = errors(site, answer, answer.world[0], "C")
         bent.append(rms(off))
         axes.append(np.sqrt((off**2).mean()))
@@ -213,7 +212,7 @@ def _fill(m: Map, site: Site, params: SiteParams) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--sites", type=int, default=10)
     parser.add_argument("--nees", type=int, default=40)
     parser.add_argument("--folder", type=Path, help="where to keep the map; a temporary one by default")

@@ -11,12 +11,13 @@ the same verb again must end as if nothing had happened. Prints a table; exit co
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
+
+from tools.harness import argument_parser, say
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "faults"))
 
@@ -27,7 +28,7 @@ from fault_verbs import VERBS
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--verbs", nargs="+", metavar="VERB", default=list(VERBS), choices=list(VERBS))
     parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th change")
     parser.add_argument("--first", type=int, default=1, metavar="N", help="the first of them")
@@ -40,7 +41,7 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object: the table, and every complaint")
     args = parser.parse_args()
     if (reason := why_not()) is not None:
-        print(f"cannot run here: {reason}", file=sys.stderr)
+        say(f"cannot run here: {reason}")
         return 2
     every = not (args.kill or args.fault or args.power or args.modes)
     modes = args.modes or [*(KILLS if args.kill or every else ()), *(FAULTS if args.fault or every else ())]
@@ -49,7 +50,7 @@ def main() -> int:
         clients = [stack.enter_context(Client()) for _ in range(args.jobs)]
         for verb in args.verbs:
             if not VERBS[verb].possible:
-                print(f"{verb}: needs the package {VERBS[verb].needs}", file=sys.stderr)
+                say(f"{verb}: needs the package {VERBS[verb].needs}")
                 continue
             todo = points(verb, clients[0].ask("ops", verb=verb), modes, args.every, args.first)
             if args.power or every:
@@ -57,7 +58,7 @@ def main() -> int:
             run(todo, clients, tally.add)
             row = tally.rows.get(verb, {})
             wrong = {k: int(v) for k, v in row.items() if v and k != "seconds"}
-            print(f"{time.monotonic() - began:7.0f} s  {verb}: {wrong}", file=sys.stderr, flush=True)
+            say(f"{time.monotonic() - began:7.0f} s  {verb}: {wrong}")
     if args.json:
         print(json.dumps({"total": tally.total, "verbs": tally.rows, "complaints": tally.complaints}, indent=1))
     else:

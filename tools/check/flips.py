@@ -10,7 +10,6 @@ of the catalog, ``check`` on all.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import random
@@ -24,6 +23,7 @@ import numpy as np
 from gsmap.errors import CorruptError, GsmapError
 from gsmap.store import Store, sqlite
 from gsmap.types import Cameras, Gaussians
+from tools.harness import argument_parser
 
 WAYS = ("fresh", "after cp -r", "after a write")
 
@@ -118,7 +118,7 @@ def count_found(path: Path, count: int, seed: int = 0) -> tuple[dict[str, int], 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()

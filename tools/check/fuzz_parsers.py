@@ -33,6 +33,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from tools.harness import argument_parser, say
+
 MAX_BYTES = 64 << 20
 LIMIT_S = 5
 MAX_MESSAGE = 1000
@@ -46,7 +48,7 @@ class TooSlow(BaseException):
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--inputs", type=int, default=20_000, help="of all parsers together")
     parser.add_argument("--parsers", default="", help="comma-separated; all without it")
     parser.add_argument("--seed", type=int, default=1)
@@ -108,7 +110,7 @@ def fuzz(name: str, inputs: int, seed: int, keep: Path) -> tuple[int, int]:
             failures += 1
             keep.mkdir(exist_ok=True)
             (keep / f"{name}.ended.{restart}.txt").write_text(ended.stderr[-20_000:])
-            print(f"{name}: the process ended with {ended.returncode}, see {keep}", file=sys.stderr, flush=True)
+            say(f"{name}: the process ended with {ended.returncode}, see {keep}")
             done += 1
     rate = done / (time.monotonic() - start)
     told = ", ".join(f"{kind} {count}" for kind, count in outcomes.most_common())

@@ -8,7 +8,6 @@ Renders a seeded cloud forward and backward with the baseline kernels, and finds
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import platform
 import sys
@@ -16,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from tools.harness import argument_parser
 
 COUNT, WIDTH, HEIGHT = 3000, 96, 72
 
@@ -96,7 +97,7 @@ def clique(native: Any, rng: np.random.RandomState) -> np.ndarray:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("module", type=Path)
     parser.add_argument("--write", type=Path)
     parser.add_argument("--compare", type=Path)

@@ -26,6 +26,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tools.harness import argument_parser
+
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "synthetic"), str(ROOT / "tests" / "map")]
 
@@ -51,7 +53,7 @@ class Row:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--orders", type=int, default=20)
     parser.add_argument("--captures", type=Path, nargs="+", default=[], help="files that gsmap ingests; or a folder")
     parser.add_argument("--thin", type=int, default=1, help="keep every n-th Gaussian of the captures")

@@ -31,6 +31,8 @@ from typing import Any
 
 import numpy as np
 
+from tools.harness import argument_parser, say
+
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "store")]
 
@@ -244,7 +246,7 @@ def soak(kind: str, folder: Path, url: str | None, args: argparse.Namespace) -> 
         ]
         shutil.rmtree(folder / "restored")
     for line in [*lost[:5], *unequal[:5], *(f"{e['do']}: {e['error']}" for e in errors[:10])]:
-        print(f"  {line}", file=sys.stderr)
+        say(f"  {line}")
     did = Counter(line["do"] for line in actions)
     written = sum(did[do] for do in ("ingest", "note", "edge", "review", "prior", "optimize", "remove", "prune"))
     reads = sum(did[do] for do in ("list", "show", "read", "status", "check"))
@@ -261,7 +263,7 @@ def soak(kind: str, folder: Path, url: str | None, args: argparse.Namespace) -> 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--writers", type=int, default=8)
     parser.add_argument("--readers", type=int, default=8)

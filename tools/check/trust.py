@@ -12,7 +12,6 @@ promise is not kept.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shlex
@@ -22,6 +21,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+
+from tools.harness import argument_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -138,7 +139,7 @@ PROMISES = (
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--quick", action="store_true", help="a part of each")
     parser.add_argument("--only", nargs="+", choices=[promise.name for promise in PROMISES], metavar="NAME")
     parser.add_argument("--postgres", metavar="URL", default="temporary", help="an empty database, or a server's own")

@@ -11,7 +11,6 @@ changed. Right and wrong ones weigh the same in the fit. By each probability: ho
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import sys
@@ -25,6 +24,7 @@ from gsmap.change import VERSION, Params, compare
 from gsmap.change.confidence import pieces
 from gsmap.types import PosedScene
 from tools.bench import change_scores as scores
+from tools.harness import argument_parser
 from tools.make.change_truth import VOXEL_M, Truth, changed_voxels
 
 _NEAR_M = 0.15
@@ -52,7 +52,7 @@ class Row:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path, nargs="+", help="folders of tools/make/change.py to fit on")
     parser.add_argument("--test", type=Path, nargs="+", default=[], help="folders that are only judged")
     parser.add_argument("--cache", type=Path, required=True, help="keep what comparing came up with here")

@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import hashlib
 import pickle
 import sys
@@ -234,7 +235,7 @@ def _errors(rows: Sequence[tuple[np.ndarray, np.ndarray, Frame]]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path)
     parser.add_argument("what", choices=("alike", "bundle"))
     parser.add_argument("--cache", type=Path, required=True)

@@ -20,14 +20,14 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, say
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import itertools
 import json
 import pickle
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -111,7 +111,7 @@ THREE_SIGMA = 0.9973
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--cache", type=Path, required=True, help="keep made places and their errors here")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="print the honesty in these folders, too")
     options = parser.parse_args()
@@ -138,7 +138,7 @@ def made(cache: Path, level: float, seed: int) -> Path:
     """The folder of three captures of a made place."""
     folder = cache / f"{KINDS.get(level, f'bent_{level:g}')}_{seed}"
     if not folder.exists():
-        print(f"making {folder.name}", file=sys.stderr, flush=True)
+        say(f"making {folder.name}")
         if level == TRAINED:
             sizes = {"num_frames": 40, "num_gaussians": 30_000, "size_px": (240, 180)}
             write_captures(folder, make_captures(seed, 3, steps=200, vary_exposure=True, **sizes))

@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, say
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import json
 import pickle
 import sys
@@ -63,7 +64,7 @@ class Pair:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path)
     parser.add_argument("--cache", type=Path, required=True)
     parser.add_argument("--keep", action="store_true", help="leave the file as it is")
@@ -214,10 +215,6 @@ def graph_of(name: str, capture: Capture, keep: np.ndarray) -> SceneGraph:
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
-
-
-def say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ to it lights otherwise has changed, too. Under true poses.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -25,13 +24,14 @@ from gsmap.compare import segments
 from gsmap.merge.changes import resolve_changes
 from gsmap.types import PosedScene
 from tools.bench import change_scores as scores
+from tools.harness import argument_parser
 from tools.make.change_truth import Truth
 
 COLUMNS = ("gone", "painted", "false", "false_unlit")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path, nargs="+")
     parser.add_argument("--set", action="append", default=[], metavar="MODULE.NAME=V,V", help="values to try")
     args = parser.parse_args()

@@ -9,7 +9,6 @@ mean average precision on the places themselves, each left out of the fit in tur
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ import gsmap.find
 from gsmap.find.similarity import DIFFERENCES, SimilarityModel, differences
 from tools.bench.find_scores import Item, average_precisions, by_model, items_of
 from tools.fit.monotone import fit_curves
+from tools.harness import argument_parser
 from tools.make import find_places
 
 _RIDGE = 3e-4
@@ -27,7 +27,7 @@ _RIGHT = 0.1  # share of the weight that pairs of one look have
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=int, nargs=2, default=(200, 210), metavar=("FIRST", "END"))
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--write", action="store_true", help="write gsmap/find/similarity.json")

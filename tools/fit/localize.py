@@ -20,10 +20,11 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, timed
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import hashlib
 import json
 import pickle
@@ -670,9 +671,10 @@ def place_all(found: list[Place], params: Params) -> None:
             other = found[(number + elsewhere) % len(found)]
             scenes = {scene.scene: scene for scene in other.scenes}
             for told in place.photos[:: 4 if elsewhere else 1]:
-                began = time.process_time()
-                said = localization.localize_photo(place.photo(told), indexes[other.seed], scenes, extractor, params)
-                seconds.append(time.process_time() - began)
+                said, took = timed(
+                    localization.localize_photo, place.photo(told), indexes[other.seed], scenes, extractor, params
+                )
+                seconds.append(took)
                 wrong = False
                 if said.T_map_camera is not None:
                     apart = np.linalg.inv(np.array(told["T_world_camera"])) @ said.T_map_camera
@@ -793,7 +795,7 @@ def save(**models: Odds) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path)
     parser.add_argument(
         "what", choices=("words", "sigma", "displaced", "agreement", "turned", "placed", "cells", "verdict", "test")

@@ -10,18 +10,16 @@ go through seeded random axes (`gsmap.retrieve.codes`). Prints the share of the 
 
 from __future__ import annotations
 
-import argparse
-import sys
-
 import numpy as np
 
 from gsmap.describe import Params, describe
 from gsmap.retrieve.codes import AXES, NUM_DIMS
 from gsmap_synthetic import make_captures
+from tools.harness import argument_parser, say
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[61, 62, 63, 64])
     args = parser.parse_args()
     vectors: dict[int, list[np.ndarray]] = {}
@@ -32,7 +30,7 @@ def main() -> None:
             for layer in graph.layers.values():
                 if len(layer):
                     vectors.setdefault(layer.embeddings.shape[1], []).append(layer.embeddings)
-        print(f"flat {seed} described", file=sys.stderr, flush=True)
+        say(f"flat {seed} described")
     arrays = {}
     for dim, parts in vectors.items():
         found = np.concatenate(parts).astype(np.float64)

@@ -9,7 +9,6 @@ No real scan has a part in it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import pickle
 import time
@@ -28,6 +27,7 @@ from gsmap.types.scan import Scan
 from gsmap_synthetic import DemoCapture, Place, film, make_captures, make_place, walk
 from tools.bench.scan import lifted, noisy
 from tools.fit.monotone import fit_curves
+from tools.harness import argument_parser
 
 _DEG, _M = 3.0, 0.15
 _SIZE_PX = (200, 150)
@@ -38,7 +38,7 @@ Sample = tuple[np.ndarray, bool]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=int, nargs=2, default=(600, 605), metavar=("FIRST", "END"))
     parser.add_argument("--cache", type=Path, required=True)
     parser.add_argument("--write", action="store_true")

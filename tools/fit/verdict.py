@@ -18,10 +18,11 @@ from __future__ import annotations
 
 import os
 
+from tools.harness import argument_parser, say
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import argparse
 import json
 import pickle
 import sys
@@ -333,7 +334,7 @@ def contradicted(row: Judged, bars: verdict.Params) -> bool:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("places", type=Path)
     parser.add_argument("--cache", type=Path, required=True)
     parser.add_argument("--also", type=Path, nargs="+", default=[], help="folders of captured places to be judged, too")
@@ -366,10 +367,6 @@ def main() -> int:
     }
     target.write_text(json.dumps(stored, indent=1) + "\n")
     return 0
-
-
-def say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

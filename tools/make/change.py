@@ -29,6 +29,7 @@ from gsmap_synthetic.change import sight, states, true_changes
 from gsmap_synthetic.edits import edit_place
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.script import random_edits
+from tools.harness import argument_parser, say
 
 HOLD_OUT = 6
 
@@ -86,7 +87,7 @@ SETS: dict[str, dict[int, tuple[Visit, ...]]] = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--set", choices=SETS, help="all places of a set, each in OUT/SEED")
     parser.add_argument("--seed", type=int, help="one place, in OUT itself")
@@ -111,7 +112,7 @@ def main() -> int:
             later = [Visit(f"t{k}", args.edits, args.light, args.exposure) for k in range(1, args.times)]
             make(args.out, args.seed, known.get(args.seed, (_T0, *later)), args)
     except GsmapError as error:
-        print(f"make_change: {error}", file=sys.stderr)
+        say(f"make_change: {error}")
         return 1
     return 0
 

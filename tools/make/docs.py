@@ -9,7 +9,6 @@ and JSON keys, then calls Sphinx, where a warning is an error. Needs what `tools
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import shutil
@@ -18,6 +17,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from tools.harness import argument_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -144,7 +145,7 @@ def write_json() -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--out", type=Path, default=DOCS / "site", help="where the site goes")
     parser.add_argument("--keep", type=Path, help="run the commands in this folder, and keep what they leave")
     arguments = parser.parse_args()

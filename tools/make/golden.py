@@ -7,20 +7,21 @@ Run it after raising the VERSION of a method whose output has changed on purpose
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
+from tools.harness import argument_parser, say
+
 
 def main() -> int:
-    argparse.ArgumentParser(description=__doc__).parse_args()
+    argument_parser(__doc__).parse_args()
     sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "contracts"))
     import sketches
 
     changed = sketches.write()
     for name in changed:
         print(name)
-    print(f"{len(changed)} of {len(sketches.cases())} changed", file=sys.stderr)
+    say(f"{len(changed)} of {len(sketches.cases())} changed")
     return 0
 
 

@@ -15,7 +15,6 @@ share of the pixels differs (by more than a tenth of the range) from the same ph
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import sys
@@ -36,6 +35,7 @@ from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.place import Place
 from gsmap_synthetic.script import random_edits
 from gsmap_synthetic.streets import make_street, street_routes
+from tools.harness import argument_parser
 
 SETS = {"fit": range(50_000, 50_012), "test": range(60_000, 60_006)}
 STREETS = {"fit": range(50_100, 50_108), "test": range(60_100, 60_104)}
@@ -47,7 +47,7 @@ DIFFERS = 0.1
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--set", choices=SETS, required=True)
     parser.add_argument("--only", type=int)

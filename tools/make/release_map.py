@@ -10,7 +10,6 @@ with a word on one, one comparison of a pair superseded by another, a tag and a 
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tarfile
@@ -28,6 +27,7 @@ from gsmap.map.stages.describe import graph_keys
 from gsmap.register import recipe_key
 from gsmap.types import Cameras, Gaussians, Prior, Registration, Sim3
 from gsmap.version import __version__
+from tools.harness import argument_parser
 from tools.make.tiny_encoder import image_encoder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,7 +36,7 @@ LIMIT_KB = 200
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     default = ROOT / "tests" / "store" / "releases" / f"{__version__}.tar.xz"
     parser.add_argument("out", type=Path, nargs="?", default=default)
     out = parser.parse_args().out.absolute()

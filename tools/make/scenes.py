@@ -31,10 +31,11 @@ from gsmap_synthetic.court import court_captures
 from gsmap_synthetic.initialise import from_colour, from_depth
 from gsmap_synthetic.make import put_in_own_frame
 from gsmap_synthetic.train import Params, train
+from tools.harness import argument_parser, say, timed
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     place = verbs.add_parser("place", help="capture a synthetic place")
     place.add_argument("out", type=Path)
@@ -68,7 +69,7 @@ def main() -> int:
         captures = [_from_folder(args)] if args.verb == "frames" else _from_place(args)
         synthetic.write_captures(args.out, captures, images=args.images)
     except GsmapError as error:
-        print(f"make_scenes: {error}", file=sys.stderr)
+        say(f"make_scenes: {error}")
         return 1
     return 0
 
@@ -88,7 +89,7 @@ def _from_place(args: argparse.Namespace) -> list[synthetic.DemoCapture]:
         hold_out=args.hold_out,
         progress=lambda fraction, text: print(f"\r{100 * fraction:3.0f} %  {text:60}", end="", file=sys.stderr),
     )
-    print(f"\n{args.captures} captures: {time.process_time() - start:.1f} CPU s", file=sys.stderr)
+    say(f"\n{args.captures} captures: {time.process_time() - start:.1f} CPU s")
     for capture in captures:
         _report(capture.name, capture.gaussians, synthetic.Frames(capture.images, capture.cameras), args.hold_out)
     return captures
@@ -103,9 +104,8 @@ def _from_folder(args: argparse.Namespace) -> synthetic.DemoCapture:
         start = from_colour(shown, args.gaussians, *args.near_far, seed=args.seed)
         params = Params(steps=args.steps, splits=max(2, args.steps // 300))
     _report(f"{args.name}, start", start, frames, args.hold_out)
-    began = time.process_time()
-    gaussians = train(start, shown, params, seed=args.seed)
-    print(f"{args.name}: {args.steps} steps, {time.process_time() - began:.1f} CPU s", file=sys.stderr)
+    gaussians, took = timed(train, start, shown, params, seed=args.seed)
+    say(f"{args.name}: {args.steps} steps, {took:.1f} CPU s")
     _report(args.name, gaussians, frames, args.hold_out)
     return put_in_own_frame(gaussians, frames, args.name, np.random.default_rng([args.seed, 8]))
 

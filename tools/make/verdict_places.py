@@ -9,7 +9,6 @@ the capture). Seeds of the two sets are apart, and so are their places. What is 
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -29,6 +28,7 @@ from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.place import Place
 from gsmap_synthetic.plan import make_plan, with_twin
 from gsmap_synthetic.script import random_edits
+from tools.harness import argument_parser
 
 SETS = {"fit": range(20_000, 20_046), "test": range(30_000, 30_017)}
 COURTS = (*range(20_042, 20_046), *range(30_015, 30_017))  # outdoors, with rows of columns that are all alike
@@ -37,7 +37,7 @@ SIZE_PX = (240, 180)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--set", choices=SETS, required=True)
     args = parser.parse_args()
