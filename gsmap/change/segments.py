@@ -238,7 +238,8 @@ def lighting_spread(sides: tuple[SurfaceCells, SurfaceCells]) -> float:
 
 
 def _share(cells: CellLabels, rows: np.ndarray) -> float:
-    """Return the fraction of a segment that some cells make up, for the segment to which most of them belong."""
+    """Return the fraction of a segment that the cells at ``rows`` cover; it is the segment to which most of these cells
+    belong."""
     if not len(rows):
         return 0.0
     segment = int(np.bincount(cells.segment[rows]).argmax())

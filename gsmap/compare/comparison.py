@@ -205,8 +205,8 @@ def _outcomes(
 def _count(
     tally: EvidenceCounts, at: ProjectedPoints, picture: ComparedView, sure: np.ndarray, tolerance: tuple[float, float]
 ) -> None:
-    """Count where the Gaussians of one capture lie in a view of the other capture, and add the colours of that view's
-    surface."""
+    """Count how the Gaussians of one capture lie relative to the surface in a view of the other capture, and add that
+    surface's colours."""
     view, (base, share) = picture.own, tolerance
     count_looks(
         at.index,

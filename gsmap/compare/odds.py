@@ -66,8 +66,8 @@ class Odds:
         return {name: self.curves[name].at(value) for name, value in evidence.items()}
 
     def shortfalls(self, evidence: Mapping[str, float]) -> list[str]:
-        """Return the names of the present pieces of evidence, sorted by the log-odds that each lacks to its best value,
-        most first."""
+        """Return the names of the present pieces of evidence, sorted by how far the log-odds of each are below their
+        best value, the farthest first."""
         lacks = {}
         for name, value in evidence.items():
             if not np.isnan(value):

@@ -30,8 +30,8 @@ def box_means(image: np.ndarray, size_px: int, *, reflect: bool = True, first: i
 
 
 def maximum(image: np.ndarray, size_px: int) -> np.ndarray:
-    """Return the maxima over squares of ``size_px`` around every pixel; an even square reaches one pixel farther to the
-    left and up."""
+    """Return the maxima over squares of ``size_px`` around every pixel; squares of even size reach one pixel farther up
+    and left."""
     out: np.ndarray = native_highest(_as_planes(image), size_px // 2, (size_px - 1) // 2)
     return out.reshape(image.shape)
 

@@ -409,8 +409,8 @@ def combine_probabilities(
 
 
 def _linked(k: int, links: Mapping[tuple[int, int], bool]) -> list[tuple[int, float]]:
-    """Return a photo and all photos that are linked to it, directly or over other photos, with the probability of the
-    links."""
+    """Return a photo and all photos that are linked to it, directly or through other photos, with the probability of
+    the links."""
     reached, fringe = {k: 1.0}, [k]
     while fringe:
         at = fringe.pop()

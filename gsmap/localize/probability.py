@@ -57,8 +57,8 @@ class EvidenceModel:
         return float(np.clip(prior / (prior + against), self.other.least, 1 - self.other.least))
 
     def shortfalls(self, evidence: Mapping[str, float]) -> list[str]:
-        """Return the names of the evidence against the likelier alternative, sorted by the log-odds that each lacks to
-        its best value, most first."""
+        """Return the names of the evidence against the likelier alternative, sorted by how far the log-odds of each are
+        below their best value, the farthest first."""
         return min((self.other, self.aliased), key=lambda odds: odds.log_odds(evidence)).shortfalls(evidence)
 
 

@@ -221,8 +221,8 @@ def _probe_lists(found: Keypoints, vocabulary: Vocabulary) -> _Probes:
 
 
 def _near(segment: Segment, probes: _Probes) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield blocks of near pairs: features of the photo (k,), Hamming distances (k,) to features of a segment, and rows
-    (k, B) of the latter."""
+    """Yield blocks of k near pairs: the features of the photo (k,), the Hamming distances (k,) of the pairs, and the
+    rows (k, B) of the segment's features."""
     keys, starts = lists_of(segment)
     wanted, first = np.unique(probes.words, return_index=True)
     last = np.r_[first[1:], len(probes.words)]

@@ -1,4 +1,4 @@
-"""Balance exposure: bring scenes of different exposure and white balance to a common one."""
+"""Balance exposure: bring scenes to a common exposure and white balance."""
 
 from __future__ import annotations
 

@@ -225,8 +225,7 @@ def _best_views(
 def _count(
     seen: Rendering, disputed: np.ndarray | None, pixels: np.ndarray, sure: np.ndarray, largest: np.ndarray
 ) -> None:
-    """Count dominated pixels, both all and undisputed ones: Gaussians that are visible only at disputed pixels count
-    nothing."""
+    """Add the pixels that each Gaussian dominates to ``pixels``, undisputed ones to ``sure``; update ``largest``."""
     dominant = seen.dominant_id[0]
     pixels += np.bincount(dominant[dominant >= 0], minlength=len(pixels))
     undisputed = dominant >= 0 if disputed is None else (dominant >= 0) & ~disputed

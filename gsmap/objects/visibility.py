@@ -105,7 +105,7 @@ def observe_points(views: RenderedViews, points: np.ndarray, unit_m: float) -> P
 def classify_observation(
     seen: PointObservations, points: np.ndarray, colours: np.ndarray, shift: np.ndarray
 ) -> tuple[ObservationState, float]:
-    """Classify the observation of an object of other scenes in a scene.
+    """Classify how a scene shows an object that was found in other scenes.
 
     Args:
         seen: observation of the object's points.

@@ -91,8 +91,8 @@ def separating_threshold(accepted: np.ndarray, contradicted: np.ndarray) -> floa
 def find_first_contradicted(
     m: Measurements, eligible: np.ndarray, terms: PriorTerms, gate: float, params: Params
 ) -> np.ndarray:
-    """Return an (E,) mask of the edges from the rank onwards at which most edges are contradicted; all False if there
-    is no such rank.
+    """Find the rank of likelihood from which on most edges are contradicted; return an (E,) mask of the edges from this
+    rank on, all False if there is no such rank.
 
     Edges are accepted in order of likelihood. Early edges connect scenes; late edges, whose scenes are already
     connected, agree with the map or are contradicted.

@@ -172,8 +172,8 @@ class EdgeGroup:
 
 
 def _contested(edges: Measurements, accepted: np.ndarray, link: np.ndarray) -> np.ndarray:
-    """Return an (E,) mask of the edges of contested scenes, which join no side: one edge in `_CONTESTED_RATIO`, or
-    more, crosses the link."""
+    """Return an (E,) mask of the edges of contested scenes. A scene is contested if at least one in `_CONTESTED_RATIO`
+    of its edges crosses the link; it joins neither side."""
     n = edges.num_scenes
     across = np.bincount(np.r_[edges.targets[link], edges.sources[link]], minlength=n)
     rows = np.union1d(np.flatnonzero(accepted), link)

@@ -129,7 +129,7 @@ class CommonPoints:
         return turns, float(np.sqrt(max(0.0, covariance[6, 6]))) / size
 
     def robust_fit(self) -> tuple[Sim3, np.ndarray]:
-        """Fit the ``S_world_map`` that most points agree with; also return (P,) bool, the points that agree.
+        """Fit the ``S_world_map`` that most points agree with; also return a (P,) mask of the points that agree.
 
         Every triple of points is tried, or `_DRAWS` of them; a point agrees if its residual is within its error and the
         drift of the map. Errors that all points share do not count.
@@ -194,7 +194,8 @@ class CommonPoints:
         return 3 * float(np.sqrt((reach**2).sum(1).mean())) + 0.002 * extent
 
     def moved(self, rows: np.ndarray, by_m: np.ndarray) -> CommonPoints:
-        """Return the points, with those at ``rows`` moved in the world by (n, 3) or (3,)."""
+        """Return all points, where the world positions of the points at ``rows`` are moved by ``by_m`` (n, 3) or
+        (3,)."""
         in_world = self.in_world.copy()
         in_world[rows] += by_m
         return replace(self, in_world=in_world)

@@ -23,8 +23,8 @@ def initial_points(system: System, x: Unknowns) -> np.ndarray:
 
 
 def exclude_outliers(system: System, x: Unknowns, allowed: Active, gross: Active) -> tuple[Unknowns, Active]:
-    """Solve without outliers: graduated non-convexity (Geman-McClure), then exclude the worst observation or readmit
-    one that fits, repeatedly.
+    """Solve without outliers: after graduated non-convexity (Geman-McClure), repeatedly exclude the worst observation
+    or readmit an observation that fits.
 
     Args:
         allowed: observations that may be used.

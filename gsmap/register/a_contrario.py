@@ -17,8 +17,8 @@ _HEIGHT_BAND_M = 0.5  # largest height difference of a random partner where grav
 
 
 def find_inliers(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarray:
-    """Return an (M,) mask that is True for inliers: correspondences whose ends the pose brings within the radius. Each
-    node is used once; the nearest correspondences come first."""
+    """Return an (M,) mask that is True for inliers: correspondences whose two nodes are within the radius of each other
+    under the pose. Each node is used once, by its nearest correspondence."""
     distance = np.linalg.norm(pose.apply(matches.source) - matches.target, axis=1)
     keep = np.zeros(len(matches), dtype=bool)
     used_t, used_s = set(), set()

@@ -64,8 +64,8 @@ def _align_closely(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _coinciding_cameras(target: SceneView, source: SceneView, S_target_source: Sim3) -> tuple[int, int]:
-    """Count the cameras of the scene with fewer cameras that share a pose with a camera of the other scene; return this
-    count and the number of cameras of that scene."""
+    """Return two numbers for the scene with fewer cameras: how many of its cameras have the pose of a camera of the
+    other scene, and how many cameras it has."""
     from scipy.spatial import cKDTree
 
     ours, theirs = target.cameras, source.cameras

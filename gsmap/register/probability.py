@@ -62,8 +62,8 @@ def worth(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None
 
 
 def shortfalls(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None) -> list[str]:
-    """Return the names of the available pieces of evidence, sorted by the log-odds that each lacks to its best value,
-    most first."""
+    """Return the names of the available pieces of evidence, sorted by how far the log-odds of each are below their best
+    value, the farthest first."""
     return (model or Model.load()).shortfalls(evidence_of(proposal, evidence))
 
 

@@ -29,7 +29,7 @@ def polish(pair: MetricPair, pose: Sim3, params: Params, *, with_scale: bool) ->
 
 
 def refiner_for(name: str, with_scale: bool) -> str:
-    """Return the name of the refiner to run: the given one, unless the scale is free and it cannot refine scales."""
+    """Return ``name``; or `SCALE_REFINER` if the scale is free and the refiner ``name`` cannot refine scales."""
     return SCALE_REFINER if with_scale and not family("refiner").get(name).SCALES else name
 
 

@@ -159,7 +159,7 @@ def is_acceptable(proposal: Proposal, evidence: PoseEvidence, params: Params) ->
 
 
 def improbable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> str:
-    """Return the reason why a pose is not probable enough, by all evidence together; empty if it is."""
+    """Return the reason why all evidence together does not make a pose probable enough; empty if it does."""
     probable = probability(proposal, evidence, PRIOR)
     # A significant clique is enough where the cameras of one scene observed too little to verify it.
     if probable >= params.min_probability or (not evidence.num_seen and is_significant(proposal, params)):

@@ -113,7 +113,7 @@ def propose_by_kind(
 def comparable_layers(
     target: SceneGraph, source: SceneGraph, kind: str, *, with_scale: bool
 ) -> list[tuple[NodeLayer, NodeLayer]]:
-    """Return the pairs of layers of one kind that may be compared: metric ones, or those for estimates of the metre."""
+    """Return the pairs of comparable layers of one kind: metric layers, or layers for estimates of the metre."""
 
     def of(graph: SceneGraph, other: SceneGraph) -> list[NodeLayer]:
         gravity_free = kind == "landmarks" and graph.up is not None and other.up is None

@@ -143,8 +143,8 @@ def refine(
 def colour_information(
     target: Surface, source: Surface, pose: Sim3, centre: np.ndarray, schedule: Schedule
 ) -> np.ndarray | None:
-    """Return the (7, 7) information about ``centre`` that colours add per pair at the last radius; None where the
-    overlap is too small. Its unit is the variance of the point-to-plane distances."""
+    """Return the (7, 7) information that colours add per pair at the last radius, about ``centre`` and in units of the
+    variance of the point-to-plane distances; None if the overlap is too small."""
     pairs = _Pairs(target, source, schedule.max_points[-1], pose, schedule.radii_m[-1], Params())
     both, planes = (pairs.equations(pose, centre, coloured=c) for c in (True, False))
     return None if both.count < _MIN_PAIRS else (both.system - planes.system) / (2 * both.pairs)
