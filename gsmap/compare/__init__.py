@@ -18,7 +18,7 @@ from gsmap.compare.comparison import (
 from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, ChangeEvidence
 from gsmap.compare.neighbourhoods import dilate, local_ranges
 
-VERSION = 4
+VERSION = 5
 """Version, raised whenever the comparison of the same two captures gives another result."""
 
 __all__ = [

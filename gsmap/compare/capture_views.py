@@ -18,6 +18,10 @@ MIN_WEIGHT = 0.1  # a surface Gaussian has at least this blending weight in some
 NEAREST_M = 0.2  # a view does not judge nearer Gaussians
 MIN_TOLERANCE_M, MAX_TOLERANCE_M = 0.03, 0.1  # limits of the tolerance of depths of one surface
 MIN_VIEWS = 2  # number of views that must agree on a conclusion
+DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=np.float64) - 1
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+"""(26, 3) unit vectors to the faces, edges and corners of a cube; one of them lies within 28 degrees of any direction."""
+_MIN_COSINE = 0.574  # a view observes the directions within 55 degrees of its own
 CELL_M = 0.12  # Gaussians nearer to each other than this vote together
 
 
@@ -71,6 +75,10 @@ class CaptureViews:
         surface: (N,) mask of Gaussians that are visible in the views; the rest are floaters or unobserved. Without
             views it is True for all.
         times_seen: (N,) int32 number of views in which a Gaussian lies on the visible surface.
+        well_observed: (N,) mask of Gaussians whose cell has a Gaussian that `MIN_VIEWS` of the views observe. Without views
+            it is True for all.
+        directions: (N,) uint32 directions from which the views observe a Gaussian, one bit for each of `DIRECTIONS`. Without
+            views all bits are set.
         sharpness: (N,) float32 sum over these views of (pixels per metre)^2; it is larger for more and nearer views.
         sure: per view, an (H, W) mask of solid pixels whose surface enough views of the capture observed.
         placed: per view, the projections of the capture's own Gaussians.
@@ -80,6 +88,8 @@ class CaptureViews:
     views: tuple[View, ...]
     surface: np.ndarray
     times_seen: np.ndarray
+    well_observed: np.ndarray
+    directions: np.ndarray
     sharpness: np.ndarray
     sure: tuple[np.ndarray, ...]
     placed: tuple[ProjectedPoints, ...]
@@ -101,16 +111,49 @@ def render_views(
         views.append(view)
         np.maximum(largest, weight, out=largest)
     times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
+    directions = np.full(count, 0 if views else 2 ** len(DIRECTIONS) - 1, dtype=np.uint32)  # all, if nothing is known
     placed = tuple(project_points(scene.gaussians.means, view, NEAREST_M) for view in views)
     for view, at in zip(views, placed, strict=True):
         margin = MIN_TOLERANCE_M
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
         times_seen[at.index[on]] += 1
+        directions[at.index[on]] |= _direction_bits(scene.gaussians.means[at.index[on]], view)
         sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
     well = max_per_cell(scene.gaussians.means, times_seen, CELL_M) >= MIN_VIEWS
+    well |= not views
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
     surface = largest >= MIN_WEIGHT if views else np.ones(count, dtype=bool)
-    return CaptureViews(scene, tuple(views), surface, times_seen, sharpness, sure, placed)
+    return CaptureViews(scene, tuple(views), surface, times_seen, well, directions, sharpness, sure, placed)
+
+
+def observed_from(points: np.ndarray, directions: np.ndarray, view: View) -> np.ndarray:
+    """Return an (N,) mask, True for points that were observed from about the direction of a view.
+
+    The two faces of a thin wall lie within the tolerance of one surface, so that the face which a capture never
+    observed would be compared by the colours of the other face.
+
+    Args:
+        points: (N, 3) means of Gaussians.
+        directions: (N,) bits of `CaptureViews.directions`.
+    """
+    nearest = (_rays(points, view) @ DIRECTIONS.T).argmax(1)
+    out: np.ndarray = (directions >> nearest.astype(np.uint32)) & 1 > 0
+    return out
+
+
+def _direction_bits(points: np.ndarray, view: View) -> np.ndarray:
+    """Return the (N,) uint32 bits of all `DIRECTIONS` near that of the view from points (N, 3)."""
+    near = _rays(points, view) @ DIRECTIONS.T > _MIN_COSINE
+    out: np.ndarray = (near @ (1 << np.arange(len(DIRECTIONS)))).astype(np.uint32)
+    return out
+
+
+def _rays(points: np.ndarray, view: View) -> np.ndarray:
+    """Return the (N, 3) unit vectors from points to the camera of a view."""
+    T_camera_frame = view.camera.T_camera_frame[0]
+    rays = -T_camera_frame[:3, :3].T @ T_camera_frame[:3, 3] - points
+    out: np.ndarray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
+    return out
 
 
 def max_per_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:

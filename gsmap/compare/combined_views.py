@@ -43,12 +43,14 @@ def combine_views(
                 replace(at, index=row[at.index[kept]], row=at.row[kept], column=at.column[kept], z=at.z[kept])
             )
     gaussians = Gaussians.concatenate([capture.gaussians[stays] for capture, stays in parts])
-    surface, times_seen, sharpness = (
+    surface, times_seen, well_observed, directions, sharpness = (
         np.concatenate([getattr(capture, name)[stays] for capture, stays in parts])
-        for name in ("surface", "times_seen", "sharpness")
+        for name in ("surface", "times_seen", "well_observed", "directions", "sharpness")
     )
     scene = PosedScene(gaussians, scene_id="+".join(capture.scene.scene_id for capture, _ in parts))
-    return CaptureViews(scene, tuple(views), surface, times_seen, sharpness, tuple(sure), tuple(placed))
+    return CaptureViews(
+        scene, tuple(views), surface, times_seen, well_observed, directions, sharpness, tuple(sure), tuple(placed)
+    )
 
 
 def mask_outdated(capture: CaptureViews, comparison: Comparison, stays: np.ndarray) -> CaptureViews:

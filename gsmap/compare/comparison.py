@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from gsmap.compare.capture_views import (
     ProjectedPoints,
     View,
     make_view,
+    observed_from,
     project_points,
 )
 from gsmap.compare.colours import Balance, balance, colours_differ
@@ -90,7 +91,10 @@ def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
 
     surfaces = {id(one): _surface(one) for one in (older, newer)}
     crossed = [
-        [(own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)])) for i in range(len(own.views))]
+        [
+            (own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)], other))
+            for i in range(len(own.views))
+        ]
         for own, other in ((older, newer), (newer, older))
     ]
     tolerance = _tolerance([pair for pairs in crossed for pair in pairs])
@@ -138,11 +142,24 @@ def _surface(capture: CaptureViews) -> tuple[Gaussians, np.ndarray]:
     return (capture.gaussians if len(rows) == len(capture.surface) else capture.gaussians[rows]), rows
 
 
-def _seen_by(view: View, gaussians: Gaussians, rows: np.ndarray) -> View:
-    seen = render(gaussians, view.camera)
+def _seen_by(view: View, surface: Gaussians, rows: np.ndarray, capture: CaptureViews) -> View:
+    """Render the surface of a capture into a view of another; only what the capture observed well is solid.
+
+    That is a surface which several of its own views observe, from about this direction: the two faces of a thin wall
+    lie within the tolerance of one surface, and the unobserved face would be compared by the colours of the other.
+
+    Args:
+        surface, rows: the Gaussians on surfaces, and their rows in the capture.
+    """
+    seen = render(surface, view.camera)
     dominant = seen.dominant_id[0]
     whole = np.where(dominant >= 0, rows[np.maximum(dominant, 0)] if len(rows) else -1, -1).astype(np.int32)
-    return make_view(seen.colour[0], seen.alpha[0], seen.depth[0], whole, view.camera)
+    made = make_view(seen.colour[0], seen.alpha[0], seen.depth[0], whole, view.camera)
+    shown = np.unique(dominant[dominant >= 0])
+    observed = np.zeros(len(surface) + 1, dtype=bool)  # the last for no Gaussian, -1
+    observed[shown] = observed_from(surface.means[shown], capture.directions[rows[shown]], view)
+    observed[shown] &= capture.well_observed[rows[shown]]
+    return replace(made, solid=made.solid & observed[dominant])
 
 
 def _tolerance(pairs: list[tuple[View, np.ndarray, View]]) -> tuple[float, float]:

@@ -118,6 +118,19 @@ def test_what_one_capture_did_not_see_has_not_changed():
     assert "no cameras" in blind.notes[0]
 
 
+@pytest.mark.guards("answers")
+def test_the_faces_of_a_thin_wall_are_not_compared_with_each_other():
+    """Each capture observes one face, 3 cm from the other; a face that both observe and that was painted is found."""
+    floor = shell()[0]
+    front = ([0.8, 1.50, 0], [1.2, 0, 0], [0, 0, 1.6], plain(0.7, 0.3, 0.2))
+    back = ([2.0, 1.53, 0], [-1.2, 0, 0], [0, 0, 1.6], plain(0.2, 0.4, 0.7))
+    before = capture([floor, front], 1, angles=(-2.3, -0.8))
+    assert segments(change.compare(before, capture([floor, back], 2, angles=(0.8, 2.3)))) == []
+    repainted = capture([floor, (*front[:3], plain(0.2, 0.4, 0.7))], 2, angles=(-2.3, -0.8))
+    (found,) = segments(change.compare(before, repainted))
+    assert found.kind == "recoloured"
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_capture_that_shows_nothing_or_a_wall_alone_says_nothing(count):
     whole = capture(shell(), 1)

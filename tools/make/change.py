@@ -21,10 +21,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 import gsmap_synthetic as synthetic
 from gsmap.errors import ConfigError, GsmapError
-from gsmap_synthetic.capture import default_routes, unused_doors
+from gsmap_synthetic.capture import Frames, default_routes, unused_doors
 from gsmap_synthetic.change import sight, states, true_changes
 from gsmap_synthetic.edits import edit_place
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
@@ -43,6 +44,9 @@ class Visit:
             "moved:3,small:1".
         light, exposure: by day or night; with an exposure and white balance of its own.
         route: which of the place's default routes is walked.
+        steps: number of training steps, in place of ``--steps``; few leave the capture unconverged.
+        frames: number of photos, in place of ``--frames``; few leave much of the place to a view or two.
+        blur_px: standard deviation in pixels by which the photos are blurred before training.
     """
 
     name: str
@@ -50,10 +54,21 @@ class Visit:
     light: str = "day"
     exposure: bool = False
     route: int = 0
+    steps: int | None = None
+    frames: int | None = None
+    blur_px: float = 0.0
 
 
 _T0, _T1 = Visit("t0"), Visit("t1", "default")
 _FALSE = (_T0, Visit("e1", exposure=True), Visit("n1", light="night"), Visit("s1"))
+_QUALITY = (
+    _T0,
+    Visit("u1", steps=60),
+    Visit("b1", blur_px=2.0),
+    Visit("f1", frames=16),
+    Visit("u2", steps=150, route=1),
+)
+_POOR = (Visit("t0", steps=100), _T1), (_T0, replace(_T1, blur_px=1.5)), (_T0, replace(_T1, frames=20))
 SETS: dict[str, dict[int, tuple[Visit, ...]]] = {
     # Constants may be chosen on these ...
     "dev": {
@@ -65,6 +80,8 @@ SETS: dict[str, dict[int, tuple[Visit, ...]]] = {
     },
     "dev-small": {seed: (_T0, Visit("t1", "small:5,replaced:3,moved:2")) for seed in range(6001, 6007)},
     "dev-false": {111: _FALSE, 121: _FALSE, 131: _FALSE},
+    # ... those that differ in training, sharpness and number of photos: the same place, and one that changed ...
+    "dev-quality": {141: _QUALITY, 151: _QUALITY, 161: _POOR[0], 171: _POOR[1], 181: _POOR[2]},
     # ... and on these since their scores were looked at one by one ...
     "seen": {
         404: (_T0, _T1, Visit("t2", "moved:3,removed:1,added:1,small:1", route=1)),
@@ -83,6 +100,7 @@ SETS: dict[str, dict[int, tuple[Visit, ...]]] = {
         **dict.fromkeys((4141, 4242, 4343, 4444, 4545, 4646), (_T0, _T1)),
     },
     "false": {707: _FALSE, 808: _FALSE, 909: _FALSE, 1010: (_T0, replace(_FALSE[1], name="e1"))},
+    "test-quality": {1111: _QUALITY, 1212: _QUALITY, 1313: _POOR[0], 1414: _POOR[1]},
 }
 
 
@@ -134,11 +152,14 @@ def make(out: Path, seed: int, visits: tuple[Visit, ...], args: argparse.Namespa
         if visit.exposure:
             exposure = {"gain": rng.uniform(0.75, 1.2) * rng.uniform(0.93, 1.07, 3), "gamma": rng.uniform(0.9, 1.15)}
         shut = unused_doors(place, route)
-        poses = synthetic.walk(place, route, args.frames, seed=k)
+        poses = synthetic.walk(place, route, visit.frames or args.frames, seed=k)
         size_px = (args.size, args.size * 3 // 4)
         frames = synthetic.film(place, poses, size_px=size_px, shut=shut, name=visit.name, **exposure)
         shown = synthetic.shown(len(frames), HOLD_OUT)
-        gaussians = fit_frames(frames[shown], steps=args.steps, num_gaussians=args.gaussians, seed=k)
+        steps = args.steps if visit.steps is None else visit.steps
+        gaussians = fit_frames(
+            _blurred(frames[shown], visit.blur_px), steps=steps, num_gaussians=args.gaussians, seed=k
+        )
         capture = put_in_own_frame(gaussians, frames, visit.name, np.random.default_rng([seed, k, 8]))
         synthetic.write_captures(out, [capture], images=True)
         dated = f"{min(2022, 2026 - len(visits)) + k}-05-14T10:00:00+00:00"
@@ -159,6 +180,13 @@ def make(out: Path, seed: int, visits: tuple[Visit, ...], args: argparse.Namespa
         walked |= set(route)
         print(f"{seed} {visit.name}: {len(gaussians)} Gaussians, {time.process_time() - began:.0f} CPU s", flush=True)
     _write_truth(out, places, shuts, films)
+
+
+def _blurred(frames: Frames, sigma_px: float) -> Frames:
+    """Blur the photos, as motion or defocus does."""
+    if not sigma_px:
+        return frames
+    return replace(frames, images=gaussian_filter(frames.images, (0, sigma_px, sigma_px, 0)))
 
 
 def asked(edits: str) -> dict:
