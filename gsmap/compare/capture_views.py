@@ -20,7 +20,7 @@ MIN_TOLERANCE_M, MAX_TOLERANCE_M = 0.03, 0.1  # limits of the tolerance of depth
 MIN_VIEWS = 2  # number of views that must agree on a conclusion
 DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=np.float64) - 1
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-"""(26, 3) unit vectors to the faces, edges and corners of a cube; one of them lies within 28 degrees of any direction."""
+"""(26, 3) unit vectors to the faces, edges and corners of a cube, of which one is within 28 degrees of any."""
 _MIN_COSINE = 0.574  # a view observes the directions within 55 degrees of its own
 CELL_M = 0.12  # Gaussians nearer to each other than this vote together
 
@@ -75,10 +75,10 @@ class CaptureViews:
         surface: (N,) mask of Gaussians that are visible in the views; the rest are floaters or unobserved. Without
             views it is True for all.
         times_seen: (N,) int32 number of views in which a Gaussian lies on the visible surface.
-        well_observed: (N,) mask of Gaussians whose cell has a Gaussian that `MIN_VIEWS` of the views observe. Without views
-            it is True for all.
-        directions: (N,) uint32 directions from which the views observe a Gaussian, one bit for each of `DIRECTIONS`. Without
-            views all bits are set.
+        well_observed: (N,) mask of Gaussians whose cell has a Gaussian that `MIN_VIEWS` of the views observe. Without
+            views it is True for all.
+        directions: (N,) uint32 directions from which the views observe a Gaussian, one bit for each of `DIRECTIONS`.
+            Without views all bits are set.
         sharpness: (N,) float32 sum over these views of (pixels per metre)^2; it is larger for more and nearer views.
         sure: per view, an (H, W) mask of solid pixels whose surface enough views of the capture observed.
         placed: per view, the projections of the capture's own Gaussians.
