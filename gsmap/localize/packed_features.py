@@ -39,7 +39,8 @@ def pack(features: SceneFeatures, step: float, first: int) -> dict[str, np.ndarr
     low = features.points.min(0).astype(np.float64) if features.num_features else np.zeros(3)
     step = compression.finest_step(features.points, step)
     codes = compression.encode_points(features.points, low, step)
-    order = np.concatenate([a + np.argsort(codes[a:b], kind="stable") for a, b in pairwise(runs.tolist())])
+    sorted_runs = [a + np.argsort(codes[a:b], kind="stable") for a, b in pairwise(runs.tolist())]
+    order = np.concatenate([np.zeros(0, np.int64), *sorted_runs])  # a scene may have no views
     mean, axes = _principal(features.descriptors)
     along = (features.descriptors[order].astype(np.float64) - mean) @ (axes / (_AXIS * UNIT))
     rounded = np.clip(np.round(along / _STEP), -127, 127).astype(np.int8)

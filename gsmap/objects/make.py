@@ -94,6 +94,8 @@ def make_objects(
         progress: called with the fraction done in [0, 1] and the current step.
     """
     params = params or Params()
+    if not captures:
+        return []
     placed = [_placed(capture, metres) for capture in captures]
     groups = fuse(placed, moved, parted, params.min_overlap)
     gone = set(parted)
