@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -20,6 +21,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsmap.errors import BusyError, CorruptError, InputError
+
+_OWNER = 12  # characters of an owner's id in names of staged folders
 
 
 def sync_folder(folder: Path) -> None:
@@ -65,7 +68,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     _replace(path, path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}"), write)
 
 
-def write_output(path: Path, write: Callable[[Path], object]) -> None:
+def write_output(path: Path, write: Callable[[Path], object], owner: str | None = None) -> None:
     """Let ``write`` fill an output file that the user named.
 
     A file, or the target of a symbolic link, is replaced atomically. A pipe, a character device and an open file of
@@ -73,6 +76,7 @@ def write_output(path: Path, write: Callable[[Path], object]) -> None:
 
     Args:
         write: fills the file at the path it gets, whose name ends with that of ``path``.
+        owner: id of the map that the file shows, by which a purge finds what a killed process left (`staged_folder`).
 
     Raises:
         InputError: a folder, a socket or a block device.
@@ -94,13 +98,107 @@ def write_output(path: Path, write: Callable[[Path], object]) -> None:
                 f"cannot write {path}: it is a socket or a block device; name a file, or a pipe", code="not_writable"
             )
     target = Path(os.path.realpath(path))
+    if owner is not None:
+        write_owned(target, owner, write)
+        return
     # A random name, at which no link can exist, with the requested suffix.
     _replace(target, target.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}"), write)
 
 
-def write_text_output(path: Path, text: str) -> None:
+def write_text_output(path: Path, text: str, owner: str | None = None) -> None:
     """Write a text (UTF-8) to an output file that the user named; see `write_output`."""
-    write_output(path, lambda staged: staged.write_bytes(text.encode("utf-8")))
+    write_output(path, lambda staged: staged.write_bytes(text.encode("utf-8")), owner)
+
+
+def write_owned(path: Path, owner: str, write: Callable[[Path], object]) -> None:
+    """Replace a file atomically through a `staged_folder`; see `write_whole`."""
+    with staged_folder(path, owner) as folder:
+        _replace(path, folder / path.name, write)
+
+
+@contextlib.contextmanager
+def staged_folder(target: Path, owner: str) -> Iterator[Path]:
+    """Yield a new locked folder beside ``target``, to fill and to rename, or files of it; deleted if it is still there.
+
+    Its name carries the owner, and the lock lasts as long as this process: so whoever stages there next, and a purge
+    (`remove_staged`), can delete what a killed process left.
+
+    Args:
+        owner: id of the map of which the content is.
+    """
+    remove_staged(target.parent, owner, target.name)
+    staged, handle = make_locked_folder(target.with_name(f".{target.name}.{owner[:_OWNER]}"))
+    try:
+        yield staged
+    finally:
+        with contextlib.suppress(OSError):
+            remove_tree(staged.parent, staged.name)  # missing once renamed
+        os.close(handle)
+
+
+def remove_staged(parent: Path, owner: str, name: str | None = None) -> tuple[int, list[Path]]:
+    """Delete what killed processes left of `staged_folder`.
+
+    Args:
+        parent: folder to search.
+        owner: as in `staged_folder`.
+        name: name of the target; None for all targets in ``parent``.
+
+    Returns:
+        Number of deleted files, and the folders that living processes still fill.
+
+    Raises:
+        OSError: a system call failed.
+    """
+    named = ".+" if name is None else re.escape(name)
+    pattern = re.compile(rf"\.{named}\.{re.escape(owner[:_OWNER])}\.[0-9a-f]{{8}}", re.DOTALL)
+    num_files = 0
+    busy: list[Path] = []
+    for entry in sorted(os.listdir(parent)) if parent.is_dir() else []:
+        if not pattern.fullmatch(entry) or not is_folder(parent / entry):
+            continue
+        try:
+            handle = lock_folder(parent / entry, fcntl.LOCK_NB)
+        except BlockingIOError:
+            busy.append(parent / entry)
+            continue
+        except FileNotFoundError:
+            continue
+        try:
+            num_files += len(files_below(parent / entry))
+            remove_tree(parent, entry)
+        finally:
+            os.close(handle)
+    return num_files, busy
+
+
+def make_locked_folder(path: Path) -> tuple[Path, int]:
+    """Make a folder whose name begins with that of ``path``; return it and the descriptor of `lock_folder`."""
+    while True:
+        made = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}")
+        made.mkdir()
+        try:
+            handle = lock_folder(made)
+        except FileNotFoundError:
+            continue  # removed as a leftover before it was locked
+        if os.fstat(handle).st_nlink:
+            return made, handle
+        os.close(handle)
+
+
+def lock_folder(folder: Path, how: int = 0) -> int:
+    """Open and lock a folder, not a link to one; return the descriptor, with which the lock goes.
+
+    Args:
+        how: `fcntl.LOCK_NB` to raise BlockingIOError instead of waiting.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | how)
+    except BaseException:
+        os.close(handle)
+        raise
+    return handle
 
 
 def is_stream(path: Path) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import make_folder, open_file, remove_file, write_output, write_text_whole, write_whole
+from gsmap.durable import make_folder, open_file, remove_file, remove_staged, write_output, write_owned
 from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -51,6 +51,7 @@ class PictureFolder:
             InputError: what it holds cannot be read.
         """
         path = folder / FILE_NAME
+        remove_staged(folder, map_id)
         if not os.path.lexists(path):
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
                 raise ConfigError(
@@ -74,7 +75,8 @@ class PictureFolder:
 
     def save(self, folder: Path) -> None:
         content = {"version": _VERSION, "map_id": self.map_id, "pictures": self.scenes}
-        write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
+        text = json.dumps(content, indent=1)
+        write_owned(folder / FILE_NAME, self.map_id, lambda staged: staged.write_text(text, encoding="utf-8"))
 
     def forget(self, folder: Path, scene: str) -> int:
         """Delete the images that show a scene; return their number."""
@@ -109,7 +111,7 @@ def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageP
             if (row.older, row.newer) == pair:
                 progress("pictures", len(files) / len(rows), row.id)
                 files[row.id] = str(folder / f"{row.id}.png")
-                write_whole(folder / f"{row.id}.png", partial(drawer.draw, row))
+                write_owned(folder / f"{row.id}.png", store.id, partial(drawer.draw, row))
     progress("pictures", 1.0, f"{len(files)} pictures")
     return files
 
@@ -130,7 +132,7 @@ def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
     _note(store, folder)
     known.scenes[name] = [edge.target, edge.source]
     known.save(folder)
-    write_whole(folder / name, partial(_save, picture))
+    write_owned(folder / name, store.id, partial(_save, picture))
     return str(folder / name)
 
 
@@ -230,7 +232,7 @@ def draw_places(
         placed = _placed(store, scene, in_metres(poses.poses[scene].S_map_scene, metres[scene]))
         for name, one, box in zip(names, scenes, boxes, strict=True):
             if one == scene:
-                write_whole(folder / name, partial(_save, draw_place(placed, box * metres[scene])))
+                write_owned(folder / name, store.id, partial(_save, draw_place(placed, box * metres[scene])))
     progress("pictures", 1.0, f"{len(names)} pictures")
     return [str(folder / name) for name in names]
 

@@ -6,7 +6,6 @@ import json
 import logging
 import math
 import os
-import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -22,10 +21,11 @@ from gsmap.durable import (
     refuse_links,
     remove_empty_folder,
     remove_file,
-    remove_tree,
+    remove_staged,
+    staged_folder,
     sync_folder,
     write_output,
-    write_whole,
+    write_owned,
 )
 from gsmap.errors import MALFORMED, ConfigError, CorruptError, NotFoundError
 from gsmap.map.comparison_pictures import note_target
@@ -56,22 +56,17 @@ def write_site(
     _check_folder(store, folder)
     page, page_source = built_page(), MapPageSource(store, settings, tiles=tiles)
     make_folder(folder.parent)
-    staged = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}"
-    with _levels(page_source, settings) as levels:
-        try:
-            staged.mkdir()
-            told = partial(progress, "page")
-            written = site.write_site(staged, page_source, levels, settings.view, page, told)
-            made = _in_order(files_below(staged))
-            marker = _mark(store.id, made)
-            (staged / SITE).write_bytes(marker)
-            notes = written.notes
-            if (refused := note_target(store, folder, {"site": True})) is not None:
-                notes = (*notes, f"{refused}: a purge of a scene will not find this page")
-            _check_folder(store, folder)  # again: it may have been filled meanwhile
-            _put(staged, folder, store.id, made)
-        finally:
-            remove_tree(staged.parent, staged.name)
+    refused = note_target(store, folder, {"site": True})  # first: a purge must find what a killed export leaves
+    with _levels(page_source, settings) as levels, staged_folder(folder.absolute(), store.id) as staged:
+        written = site.write_site(staged, page_source, levels, settings.view, page, partial(progress, "page"))
+        made = _in_order(files_below(staged))
+        marker = _mark(store.id, made)
+        (staged / SITE).write_bytes(marker)
+        notes = written.notes
+        if refused is not None:
+            notes = (*notes, f"{refused}: a purge of a scene will not find this page")
+        _check_folder(store, folder)  # again: it may have been filled meanwhile
+        _put(staged, folder, store.id, made)
     progress("page", 1.0, "")
     num_bytes = written.num_bytes + len(marker)
     return ViewReport(path=str(folder), num_bytes=num_bytes, num_scenes=written.num_scenes, notes=notes)
@@ -107,7 +102,7 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
             mark=mark,
         )
         refused = None if is_stream(path) else note_target(store, path, {"page": True})
-        write_output(path, lambda staged: made.append(write(staged)))
+        write_output(path, lambda staged: made.append(write(staged)), store.id)
     notes = made[0].notes
     if refused is not None:
         notes = (*notes, f"{refused}: a purge of a scene will not find this page")
@@ -184,6 +179,7 @@ def _check_folder(store: Store, folder: Path) -> None:
     """Refuse a folder with anything but this map's page."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise ConfigError(f"{folder} is not a folder: give an empty or a new one", code="not_a_folder")
+    remove_staged(folder, store.id)
     if folder.is_dir() and any(folder.iterdir()) and site_owner(folder) != store.id:
         raise ConfigError(
             f"{folder} holds other files than a page of this map: give an empty or a new folder",
@@ -218,7 +214,7 @@ def _put(staged: Path, folder: Path, map_id: str, made: Sequence[str]) -> None:
     before = site_files(folder)
     for path in made:
         _check_free(folder, path, path in before)
-    write_whole(folder / SITE, lambda place: place.write_bytes(_mark(map_id, [*dict.fromkeys([*before, *made])])))
+    _write_marker(folder, map_id, [*dict.fromkeys([*before, *made])])
     for path in made:
         place = folder / path
         make_folder(place.parent)
@@ -226,7 +222,11 @@ def _put(staged: Path, folder: Path, map_id: str, made: Sequence[str]) -> None:
     for below in {(folder / path).parent for path in made}:
         sync_folder(below)
     _remove(folder, sorted(set(before) - set(made)))
-    write_whole(folder / SITE, lambda place: place.write_bytes(_mark(map_id, made)))
+    _write_marker(folder, map_id, made)
+
+
+def _write_marker(folder: Path, map_id: str, files: Sequence[str]) -> None:
+    write_owned(folder / SITE, map_id, lambda place: place.write_bytes(_mark(map_id, files)))
 
 
 def _check_free(folder: Path, path: str, is_ours: bool) -> None:

@@ -107,7 +107,7 @@ def write_report(
     if not is_stream(path) and (refused := note_target(store, path, {"report": True})) is not None:
         report = replace(report, notes=(*report.notes, f"{refused}: a purge of a scene will not find this page"))
         text = page(report)
-    write_text_output(path, text)
+    write_text_output(path, text, store.id)
     standing, sentences = verdict(report)
     return WrittenReport(
         path=str(path),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 import os
 import zipfile
@@ -20,7 +21,16 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import open_file, sync_file, sync_folder
+from gsmap.durable import (
+    is_file,
+    open_file,
+    remove_empty_folder,
+    remove_file,
+    staged_folder,
+    sync_file,
+    sync_folder,
+    write_owned,
+)
 from gsmap.errors import MALFORMED, ConfigError, CorruptError, GsmapError, NotFoundError, StoreError
 from gsmap.export.levels import Params as LevelParams
 from gsmap.export.levels import make_level
@@ -37,17 +47,19 @@ from gsmap.localize import (
 )
 from gsmap.localize.features import INDEXED_FEATURES
 from gsmap.map import static_filter
+from gsmap.map.comparison_pictures import note_target
 from gsmap.map.objects import MapObjects
 from gsmap.map.settings import Settings, settings_of
 from gsmap.map.stages.localize import Localizer, SearchRegion
 from gsmap.map.static_filter import find_dynamic_content
 from gsmap.methods import family
-from gsmap.store import Store, staging
+from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.exports import SmallMapReport, SmallSceneRow
 
+_log = logging.getLogger("gsmap.map")
 FILE_NAME = "localize.json"
 _FORMAT, _VERSION = "gsmap small map", 2
 _MAX_JSON, _MAX_SCENE = 1 << 25, 1 << 31
@@ -139,7 +151,9 @@ def export_small(
     _require_enough(rows, shown, budget_bytes, total)
     header = _header(store, localizer, files)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with staging.beside(out.absolute()) as staged:
+    if (refused := note_target(store, out, {"small_map": True})) is not None:
+        _log.warning("%s: the folder is not recorded in the map, so a purge will not find this small map", refused)
+    with staged_folder(out.absolute(), store.id) as staged:
         for name, content in (*((f"{scene}.npz", files[scene]) for scene in scenes), (FILE_NAME, header)):
             (staged / name).write_bytes(content)
             sync_file(staged / name)
@@ -299,6 +313,7 @@ def _header(store: Store, localizer: Localizer, files: Mapping[str, bytes]) -> b
     told = {
         "format": _FORMAT,
         "version": _VERSION,
+        "map_id": store.id,
         "metres_per_unit": {str(component): value for component, value in localizer.metres.items()},
         "world": [
             {"component": tie.component, "S_world_map": tie.S_world_map.matrix().tolist(), "crs": tie.frame.crs}
@@ -308,6 +323,41 @@ def _header(store: Store, localizer: Localizer, files: Mapping[str, bytes]) -> b
         "scenes": scenes,
     }
     return json.dumps(told).encode()
+
+
+# --- purged ----------------------------------------------------------------------------------------------------------
+
+
+def owner_of(folder: Path) -> str | None:
+    """Return the id of the map that a small map was exported from; None if the folder holds none that says so."""
+    try:
+        told = _read_header(folder / FILE_NAME)
+        return str(told["map_id"]) if all(row["id"] for row in told["scenes"]) else None
+    except (GsmapError, *MALFORMED):
+        return None
+
+
+def num_files(folder: Path, scene: str) -> int:
+    """Return the number of files that are about a scene: its own, and the list of all scenes if it names it."""
+    listed = any(row["id"] == scene for row in _read_header(folder / FILE_NAME)["scenes"])
+    return int(listed) + int(is_file(folder / f"{scene}.npz"))
+
+
+def forget(folder: Path, scene: str) -> None:
+    """Delete a scene from a small map; the last one with the folder.
+
+    The list goes first, so that an interrupted call leaves a small map that works, and the same call goes on.
+    """
+    told = _read_header(folder / FILE_NAME)
+    left = [row for row in told["scenes"] if row["id"] != scene]
+    if left and len(left) < len(told["scenes"]):
+        text = json.dumps(told | {"scenes": left})
+        write_owned(folder / FILE_NAME, told["map_id"], lambda staged: staged.write_text(text, encoding="utf-8"))
+    remove_file(folder, f"{scene}.npz")
+    if not left:
+        remove_file(folder, FILE_NAME)
+    sync_folder(folder)
+    remove_empty_folder(folder.parent, folder.name)
 
 
 # --- read ------------------------------------------------------------------------------------------------------------

@@ -7,11 +7,10 @@ import fcntl
 import os
 import re
 import time
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
-from gsmap.durable import is_folder, remove_tree
+from gsmap.durable import is_folder, lock_folder, make_locked_folder, remove_tree
 
 # Doubled for a map made in a folder that is staged itself.
 _STAGED = r"\.{{1,2}}{name}(\.[0-9a-f]{{8}}){{1,2}}"
@@ -29,16 +28,7 @@ def beside(folder: Path) -> Iterator[Path]:
     name are removed first.
     """
     _remove_leftovers(folder)
-    while True:
-        staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
-        staged.mkdir()
-        try:
-            handle = _locked(staged)
-        except FileNotFoundError:
-            continue  # removed as a leftover before it was locked
-        if os.fstat(handle).st_nlink:
-            break
-        os.close(handle)
+    staged, handle = make_locked_folder(folder.with_name(f".{folder.name}"))
     try:
         yield staged
     finally:
@@ -65,19 +55,9 @@ def _remove_leftovers(folder: Path) -> None:
         if not (staged.fullmatch(name) and is_folder(path)):
             continue
         with contextlib.suppress(OSError):  # locked by another process, or not permitted
-            handle = _locked(path, fcntl.LOCK_NB)
+            handle = lock_folder(path, fcntl.LOCK_NB)
             try:
                 if all(_PART.fullmatch(part) for part in os.listdir(handle)):
                     remove_tree(folder.parent, name)
             finally:
                 os.close(handle)
-
-
-def _locked(folder: Path, how: int = 0) -> int:
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | how)
-    except BaseException:
-        os.close(handle)
-        raise
-    return handle

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmap.durable import files_below, is_folder, staged_folder
 from gsmap.errors import MALFORMED
 from gsmap.formats.tiles3d import CONTENT_FOLDER
 from gsmap.types import Gaussians
@@ -30,6 +31,8 @@ _MANIFEST = "files.json"
 _TILE = re.compile(rf"{CONTENT_FOLDER}/[0-9a-z]+-([0-9a-f]{{16}})\.glb")
 _COLUMNS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "sh": 3}
 _STALE_S = 3600.0  # age after which a staged entry counts as left over by a process that died
+_OWNER = "cache"  # in names of staged folders: entries belong to no map
+_NAMELESS = re.compile(r"\.[0-9a-f]{32}")  # entries that an older gsmap was making
 
 
 class TreeCache:
@@ -71,13 +74,10 @@ class TreeCache:
         columns = [getattr(made.gaussians, name).reshape(len(table) - 2, -1) for name in _COLUMNS]
         table[2:] = np.concatenate(columns, axis=1)
         self._make_folder()
-        staged = self._staged()
-        try:
-            with open(staged, "xb") as file:
+        with staged_folder(self._sketch(key, max_count), _OWNER) as staged:
+            with open(staged / "sketch", "xb") as file:
                 np.save(file, table)
-            os.replace(staged, self._sketch(key, max_count))
-        finally:
-            staged.unlink(missing_ok=True)
+            os.replace(staged / "sketch", self._sketch(key, max_count))
 
     # --- trees -------------------------------------------------------------------------------------------------------
 
@@ -121,8 +121,8 @@ class TreeCache:
         If another process was faster, its tree is kept.
         """
         self._make_folder()
-        staged = self._staged()
-        try:
+        with staged_folder(self._tree(key), _OWNER) as folder:
+            staged = folder / "tree"
             write(staged)
             tiles = {
                 f"{CONTENT_FOLDER}/{path.name}": path.stat().st_size for path in (staged / CONTENT_FOLDER).iterdir()
@@ -132,21 +132,26 @@ class TreeCache:
             self._make_room(sum(tiles.values()))
             with contextlib.suppress(OSError):  # another process was faster
                 os.rename(staged, self._tree(key))
-        finally:
-            shutil.rmtree(staged, ignore_errors=True)
         return self._tree(key)
 
     # --- all entries -------------------------------------------------------------------------------------------------
 
     def num_files(self, scene: str) -> int:
         """Count the cached files of a scene, which the prefix of their keys identifies."""
-        found = self.root.glob(f"{glob.escape(scene)}*")
-        return sum(sum(f.is_file() for f in path.rglob("*")) if path.is_dir() else 1 for path in found)
+        return sum(len(files_below(path)) if is_folder(path) else 1 for path in self._of(scene))
 
     def forget(self, scene: str) -> None:
-        """Delete all entries of a scene, which the prefix of their keys identifies."""
-        for path in self.root.glob(f"{glob.escape(scene)}*"):
+        """Delete all entries of a scene, which the prefix of their keys identifies, and what killed processes left of them.
+
+        Entries that an older gsmap left half-made do not name their scene, and are deleted, too.
+        """
+        for path in self._of(scene):
             self._drop(path)
+
+    def _of(self, scene: str) -> list[Path]:
+        escaped = glob.escape(scene)
+        nameless = [path for path in self.root.glob(".*") if _NAMELESS.fullmatch(path.name)]
+        return [*self.root.glob(f"{escaped}*"), *self.root.glob(f".{escaped}*"), *nameless]
 
     def _tree(self, key: str) -> Path:
         return self.root / f"{key}.tree"
@@ -154,15 +159,12 @@ class TreeCache:
     def _sketch(self, key: str, max_count: int) -> Path:
         return self.root / f"{key}.{max_count}.sketch"
 
-    def _staged(self) -> Path:
-        return self.root / f".{uuid.uuid4().hex}"
-
     def _make_folder(self) -> None:
         self.root.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _drop(self, path: Path) -> None:
         """Delete an entry such that other processes see it whole or not at all."""
-        grave = self._staged()
+        grave = path.with_name(f".{path.name.removeprefix('.')}.{uuid.uuid4().hex[:8]}")
         try:
             os.rename(path, grave)
         except OSError:

@@ -15,6 +15,7 @@ from gsmap.durable import (
     refuse_links,
     remove_empty_folder,
     remove_file,
+    remove_staged,
     remove_tree,
     sync_folder,
 )
@@ -25,6 +26,7 @@ from gsmap.export.pyramid import LEVELS_FOLDER, is_stale
 from gsmap.export.streamed_sog import StreamedSog
 from gsmap.export.tileset import Tiles3D
 from gsmap.export.write import leftovers
+from gsmap.map import small_map
 from gsmap.map.comparison_pictures import FILE_NAME as PICTURES
 from gsmap.map.comparison_pictures import PictureFolder
 from gsmap.map.page_export import SITE, remove_site, site_files, site_owner
@@ -101,6 +103,8 @@ def _finish(store: Store, begun: Purge) -> Purge:
     for target in begun.receipt["pending"]["targets"]:
         try:
             out = Path(target)
+            begun, left = _clean_staged(store, out, begun)
+            unreachable += left
             if os.path.lexists(out / FILE_NAME):
                 with folder_lock(out):
                     begun = _clean(store, out, begun)
@@ -111,16 +115,37 @@ def _finish(store: Store, begun: Purge) -> Purge:
                 if site_owner(out) == store.id:  # it shows all scenes; gsmap view --export makes it anew
                     begun = purging.record_files(store, begun, str(out), len(site_files(out)) + 1)
                     remove_site(out)
+            elif os.path.lexists(out / small_map.FILE_NAME):
+                if small_map.owner_of(out) == store.id:
+                    begun = purging.record_files(store, begun, str(out), small_map.num_files(out, begun.scene))
+                    small_map.forget(out, begun.scene)
+                else:
+                    unreachable.append(f"{out}: it holds a small map that this map or version of gsmap did not write")
             elif os.path.lexists(out / PICTURES):
                 if gone := PictureFolder.load(out, store.id).forget(out, begun.scene):
                     begun = purging.record_files(store, begun, str(out), gone)
             else:
-                unreachable.append(f"{out}: it is not there, or no report, and holds no {FILE_NAME} and no {PICTURES}")
+                unreachable.append(f"{out}: it is not there, or nothing in it was written by gsmap")
         except (OSError, GsmapError) as error:
             if (passing := _passing(error)) is not None:
                 raise passing(f"{target} could not be cleaned yet ({error}): run the same command again") from error
             unreachable.append(f"{target}: {error}")
     return purging.finish(store, begun, unreachable)
+
+
+def _clean_staged(store: Store, out: Path, begun: Purge) -> tuple[Purge, list[str]]:
+    """Delete what killed exports left beside and in a target; return what is not certainly theirs, too."""
+    found = [remove_staged(out.parent, store.id, out.name), remove_staged(out, store.id)]
+    if num_files := sum(count for count, _ in found):
+        begun = purging.record_files(store, begun, f"{out} (interrupted exports)", num_files)
+    left = [f"{path}: another process is writing it" for _, busy in found for path in busy]
+    name = re.escape(out.name)
+    # As an older gsmap named them, without the id of the map.
+    older = re.compile(rf"\.{name}\.[0-9a-f]{{8}}|\.[0-9a-f]{{8}}\.{name}")
+    for entry in sorted(os.listdir(out.parent)) if is_folder(out.parent) else []:
+        if older.fullmatch(entry):
+            left.append(f"{out.parent / entry}: an interrupted export of an older gsmap may have left it: delete it")
+    return begun, left
 
 
 def _passing(error: OSError | GsmapError) -> type[GsmapError] | None:
