@@ -187,6 +187,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "camera_not_found": "There is no camera or photo of this name.",
     "change_not_found": "There is no change or comparison of this name.",
     "change_unplaced": "A change cannot be placed in the map by the newest poses.",
+    "clock_contradicts_map": "The clock of this computer contradicts times or dates in the map.",
     "changed_meanwhile": "Another process changed or pruned the data during this command.",
     "component_not_found": "The map has no component of this number.",
     "confirmed_edges_contradict": "A confirmed edge contradicts the other confirmed edges.",

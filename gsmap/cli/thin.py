@@ -24,6 +24,14 @@ def command(
     budget: Annotated[
         str | None, typer.Option("--budget", help="Stop when the captures fit into this size, such as 2GiB.")
     ] = None,
+    now: Annotated[
+        str | None,
+        typer.Option(
+            "--now",
+            metavar="DATE",
+            help="Day from which --keep-days counts; default: when the map was last written.",
+        ),
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be thinned.")] = False,
     json: AsJson = False,
 ) -> None:
@@ -37,7 +45,7 @@ def command(
     """
     size = None if budget is None else parse_size(budget)
     with opened(map) as m:
-        report = m.thin(keep_days=keep_days, budget_bytes=size, dry_run=dry_run)
+        report = m.thin(keep_days=keep_days, budget_bytes=size, dry_run=dry_run, now=now)
     if json:
         print_rows("thin", report, json)
         return

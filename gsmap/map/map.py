@@ -1249,7 +1249,10 @@ class Map(AbstractContextManager["Map"]):
         Args:
             keep_days: captures of this many days before ``now`` stay whole.
             budget_bytes: thin only until the arrays of living scenes fit.
-            now: ISO 8601; None for the current time.
+            now: ISO 8601; None for the time at which the map was last written, or the clock's if that is earlier.
+
+        Raises:
+            ConfigError: no days and no budget; or the clock contradicts what is stored, and ``now`` is not given.
         """
         from gsmap.map.stages.thin import Request, thin
 

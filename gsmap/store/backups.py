@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from sqlalchemy import insert, select
 
-from gsmap.store.catalog import Catalog, now
-from gsmap.store.schema import backups
+from gsmap.store.catalog import Catalog, next_timestamp
+from gsmap.store.schema import backups, scenes
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,11 @@ class Backups:
         self._catalog = catalog
 
     def add(self, target: str, snapshot: str, num_bytes: int) -> None:
-        row = {"target": target, "snapshot": snapshot, "created_at": now(), "num_bytes": num_bytes}
+        row = {"target": target, "snapshot": snapshot, "num_bytes": num_bytes}
         with self._catalog.write() as connection:
-            connection.execute(insert(backups), row)
+            # After every scene that is in it, whatever a clock said: purges list the backups that may hold a scene.
+            when = next_timestamp(connection, scenes.c.ingested_at)
+            connection.execute(insert(backups), row | {"created_at": when})
 
     def list(self) -> list[StoredBackup]:
         """Return all backups, oldest first."""

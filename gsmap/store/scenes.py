@@ -18,7 +18,7 @@ from gsmap.store import compact, facts
 from gsmap.store.array_archive import StreamedArray
 from gsmap.store.array_groups import forget_derived, has_group, manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.arrays import Arrays, StoredFile, digest
-from gsmap.store.catalog import Catalog, now
+from gsmap.store.catalog import Catalog, next_timestamp, now
 from gsmap.store.chunk_boxes import chunk_boxes, chunks_touching, put_boxes, row_ranges
 from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.facts import Fact
@@ -479,7 +479,9 @@ class Scenes:
         """Remove a scene from lists and the next revision, leaving a tombstone; `prune` deletes its arrays later."""
         with self._catalog.write() as connection:
             row = find_living(connection, ref)
-            connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=now()))
+            # A merge compares both times: the later of removing and restoring counts, whatever a clock said.
+            when = next_timestamp(connection, scenes.c.ingested_at, scenes.c.id == row.id)
+            connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=when))
             return _with_tags(connection, row)
 
     def restore(self, ref: str) -> Scene:
@@ -509,7 +511,8 @@ class Scenes:
                     code="arrays_corrupt",
                 )
             name = unused_name(connection, row.name)
-            back = {"removed_at": None, "ingested_at": now(), "name": name}
+            when = next_timestamp(connection, scenes.c.removed_at, scenes.c.id == row.id)
+            back = {"removed_at": None, "ingested_at": when, "name": name}
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(**back))
             if name != row.name:
                 facts.add_facts(connection, row.id, [("name", name)])
@@ -545,7 +548,8 @@ class Scenes:
                 f"another scene has the name {wanted!r}: choose another name, or remove that scene first",
                 code="name_taken",
             )
-        fields = fields | {"name": name, "ingested_at": now(), "removed_at": None}
+        when = next_timestamp(connection, scenes.c.removed_at, scenes.c.id == new_id)
+        fields = fields | {"name": name, "ingested_at": when, "removed_at": None}
         before = by_id(connection, new_id)
         if before is None:
             connection.execute(insert(scenes), fields | {"id": new_id})

@@ -42,6 +42,7 @@ from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
 from gsmap.store.view_features import ViewFeatures
 from gsmap.store.world import WorldObservations
+from gsmap.store.written import time_written
 from gsmap.types.progress import Progress
 from gsmap.version import __version__
 
@@ -273,6 +274,10 @@ class Store:
         """Commit all changes of the block together, or none. Keep the block short, as other writers wait for it."""
         with self.catalog.write():
             yield
+
+    def time_written(self) -> str | None:
+        """Return the time of the map's newest row, ISO 8601; None for an empty map."""
+        return time_written(self.catalog)
 
     def upload_settings(self) -> None:
         """Upload ``settings.toml`` of a remote map; does nothing for a local map."""

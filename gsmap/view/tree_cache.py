@@ -141,7 +141,7 @@ class TreeCache:
         return sum(len(files_below(path)) if is_folder(path) else 1 for path in self._of(scene))
 
     def forget(self, scene: str) -> None:
-        """Delete all entries of a scene, which the prefix of their keys identifies, and what killed processes left of them.
+        """Delete all entries of a scene, which the prefix of their keys identifies, and their leftovers.
 
         Entries that an older gsmap left half-made do not name their scene, and are deleted, too.
         """

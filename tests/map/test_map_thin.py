@@ -1,10 +1,12 @@
 """Thinning through the door: which captures may go compact, and what a dry run changes."""
 
 import sys
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
+from raising import raises
 
 import gsmap.map
 from gsmap.errors import ConfigError
@@ -81,3 +83,44 @@ def test_what_makes_no_sense_is_refused(tmp_path):
         for wrong in ({}, {"keep_days": -1}, {"keep_days": 1, "now": "yesterday"}, {"keep_days": 1e12}):
             with pytest.raises(ConfigError):
                 m.thin(**wrong)
+
+
+# --- clocks ----------------------------------------------------------------------------------------------------------
+
+
+def set_clock(patch: pytest.MonkeyPatch, when: datetime) -> None:
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return when
+
+    patch.setattr("gsmap.map.stages.thin.datetime", Clock)
+
+
+def test_a_clock_that_is_ahead_makes_no_capture_older(tmp_path, monkeypatch):
+    with walls(tmp_path / "m.gsmap", [0.0, 0.0, 0.0]) as m:
+        days = (datetime.now(UTC) - datetime(2021, 6, 1, tzinfo=UTC)).days
+        asked = {"keep_days": days - 30, "dry_run": True}
+        right = [row.scene_name for row in m.thin(**asked).scenes]
+        set_clock(monkeypatch, datetime.now(UTC) + timedelta(days=3650))
+        assert [row.scene_name for row in m.thin(**asked).scenes] == right == ["w0", "w1"]
+        assert [row.scene_name for row in m.thin(**{**asked, "keep_days": days + 30}).scenes] == ["w0"]
+
+
+def test_a_clock_that_contradicts_the_map_thins_nothing_until_the_day_is_said(tmp_path, monkeypatch):
+    with walls(tmp_path / "m.gsmap", [0.0, 0.0]) as m:
+        today = datetime.now(UTC)
+        set_clock(monkeypatch, today - timedelta(days=3650))
+        for asked in ({"keep_days": 1.0}, {"budget_bytes": 1}):
+            with raises(ConfigError, code="clock_contradicts_map"):
+                m.thin(**asked)
+        assert all(scene.thinning is None for scene in m.scenes())
+        assert m.thin(keep_days=1.0, now=today.isoformat()).scenes[0].thinned
+
+
+def test_a_capture_dated_in_the_future_supersedes_nothing_until_the_day_is_said(tmp_path):
+    with walls(tmp_path / "m.gsmap", [0.0, 0.0]) as m:
+        m.store.scenes.edit("w1", captured_at="2190-06-01T00:00:00+00:00")
+        with raises(ConfigError, match="w1 is dated", code="clock_contradicts_map"):
+            m.thin(keep_days=1.0)
+        assert all(scene.thinning is None for scene in m.scenes())

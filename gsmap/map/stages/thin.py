@@ -21,6 +21,8 @@ from gsmap.types import PosedScene, PoseGraph, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.thinning import ThinReport, ThinRow
 
+_TOLERANCE = timedelta(days=1)  # of clocks and time zones of other computers
+
 
 @dataclass(frozen=True)
 class Request:
@@ -30,7 +32,7 @@ class Request:
         keep_days: scenes captured in this many days before ``now`` stay whole; None for no limit by age.
         budget_bytes: thin only until the arrays of living scenes fit; None thins all that may be.
         dry_run: change nothing.
-        now: ISO 8601; None for the current time.
+        now: ISO 8601; None for the time at which the map was last written, or the clock's if that is earlier.
     """
 
     keep_days: float | None = None
@@ -46,7 +48,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     it when a new capture is registered or a picture localised. Poses, registrations and words stay.
 
     Raises:
-        ConfigError: neither days nor a budget, or negative ones.
+        ConfigError: neither days nor a budget, or negative ones; the clock contradicts what is stored.
         NotFoundError: the map has no poses.
     """
     if request.keep_days is None and request.budget_bytes is None:
@@ -59,7 +61,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     living = {scene.id: scene for scene in store.scenes.list()}
     dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
     try:
-        now = datetime.now(UTC) if request.now is None else _moment(request.now)
+        now = _present(store, dated) if request.now is None else _moment(request.now)
         before = now - timedelta(days=request.keep_days or 0)
     except OverflowError as error:
         raise ConfigError(
@@ -107,6 +109,28 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         num_bytes_freed=freed,
         fits=request.budget_bytes is None or sum(sizes.values()) <= request.budget_bytes,
     )
+
+
+def _present(store: Store, dated: Sequence[Scene]) -> datetime:
+    """Return the time from which days are counted.
+
+    Thinning cannot be undone, and a clock may be wrong. While it is ahead, no capture is older than it was when the map
+    was last written; behind what is stored, nobody knows how old captures are.
+
+    Args:
+        dated: scenes with a date, oldest first.
+    """
+    now, written = datetime.now(UTC), store.time_written()
+    latest = now + _TOLERANCE
+    advice = f"and this computer's clock says {now:%Y-%m-%d}: correct the clock, or say which day it is (--now DATE)"
+    if written is not None and _moment(written) > latest:
+        raise ConfigError(f"the map was last written at {written}, {advice}", code="clock_contradicts_map")
+    if dated and _when(dated[-1]) > latest:
+        raise ConfigError(
+            f"scene {dated[-1].name} is dated {dated[-1].captured_at}, {advice}, or correct the date (gsmap edit)",
+            code="clock_contradicts_map",
+        )
+    return now if written is None else min(now, _moment(written))
 
 
 THINGS = RecipeKey("thin", "things", {"things": 1})
