@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from gsmap.errors import BusyError, CorruptError, InputError
+from gsmap.errors import BusyError, CorruptError, DiskFullError, InputError, failed_path, of_system
 
 _OWNER = 12  # characters of an owner's id in names of staged folders
 
@@ -129,7 +129,8 @@ def staged_folder(target: Path, owner: str) -> Iterator[Path]:
     remove_staged(target.parent, owner, target.name)
     staged, handle = make_locked_folder(target.with_name(f".{target.name}.{owner[:_OWNER]}"))
     try:
-        yield staged
+        with staged_for(staged, target):
+            yield staged
     finally:
         with contextlib.suppress(OSError):
             remove_tree(staged.parent, staged.name)  # missing once renamed
@@ -201,6 +202,19 @@ def lock_folder(folder: Path, how: int = 0) -> int:
     return handle
 
 
+@contextlib.contextmanager
+def staged_for(staged: Path, target: Path) -> Iterator[None]:
+    """Context in which an OSError names the target, not the staged file or folder that its content is written to."""
+    try:
+        yield
+    except OSError as error:
+        failed = failed_path(error)
+        inside = failed is not None and Path(failed).is_relative_to(staged)
+        if inside or (failed is None and of_system(error) is DiskFullError):
+            error.filename, error.filename2 = str(target), None
+        raise
+
+
 def is_stream(path: Path) -> bool:
     """Return True if a path is a pipe, a character device or an open file of this process."""
     if _descriptor(path) is not None:
@@ -237,9 +251,10 @@ def _opened_stream(path: Path) -> BinaryIO:
 def _replace(path: Path, staged: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` fill ``staged``, and rename it to ``path``."""
     try:
-        write(staged)
-        sync_file(staged)
-        os.replace(staged, path)
+        with staged_for(staged, path):
+            write(staged)
+            sync_file(staged)
+            os.replace(staged, path)
     finally:
         staged.unlink(missing_ok=True)
     sync_folder(path.parent)

@@ -22,6 +22,7 @@ results with a status and a reason, never errors.
 """
 
 import errno
+import os
 
 MALFORMED = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 """Exceptions that Python raises for JSON or TOML that is damaged, too deeply nested, or of another structure."""
@@ -129,6 +130,17 @@ class MissingDependencyError(GsmapError, ImportError):
     """An optional package is not installed."""
 
     code = "missing_dependency"
+
+
+def failed_path(error: OSError) -> str | None:
+    """Return the path at which a system call failed; None if the error names none.
+
+    A failed copy names its source first: a full disk is that of the target.
+    """
+    names = [name for name in (error.filename, error.filename2) if isinstance(name, (str, bytes))]
+    if not names:
+        return None
+    return os.fsdecode(names[-1] if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS) else names[0])
 
 
 def of_system(error: OSError) -> type[StoreError]:

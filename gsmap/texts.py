@@ -8,28 +8,35 @@ from typing import Any
 
 # Cc, Cs: escape sequences, line breaks, halves of characters. Zl, Zp: line breaks of another kind.
 _CATEGORIES = ("Cc", "Cs", "Zl", "Zp")
-# Bidirectional overrides, which disguise a text.
-_TURNING = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+# Invisible format characters (bidirectional overrides, zero-width characters, tags), which disguise a text, but for the
+# two joiners that scripts and emoji need.
+_INVISIBLE = "Cf"
+_JOINERS = frozenset("\u200c\u200d")
 
 
 def control_characters(text: str, *, lines: bool = False) -> list[str]:
-    """Return the characters of a text that control a terminal, in order.
+    """Return the characters of a text that control a terminal or cannot be seen, in order.
 
     Args:
         lines: allow line feeds.
     """
     if text.isascii() and text.isprintable():
         return []
-    return [c for c in text if _steers(c) and not (lines and c == "\n")]
+    around = zip(" " + text[:-1], text, text[1:] + " ", strict=True)
+    return [
+        c
+        for before, c, after in around
+        if (_steers(c) and not (lines and c == "\n")) or (c in _JOINERS and (before.isascii() or after.isascii()))
+    ]
 
 
 def escaped(text: str, *, lines: bool = False) -> str:
-    r"""Escape control characters as ``\x1b`` and the like; other characters are unchanged.
+    r"""Escape control and invisible characters as ``\x1b`` and the like; other characters are unchanged.
 
     Args:
         lines: keep line feeds.
     """
-    if not control_characters(text, lines=lines):
+    if text.isascii() and text.isprintable():
         return text
     parts = (c.encode("unicode_escape").decode() if _steers(c) and not (lines and c == "\n") else c for c in text)
     return "".join(parts)
@@ -57,7 +64,8 @@ def shown(value: Any, *, lines: bool = False) -> str:
 
 
 def _steers(c: str) -> bool:
-    return c in _TURNING or unicodedata.category(c) in _CATEGORIES
+    category = unicodedata.category(c)
+    return category in _CATEGORIES or (category == _INVISIBLE and c not in _JOINERS)
 
 
 def few(names: Sequence[str], most: int = 5) -> str:

@@ -18,7 +18,7 @@ from typing import Annotated
 import typer
 
 from gsmap.cli.console import expect_json, left, print_json_error, start_logging
-from gsmap.errors import ConfigError, GsmapError
+from gsmap.errors import ConfigError, DiskFullError, GsmapError, StoreError, failed_path, of_system
 from gsmap.texts import escaped
 from gsmap.version import __version__
 
@@ -127,18 +127,28 @@ def run(arguments: list[str] | None = None) -> None:
     except GsmapError as error:
         code, message, reason = 1, str(error), error.code
     except OSError as error:
-        where = f" {error.filename}" if error.filename else ""
-        code, message, reason = (
-            1,
-            f"the operating system reported an error{where and f' for{where}'}: {error.strerror or error}",
-            "system_refused",
-        )
+        where, kind = failed_path(error), of_system(error)
+        if kind is DiskFullError:
+            message = f"{where or 'a disk'}: the disk is full ({error.strerror}); free some space and try again"
+        else:
+            message = (
+                f"the operating system reported an error{f' for {where}' if where else ''}: {error.strerror or error}"
+            )
+        code, reason = 1, "system_refused" if kind is StoreError else kind.code
+    except MemoryError:
+        code, message, reason = 1, _OUT_OF_MEMORY, "out_of_memory"
     except Exception as error:
-        code, message, reason = 1, _internal_error(error), "internal_error"
+        if isinstance(error, RuntimeError) and str(error) == "can't start new thread":  # no memory for its stack
+            code, message, reason = 1, _OUT_OF_MEMORY, "out_of_memory"
+        else:
+            code, message, reason = 1, _internal_error(error), "internal_error"
     if reason and "--json" in given:
         print_json_error(reason, message)
     print(escaped(f"gsmap: {message}"), file=sys.stderr)
     sys.exit(code)
+
+
+_OUT_OF_MEMORY = "there is not enough memory: close other programs, raise the limit, or use fewer workers"
 
 
 def _internal_error(error: Exception) -> str:

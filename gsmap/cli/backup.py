@@ -34,8 +34,9 @@ def command(
 ) -> None:
     """Save the map as it is now, while other processes may write to it. Only files that the backup lacks are sent.
 
-    The command reads the catalog and the files to send; if one of them is damaged, it saves nothing. Files that were
-    damaged after they had been sent are found by `gsmap check`, and the backup keeps their sound bytes. Exit code 1 if
+    The command reads the catalog and the files to send; if one of them is damaged, it saves nothing. A branch whose
+    catalog is damaged is left out, and no older snapshot is deleted. Files that were damaged after they had been sent
+    are found by `gsmap check`, and the backup keeps their sound bytes. Exit code 1 if a branch was left out, or if
     `--verify` finds damage in the backup that the map cannot repair. For S3, set `AWS_ACCESS_KEY_ID`,
     `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and `AWS_ENDPOINT_URL`.
 

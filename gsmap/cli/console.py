@@ -117,6 +117,7 @@ def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: s
 
 
 _has_printed_json = False
+_MANY_ROWS = 500
 
 
 def print_json(data: dict[str, Any]) -> None:
@@ -169,13 +170,36 @@ def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> 
 
     table = Table(title=Text(escaped(title), "table.title"), title_justify="left", box=box.SIMPLE_HEAD)
     values = [[getattr(row, name) for name in columns] for row in rows]
-    for i, heading in enumerate(columns.values()):
-        numeric = any(isinstance(line[i], (int, float)) and not isinstance(line[i], bool) for line in values)
-        table.add_column(heading, justify="right" if numeric else "left", overflow="fold")
-    for line in values:
-        cells = zip(columns, line, strict=True)
-        table.add_row(*[Text(cell_text(name, value)) for name, value in cells])
+    numeric = [
+        any(isinstance(line[i], (int, float)) and not isinstance(line[i], bool) for line in values)
+        for i in range(len(columns))
+    ]
+    cells = [[cell_text(name, value) for name, value in zip(columns, line, strict=True)] for line in values]
+    if len(cells) > _MANY_ROWS:  # which rich draws at some milliseconds each
+        _print_lines(escaped(title), list(columns.values()), cells, numeric)
+        return
+    for heading, is_numeric in zip(columns.values(), numeric, strict=True):
+        table.add_column(heading, justify="right" if is_numeric else "left", overflow="fold")
+    for texts in cells:
+        table.add_row(*map(Text, texts))
     _print(table)
+
+
+def _print_lines(title: str, headings: list[str], cells: list[list[str]], numeric: Sequence[bool]) -> None:
+    """Print a table as `print_table`, without folding cells to the width of the terminal."""
+    from rich.cells import cell_len
+
+    lines = [headings, *cells]
+    widths = [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
+    out = []
+    for line in lines:
+        padded = (
+            " " * (width - cell_len(text)) + text if right else text + " " * (width - cell_len(text))
+            for text, width, right in zip(line, widths, numeric, strict=True)
+        )
+        out.append(f"  {'   '.join(padded)}".rstrip())
+    out.insert(1, f" {'─' * (sum(widths) + 3 * len(widths) - 1)}")
+    print(title, *out, sep="\n")
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +13,17 @@ import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 from gsmap.cli.stopping import StopSignal
+
+
+@contextmanager
+def _until_interrupted() -> Iterator[None]:
+    """Context that Ctrl-C ends, as the normal way to end the server; other signals end the process as for any verb."""
+    try:
+        yield
+    except StopSignal as stop:
+        if stop.signum != signal.SIGINT:
+            stop.add_note("reviews and edits are kept")
+            raise
 
 
 def command(
@@ -49,8 +62,7 @@ def command(
         print_rows("view", report, json) if json else say(f"{report.num_bytes:,} bytes in {report.path}")
         return
 
-    # A signal is the normal way to end the server.
-    with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, suppress(StopSignal):
+    with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, _until_interrupted():
         if json:
             print_rows("view", ViewReport(url=server.url), json)
         else:  # also with -q: the user needs the address

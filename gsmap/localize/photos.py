@@ -12,6 +12,8 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats.pictures import open_picture
 from gsmap.types.localization import Photo
 
+_MIN_INTRINSIC_PX, _MAX_INTRINSIC_PX = 0.01, 1_000_000
+
 _EXIF_IFD, _FOCAL_35MM = 0x8769, 0xA405
 _FILM_DIAGONAL_MM = 43.267  # of a frame of 36 x 24 mm, to which equivalent focal lengths refer
 _EXIF_SIGMA = 0.05  # relative: focal lengths are rounded to millimetres, and phones do not record crops
@@ -34,9 +36,10 @@ class Lens:
 
     def __post_init__(self) -> None:
         given = (*(self.intrinsics_px or ()), *((self.focal_px,) if self.focal_px is not None else ()))
-        if not np.isfinite(given).all() or any(value <= 0 for value in given):
+        if not all(_MIN_INTRINSIC_PX <= value <= _MAX_INTRINSIC_PX for value in given):
             raise ConfigError(
-                "intrinsics are fx,fy,cx,cy and a focal length is a number, in pixels and above 0",
+                "intrinsics are fx,fy,cx,cy and a focal length is a number, all in pixels and between "
+                f"{_MIN_INTRINSIC_PX} and {_MAX_INTRINSIC_PX:,}",
                 code="invalid_intrinsics",
             )
 

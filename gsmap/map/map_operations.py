@@ -15,6 +15,7 @@ from gsmap.geometry.boxes import box_corners
 from gsmap.settings import FILE_NAME
 from gsmap.store import Store, merging, staging
 from gsmap.store.branches import Branch
+from gsmap.store.error_translation import translate_errors
 from gsmap.store.purging import Purge
 from gsmap.types import Scene
 from gsmap.types.rows.map_operations import BranchRow, MergeReport, PurgeReport, SplitReport
@@ -69,7 +70,7 @@ def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> S
     folder = Path(out).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise StoreError(f"{out} exists: choose another name", code="already_exists")
-    with staging.beside(folder) as staged:
+    with translate_errors(folder, "no map was made"), staging.beside(folder) as staged:
         with Store.create(staged) as part:
             merged = merging.split(store, part, chosen)
             names = tuple(scene.name for scene in part.scenes.list())

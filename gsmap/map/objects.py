@@ -6,6 +6,7 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.durable import write_text_output
-from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.errors import ConfigError, DiskFullError, InputError, NotFoundError, ReadOnlyError
 from gsmap.geometry.directions import level_frame
 from gsmap.map.object_annotations import apply_annotations, why_distinct
 from gsmap.map.photos import add_photo_observations
@@ -194,9 +195,12 @@ def _numbered(store: Store, parts: Sequence[ComponentObjects]) -> list[MapObject
     made: dict[int, Sequence[MapObject]] = {
         part.component: [replace(thing, component=part.component) for thing in part.made.objects] for part in parts
     }
+    saved = None
     if store.catalog.writable and all(part.key is not None for part in new):
         computed = [ComputedObjects(part.made, part.places or (), part.key) for part in new if part.key is not None]
-        saved = store.objects.save(computed) if computed else []
+        with suppress(DiskFullError, ReadOnlyError):
+            saved = store.objects.save(computed) if computed else []
+    if saved is not None:
         made |= {part.component: kept.objects for part, kept in zip(new, saved, strict=True)}
     elif new:
         numbers = iter(store.objects.match_numbers([one for part in new for one in part.places or ()]))

@@ -76,7 +76,7 @@ def _prior(opened: EditableMap, said: Mapping[str, Any]) -> None:
 
 def _earlier_prior(opened: EditableMap, said: Mapping[str, Any]) -> None:
     scene, number = _text(said, "scene"), said.get("number")
-    if not isinstance(number, int) or isinstance(number, bool):
+    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 1 << 63:
         raise InputError("the number of a revision must be an integer", code="invalid_request")
     opened.set_prior(opened.store.priors.earlier(scene, number))
 

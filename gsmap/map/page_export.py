@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -46,6 +45,7 @@ SITE = "gsmap-site.json"
 _WITHOUT_LIST, _VERSION = 1, 2
 _MAX_BYTES = 1 << 28
 _ENTRIES = ("map.json", "index.html")  # what a browser asks for first
+_MIN_MB, _MAX_MB = 0.001, 100_000
 _SUFFIXES = (".html", ".htm")
 
 
@@ -74,9 +74,10 @@ def write_site(
 
 def write_page(store: Store, settings: Settings, path: Path, megabytes: float, progress: StageProgress) -> ViewReport:
     """Write the page as one file; see `gsmap.Map.write_page`."""
-    if not (math.isfinite(megabytes) and megabytes > 0):
+    if not _MIN_MB <= megabytes <= _MAX_MB:
         raise ConfigError(
-            f"the page's levels of detail need a positive number of megabytes, got {megabytes}", code="out_of_range"
+            f"the page's levels of detail need between {_MIN_MB} and {_MAX_MB:,} megabytes, got {megabytes}",
+            code="out_of_range",
         )
     if path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(f"a page in one file ends with .html, not {path.name or path}", code="wrong_suffix")

@@ -54,6 +54,7 @@ from gsmap.map.stages.localize import Localizer, SearchRegion
 from gsmap.map.static_filter import find_dynamic_content
 from gsmap.methods import family
 from gsmap.store import Store
+from gsmap.store.error_translation import translate_errors
 from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
 from gsmap.types.progress import StageProgress
@@ -153,7 +154,7 @@ def export_small(
     out.parent.mkdir(parents=True, exist_ok=True)
     if (refused := note_target(store, out, {"small_map": True})) is not None:
         _log.warning("%s: the folder is not recorded in the map, so a purge will not find this small map", refused)
-    with staged_folder(out.absolute(), store.id) as staged:
+    with translate_errors(out, "no small map was made"), staged_folder(out.absolute(), store.id) as staged:
         for name, content in (*((f"{scene}.npz", files[scene]) for scene in scenes), (FILE_NAME, header)):
             (staged / name).write_bytes(content)
             sync_file(staged / name)

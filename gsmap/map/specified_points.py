@@ -16,6 +16,7 @@ HOW = (
     "X,Y,Z (in the map), SCENE:X,Y,Z, SCENE:CAMERA@COLUMN,ROW (a pixel), or world:X,Y,Z (in the map's CRS; "
     "EPSG:N:X,Y,Z in another)"
 )
+_MAX_COORDINATE = 1e12  # far beyond any CRS, and its square is exact enough
 _CRS = re.compile(r"(?i)(world|[a-z]+:\d+(?:\+\d+)?):([^:]*)")
 
 
@@ -83,4 +84,8 @@ def _numbers(text: str, count: int) -> np.ndarray | None:
         found = np.array([float(part) for part in text.split(",")])
     except ValueError:
         return None
-    return found if len(found) == count and np.isfinite(found).all() else None
+    if len(found) != count or not np.isfinite(found).all():
+        return None
+    if np.abs(found).max() > _MAX_COORDINATE:
+        raise ConfigError(f"the coordinates of {text!r} exceed {_MAX_COORDINATE:g}", code="out_of_range")
+    return found

@@ -123,6 +123,18 @@ class Catalog:
                 connection = connection.execution_options(isolation_level="REPEATABLE READ")
             yield connection
 
+    def copy(self, target: Path) -> None:
+        """Write a consistent copy of an SQLite catalog, with its own page digests, to a new file.
+
+        Works on a full disk; errors name the disk that failed: that of the catalog or of the copy.
+        """
+        with translate_errors(self.folder), self._reading() as connection:
+            try:
+                sqlite.backup(connection, target)
+            except (sqlite3.Error, OSError) as error:
+                with translate_errors(self.folder if sqlite.is_read_error(error) else target.parent):
+                    raise
+
     @contextlib.contextmanager
     def write(self) -> Iterator[Connection]:
         """Open a transaction that commits durably at the end of the block, or changes nothing if the block raises.

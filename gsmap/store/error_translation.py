@@ -20,6 +20,7 @@ from gsmap.errors import (
     GsmapError,
     ReadOnlyError,
     StoreError,
+    failed_path,
     of_system,
 )
 from gsmap.store import sqlite
@@ -34,7 +35,7 @@ LITTLE_BYTES = 64 << 10  # a disk with less is full: the index of SQLite's log a
 
 _Explanation = tuple[type[StoreError], str, str, str]  # error class, code, problem, advice
 PRUNE_MAY = " (gsmap prune may)"
-_FULL: _Explanation = (DiskFullError, "disk_full", "the disk is full", f"free some space{PRUNE_MAY} and try again")
+_FULL: _Explanation = (DiskFullError, "disk_full", "the disk is full", "free some space and try again")
 _READ_ONLY: _Explanation = (ReadOnlyError, "read_only", "the disk is read-only", "")
 _DENIED: _Explanation = (ReadOnlyError, "no_permission", "permission is missing", "check who may read and write there")
 _FAILED: _Explanation = (
@@ -62,6 +63,7 @@ _PASSWORD: _Explanation = (
 
 
 _DISPLAY_NAMES: dict[Path, str] = {}
+_STAGED: dict[Path, Path] = {}
 
 
 def set_display_name(folder: Path, name: str) -> None:
@@ -69,9 +71,29 @@ def set_display_name(folder: Path, name: str) -> None:
     _DISPLAY_NAMES[folder] = name
 
 
-def display_name(folder: Path) -> str:
-    """Return the name that messages use for a folder."""
-    return _DISPLAY_NAMES.get(folder, str(folder))
+def display_name(path: Path) -> str:
+    """Return the name that messages use for a path."""
+    for folder in (path, *path.parents):
+        name = display_name(_STAGED[folder]) if folder in _STAGED else _DISPLAY_NAMES.get(folder)
+        if name is not None:
+            return name if folder == path else f"{name}/{path.relative_to(folder).as_posix()}"
+    return str(path)
+
+
+@contextlib.contextmanager
+def staged_for(staged: Path, target: Path) -> Iterator[None]:
+    """Context in which messages name ``target`` for a folder in which its content is staged."""
+    _STAGED[staged] = target
+    try:
+        yield
+    finally:
+        _STAGED.pop(staged, None)
+
+
+def _may_prune(path: Path, folder: Path) -> bool:
+    """Return True if `prune` of the map in a folder may free space on the disk of a path."""
+    is_map = any((folder / name).is_file() for name in (sqlite.FILE, "catalog.url"))
+    return is_map and path.is_relative_to(folder) and not any(part in _STAGED for part in (path, *path.parents))
 
 
 @contextlib.contextmanager
@@ -95,10 +117,10 @@ def translate_errors(folder: Path, state: str = "", *, committing: bool = False)
         if explanation is None:
             raise
         uncertain = committing and explanation[:3] in (_FAILED[:3], _GONE[:3])
-        raise _error(folder, explanation, _text(error), UNCERTAIN if uncertain else state) from error
+        raise _error(folder, folder, explanation, _text(error), UNCERTAIN if uncertain else state) from error
     except OSError as error:
-        where = Path(os.fsdecode(error.filename)) if isinstance(error.filename, (str, bytes)) else folder
-        raise _error(where, _explain_system(error), error.strerror or str(error), state) from error
+        where = Path(failed_path(error) or folder)
+        raise _error(where, folder, _explain_system(error), error.strerror or str(error), state) from error
 
 
 def _explain_system(error: OSError) -> _Explanation:
@@ -129,8 +151,10 @@ def sqlite_code(error: BaseException) -> int | None:
     return code if isinstance(code, int) else None
 
 
-def _error(where: Path, explanation: _Explanation, text: str, state: str) -> StoreError:
+def _error(where: Path, folder: Path, explanation: _Explanation, text: str, state: str) -> StoreError:
     kind, code, what, advice = explanation
+    if explanation is _FULL and _may_prune(where, folder):
+        advice = f"free some space{PRUNE_MAY} and try again"
     return kind(
         "; ".join(part for part in (f"{display_name(where)}: {what} ({text})", state, advice) if part), code=code
     )

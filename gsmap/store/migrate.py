@@ -105,7 +105,7 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
     with catalog.lock():
         if before is not None and catalog.is_sqlite:
             with translate_errors(catalog.folder, NOT_KEPT):
-                sqlite.backup(catalog.engine, catalog.folder / f"{sqlite.FILE}.{before}.bak")
+                catalog.copy(catalog.folder / f"{sqlite.FILE}.{before}.bak")
         with translate_errors(catalog.folder, NOT_KEPT), catalog.engine.connect() as connection:
             if catalog.is_sqlite:
                 # Batch migrations rebuild tables, which foreign keys would forbid; checked before the commit.

@@ -30,7 +30,7 @@ from sqlalchemy import (
     update,
 )
 
-from gsmap.errors import NotFoundError
+from gsmap.errors import CorruptError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
@@ -489,4 +489,11 @@ def _outcomes(connection: Connection, where: ColumnElement[bool]) -> dict[tuple[
 
 def _provenance(value: dict[str, Any]) -> Provenance:
     known = {part.name: value[part.name] for part in fields(Provenance) if part.name in value}
-    return Provenance(**known | {"contradicted_priors": tuple(known.get("contradicted_priors", ()))})
+    priors = known.get("contradicted_priors", [])
+    if not isinstance(priors, list) or not all(isinstance(scene, str) for scene in priors):
+        raise CorruptError(
+            "the catalog holds a revision that gsmap did not write: its contradicted priors are not ids of scenes: "
+            "restore it from a backup",
+            code="catalog_invalid",
+        )
+    return Provenance(**known | {"contradicted_priors": tuple(priors)})

@@ -336,15 +336,31 @@ def structure_damage(file: Path) -> list[str]:
     return [] if rows == ["ok"] else rows
 
 
-def backup(engine: Engine, target: Path) -> None:
-    """Write a consistent copy of the catalog with digests of its own, also while others access the catalog."""
-    connection = engine.raw_connection()
-    try:
+def backup(connection: Connection, target: Path) -> None:
+    """Write a consistent copy of the catalog with digests of its own, also while others access the catalog.
+
+    Args:
+        connection: to the catalog; may be one of `frozen_engine`.
+    """
+    with contextlib.closing(sqlite3.connect(target)) as copy:
+        _driver(connection.connection).backup(copy)
+    if not has_log(target):  # a frozen copy has left WAL mode
         with contextlib.closing(sqlite3.connect(target)) as copy:
-            _driver(connection).backup(copy)
-    finally:
-        connection.close()
+            copy.execute("PRAGMA journal_mode = WAL")
     page_digests.write_digests(target)
+
+
+def is_read_error(error: BaseException) -> bool:
+    """Return True if SQLite failed to read a file, and not to write one."""
+    code = getattr(error, "sqlite_errorcode", 0)
+    return code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_BUSY) or code in (
+        sqlite3.SQLITE_IOERR_READ,
+        sqlite3.SQLITE_IOERR_SHORT_READ,
+        sqlite3.SQLITE_IOERR_CORRUPTFS,
+        sqlite3.SQLITE_IOERR_SHMSIZE,
+        sqlite3.SQLITE_IOERR_SHMOPEN,
+        sqlite3.SQLITE_IOERR_SHMMAP,
+    )
 
 
 def _checkpoint_passive(engine: Engine) -> int:

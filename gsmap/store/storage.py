@@ -29,6 +29,7 @@ from gsmap.errors import (
     StoreError,
     of_system,
 )
+from gsmap.store.error_translation import staged_for
 
 CHUNK_BYTES = 1 << 20  # read, hashed and written at a time
 
@@ -76,6 +77,9 @@ class Storage(Protocol):
 
     def delete(self, name: str) -> None:
         """Delete an object if it exists."""
+
+    def has_leftovers(self) -> bool:
+        """Return True if writers that were killed may have left files."""
 
     def drop_leftovers(self) -> None:
         """Delete leftovers of killed writers; no other process may write meanwhile."""
@@ -157,7 +161,8 @@ class FolderStorage:
             make_folder(self.root / _STAGING)
             folder = Path(tempfile.mkdtemp(dir=self.root / _STAGING))
         try:
-            yield folder
+            with staged_for(folder, self.root):
+                yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -202,6 +207,15 @@ class FolderStorage:
     def delete(self, name: str) -> None:
         with self._translate_errors():
             self._path(name).unlink(missing_ok=True)
+
+    def has_leftovers(self) -> bool:
+        with (
+            self._translate_errors(),
+            contextlib.suppress(FileNotFoundError),
+            os.scandir(self.root / _STAGING) as found,
+        ):
+            return any(found)
+        return False
 
     def drop_leftovers(self) -> None:
         with (
@@ -346,6 +360,9 @@ class BucketStorage:
         with self._translate_errors("delete"), contextlib.suppress(FileNotFoundError):
             self._api.delete(self._store, name)
 
+    def has_leftovers(self) -> bool:
+        return False
+
     def drop_leftovers(self) -> None:
         """Do nothing: unfinished multipart uploads expire by a lifecycle rule of the bucket."""
 
@@ -372,6 +389,7 @@ class StorageRequestError(StoreError):
 
 
 def _first_line(error: BaseException) -> str:
-    """Return an error message without the XML that servers append."""
+    """Return an error message without the XML that servers append, and without the password of a URL."""
     lines = re.split(r"\n|: <\?xml|\bDebug source", str(error).strip())
-    return re.sub(r"\s+", " ", lines[0])[:300]
+    without_password = re.sub(r"//[^\s/?#]*@", "//", lines[0])  # of an endpoint
+    return re.sub(r"\s+", " ", without_password)[:300]

@@ -20,7 +20,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 
 from gsmap.durable import open_file, write_whole
-from gsmap.errors import CorruptError, StoreError
+from gsmap.errors import MALFORMED, CorruptError, StoreError
 from gsmap.store.column_types import is_digest
 from gsmap.store.error_translation import display_name
 from gsmap.texts import control_characters
@@ -139,7 +139,7 @@ def trusted_urls() -> dict[str, tuple[str, ...]]:
             raise TypeError("it must be a JSON object that maps ids to URLs")
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, *MALFORMED) as error:
         raise StoreError(
             f"{path} cannot be read ({error}): repair it, or remove it and run gsmap trust for your maps again",
             code="trust_file_unreadable",

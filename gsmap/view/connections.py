@@ -29,7 +29,8 @@ class Connection:
 
     Args:
         socket: Socket of the client.
-        waiting_since: `time.monotonic` since which the server waits for a request; None while it answers one.
+        waiting_since: `time.monotonic` since which the server waits for a request, or for the client to read a part of
+            the answer; None while it computes one.
     """
 
     socket: socket.socket
@@ -44,8 +45,8 @@ class Connection:
 class LocalServer(HTTPServer):
     """An HTTP server with at most `MAX_CONNECTIONS` connections, each in a thread of its own.
 
-    A further connection replaces the one that has been idle for longest, so that incomplete requests cannot block the
-    page.
+    A further connection replaces the one whose client has kept the server waiting for longest, so that neither
+    incomplete requests nor clients that do not read their answers block the page.
     """
 
     request_queue_size = 64

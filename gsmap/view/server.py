@@ -307,6 +307,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         if self.command != "HEAD":
             for start in range(0, len(body), _PART_BYTES):
+                self._waits_since(time.monotonic())  # a client that does not read must not keep others out
                 self.wfile.write(memoryview(body)[start : start + _PART_BYTES])
 
     def end_headers(self) -> None:

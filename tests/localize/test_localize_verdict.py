@@ -12,6 +12,7 @@ from gsmap.localize import MapScene, verdict
 from gsmap.localize.covariance import add_scene_covariance
 from gsmap.localize.features import smooth_depth
 from gsmap.localize.probability import load_model
+from gsmap.reason_codes import reason_code
 from gsmap.render import Rendering
 from gsmap.types import Sim3
 
@@ -50,6 +51,16 @@ def test_good_evidence_is_probable_and_bad_is_not() -> None:
     assert probability(GOOD) > 0.97
     assert probability(BAD) < 0.05
     assert 0 < probability(GOOD | {"colour": float("nan"), "matches": float("nan")}) < 1
+
+
+@pytest.mark.guards("answers")
+@pytest.mark.parametrize("unknown", [float("nan"), float("inf")])
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_pose_of_unknown_uncertainty_is_refused(which: int, unknown: float) -> None:
+    sigmas = (unknown, SURE[1]) if which == 0 else (SURE[0], unknown)
+    assert verdict.rejection_reason(GOOD, 0.999, SURE, 0.0, verdict.Params()) == ""
+    refused = verdict.rejection_reason(GOOD, 0.999, sigmas, 0.0, verdict.Params())
+    assert reason_code(refused) == "not_confirmed"
 
 
 @pytest.mark.guards("answers")

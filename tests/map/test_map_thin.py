@@ -60,6 +60,18 @@ def test_no_capture_stands_for_another_that_goes_itself(tmp_path):
         assert len(whole) > 1
 
 
+def test_no_capture_stands_for_one_of_another_component(tmp_path):
+    """Their frames have nothing to do with each other, though their coordinates are the same."""
+    with walls(tmp_path / "m.gsmap", [0.0, 0.0]) as m:
+        (before,) = m.thin(keep_days=3200, dry_run=True, now=NOW).scenes
+        assert before.seen_again > 0.9
+        poses = {s.id: ScenePose(s.id, Sim3.identity(), k, "placed") for k, s in enumerate(m.scenes())}
+        m.store.revisions.save(PoseGraph(poses, {}), RecipeKey("optimize", "apart", {}, {}, ""))
+        (after,) = m.thin(keep_days=3200, now=NOW).scenes
+        assert (after.seen_again, after.thinned) == (0.0, False)
+        assert all(scene.thinning is None for scene in m.scenes())
+
+
 @pytest.mark.parametrize("unit", [0.1, 10.0])
 def test_what_supersedes_a_capture_is_the_same_in_another_unit(tmp_path, unit):
     with walls(tmp_path / "one.gsmap", [0.0, 1.0]) as one, walls(tmp_path / "two.gsmap", [0.0, 1.0], unit) as two:

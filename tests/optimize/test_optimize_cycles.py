@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from made_worlds import poses_at
+from scipy.optimize import brentq
+from scipy.stats import chi2
 
 from gsmap.geometry import similarities
 from gsmap.geometry.similarities import Similarities
@@ -58,6 +60,22 @@ def test_a_triangle_that_does_not_close_supports_nothing():
     off = m.measured.replaced(np.array([2]), poses_at(np.array([[20.0, 0, 0]]), 9))
     broken = measurements(IDS, [Edge(*m.keys[k], off.item(k), full(m.information[k])) for k in range(3)], rigid=True)
     assert count_cycle_support(broken, 0.999).agree.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("times", "agree"), [(0.95, 1), (1.05, 0)])
+def test_a_triangle_agrees_up_to_the_quantile_of_its_noise(times, agree):
+    m = triangle(0, [(0, 1), (1, 2), (0, 2)])
+    cycles, signs = list_triangles(m.targets, m.sources, m.num_scenes)
+    third = np.array([2])
+
+    def moved(by):
+        step = m.measured[third] @ similarities.exp(np.array([[0, 0, 0, by, 0, 0, 0.0]]))
+        off = m.measured.replaced(third, step)
+        return measurements(IDS, [Edge(*m.keys[k], off.item(k), full(m.information[k])) for k in range(3)], rigid=True)
+
+    wanted = times * chi2.ppf(0.999, 6)
+    by = brentq(lambda by: cycle_chi2(moved(by), cycles, signs)[0] - wanted, 0, 100)
+    assert count_cycle_support(moved(by), 0.999).agree.tolist() == [agree] * 3
 
 
 def full(information):

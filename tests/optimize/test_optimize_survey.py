@@ -167,6 +167,37 @@ def test_a_scale_bar_alone_gives_the_metre_and_nothing_else() -> None:
     assert "not determined" in tie.problem
 
 
+def test_scale_bars_that_contradict_each_other_are_less_sure_than_they_claim() -> None:
+    site = surveyed_site(6, SMALL)
+    a, b = site.names[0], site.names[3]
+    length = float(np.linalg.norm(site.truth[0].translation - site.truth[3].translation))
+
+    def sigma(*off: float) -> float:
+        bars = tuple(
+            ScaleBar(f"bar{k}", (a, b), np.zeros((2, 3)), (1e-6, 1e-6), length * (1 + by), 1e-3 * length)
+            for k, by in enumerate(off)
+        )
+        _, tie = solved(site, Survey(bars=bars))
+        assert tie.metres_per_unit == pytest.approx(0.5, rel=5e-2)
+        return tie.scale_sigma
+
+    assert sigma(0.0, 0.0) == pytest.approx(1e-3 / 2**0.5, rel=0.05)
+    apart = np.log1p([-0.02, 0.02])  # forty times their sigmas apart
+    assert sigma(-0.02, 0.02) == pytest.approx(apart.std(ddof=1) / 2**0.5, rel=0.05)
+
+
+def test_a_check_point_is_compared_within_the_sigma_of_the_map() -> None:
+    """Known to a micrometre, it still lies where the map, known to millimetres, puts it."""
+    site = surveyed_site(10, SMALL)
+    survey = survey_of(site)
+    exact = tuple(replace(point, sigma_m=(1e-6, 1e-6)) if point.check else point for point in survey.points)
+    _, tie = solved(site, replace(survey, points=exact))
+    rows = [row for row in tie.residuals if row.kind == "point" and row.use == "check" and row.error_m]
+    assert len(rows) > 3
+    limit = chi2.ppf(0.9999, 3)
+    assert all(row.statistic is not None and row.statistic < limit for row in rows)
+
+
 def test_positions_of_cameras_tie_a_map_with_an_honest_sigma() -> None:
     """What all of a capture's fixes are off by together is not averaged away."""
     rng = np.random.default_rng(0)

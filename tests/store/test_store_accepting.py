@@ -90,7 +90,7 @@ def test_what_sqlite_finds_broken_cannot_be_accepted(closed):
 def test_a_backup_that_was_put_back_is_known(closed):
     file = closed / sqlite.FILE
     with Store.open(closed) as store:
-        sqlite.backup(store.catalog.engine, closed / "map.sqlite.0002.bak")
+        store.catalog.copy(closed / "map.sqlite.0002.bak")
         store.scenes.edit("monday", name="renamed")
     shutil.copyfile(closed / "map.sqlite.0002.bak", file)
     with Store.open(closed, "r") as store:

@@ -365,6 +365,38 @@ def test_a_snapshot_that_another_dates_later_meanwhile_does_not_end_the_one_just
 
 
 @pytest.mark.guards("data")
+@pytest.mark.guards("data")
+def test_every_snapshot_that_is_left_is_whole_wherever_a_sweep_ends(filled, place, tmp_path, monkeypatch):
+    save(filled, place)
+    filled.scenes.remove("a")
+    filled.prune()
+    filled.scenes.add(make_gaussians(20, seed=9), make_cameras(), name="new")
+    save(filled, place)
+    num_deleted = len(objects(place))
+    for stop in range(num_deleted):
+        there = FolderStorage(tmp_path / f"copy{stop}")
+        shutil.copytree(place.root, there.root)
+        left, delete = iter(range(stop)), there.delete
+
+        def delete_some(name, left=left, delete=delete):
+            if not name.startswith("leases/") and next(left, None) is None:
+                raise KeyboardInterrupt
+            delete(name)
+
+        monkeypatch.setattr(there, "delete", delete_some)
+        try:
+            sweep(Backup.at(there), 1)
+        except KeyboardInterrupt:
+            pass
+        else:
+            break
+        for snapshot in Backup.at(there).snapshots():
+            for file in Backup.at(there).files(snapshot):
+                assert there.size_bytes(object_name(file.sha256)) == file.size_bytes
+    assert stop > 3
+    assert len(Backup.at(there).names()) == 1
+
+
 def test_keep_deletes_nothing_when_a_snapshot_cannot_be_read(filled, place):
     save(filled, place)
     second = save(filled, place).snapshot

@@ -13,6 +13,8 @@ from gsmap.errors import ConfigError, CorruptError, GsmapError, InputError, NotF
 from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store
 from gsmap.store.merging import import_scene, merge, split
+from gsmap.store.revisions import newest_poses
+from gsmap.store.scene_replacement import inherit
 from gsmap.types import EdgeOutcome, PoseGraph, Prior, Registration, SceneGraph, ScenePose, Sim3
 
 
@@ -247,6 +249,37 @@ def test_life_and_death_by_the_later_word(store, other):
     store.scenes.remove(a)
     assert merge(store, other).scenes == 0
     assert store.scenes.list() == []
+
+
+def test_a_removal_there_before_the_last_ingest_here_changes_nothing(store, other):
+    scene = add(other, 1)
+    other.scenes.remove("scene1")
+    assert add(store, 1) == scene
+    assert merge(store, other).removed == 0
+    assert [one.id for one in store.scenes.list()] == [scene]
+
+
+def test_a_merge_places_no_removed_scene(store, other):
+    a, b = (add(other, seed) for seed in (1, 2))
+    solve(other, pose(a), pose(b, 1.0))
+    assert (add(store, 1), add(store, 2)) == (a, b)
+    solve(store, pose(a))
+    store.scenes.remove("scene2")
+    assert merge(store, other).revision is not None
+    with store.catalog.read() as connection:
+        assert set(newest_poses(connection).poses) == {a}
+
+
+def test_a_prior_that_was_withdrawn_does_not_come_back_with_a_replacement(store):
+    old, new, free = add(store, 1), add(store, 2), np.full(7, np.inf)
+    for sigma in (0.5, 1.5):  # the first is replaced by the second
+        store.priors.set(Prior(old, Sim3.identity(), np.where(np.arange(7) < 6, sigma, free)))
+    inherit(store, old, new)
+    assert [one.sigma[0] for one in store.priors.list() if one.scene == new] == [1.5]
+    store.priors.remove(old)
+    third = add(store, 3)
+    inherit(store, old, third)
+    assert third not in {one.scene for one in store.priors.list()}
 
 
 def test_scenes_in_both_tie_the_frames(store, other):

@@ -1,5 +1,7 @@
 """A damaged page of the catalog is found, whatever happened to the map since; a sound one is never called damaged."""
 
+import contextlib
+import os
 import random
 import shutil
 from pathlib import Path
@@ -144,6 +146,21 @@ def test_killed_anywhere_in_a_fold(closed, tmp_path, monkeypatch):
         assert page_digests.load(stage / sqlite.FILE).next_count == 0
         with Store.open(stage, "r") as store:
             assert store.check().problems == ()
+
+
+@pytest.mark.guards("data")
+def test_a_page_that_is_missing_while_a_fold_is_under_way_is_found(closed, tmp_path, monkeypatch):
+    """Only pages that the fold itself adds may be missing from the end of the file."""
+    under_way = stages_of_a_fold(closed, tmp_path / "stages", monkeypatch)[1]
+    file = under_way / sqlite.FILE
+    noted = page_digests.load(file)
+    assert noted.next_count > noted.count
+    os.truncate(file, (noted.count - 1) * PAGE)
+    with contextlib.closing(FileHandle(file)) as handle:
+        found = page_digests.problems(file, handle, noted, read_log(wal_path(file)))
+    assert any(f" {noted.count}" in problem for problem in found), found
+    with raises(CorruptError, code="catalog_damaged"):
+        Store.open(under_way)
 
 
 def test_a_catalog_that_shrinks(closed, tmp_path, monkeypatch):

@@ -55,6 +55,15 @@ def test_one_that_was_taken_back_can_be_added_again(store, scene):
     assert store.photos.find("p2").sighting.name == "photo0.jpg"
 
 
+def test_prune_leaves_the_pictures_of_photos_that_are_kept(store, scene):
+    for number in (1, 2):
+        store.photos.add(kept_photo(scene, number), JPEG + bytes([number]))
+    store.photos.remove(store.photos.find("photo1.jpg").number)
+    store.prune()
+    assert store.photos.jpeg(store.photos.find("photo2.jpg").number) == JPEG + b"\2"
+    assert store.check().ok
+
+
 def test_photos_are_named_by_file_number_or_digest(store, scene):
     for number in (1, 2):
         store.photos.add(kept_photo(scene, number), JPEG)

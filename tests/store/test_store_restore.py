@@ -72,6 +72,33 @@ def test_nothing_that_exists_is_overwritten(site, place, tmp_path):
 
 
 @pytest.mark.guards("security")
+@pytest.mark.guards("data")
+def test_all_of_a_restored_map_is_on_the_disk_before_it_gets_its_name(site, place, tmp_path, monkeypatch):
+    with Store.open(site) as store:
+        store.branches.make("what-if")
+        save(store, place)
+    synced, at_rename = {}, {}
+    fsync, rename = os.fsync, os.rename
+
+    def note_sync(handle):
+        fsync(handle)
+        about = os.fstat(handle)
+        synced[about.st_ino] = about.st_mtime_ns
+
+    def note_rename(source, target):
+        if target == tmp_path / "back.gsmap":
+            for path in [source, *source.rglob("*")]:
+                about = path.stat()
+                at_rename[path.relative_to(source).as_posix()] = synced.get(about.st_ino) == about.st_mtime_ns
+        rename(source, target)
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    monkeypatch.setattr(os, "rename", note_rename)
+    restore(place, tmp_path / "back.gsmap")
+    assert {"map.sqlite", "settings.toml", "arrays", "branches/what-if/map.sqlite"} <= set(at_rename)
+    assert [path for path, is_synced in at_rename.items() if not is_synced] == []
+
+
 def test_nobody_is_at_work_on_a_restored_map(site, place, tmp_path):
     lease = "INSERT INTO leases VALUES ('map', 't', 'h', '1', 'update', '2026-01-01', '2999-01-01')"
     with Store.open(site) as store:

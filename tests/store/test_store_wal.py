@@ -62,6 +62,23 @@ def test_a_torn_end_of_the_log_is_no_damage(killed):
         assert store.check().ok
 
 
+@pytest.mark.guards("data")
+@pytest.mark.parametrize("commits_lost", [1, 4])
+def test_a_log_that_ends_before_the_commits_that_were_acknowledged_is_damage(killed, commits_lost):
+    """Its index names the last one: a whole, shorter log is no torn end."""
+    log = wal_path(killed / sqlite.FILE)
+    whole = log.read_bytes()
+    frame = PAGE + 24
+    commits = [i for i in range(32, len(whole), frame) if int.from_bytes(whole[i + 4 : i + 8], "big")]
+    log.write_bytes(whole[: commits[-1 - commits_lost] + frame])
+    assert read_log(log, read_index_header(killed / sqlite.FILE)).problem
+    with raises(CorruptError, code="catalog_damaged"):
+        Store.open(killed)
+    log.write_bytes(whole)
+    with Store.open(killed) as store:
+        assert len(store.exports.list()) == 10
+
+
 def test_the_log_is_read_as_sqlite_reads_it(killed):
     file = killed / sqlite.FILE
     log = read_log(wal_path(file), read_index_header(file))

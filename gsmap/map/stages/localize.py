@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
@@ -14,7 +15,7 @@ import numpy as np
 from gsmap import localize as localizing
 from gsmap import retrieve
 from gsmap.engine import QuarantinedJob, run_jobs
-from gsmap.errors import ConfigError, CorruptError, GsmapError, NotFoundError, ReadOnlyError
+from gsmap.errors import ConfigError, CorruptError, DiskFullError, GsmapError, NotFoundError, ReadOnlyError
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.localize import MapScene, ViewIndex, new_segment, view_index
 from gsmap.map import models
@@ -33,6 +34,7 @@ from gsmap.types.progress import StageProgress
 from gsmap.types.segments import InMemory
 
 _Said = TypeVar("_Said")
+_log = logging.getLogger("gsmap.map")
 
 _KEPT = 12  # scenes whose arrays stay in memory while photographs come: about a gigabyte
 
@@ -134,9 +136,11 @@ class Localizer:
         index = self._scene_index()
         for left in reversed(range(PATIENCE)):
             try:
+                kept = None
                 if self.store.catalog.writable and not self._held:
-                    kept = index.update(lambda told: progress("localize", 0.0, f"{told} of views"))
-                else:
+                    with suppress(DiskFullError, ReadOnlyError):
+                        kept = index.update(lambda told: progress("localize", 0.0, f"{told} of views"))
+                if kept is None:
                     kept = index.segments()
                 missing = index.missing(kept)
                 parts = [missing[start : start + AT_ONCE] for start in range(0, len(missing), AT_ONCE)]
@@ -295,7 +299,7 @@ def ensure(
     progress: StageProgress,
     held: dict[str, SceneFeatures],
 ) -> None:
-    """Make the missing features and store them, or keep them in ``held`` if the map is read-only."""
+    """Make the missing features and store them, or keep them in ``held`` if the map cannot be written."""
     kept = store.view_features.stored_keys(keys.values())
     missing = [scene for scene in scenes if keys[scene.id].digest not in kept]
     if not missing:
@@ -303,12 +307,17 @@ def ensure(
     params, specs = settings.localize, models.specs(store)
     jobs = {keys[scene.id].digest: (store.location, scene.id, specs, params) for scene in missing}
     names = {keys[scene.id].digest: scene.name for scene in missing}
-    if not store.catalog.writable:
-        running = run_jobs(features_of_scene, iter(jobs.values()), settings.engine)
+
+    def make_in_memory() -> None:
+        left = [scene for scene in missing if scene.id not in held]
+        running = run_jobs(features_of_scene, iter([jobs[keys[scene.id].digest] for scene in left]), settings.engine)
         for count, (number, found) in enumerate(running):
             if not isinstance(found, QuarantinedJob):
-                held[missing[number].id] = found
-            progress("localize", (count + 1) / len(jobs), f"{missing[number].name}: read-only, made for this run alone")
+                held[left[number].id] = found
+            progress("localize", (count + 1) / len(left), f"{left[number].name}: not stored, made for this run alone")
+
+    if not store.catalog.writable:
+        make_in_memory()
         return
 
     def done(wanted: Collection[str]) -> set[str]:
@@ -318,16 +327,22 @@ def ensure(
     shared = SharedJobs(store, "localize", "views", jobs, about, done, progress)
     results = shared.results(lambda arguments: run_jobs(features_of_scene, arguments, settings.engine))
     there = len(scenes) - len(missing)
-    with (
-        note_interruption(lambda: f"the views of {there + shared.num_kept()} of {len(scenes)} scenes are kept"),
-        closing(results),
-    ):
-        for key, found in results:
-            try:
-                store.view_features.save(found, keys[found.scene])
-            except ReadOnlyError:
-                held[found.scene] = found
-            shared.saved(key, f"{names[key]}: {found.num_features} features of {found.num_views} views")
+    try:
+        with (
+            note_interruption(lambda: f"the views of {there + shared.num_kept()} of {len(scenes)} scenes are kept"),
+            closing(results),
+        ):
+            for key, found in results:
+                try:
+                    store.view_features.save(found, keys[found.scene])
+                except (DiskFullError, ReadOnlyError):
+                    held[found.scene] = found
+                shared.saved(key, f"{names[key]}: {found.num_features} features of {found.num_views} views")
+    except (DiskFullError, ReadOnlyError) as error:  # leases cannot be written
+        _log.warning("view features are computed for this run alone: %s", error)
+        stored = store.view_features.stored_keys(jobs)
+        missing = [scene for scene in missing if keys[scene.id].digest not in stored]
+        make_in_memory()
 
 
 def localize(

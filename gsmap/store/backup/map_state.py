@@ -50,6 +50,7 @@ class MapState:
         revision: number of the newest revision; None before the first.
         counts: numbers of ``scenes`` (without ``removed`` ones), ``groups``, ``graphs``, ``registrations``,
             ``revisions``.
+        problems: damaged branches that are left out.
     """
 
     map_id: str
@@ -58,6 +59,7 @@ class MapState:
     files: tuple[StoredFile, ...]
     revision: int | None
     counts: Mapping[str, int]
+    problems: tuple[str, ...] = ()
 
     @property
     def num_bytes(self) -> int:
@@ -73,29 +75,41 @@ def capture_state(store: Store, folder: Path, *, branches: bool = True) -> MapSt
     """Copy the catalogs and settings of a map to an empty folder, and list the files that they name.
 
     The ``map.sqlite`` there is a snapshot whatever other processes write meanwhile: by SQLite's own backup, or row by
-    row in one transaction of another database. So are the catalogs of branches, each at its own moment.
+    row in one transaction of another database. So are the catalogs of branches, each at its own moment; a branch whose
+    catalog is damaged is left out.
 
     Raises:
-        CorruptError: the catalog differs from its page digests, or names a file that the map lacks.
+        CorruptError: the map's own catalog differs from its page digests, or names a file that the map lacks.
     """
     created_at = _catalog.now()
     home = map_folder(store)
     state = _capture_catalog(store.catalog, folder)
     files = {file.path: file for file in state.files}
+    problems: list[str] = []
     for place in branch_locations(home) if branches else ():
         own = folder / BRANCHES / place.branch
         own.mkdir(parents=True)
         try:
             files |= {file.path: file for file in _capture_branch(place.folder, own).files}
-        except (StoreError, FileNotFoundError):
-            if place.folder.exists():
+        except (StoreError, FileNotFoundError) as error:
+            if not place.folder.exists():  # deleted meanwhile
+                shutil.rmtree(own)
+            elif isinstance(error, CorruptError):
+                problems.append(f"branch {place.branch} is left out: {error}")
+                shutil.rmtree(own)
+            else:
                 raise
-            shutil.rmtree(own)  # the branch was deleted meanwhile
     for path in folder.rglob("*"):
         if path.name in (sqlite.FILE, SETTINGS, BRANCH_FILE):
             files[path.relative_to(folder).as_posix()] = _stored(path, folder)
     return MapState(
-        state.map_id, created_at, state.schema, tuple(files[p] for p in sorted(files)), state.revision, state.counts
+        state.map_id,
+        created_at,
+        state.schema,
+        tuple(files[p] for p in sorted(files)),
+        state.revision,
+        state.counts,
+        tuple(problems),
     )
 
 
@@ -232,16 +246,14 @@ def verify_chunks(chunks: Iterator[bytes], file: StoredFile, what: str) -> Itera
 
 
 def _capture_catalog(source: Catalog, folder: Path) -> MapState:
-    file = folder / sqlite.FILE
+    file, file_name = folder / sqlite.FILE, source.folder / sqlite.FILE
     if source.is_sqlite:
         with translate_errors(source.folder):
             for problem in source.page_problems():
-                raise CorruptError(f"{problem}: run gsmap check; nothing was backed up", code="map_damaged")
-            sqlite.backup(source.engine, file)
+                raise CorruptError(f"{file_name}: {problem}: run gsmap check; it was not backed up", code="map_damaged")
+            source.copy(file)
             for problem in sqlite.file_problems(file):
-                raise CorruptError(
-                    f"{source.folder / sqlite.FILE} is damaged ({problem}); nothing was backed up", code="map_damaged"
-                )
+                raise CorruptError(f"{file_name} is damaged ({problem}); it was not backed up", code="map_damaged")
     else:
         made = empty_catalog(folder)
         try:
@@ -249,7 +261,9 @@ def _capture_catalog(source: Catalog, folder: Path) -> MapState:
         finally:
             made.close()
     with translate_errors(source.folder), contextlib.suppress(FileNotFoundError):
-        (folder / SETTINGS).write_bytes((source.folder / SETTINGS).read_bytes())
+        settings = (source.folder / SETTINGS).read_bytes()
+        with translate_errors(folder):
+            (folder / SETTINGS).write_bytes(settings)
     return read_state(file)
 
 

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from sqlalchemy import delete, inspect, select, text
+from sqlalchemy import delete, insert, inspect, select, text
 
 from gsmap.durable import sync_folder
 from gsmap.errors import CorruptError, DiskError, DiskFullError, GsmapError, NotFoundError, StoreError, of_system
@@ -99,6 +99,7 @@ def restore(
         _fetch_all(backup, files, folder, progress)
         state = _verify_catalogs(folder, files, chosen)
         _reset_catalogs(folder)
+        _record_snapshot(folder, backup.storage.url, chosen)
         if catalog_url is not None:
             state = _move_catalog(folder, catalog_url, undo)
         _synchronise(folder)
@@ -255,6 +256,14 @@ def _reset_catalogs(folder: Path) -> None:
                 connection.execute(delete(schema.leases))
         for left in (_catalog.LOCK_FILE, f"{sqlite.FILE}-wal", f"{sqlite.FILE}-shm"):
             (one / left).unlink(missing_ok=True)
+
+
+def _record_snapshot(folder: Path, url: str, snapshot: Snapshot) -> None:
+    """Record in the map that it comes from a snapshot, which its own catalog does not name yet."""
+    with contextlib.closing(open_sqlite_catalog(folder)) as catalog, catalog.write() as connection:
+        if inspect(connection).has_table("backups"):
+            row = {"target": url, "snapshot": snapshot.name, "created_at": snapshot.created_at}
+            connection.execute(insert(schema.backups), row | {"num_bytes": snapshot.num_bytes_new})
 
 
 def _branches(folder: Path) -> list[Path]:

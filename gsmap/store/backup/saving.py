@@ -43,7 +43,7 @@ class BackupResult:
         deleted: names of the snapshots deleted.
         num_bytes_freed: size of the objects deleted.
         num_verified: number of objects read again; None without verification.
-        problems: damage in the backup that could not be repaired from the map.
+        problems: damaged branches that were left out, and damage in the backup that could not be repaired from the map.
         notes: remarks for the user.
     """
 
@@ -67,7 +67,8 @@ def save(
         keep: afterwards delete all but this many of the newest snapshots, and the objects that only they need.
 
     Raises:
-        CorruptError: the map is damaged: nothing damaged is sent, and no snapshot is written.
+        CorruptError: the map is damaged: nothing damaged is sent, and no snapshot is written. A damaged catalog of a
+            branch is left out, and no older snapshot is deleted.
         StoreError: the storage cannot be reached or written, is full, or holds other files.
         BusyError: another process is deleting for too long.
         ConfigError: ``keep`` is less than 1; a branch instead of the map; a folder inside the map.
@@ -83,13 +84,16 @@ def save(
             code="backup_inside_map",
         )
     backup = Backup.at_or_new(storage, store.id)
+    _remove_leftovers(storage)
     with BackupLease(storage, SAVE) as lease:
         lease.wait_for_sweepers()
         run = _BackupRun(store, backup, lease, progress)
         found = run.verify() if verify else None
+        before = backup.names()
         snapshot = run.save()
         problems = run.remaining_problems(found) if found is not None else ()
-    notes = (*run.notes, *run.note(snapshot))
+    notes = (*run.notes, *run.note(snapshot, before))
+    problems = (*run.problems, *problems)
     saved = BackupResult(
         storage.url,
         snapshot,
@@ -100,8 +104,19 @@ def save(
     )
     if keep is None:
         return saved
+    if run.problems:
+        kept = "no older snapshot was deleted, since this one does not hold the whole map"
+        return replace(saved, notes=(*notes, kept))
     deleted, freed, sweep_notes = sweep(backup, keep, made=snapshot.name)
     return replace(saved, deleted=deleted, num_bytes_freed=freed, notes=(*notes, *sweep_notes))
+
+
+def _remove_leftovers(storage: Storage) -> None:
+    """Delete what killed backups left in the staging folder, and their leases, unless other processes are at work."""
+    if storage.has_leftovers():
+        with BackupLease(storage, SWEEP) as lease:
+            if not lease.others():  # which also deletes leases of dead processes
+                storage.drop_leftovers()
 
 
 def sweep(backup: Backup, keep: int, *, made: str = "") -> tuple[tuple[str, ...], int, tuple[str, ...]]:
@@ -163,6 +178,7 @@ class _BackupRun:
         self.progress = progress
         self.num_sent = 0
         self.notes: list[str] = []
+        self.problems: tuple[str, ...] = ()  # of the map: what the snapshot lacks
         self._bytes_sent = 0
         self._counting = threading.Lock()
         self._bad: set[str] = set()  # digests of damaged objects
@@ -241,13 +257,23 @@ class _BackupRun:
                 self.backup.storage.delete(object_name(sha256))  # unneeded, and must not be taken for a sound object
         return tuple(out)
 
-    def note(self, snapshot: Snapshot) -> tuple[str, ...]:
-        """Record the backup in the map; return notes."""
+    def note(self, snapshot: Snapshot, before: list[str]) -> tuple[str, ...]:
+        """Record the backup in the map; return notes.
+
+        Args:
+            before: names of the earlier snapshots there.
+        """
         target = self.backup.storage.url
         if not self.store.catalog.writable:
             return ("the map cannot be written, so it has no record of this backup",)
         try:
+            known = {one.snapshot for one in self.store.backups.list()}
             self.store.backups.add(target, snapshot.name, snapshot.num_bytes_new)
+            if before and before[-1] not in known:
+                return (
+                    f"this map has no record of snapshot {before[-1]} in {target}: if another copy of the map is "
+                    "backed up there too, their snapshots mix; give each copy a folder of its own",
+                )
         except GsmapError as error:
             return (f"the backup is complete, but the map could not record it: {error}",)
         return ()
@@ -276,6 +302,7 @@ class _BackupRun:
 
     def _write(self, state: MapState) -> Snapshot:
         """Write the list of files, check that the storage has all of them, and write the snapshot."""
+        self.problems = state.problems
         text = format_file_list(list(state.files))
         own = StoredFile("", len(text), hashlib.sha256(text).hexdigest())
         if self._sound_sizes().get(own.sha256) != own.size_bytes:
