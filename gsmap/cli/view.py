@@ -16,7 +16,7 @@ from gsmap.cli.stopping import StopSignal
 
 
 @contextmanager
-def _until_interrupted() -> Iterator[None]:
+def until_interrupted() -> Iterator[None]:
     """Context that Ctrl-C ends, as the normal way to end the server; other signals end the process as for any verb."""
     try:
         yield
@@ -62,7 +62,7 @@ def command(
         print_rows("view", report, json) if json else say(f"{report.num_bytes:,} bytes in {report.path}")
         return
 
-    with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, _until_interrupted():
+    with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, until_interrupted():
         if json:
             print_rows("view", ViewReport(url=server.url), json)
         else:  # also with -q: the user needs the address

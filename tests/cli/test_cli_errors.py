@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
+import signal
 import stat
 import tempfile
 from collections.abc import Callable
@@ -13,6 +14,8 @@ from typing import Any
 import pytest
 
 import gsmap.map
+from gsmap.cli.stopping import StopSignal
+from gsmap.cli.view import until_interrupted
 from gsmap.map import Map
 from gsmap.methods import families
 
@@ -112,6 +115,59 @@ def test_an_error_that_cannot_be_logged_is_printed(empty: Path, cli: Run, monkey
     assert "ZeroDivisionError" in done.stderr.splitlines()[-1]
 
 
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
+def test_too_little_memory_is_one_line(
+    error: Exception, empty: Path, cli: Run, logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: Map, **chosen: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr(Map, "scene_rows", fail)
+    done = cli("list", empty, "scenes", "--json")
+    assert (done.code, done.json["error"]["code"]) == (1, "out_of_memory")
+    assert len(done.stderr.splitlines()) == 1
+    assert list(logs.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [
+        (errno.ENOSPC, "disk_full"),
+        (errno.EDQUOT, "disk_full"),
+        (errno.EROFS, "read_only"),
+        (errno.EIO, "disk_failed"),
+        (errno.ENOTDIR, "system_refused"),
+    ],
+)
+def test_an_error_of_the_system_has_a_code_and_names_what_was_written(
+    number: int, code: str, empty: Path, cli: Run, logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: Map, **chosen: Any) -> Any:
+        raise OSError(number, "refused", "/the/source", None, "/the/target")
+
+    monkeypatch.setattr(Map, "scene_rows", fail)
+    done = cli("list", empty, "scenes", "--json")
+    assert (done.code, done.json["error"]["code"]) == (1, code)
+    (line,) = done.stderr.splitlines()
+    assert ("/the/target" in line) == (code in ("disk_full", "read_only"))
+    assert list(logs.iterdir()) == []
+
+
+@pytest.mark.parametrize("sigma", ["1e308", "-1e308", "1e13"])
+def test_coordinates_beyond_measure_are_refused(made_site: Path, cli: Run, sigma: str) -> None:
+    for a in (f"{sigma},0,0", f"left:0,{sigma},0", f"world:0,0,{sigma}"):
+        done = cli("measure", made_site, a, "1,0,0", "--component", 0, "--json")
+        assert (done.code, done.json["error"]["code"]) == (2, "out_of_range"), done.stderr
+    assert cli("measure", made_site, "1e-308,0,0", "1,0,0", "--component", 0).code == 0
+
+
+@pytest.mark.parametrize("megabytes", ["1e308", "1e-308", "0", "nan", "inf", "-1"])
+def test_a_page_of_no_sensible_size_is_refused(made_site: Path, cli: Run, tmp_path: Path, megabytes: str) -> None:
+    done = cli("export", made_site, tmp_path / "p.html", "--format", "html", "--page-mb", megabytes, "--json")
+    assert (done.code, done.json["error"]["code"]) == (2, "out_of_range")
+    assert not (tmp_path / "p.html").exists()
+
+
 @pytest.mark.usefixtures("broken_package")
 def test_a_broken_plug_in_that_is_not_chosen_is_a_warning(tmp_path: Path, captures: Path, cli: Run) -> None:
     path = tmp_path / "new.gsmap"
@@ -156,3 +212,12 @@ def test_a_failure_with_json_is_one_object_with_a_code(empty: Path, cli: Run) ->
 @pytest.mark.usefixtures("broken_list")
 def test_an_internal_error_with_json_has_a_code(empty: Path, cli: Run, logs: Path) -> None:
     assert cli("list", empty, "scenes", "--json").json["error"]["code"] == "internal_error"
+
+
+def test_ctrl_c_ends_the_page_and_other_signals_stop_the_verb() -> None:
+    with until_interrupted():
+        raise StopSignal(signal.SIGINT)
+    for signum in (signal.SIGTERM, signal.SIGHUP):
+        with pytest.raises(StopSignal) as stopped, until_interrupted():
+            raise StopSignal(signum)
+        assert stopped.value.signum == signum

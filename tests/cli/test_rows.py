@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 import typing
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -158,3 +159,18 @@ def test_coordinates_name_their_frame_and_unit(row: type[Row]) -> None:
     in_scene = any("scene units" in row.columns[name] for name in of_map)
     in_a_titled_table = row.__name__ == "PhotoChangeRow"  # of one photo, whose component is in the title
     assert not of_map or in_scene or in_a_titled_table or "component" in row.columns
+
+
+def test_a_long_table_holds_what_a_short_one_does_and_is_printed_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    columns = {"scene": "id", "scene_name": "name"}
+    many = [rows.SceneRef(scene=f"{i:032x}", scene_name=f"部屋 {i} [bold]") for i in range(5000)]
+    print_table("t", columns, many[:100])
+    short = [line.rstrip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    start = time.process_time()
+    print_table("t", columns, many)
+    assert time.process_time() - start < 2.0  # rich takes more than ten times as long
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3 + len(many)
+    words = [line.split() for line in lines]
+    assert [words[0], words[1], *words[3:103]] == [line.split() for line in (short[0], short[1], *short[3:])]
+    assert len({line.index("部屋") for line in lines[3:]}) == 1

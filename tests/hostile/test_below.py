@@ -175,7 +175,7 @@ def test_whom_the_user_trusts_is_the_users_own_file(tmp_path, monkeypatch):
     trust.trust("1" * 32, "postgresql://me@here/b")
     assert trust.trusted_urls() == {"0" * 32: ("postgresql://me@here/a",), "1" * 32: ("postgresql://me@here/b",)}
     assert stat.S_IMODE(trust.config_file().stat().st_mode) == 0o600
-    for text in ("[]", '{"catalogs": {"0": 5}}', '{"catalogs": {"0": [5]}}'):
+    for text in ("[]", '{"catalogs": {"0": 5}}', '{"catalogs": {"0": [5]}}', "[" * 100_000):
         trust.config_file().write_text(text)
         with raises(StoreError, code="trust_file_unreadable"):
             trust.trusted_urls()

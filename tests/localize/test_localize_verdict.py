@@ -11,6 +11,7 @@ from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.localize import MapScene, verdict
 from gsmap.localize.covariance import add_scene_covariance
 from gsmap.localize.features import smooth_depth
+from gsmap.localize.photos import Lens
 from gsmap.localize.probability import load_model
 from gsmap.reason_codes import reason_code
 from gsmap.render import Rendering
@@ -61,6 +62,14 @@ def test_a_pose_of_unknown_uncertainty_is_refused(which: int, unknown: float) ->
     assert verdict.rejection_reason(GOOD, 0.999, SURE, 0.0, verdict.Params()) == ""
     refused = verdict.rejection_reason(GOOD, 0.999, sigmas, 0.0, verdict.Params())
     assert reason_code(refused) == "not_confirmed"
+
+
+@pytest.mark.parametrize("value", [1e-308, 1e308, 0.0, -1.0, float("nan"), float("inf")])
+def test_intrinsics_that_no_camera_has_are_refused(value: float) -> None:
+    for lens in ({"focal_px": value}, {"intrinsics_px": (500.0, value, 320.0, 240.0)}):
+        with raises(ConfigError, code="invalid_intrinsics"):
+            Lens(**lens)
+    assert Lens(focal_px=500.0).focal_px == 500.0
 
 
 @pytest.mark.guards("answers")

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import networkx as nx
 import numpy as np
@@ -19,16 +20,19 @@ from sqlalchemy import delete, select, update
 
 import gsmap.map
 from gsmap import formats
-from gsmap.errors import ConfigError, InputError, NotFoundError, StoreError
+from gsmap.errors import ConfigError, DiskFullError, InputError, NotFoundError, ReadOnlyError, StoreError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
+from gsmap.map.objects import _numbered
 from gsmap.map.page_source import MapPageSource
 from gsmap.map.small_map import SmallLocalizer
+from gsmap.map.stages.objects import ComponentObjects
 from gsmap.map.static_filter import is_dynamic
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, schema
 from gsmap.store.graphs import Graphs
+from gsmap.store.objects import ObjectSet
 from gsmap.store.scenes import Scenes
 from gsmap.types import Change, ChangeReport, MapObject, ObjectObservation, PoseGraph, ScenePose, Segments, Sim3
 
@@ -551,3 +555,17 @@ def test_captures_without_things_are_named(site: Map) -> None:
     assert "may" in report.notes[0]
     assert (site.objects(), site.history(at(CUPBOARD))) == (report, history), "kept, it is the same"
     assert len(report.objects) == 2
+
+
+@pytest.mark.parametrize("error", [DiskFullError("full"), ReadOnlyError("read-only")])
+def test_objects_are_reported_where_they_cannot_be_stored(error: Exception) -> None:
+    """So a full disk is no reason for `edit` to fail after what was said is stored."""
+    box = np.array([[0.0, 0, 0], [1, 1, 1]])
+    things = [MapObject(f"{k:08x}", 0, box, box.mean(0), np.zeros(3, np.float32), ()) for k in range(2)]
+    key = RecipeKey("objects", "test", {}, {}, "")
+    part = ComponentObjects(0, ObjectSet("", "", 1.0, {}, {}, tuple(things)), ({}, {}), key)
+    store = Mock()
+    store.objects.save.side_effect = error
+    store.objects.match_numbers.return_value = [7, None]
+    assert [one.id for one in _numbered(store, [part])] == ["o7", "00000001"]
+    store.objects.save.assert_called_once()

@@ -171,6 +171,8 @@ def test_what_a_person_does_is_done_by_the_maps_own_doors(folder):
             ("remove_prior", {}, 400),
             ("earlier_prior", {"scene": ids[0], "number": number}, 404),
             ("earlier_prior", {"scene": ids[1], "number": "1"}, 400),
+            ("earlier_prior", {"scene": ids[1], "number": 10**4000}, 400),
+            ("earlier_prior", {"scene": ids[1], "number": -1}, 400),
         ]
         for name, asked, expected in refused:
             status, body = page.ask(f"actions/{name}", asked)

@@ -190,7 +190,11 @@ def test_a_check_point_is_compared_within_the_sigma_of_the_map() -> None:
     """Known to a micrometre, it still lies where the map, known to millimetres, puts it."""
     site = surveyed_site(10, SMALL)
     survey = survey_of(site)
-    exact = tuple(replace(point, sigma_m=(1e-6, 1e-6)) if point.check else point for point in survey.points)
+    truth = {mark.name: mark.true_m for mark in site.marks}
+    exact = tuple(
+        replace(point, position=truth[point.name], sigma_m=(1e-6, 1e-6)) if point.check else point
+        for point in survey.points
+    )
     _, tie = solved(site, replace(survey, points=exact))
     rows = [row for row in tie.residuals if row.kind == "point" and row.use == "check" and row.error_m]
     assert len(rows) > 3

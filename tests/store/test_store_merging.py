@@ -7,11 +7,12 @@ import shutil
 import numpy as np
 import pytest
 from raising import raises
+from sqlalchemy import select
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import ConfigError, CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
-from gsmap.store import Store
+from gsmap.store import Store, schema
 from gsmap.store.merging import import_scene, merge, split
 from gsmap.store.revisions import newest_poses
 from gsmap.store.scene_replacement import inherit
@@ -275,7 +276,9 @@ def test_a_prior_that_was_withdrawn_does_not_come_back_with_a_replacement(store)
     for sigma in (0.5, 1.5):  # the first is replaced by the second
         store.priors.set(Prior(old, Sim3.identity(), np.where(np.arange(7) < 6, sigma, free)))
     inherit(store, old, new)
-    assert [one.sigma[0] for one in store.priors.list() if one.scene == new] == [1.5]
+    assert [one.sigmas[0] for one in store.priors.list() if one.scene == new] == [1.5]
+    with store.catalog.read() as connection:
+        assert len(connection.execute(select(schema.priors).where(schema.priors.c.scene == new)).all()) == 1
     store.priors.remove(old)
     third = add(store, 3)
     inherit(store, old, third)

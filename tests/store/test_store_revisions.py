@@ -29,6 +29,17 @@ def store(tmp_path):
         yield made
 
 
+@pytest.mark.parametrize("value", ['{"contradicted_priors": [7]}', '{"contradicted_priors": 7}'])
+def test_provenance_that_gsmap_did_not_write_is_refused(store, value):
+    scene = store.scenes.list()[0].id
+    store.revisions.save(PoseGraph({scene: ScenePose(scene, Sim3.identity(), 0, "placed")}))
+    with store.catalog.write() as connection:
+        connection.exec_driver_sql("UPDATE revisions SET provenance = ?", (value,))
+    for read in (store.revisions.get, store.revisions.list):
+        with raises(CorruptError, code="catalog_invalid"):
+            read()
+
+
 def some_pose(rng):
     return Sim3(exp_so3(rng.normal(size=3)), rng.normal(size=3), float(rng.uniform(0.5, 2)))
 

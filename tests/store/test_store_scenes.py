@@ -263,3 +263,24 @@ def test_real_capture(store, shared_data):
     scene, _ = store.scenes.add(capture.gaussians, capture.cameras, name=capture.name, source=capture.source)
     np.testing.assert_array_equal(rows(store.scenes.gaussians("k0")), rows(capture.gaussians))
     assert scene.name == "k0"
+
+
+@pytest.mark.parametrize("name", ["a\u200bb", "a\u200d", "\ufeffa", "a\u00adb", "x\U000e0041", "\u202ea", "\u2060"])
+def test_names_with_characters_that_nobody_sees_are_refused(store, name):
+    with raises(InputError, code="invalid_name"):
+        store.scenes.add(make_gaussians(), make_cameras(), name=name)
+    assert store.scenes.list() == []
+
+
+@pytest.mark.parametrize("name", ["نمی\u200cخواهم", "👩\u200d🚀", "salle à manger", "部屋"])
+def test_names_in_any_script_are_kept(store, name):
+    assert store.scenes.add(make_gaussians(), make_cameras(), name=name)[0].name == name
+
+
+@pytest.mark.parametrize("name", ["o1", "c12", "p3"])
+def test_no_scene_is_called_as_an_object_a_change_or_a_photo(store, name):
+    """A capture of such a file is still ingested, under the next free name."""
+    assert store.scenes.add(make_gaussians(), make_cameras(), name=name)[0].name == f"{name}-2"
+    with raises(InputError, code="name_taken"):
+        store.scenes.edit(f"{name}-2", name=name)
+    assert store.scenes.add(make_gaussians(seed=5), make_cameras(), name="o0")[0].name == "o0"

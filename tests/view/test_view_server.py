@@ -135,6 +135,25 @@ def test_half_requests_end_and_hold_neither_threads_nor_the_page(server, monkeyp
         one.close()
 
 
+def test_clients_that_do_not_read_do_not_keep_the_page_out(server, page_source):
+    (server.page / "large.js").write_bytes(bytes(8 << 20))
+    request = f"GET /large.js?token={server.token} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+    crowd = [socket.socket() for _ in range(connections.MAX_CONNECTIONS + 4)]
+    for one in crowd:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        one.connect(("127.0.0.1", server.port))
+        one.sendall(request)
+        one.recv(1)  # it is being answered
+        time.sleep(0.02)
+    start = time.monotonic()
+    assert ask(server, f"/map.json?token={server.token}")[0] == 200
+    assert time.monotonic() - start < 5
+    for one in crowd:
+        one.close()
+    status, _, body = ask(server, f"/large.js?token={server.token}")
+    assert (status, len(body)) == (200, 8 << 20)
+
+
 def test_a_busy_server_ends_at_once(server):
     idle = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(5)]
     start = time.monotonic()
