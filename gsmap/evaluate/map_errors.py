@@ -60,13 +60,13 @@ class Params:
     def __post_init__(self) -> None:
         if not (self.max_rre_deg > 0 and self.max_rte_m > 0):
             raise ConfigError(
-                f"max_rre_deg and max_rte_m must be positive, got {self.max_rre_deg} and {self.max_rte_m}",
+                f"max_rre_deg and max_rte_m must be positive, got {self.max_rre_deg} deg, {self.max_rte_m} m",
                 code="out_of_range",
             )
         if not (0 <= self.truth_sigma_deg < np.inf and 0 <= self.truth_sigma_m < np.inf):
             raise ConfigError(
-                f"truth_sigma_deg and truth_sigma_m must not be negative, got {self.truth_sigma_deg} and "
-                f"{self.truth_sigma_m}",
+                f"truth_sigma_deg and truth_sigma_m must not be negative, got {self.truth_sigma_deg} deg, "
+                f"{self.truth_sigma_m} m",
                 code="out_of_range",
             )
 
