@@ -23,6 +23,9 @@ results with a status and a reason, never errors.
 
 import errno
 import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 MALFORMED = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 """Exceptions that Python raises for JSON or TOML that is damaged, too deeply nested, or of another structure."""
@@ -45,6 +48,49 @@ class GsmapError(Exception):
         super().__init__(*(_one_line(arg) if isinstance(arg, str) else arg for arg in args))
         if code is not None:
             self.code = code  # an attribute of the instance, which pickling keeps
+
+    def __str__(self) -> str:
+        """Return the message; it names options as the command line does there, and as arguments elsewhere."""
+        text = super().__str__()
+        return text if _names_options else with_arguments(text)
+
+
+_names_options = False
+
+
+@contextmanager
+def on_command_line() -> Iterator[None]:
+    """Let messages of this process name options as they are typed."""
+    global _names_options
+    before, _names_options = _names_options, True
+    try:
+        yield
+    finally:
+        _names_options = before
+
+
+# A command to type stays as it is, up to the end of its clause.
+_OPTION = re.compile(r"\b(?:gsmap|pyproj|pip) [a-z](?:(?![:;,] |\)).)*|--set ([\w.]+)=([^\s,;)]+)|--([a-z][a-z0-9-]*)")
+_ARGUMENTS = {  # options whose argument of `gsmap.map.Map` is called otherwise
+    "budget": "budget_bytes",
+    "from": "source",
+    "photo-size": "photo_size_px",
+    "scale-bar": "bars",
+    "tile-size": "tile_size_m",
+}
+
+
+def with_arguments(text: str) -> str:
+    """Return a message with arguments in place of options: ``masks=`` for ``--masks``."""
+
+    def argument(found: re.Match[str]) -> str:
+        if found[1]:
+            return f"with_settings({{{found[1]!r}: {found[2]!r}}})"
+        if found[3]:
+            return f"{_ARGUMENTS.get(found[3], found[3].replace('-', '_'))}="
+        return found[0]
+
+    return _OPTION.sub(argument, text)
 
 
 def _one_line(text: str) -> str:

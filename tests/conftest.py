@@ -28,6 +28,9 @@ def pytest_configure() -> None:
     # What the person trusts is none of the tests' business, and what they trust is none of the person's.
     os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="gsmap-test-config-")
     atexit.register(shutil.rmtree, os.environ["XDG_CONFIG_HOME"], ignore_errors=True)
+    # Nor do results of other versions of gsmap decide what a test finds.
+    os.environ["GSMAP_CACHE"] = tempfile.mkdtemp(prefix="gsmap-test-cache-")
+    atexit.register(shutil.rmtree, os.environ["GSMAP_CACHE"], ignore_errors=True)
     os.environ.pop("GSMAP_CATALOG", None)
     if os.environ.get("GSMAP_TEST_INSTALLED"):
         return

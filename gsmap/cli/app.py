@@ -18,7 +18,15 @@ from typing import Annotated
 import typer
 
 from gsmap.cli.console import expect_json, left, print_json_error, start_logging
-from gsmap.errors import ConfigError, DiskFullError, GsmapError, StoreError, failed_path, of_system
+from gsmap.errors import (
+    ConfigError,
+    DiskFullError,
+    GsmapError,
+    StoreError,
+    failed_path,
+    of_system,
+    on_command_line,
+)
 from gsmap.texts import escaped
 from gsmap.version import __version__
 
@@ -104,6 +112,7 @@ def build(verbs: Sequence[str] = VERBS) -> typer.Typer:
     return app
 
 
+@on_command_line()
 def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code; typer itself exits with 2 on wrong usage.
 

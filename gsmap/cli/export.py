@@ -29,22 +29,38 @@ class Purpose(StrEnum):
     localize = "localize"
 
 
-_TILE_SIZE_M = 10.0
+class Up(StrEnum):
+    y = "y"
+    z = "z"
 
 
 def command(
     map: MapPath,
     out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; a later export to it updates it.")],
     format: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--format",
-            help="ply, compressed.ply, splat, spz, sog, glb, usdc, 3dtiles, streamed-sog, or html (one page to view).",
+            help="ply, compressed.ply, splat, spz, sog, glb, usdc, 3dtiles, streamed-sog, or html (one page to view). "
+            "Default: spz, or ply with --provenance.",
         ),
-    ] = "ply",
+    ] = None,
     tile_size: Annotated[
-        float, typer.Option("--tile-size", help="Edge length of a tile in metres; 0 writes one file.")
-    ] = _TILE_SIZE_M,
+        float | None,
+        typer.Option(
+            "--tile-size",
+            help="Edge length of a tile in metres; 0 writes one file per component. Default: one file up to 1.5 "
+            "million Gaussians, which viewers load at once, and tiles of 10 m beyond.",
+        ),
+    ] = None,
+    up: Annotated[
+        Up | None,
+        typer.Option(
+            "--up",
+            help="Vertical axis of the files: z, as in the map, or y, as viewers of the format expect it. Default: z "
+            "for ply, 3dtiles and streamed-sog, y for the others.",
+        ),
+    ] = None,
     bbox: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option("--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Export only this box of the map, in map units."),
@@ -106,9 +122,10 @@ def command(
     ] = 20.0,
     json: AsJson = False,
 ) -> None:
-    """Write merged tiles. Only tiles that changed since the last export to OUT are computed.
+    """Write the merged map, one file per component or tiles. Only files that changed since the last export to OUT are
+    made, and a further format or OUT merges nothing again.
 
-    Example: `gsmap export site.gsmap tiles --format spz --as-of 2024-05-31`
+    Example: `gsmap export site.gsmap house`, then `gsmap export site.gsmap tiles --format 3dtiles`
     """
     if format == "html":
         _write_page(
@@ -130,7 +147,8 @@ def command(
                 "--prefer": prefer,
                 "--as-of": as_of,
                 "--static": static or None,
-                "--tile-size": None if tile_size == _TILE_SIZE_M else tile_size,
+                "--tile-size": tile_size,
+                "--up": up,
             },
         )
         return
@@ -158,6 +176,7 @@ def command(
             prefer=prefer,
             as_of=as_of,
             static=static,
+            up=up,
             wait=wait,
         )
     for note in report.notes:
@@ -172,8 +191,10 @@ def command(
         print_rows("export", report, json)
     else:
         columns = {"path": "file", "component": "component", "num_gaussians": "Gaussians", "truncated": "truncated"}
-        print_table(f"tiles in {out}", columns, report.tiles)
-    say(f"{report.recomputed} tiles computed, {report.reused} unchanged, {report.removed} removed")
+        print_table(f"files in {out}", columns, report.tiles)
+    written = f"{report.recomputed} file{'s' * (report.recomputed != 1)} written"
+    counts = f"{written}, {report.reused} unchanged, {report.removed} removed"
+    say(f"{counts}; {'z is up' if report.up == 'z' else 'y is vertical, as viewers of the format expect'}")
 
 
 def _write_page(

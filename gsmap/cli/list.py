@@ -35,7 +35,8 @@ def command(
     status: Annotated[
         str | None,
         typer.Option(
-            "--status", help="List only scenes or edges of this status; for edges also used, tentative or undecided."
+            "--status",
+            help="List only scenes or edges of this status, in the words of the tables (one-pair, used, ...).",
         ),
     ] = None,
     after: Annotated[

@@ -121,7 +121,7 @@ def _print_pair(pair: PairReport) -> None:
         "source": f"{pair.source_name} ({pair.source})",
         "status": pair.status,
         "reason": pair.reason,
-        "used": pair.used,
+        "use": pair.use,
         "undecided": "yes: another group of edges contradicts it" if pair.undecided else None,
         "review": pair.review,
         "source in target (target units)": _pose(pair.S_target_source),

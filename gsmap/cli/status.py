@@ -28,7 +28,8 @@ def command(map: MapPath, json: AsJson = False) -> None:
     if whole:
         print_table("at work", whole[0].columns, whole)
     print(
-        f"{report.scenes} scenes in {components}, {report.tentative} tentative; "
+        f"{report.scenes} scenes in {components}, {report.one_pair} placed by one pair, "
+        f"{report.tentative - report.one_pair} in doubt; "
         + ("no revision yet" if report.revision is None else f"revision {report.revision}")
         + ("" if report.todo else "; nothing to do")
     )

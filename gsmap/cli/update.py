@@ -49,6 +49,7 @@ def command(
             say(f"created {map}")
         report = m.update(*(paths or ()), captured_at=captured_at)
         status = None if json else m.status()
+        held = [] if status is None or not status.tentative else m.edge_rows(status="tentative")
     for row in report.ingested:
         for note in row.notes:
             say(f"{row.scene_name}: {note}")
@@ -61,9 +62,11 @@ def command(
         if not report.scenes and not report.edges:
             print("nothing is new")
         if (newest := report.revision) is not None:
+            by_one = sum(row.use == "one pair" for row in held)
             print(
                 f"the map has {newest.scenes} scenes in {newest.components} component{'s' * (newest.components != 1)}; "
-                f"{newest.edges_used} edges used, {newest.edges_tentative} tentative, {newest.edges_refused} refused"
+                f"{newest.edges_used} edges used, {by_one} placed by one pair, "
+                f"{newest.edges_tentative - by_one} in doubt, {newest.edges_refused} refused"
             )
     if status is not None:
         for todo in status.todo:
@@ -87,7 +90,7 @@ def print_rows_of(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
     """Print a table of scenes and a table of edges with reasons, each only if it has rows."""
     columns = {
         "name": "scene",
-        "status": "status",
+        "standing": "status",
         "component": "component",
         "num_gaussians": "Gaussians",
         "num_nodes": "nodes",
@@ -97,7 +100,7 @@ def print_rows_of(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
     columns = {
         "pair": "pair",
         "status": "status",
-        "used": "used",
+        "use": "use",
         "overlap": "overlap",
         "num_inliers": "inliers",
         "reason": "reason",

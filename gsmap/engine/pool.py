@@ -21,6 +21,7 @@ from typing import Any
 
 from gsmap.errors import GsmapError
 from gsmap.methods.executor import QuarantinedJob
+from gsmap.types.progress import jobs_progress
 
 _WORKER = Path(__file__).with_name("worker.py")
 _NOT_TO_WORKERS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -83,8 +84,10 @@ class Worker:
             raise self._died() from error
         self.read.append(reads)
 
-    def answer(self) -> tuple[bool, Any] | None:
+    def answer(self) -> tuple[bool | None, Any] | None:
         """Wait for (True, value) or (False, error) of the job; None if the worker reports only that it has started.
+
+        A job that reports progress gives (None, (fraction, text)) before.
 
         Raises:
             WorkerDeath: the process ended.
@@ -202,6 +205,9 @@ class Pool:
                             )
                         continue
                     if answer is None:
+                        continue
+                    if answer[0] is None:
+                        jobs_progress.get()(task.index, *answer[1])
                         continue
                     del at[connection]
                     self._idle.append(worker)

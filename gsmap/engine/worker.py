@@ -9,6 +9,12 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
+_REPORT_EVERY_S = 0.5
 
 
 def end_with_parent(parent: int) -> None:
@@ -34,9 +40,9 @@ def work(socket: int) -> None:
     import queue
     import threading
     from multiprocessing import process, spawn
-    from multiprocessing.connection import Connection
+    from multiprocessing.connection import Connection as Socket
 
-    parent = Connection(socket)
+    parent = Socket(socket)
     received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def receive() -> None:
@@ -56,7 +62,27 @@ def work(socket: int) -> None:
     logging.getLogger("gsmap.methods").setLevel(logging.ERROR)  # the parent has warned of methods that do not load
     parent.send_bytes(b"")  # the worker has begun: from now on only a job can end it
     while True:
-        parent.send_bytes(answer(received.get()))
+        message = received.get()
+        report_to(parent)
+        parent.send_bytes(answer(message))
+
+
+def report_to(parent: Connection) -> None:
+    """Let the next job report its progress to the parent, at most twice a second: ``(None, (fraction, text))``."""
+    import pickle
+    import time
+
+    from gsmap.types.progress import job_progress
+
+    last_s = 0.0
+
+    def report(fraction: float, text: str) -> None:
+        nonlocal last_s
+        if time.monotonic() - last_s >= _REPORT_EVERY_S:
+            last_s = time.monotonic()
+            parent.send_bytes(pickle.dumps((None, (fraction, text))))
+
+    job_progress.set(report)
 
 
 def answer(message: bytes) -> bytes:

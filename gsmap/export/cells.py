@@ -51,6 +51,13 @@ class OrientedBoxes:
         """Axis-aligned box (2, 3) around all boxes."""
         return np.array([self.bounds[:, 0].min(0), self.bounds[:, 1].max(0)])
 
+    def share_within(self, which: Sequence[int], bounds: np.ndarray) -> np.ndarray:
+        """Return (K,) the fraction of the volume of each box's bounds that lies within a box (2, 3)."""
+        low, high = self.bounds[which, 0], self.bounds[which, 1]
+        shared = np.maximum(np.minimum(high, bounds[1]) - np.maximum(low, bounds[0]), 0)
+        out: np.ndarray = (shared / (high - low)).prod(axis=1)
+        return out
+
     def touch(self, which: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Return a mask (K,) that is True where box ``which[k]`` intersects the box from ``low[k]`` to ``high[k]``.
 
@@ -102,21 +109,28 @@ class CellSet:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A grid of cubes through the map's origin.
+    """A grid of cubes, of which a corner or the centre of one is the map's origin.
 
     Args:
         edge: edge of a cell, map unit.
         bbox: (2, 3) box that cells are clipped to; None for all.
         most: largest number of cells.
+        centred: whether cell 0 is centred on the origin, rather than beginning at it.
     """
 
     edge: float
     bbox: np.ndarray | None
     most: int
+    centred: bool = False
+
+    @property
+    def start(self) -> float:
+        """Lowest coordinate of cell 0 on each axis."""
+        return -self.edge / 2 if self.centred else 0.0
 
     def bounds(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners (K, 3) of blocks from cell ``low`` to ``high`` (K, 3, exclusive), clipped to the box."""
-        a, b = low * self.edge, high * self.edge
+        a, b = low * self.edge + self.start, high * self.edge + self.start
         return (a, b) if self.bbox is None else (np.maximum(a, self.bbox[0]), np.minimum(b, self.bbox[1]))
 
     def reached(
@@ -166,7 +180,7 @@ class Grid:
         if self.bbox is not None:
             low, high = np.maximum(low, self.bbox[0]), np.minimum(high, self.bbox[1])
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            first, last = np.floor(low / self.edge), np.ceil(high / self.edge)
+            first, last = np.floor((low - self.start) / self.edge), np.ceil((high - self.start) / self.edge)
             near = (np.abs(first) < _FARTHEST).all() and (np.abs(last) < _FARTHEST).all()
         if not near:
             raise self.too_many(boxes)

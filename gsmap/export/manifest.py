@@ -187,6 +187,7 @@ def _metre(entry: Mapping[str, Any]) -> MetricScale:
 
 def _entry(name: str, tile: Tile, num_bytes: int, metres_per_unit: float) -> dict[str, object]:
     """Return the entry of a tile in ``tiles.json``; docs/reference/storage.md explains every field."""
+    turned = {} if tile.up == "z" else {"up": tile.up}
     return {
         "name": name,
         "component": tile.component,
@@ -201,7 +202,7 @@ def _entry(name: str, tile: Tile, num_bytes: int, metres_per_unit: float) -> dic
         "truncated": tile.truncated,
         "notes": list(tile.notes),
         "S_map_scene": {scene: pose.matrix().tolist() for scene, pose in sorted(tile.poses.items())},
-    }
+    } | turned
 
 
 def _text(path: Path) -> str:
@@ -233,4 +234,5 @@ def _tile(entry: Mapping[str, Any], version: int) -> Tile:
         path=_checked_path(entry["path"]),
         sha256=str(entry["sha256"]),
         notes=tuple(str(note) for note in entry["notes"]) if known else (),
+        up="y" if entry.get("up") == "y" else "z",
     )

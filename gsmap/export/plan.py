@@ -15,6 +15,10 @@ from gsmap.geometry.origins import float32_step, origin_of
 from gsmap.types import Sim3
 
 _MAX_ROUNDED_M = 1e-3
+MAX_WHOLE_GAUSSIANS = 1_500_000
+"""Largest number of Gaussians, of all captures of a component, that one file is made of: what viewers in a browser load
+at once and a phone still draws (30 MB of SPZ, 160 MB of ``.ply``, at SH degree 1)."""
+AUTO_TILE_M = 10.0  # edge of the tiles of a larger component
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class PlannedTile:
         poses: ``S_map_scene`` by scene id, of every scene that may reach into it.
         extent: text that identifies the part of the map, independent of the poses.
         metres_per_unit: metric scale of the component's map frame.
+        is_cut: true if only content within the bounds belongs to it.
+        num_input: number of Gaussians of its scenes within it, by the volumes of their boxes; for progress.
     """
 
     component: int
@@ -60,25 +66,33 @@ class PlannedTile:
     poses: dict[str, Sim3]
     extent: str
     metres_per_unit: float = 1.0
+    is_cut: bool = True
+    num_input: float = 1.0
 
 
 def plan_tiles(
     poses: Mapping[str, Sim3],
     scene_bounds: Mapping[str, np.ndarray],
     *,
-    tile_size_m: float,
+    tile_size_m: float | None,
+    num_gaussians: Mapping[str, int] | None = None,
     components: Mapping[str, int] | None = None,
     bbox: np.ndarray | None = None,
     reach_m: float = 0.0,
     metres_per_unit: Mapping[int, float] | None = None,
     max_tiles: int = Params.max_tiles,
 ) -> list[PlannedTile]:
-    """Plan the tiles that scenes reach into, in a fixed order, on a grid through the map's origin.
+    """Plan the tiles of a grid that scenes reach into, in a fixed order.
+
+    The map's z is up where gravity is known, so the grid is level. A grid of a given size begins at the map's origin.
+    An automatic one is centred on it, so that it cuts no storey and no house near the first capture in two.
 
     Args:
         poses: ``S_map_scene`` by scene id, of the scenes to export.
         scene_bounds: (2, 3) box of each scene's Gaussians in the scene's frame.
-        tile_size_m: edge of a tile; 0 makes one tile of each component.
+        tile_size_m: edge of a tile; 0 makes one tile of each component; None makes one tile of a component of at most
+            `MAX_WHOLE_GAUSSIANS`, and tiles of `AUTO_TILE_M` of a larger one.
+        num_gaussians: number of Gaussians of each scene; without it none counts.
         components: component of each scene; all 0 if None.
         bbox: (2, 3) box in the map's unit that tiles are clipped to; None for all.
         reach_m: distance beyond its bounds within which scenes affect a tile.
@@ -90,7 +104,7 @@ def plan_tiles(
         InputError: no scenes, an empty box, a box outside of all scenes, or a component so far from the origin that
             single precision does not resolve a millimetre.
     """
-    if not (np.isfinite(tile_size_m) and tile_size_m >= 0):
+    if tile_size_m is not None and not (np.isfinite(tile_size_m) and tile_size_m >= 0):
         raise ConfigError(
             f"tile size must be a positive number of metres, or 0 for one file, got {tile_size_m}", code="out_of_range"
         )
@@ -107,15 +121,21 @@ def plan_tiles(
         metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
         _require_near(component, boxes.around, metres)
         reach = reach_m / metres
+        counts = np.array([(num_gaussians or {}).get(scene, 0) for scene in members], dtype=np.float64)
+        whole = list(_in_one(boxes, bbox, reach))
+        edge_m, centred = tile_size_m, False
+        if edge_m is None:
+            is_large = any(counts[rows].sum() > MAX_WHOLE_GAUSSIANS for _, _, rows in whole)
+            edge_m, centred = (AUTO_TILE_M, True) if is_large else (0.0, False)
         for cell, bounds, reaching in (
-            _in_cells(boxes, Grid(tile_size_m / metres, bbox, max_tiles), reach)
-            if tile_size_m
-            else _in_one(boxes, bbox, reach)
+            _in_cells(boxes, Grid(edge_m / metres, bbox, max_tiles, centred), reach) if edge_m else whole
         ):
             name = "map" if cell is None else "tile_" + "_".join(f"{c:+04d}" for c in cell)
-            place = json.dumps([tile_size_m, cell, None if bbox is None else bbox.tolist()])
+            place = json.dumps([edge_m, cell, None if bbox is None else bbox.tolist(), *["centred"] * centred])
             near = {members[row]: poses[members[row]] for row in reaching}
-            tiles.append(PlannedTile(component, name, bounds, near, place, metres))
+            is_cut = cell is not None or bbox is not None
+            num_input = boxes.share_within(reaching, bounds) @ counts[reaching] if num_gaussians else 1.0
+            tiles.append(PlannedTile(component, name, bounds, near, place, metres, is_cut, float(num_input)))
     if not tiles and bbox is not None:
         whole = OrientedBoxes.of(list(poses.values()), [scene_bounds[scene] for scene in poses]).around
         raise InputError(

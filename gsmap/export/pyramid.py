@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from gsmap.durable import is_file, make_folder, refuse_links, remove_tree
+from gsmap.durable import is_file, make_folder, refuse_links, remove_file, remove_tree
 from gsmap.export.levels import VERSION, Params, make_level
 from gsmap.export.manifest import FILE_NAME as MANIFEST
 from gsmap.render import backend
@@ -23,6 +24,7 @@ LEVELS_FOLDER = "levels"
 _MAX_PER_LEVEL = 100_000
 _COARSENING = 4  # least ratio of the Gaussians of a level's children to its own: half the detail on surfaces
 _Cell = tuple[int, int, int]
+_GRID_NAME = re.compile(r"tile_([+-]\d+)_([+-]\d+)_([+-]\d+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,14 +143,13 @@ def is_stale(out: Path, tiles: Sequence[Tile], layout: TreeLayout) -> bool:
 def build_pyramids(
     out: Path,
     tiles: Sequence[Tile],
-    tile_size_m: float,
     layout: TreeLayout,
-    metres_per_unit: Mapping[int, float] | None,
     cameras: Callable[[int], Cameras | None],
     levels: Params,
 ) -> Iterator[tuple[int, Path, PyramidNode]]:
     """Build the pyramid of each component; yield the component, its folder and the root.
 
+    A tile that is alone has a level above it if it holds more than a level does, so that viewers draw something early.
     Levels are named by the digest of their inputs, so those with unchanged tiles are reused, except for levels that
     were dropped because the level above is shown from as near. Memory is bounded by eight tiles.
     """
@@ -157,15 +158,16 @@ def build_pyramids(
         if tile.path:
             by_component[tile.component].append(tile)
     for component, members in by_component.items():
-        edge = tile_size_m / (1.0 if metres_per_unit is None else metres_per_unit[component])
         folder = (out / members[0].path).parent
         refuse_links(out, folder.name, LEVELS_FOLDER)
         maker = _PyramidBuilder(folder, layout, layout.known(folder), _once(cameras, component), levels)
-        cells = np.array([_cell(tile, edge) for tile in members])
+        cells = np.array([_cell(tile) for tile in members])
         cells -= cells.min(0)  # counted from the lowest one, so that each component ends in one root
-        root, _ = maker.place(
+        root, read = maker.place(
             dict(zip(map(tuple, cells.tolist()), members, strict=True)), int(cells.max()).bit_length()
         )
+        if not root.children and sum(root.parts) > _MAX_PER_LEVEL:
+            root = maker.parent([(root, read)], 1)
         yield component, folder, root
 
 
@@ -175,6 +177,13 @@ def remove_unnamed(folder: Path, root: PyramidNode) -> None:
     for path in (folder / LEVELS_FOLDER).glob("*"):
         if path.name not in named:
             remove_tree(folder, LEVELS_FOLDER, path.name)
+
+
+def remove_tree_files(out: Path, folder: str, layout_files: Sequence[str]) -> None:
+    """Delete the trees of a component's folder, and their levels."""
+    for name in layout_files:
+        remove_file(out, folder, name)  # first: it names the levels
+    remove_tree(out, folder, LEVELS_FOLDER)
 
 
 def _once(cameras: Callable[[int], Cameras | None], component: int) -> Callable[[], Cameras | None]:
@@ -189,9 +198,10 @@ def _once(cameras: Callable[[int], Cameras | None], component: int) -> Callable[
     return get
 
 
-def _cell(tile: Tile, edge: float) -> _Cell:
-    x, y, z = np.floor(tile.bounds.mean(0) / edge).astype(int).tolist()
-    return x, y, z
+def _cell(tile: Tile) -> _Cell:
+    """Return the cell of the grid that a tile's name states (`gsmap.export.plan_tiles`); a whole component is one."""
+    named = _GRID_NAME.fullmatch(Path(tile.path).stem)
+    return (0, 0, 0) if named is None else (int(named[1]), int(named[2]), int(named[3]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,10 @@ import numpy as np
 from gsmap import formats
 from gsmap.errors import ConfigError
 from gsmap.export.plan import Params, PlannedTile
+from gsmap.formats.axes import PLY, change_axes
 from gsmap.geometry.boxes import box_corners
 from gsmap.methods import RecipeKey
-from gsmap.types import Tile
+from gsmap.types import Gaussians, Tile
 
 VERSION = 1
 """Raised whenever the same merged Gaussians are written differently; all tiles are then made again."""
@@ -21,6 +22,30 @@ VERSION = 1
 _TILES_3D, _STREAMED_SOG = "3dtiles", "streamed-sog"
 _TREES = {_TILES_3D: "glb", _STREAMED_SOG: "sog"}
 """Formats that are a tree of levels over tiles, with the suffix of the tiles."""
+
+UP_AXES = ("y", "z")
+_MAP_AXES = "RFU"  # right, front, up: z is up where gravity is known
+_MAP_UP_FORMATS = ("ply", *_TREES)
+
+
+def default_up(format: str) -> str:
+    """Return the vertical axis of a format's files.
+
+    Viewers take a trained splat's frame, whose y is down, for upright, and every format has its own axes for it. Files
+    for viewers are therefore turned to it. ``.ply`` is read by other programs, which expect the coordinates of poses
+    and control points; 3D Tiles have z up by their standard, and the tree of a streamed SOG lies in the map's frame.
+    """
+    return "z" if format in _MAP_UP_FORMATS else "y"
+
+
+def upright(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians of the map's axes with the map's up where viewers of trained splats expect it: (x, -z, y)."""
+    return change_axes(gaussians, PLY, _MAP_AXES)
+
+
+def upright_back(gaussians: Gaussians) -> Gaussians:
+    """Invert `upright`."""
+    return change_axes(gaussians, _MAP_AXES, PLY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +62,11 @@ class TileRecipe:
         dates: capture date of each scene, by scene id, if the merger uses dates; None if it does not.
         without: digest of the Gaussians of each scene that are left out, by scene id, if any.
         photos: digest of the photos that a tile is fitted to, by its component and name, if any.
+        up: vertical axis of the files: ``z``, that of the map, or ``y``, as viewers of the format expect it
+            (`upright`); None takes the format's default (`default_up`).
 
     Raises:
-        ConfigError: unknown format, or one that excludes provenance or uncompressed.
+        ConfigError: unknown format, or one that excludes provenance, uncompressed or the vertical axis.
     """
 
     merge: RecipeKey
@@ -50,6 +77,7 @@ class TileRecipe:
     dates: Mapping[str, str | None] | None = None
     without: Mapping[str, str] = field(default_factory=dict)
     photos: Mapping[tuple[int, str], str] = field(default_factory=dict)
+    up: str | None = "z"
 
     def __post_init__(self) -> None:
         if self.format not in _TREES and not formats.can_write(f".{self.format}"):
@@ -62,6 +90,15 @@ class TileRecipe:
                 code="unsupported_output",
             )
 
+        if self.up is None:
+            object.__setattr__(self, "up", default_up(self.format))
+        if self.up not in UP_AXES:
+            raise ConfigError(f"the vertical axis is y or z, got {self.up!r}", code="invalid_choice")
+        if self.up == "y" and self.is_tree:
+            raise ConfigError(
+                f"{self.format} has z up, in the map's frame: leave --up y out",
+                code="unsupported_output",
+            )
         if self.uncompressed and self.format != _TILES_3D:
             raise ConfigError(
                 f"uncompressed applies only to {_TILES_3D}, not to {self.format}",
@@ -89,11 +126,23 @@ class TileRecipe:
 
     def key(self, planned: PlannedTile) -> str:
         """Return the digest of all inputs of a tile except the poses; scenes enter by id, a digest of their content."""
-        scenes = sorted(planned.poses)
-        inputs = [
+        written = [
             f"export {VERSION}",
             f"format {self.format}{' spz' * (self.is_tileset and not self.uncompressed)}",
             f"provenance {self.provenance}",
+        ]
+        if self.up != "z":  # absent for files in the map's axes, whose keys predate it
+            written.append(f"up {self.up}")
+        return self.merge.of(*written, *self._merge_inputs(planned)).digest
+
+    def merge_key(self, planned: PlannedTile) -> str:
+        """Return the digest of all inputs of the tile's merged Gaussians, poses included, whatever file they go to."""
+        poses = [f"pose {scene} {pose.matrix().tobytes().hex()}" for scene, pose in sorted(planned.poses.items())]
+        return self.merge.of("merged", *self._merge_inputs(planned), *poses).digest
+
+    def _merge_inputs(self, planned: PlannedTile) -> list[str]:
+        scenes = sorted(planned.poses)
+        inputs = [
             f"budget_s {self.budget_s}",
             f"component {planned.component}",
             f"extent {planned.extent}",
@@ -106,7 +155,7 @@ class TileRecipe:
         inputs += [f"without {scene} {self.without[scene]}" for scene in scenes if self.without.get(scene)]
         if photos := self.photos.get((planned.component, planned.name)):
             inputs.append(f"photos {photos}")
-        return self.merge.of(*inputs).digest
+        return inputs
 
 
 def dirty_reason(
@@ -142,7 +191,9 @@ def _first_change(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
             return f"another {part} of the merge method: {_difference(before.get(part), now[part])}"
     if set(tile.poses) != set(planned.poses):
         return "other scenes"
-    return "a scene's date, the format, budget, extent, metric scale or provenance, or the reference photos changed"
+    return (
+        "a scene's date, the format, axis, budget, extent, metric scale or provenance, or the reference photos changed"
+    )
 
 
 def _difference(before: Any, now: Any) -> str:

@@ -27,8 +27,6 @@ FILE_NAME = "lod-meta.json"
 def write_streams(
     out: Path,
     tiles: Sequence[Tile],
-    tile_size_m: float,
-    metres_per_unit: Mapping[int, float] | None = None,
     *,
     cameras: Callable[[int], Cameras | None] = lambda component: None,
     levels: Params | None = None,
@@ -40,15 +38,11 @@ def write_streams(
 
     Args:
         out: the export's folder with the tiles' ``.sog``.
-        tile_size_m: edge of the grid's tiles, > 0.
-        metres_per_unit: metric scale of each component; all 1 if None.
         cameras: loads the cameras of the scenes of a component, in its frame.
         levels: settings of the levels.
     """
     written = []
-    for _, folder, root in build_pyramids(
-        out, tiles, tile_size_m, StreamedSog(), metres_per_unit, cameras, levels or Params()
-    ):
+    for _, folder, root in build_pyramids(out, tiles, StreamedSog(), cameras, levels or Params()):
         write_whole(folder / FILE_NAME, partial(streamed_sog.write_tree, root=_node(root, ())))
         remove_unnamed(folder, root)
         written.append(folder / FILE_NAME)

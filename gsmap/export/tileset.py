@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import open_file, write_whole
+from gsmap.durable import is_file, open_file, write_text_whole, write_whole
 from gsmap.errors import MALFORMED, CorruptError
 from gsmap.export.levels import Params
 from gsmap.export.pyramid import LEVELS_FOLDER, PyramidNode, StoredNode, build_pyramids, remove_unnamed
@@ -24,7 +24,6 @@ FILE_NAME = "tileset.json"
 def write_tilesets(
     out: Path,
     tiles: Sequence[Tile],
-    tile_size_m: float,
     metres_per_unit: Mapping[int, float] | None = None,
     *,
     S_ecef_map: Mapping[int, Sim3] | None = None,
@@ -39,7 +38,6 @@ def write_tilesets(
 
     Args:
         out: the export's folder with the tiles' ``.glb``.
-        tile_size_m: edge of the grid's tiles, > 0.
         metres_per_unit: metric scale of each component; all 1 if None.
         S_ecef_map: poses of georeferenced components in Earth-centred metres (EPSG:4978), for globes.
         compressed: whether tiles and levels are packed as SPZ.
@@ -48,9 +46,7 @@ def write_tilesets(
     """
     written = []
     layout = Tiles3D(compressed)
-    for component, folder, root in build_pyramids(
-        out, tiles, tile_size_m, layout, metres_per_unit, cameras, levels or Params()
-    ):
+    for component, folder, root in build_pyramids(out, tiles, layout, cameras, levels or Params()):
         metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
         # The map's z is up where gravity is known.
         transform = np.diag([metres, metres, metres, 1.0])
@@ -61,6 +57,33 @@ def write_tilesets(
         remove_unnamed(folder, root)
         written.append(folder / FILE_NAME)
     return written
+
+
+def write_whole_map(out: Path, components: Collection[int], georeferenced: Collection[int] = ()) -> str:
+    """Write the ``tileset.json`` of the export's folder, which refers to those of the components.
+
+    Components have unrelated frames, so they stand side by side along x, a tenth of the widest apart. If some are
+    georeferenced, these stay in their places on the globe, and the others are left out.
+
+    Returns:
+        A remark on what is moved or left out; empty if nothing is.
+    """
+    shown = sorted(set(components) & set(georeferenced)) or sorted(components)
+    uris = [f"component_{component}/{FILE_NAME}" for component in shown]
+    linked = [tiles3d.LinkedTileset.of(uri, json.loads((out / uri).read_bytes())) for uri in uris]
+    if len(linked) > 1 and not set(shown) <= set(georeferenced):
+        gap, at = 0.1 * max(np.ptp(one.box[:, 0]) for one in linked), linked[0].box[0, 0]
+        for k, one in enumerate(linked):
+            linked[k] = replace(one, shift=np.array([at - one.box[0, 0], 0, 0]))
+            at += np.ptp(one.box[:, 0]) + gap
+    text = tiles3d.linking_tileset(linked)
+    path = out / FILE_NAME
+    if not is_file(path) or path.read_text() != text:
+        write_text_whole(path, text)
+    if len(shown) < len(components):
+        return f"{FILE_NAME} shows the georeferenced components only; the others have their own in component_N"
+    moved = any(one.shift.any() for one in linked)
+    return f"{FILE_NAME} shows {len(shown)} components side by side, as nothing relates their frames" * moved
 
 
 @dataclass(frozen=True)

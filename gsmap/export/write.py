@@ -8,7 +8,6 @@ import secrets
 import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,23 +27,20 @@ from gsmap.durable import (
 from gsmap.errors import CorruptError, GsmapError, of_system
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.plan import Params, PlannedTile
-from gsmap.export.recipe import TileRecipe, dirty_reason
+from gsmap.export.recipe import TileRecipe, dirty_reason, upright
 from gsmap.formats import tiles3d
 from gsmap.methods.executor import QuarantinedJob
 from gsmap.types import MergeResult, Tile
 from gsmap.types.metric_scale import MetricScale
-from gsmap.types.progress import Progress, silent
+from gsmap.types.progress import Progress, job_progress, jobs_progress, silent
 
 _STAGING = ".partial"
 _MARK = "this-export"
 _SHARED = "shared"
+_MERGED = 0.97  # of a tile's time, when its merger is done and its file is written
 Content = Callable[[Progress], MergeResult]
 Run = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 _At = tuple[int, str]  # component and name of a tile
-
-_within: ContextVar[Progress] = ContextVar(
-    "Reports the progress of a tile that is made in this process.", default=silent
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +49,9 @@ class ExportResult:
 
     Args:
         tiles: all tiles in the folder, in the plan's order.
-        recomputed: number of tiles made.
-        reused: number of tiles that were up to date.
-        removed: number of tiles removed, as they are no longer planned.
+        recomputed: number of files made.
+        reused: number of files that were up to date.
+        removed: number of files removed, as their tiles are no longer planned or have become empty.
         notes: notes on the tiles made.
         set_aside: quarantined tiles, whose jobs ended their process, and the reasons.
     """
@@ -144,11 +140,13 @@ def export_tiles(
     todo = [t for t in plan if _must_make(t, old.get((t.component, t.name)), manifest, out, recipe, params)]
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
-    reused = len(plan) - len(todo)
+    made_again = {(t.component, t.name) for t in todo}
+    reused = sum(bool(old[at].path) for at in planned.keys() - made_again)
     metadata = dict(metres or {}), dict(world or {}), dict(offsets or {})
     has_new_metadata = (manifest.metres, manifest.world, manifest.offsets) != metadata
     manifest.metres, manifest.world, manifest.offsets = metadata
-    report = _ProgressReport(progress or silent, len(plan), reused)
+    report = _ProgressReport(progress or silent, [tile.num_input for tile in todo])
+    order = {(tile.component, tile.name): number for number, tile in enumerate(todo)}
     news: dict[_At, Tile] = {}
     aside: list[tuple[PlannedTile, str]] = []
     staging = out / _STAGING / secrets.token_hex(16)  # workers of an earlier export may still write to theirs
@@ -174,7 +172,7 @@ def export_tiles(
                     manifest.doomed.add(old[at].path)
                 manifest.tiles[at], manifest.num_bytes[tile.path] = tile, num_bytes
                 news[at] = tile
-                report.tile_done()
+                report.tile_done(order[at])
                 manifest.save_sometimes(out)
         manifest.tiles = {at: tile for at, tile in manifest.tiles.items() if at in planned}
         manifest.doomed |= {tile.path for tile in gone if tile.path}
@@ -194,7 +192,11 @@ def export_tiles(
             with suppress(OSError, CorruptError):
                 remove_tree(out, *left)
     tiles = [manifest.tiles[at] for at in sorted(planned) if at in manifest.tiles]
-    return ExportResult(tiles, len(news), reused, len(gone), manifest.notes + _collect_notes(news), tuple(aside))
+    made_count = sum(bool(tile.path) for tile in news.values())
+    num_removed = sum(bool(tile.path) for tile in gone)
+    num_removed += sum(bool(old[at].path) and not tile.path for at, tile in news.items() if at in old)
+    notes = manifest.notes + _collect_notes(news)
+    return ExportResult(tiles, made_count, reused, num_removed, notes, tuple(aside))
 
 
 def _must_make(
@@ -218,19 +220,20 @@ def _make_tiles(
     shared = os.path.join(folder, _SHARED)
     arguments = ((make(planned, shared), recipe, folder, _staged_name(planned, recipe)) for planned in todo)
     results = run(make_file, arguments)
-    token = _within.set(report.within_tile)
+    here, elsewhere = job_progress.set(report.within_next_tile), jobs_progress.set(report.within_tile)
     try:
         for index, staged in results:
             yield todo[index], staged
     finally:
-        _within.reset(token)
+        job_progress.reset(here)
+        jobs_progress.reset(elsewhere)
         if isinstance(results, Generator):
             results.close()
 
 
 def make_file(content: Content, recipe: TileRecipe, folder: str, name: str) -> StagedTile:
     """Make a tile and write its file to a folder; return the bytes if this machine cannot access the folder. A job."""
-    found = content(_within.get())
+    found = content(job_progress.get())
     empty = StagedTile("", "", 0, len(found.gaussians), found.truncated, tuple(found.notes))
     if not len(found.gaussians):
         return empty
@@ -283,17 +286,19 @@ def _install(
         path=path,
         sha256=staged.sha256,
         notes=staged.notes,
+        up=recipe.up or "z",
     )
     return (planned.component, planned.name), tile, staged.num_bytes
 
 
 def _write(path: Path, content: MergeResult, recipe: TileRecipe) -> None:
+    gaussians = upright(content.gaussians) if recipe.up == "y" else content.gaussians
     if recipe.is_tileset:
-        tiles3d.write_content(path, content.gaussians, compressed=not recipe.uncompressed)
+        tiles3d.write_content(path, gaussians, compressed=not recipe.uncompressed)
     elif recipe.provenance:
-        formats.write(path, content.gaussians, extra={"scene": content.origin.astype(np.float32)})
+        formats.write(path, gaussians, extra={"scene": content.origin.astype(np.float32)})
     else:
-        formats.write(path, content.gaussians)
+        formats.write(path, gaussians)
 
 
 def _synced_digest(path: Path) -> tuple[str, int]:
@@ -338,15 +343,34 @@ def _collect_notes(news: dict[_At, Tile]) -> tuple[str, ...]:
 
 
 class _ProgressReport:
-    """A progress report over all tiles of an export."""
+    """Progress report over the tiles that are made, each by its number of Gaussians, as most cells of a grid are empty.
 
-    def __init__(self, progress: Progress, total: int, done: int) -> None:
-        self._progress, self._total, self._done = progress, total, done
+    Args:
+        sizes: expected number of Gaussians of each tile, in the order in which they are begun.
+    """
 
-    def within_tile(self, fraction: float, text: str) -> None:
-        at = min(self._done + min(max(fraction, 0.0), 1.0), self._total)
-        self._progress(at / self._total, f"tile {min(self._done + 1, self._total)} of {self._total}: {text}")
+    def __init__(self, progress: Progress, sizes: Sequence[float]) -> None:
+        self._progress = progress
+        self._sizes = np.maximum(np.asarray(sizes, dtype=np.float64), 1.0)
+        self._fractions = np.zeros(len(sizes))
+        self._num_done = 0
 
-    def tile_done(self) -> None:
-        self._done += 1
-        self._progress(self._done / self._total, f"tile {self._done} of {self._total}")
+    def within_next_tile(self, fraction: float, text: str) -> None:
+        """Report a tile that is made in this process, one after the other."""
+        self.within_tile(self._num_done, fraction, text)
+
+    def within_tile(self, number: int, fraction: float, text: str) -> None:
+        """Report the tile of a number, at most until it is written."""
+        if number < len(self._sizes):
+            self._fractions[number] = max(self._fractions[number], min(max(fraction, 0.0), 1.0) * _MERGED)
+            self._report(f": {text}")
+
+    def tile_done(self, number: int) -> None:
+        self._num_done += 1
+        self._fractions[number] = 1.0
+        self._report("")
+
+    def _report(self, text: str) -> None:
+        count = len(self._sizes)
+        at = f"tile {min(self._num_done + 1, count)} of {'at most ' * (count > 1)}{count}"
+        self._progress(float(self._fractions @ self._sizes / self._sizes.sum()), f"{at}{text}")

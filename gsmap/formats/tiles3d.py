@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -165,6 +165,65 @@ def write_tileset(
         "root": tile,
     }
     Path(path).write_text(json.dumps(tileset, indent=1))
+
+
+@dataclass(frozen=True, eq=False)
+class LinkedTileset:
+    """A tileset that another one refers to.
+
+    Args:
+        uri: path of its ``tileset.json``, relative to the other.
+        box: (2, 3) box around its root tile in its own world.
+        error_m: error of drawing nothing of it.
+        used, required: extensions of its content.
+        shift: (3,) where its world's origin lies in the other's.
+    """
+
+    uri: str
+    box: np.ndarray
+    error_m: float
+    used: tuple[str, ...]
+    required: tuple[str, ...]
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @classmethod
+    def of(cls, uri: str, tileset: Mapping[str, Any]) -> LinkedTileset:
+        """Describe a tileset that `write_tileset` wrote."""
+        root, content = tileset["root"], tileset["extensions"]["3DTILES_content_gltf"]
+        box = np.asarray(root["boundingVolume"]["box"], np.float64).reshape(4, 3)
+        matrix = np.asarray(root["transform"], np.float64).reshape(4, 4).T
+        center = matrix[:3, :3] @ box[0] + matrix[:3, 3]
+        half = np.abs(box[1:] @ matrix[:3, :3].T).sum(0)
+        used, required = (tuple(content.get(key, ())) for key in ("extensionsUsed", "extensionsRequired"))
+        return cls(uri, np.stack([center - half, center + half]), float(tileset["geometricError"]), used, required)
+
+
+def linking_tileset(linked: Sequence[LinkedTileset]) -> str:
+    """Return the JSON of a tileset that shows other tilesets together."""
+    corners = np.stack([one.box + one.shift for one in linked])
+    around = np.stack([corners[:, 0].min(0), corners[:, 1].max(0)])
+    error_m = max(one.error_m for one in linked)
+    root = _tile_json(TileNode(around, error_m)) | {"refine": "ADD", "children": []}
+    for one in linked:
+        shift = np.eye(4)
+        shift[:3, 3] = one.shift
+        tile = _tile_json(TileNode(one.box, one.error_m, one.uri))
+        root["children"].append(tile | ({"transform": shift.T.ravel().tolist()} if one.shift.any() else {}))
+    content = {
+        key: sorted({name for one in linked for name in names(one)})
+        for key, names in (
+            ("extensionsUsed", lambda one: one.used),
+            ("extensionsRequired", lambda one: one.required),
+        )
+    }
+    tileset = {
+        "asset": {"version": "1.1", "generator": "gsmap"},
+        "geometricError": error_m,
+        "extensionsUsed": ["3DTILES_content_gltf"],
+        "extensions": {"3DTILES_content_gltf": {key: names for key, names in content.items() if names}},
+        "root": root,
+    }
+    return json.dumps(tileset, indent=1)
 
 
 def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:

@@ -8,7 +8,7 @@ from gsmap.localize.joint_localization import localize_together
 from gsmap.localize.localization import localize_photo
 from gsmap.localize.map_scene import MapScene
 from gsmap.localize.params import Params
-from gsmap.localize.photos import Lens, read_photo
+from gsmap.localize.photos import Lens, photo_in_memory, read_photo
 from gsmap.localize.recipe import recipe_key
 from gsmap.localize.retrieval import ViewIndex, index_recipe, new_segment, view_index
 
@@ -26,6 +26,7 @@ __all__ = [
     "localize_together",
     "new_segment",
     "read_clip",
+    "photo_in_memory",
     "read_photo",
     "recipe_key",
     "render_capture_views",

@@ -61,7 +61,7 @@ def read_clip(
         raise InputError(f"{path} is not a readable video clip ({error})", code="clip_unreadable") from error
     if not chosen:
         raise InputError(f"{path} has no readable frame", code="clip_unreadable")
-    return [(at, make_photo(rgb, lens, None, f"{path.name}#{at:.2f}")) for at, rgb in chosen]
+    return [(at, make_photo(rgb, None, lens, f"{path.name}#{at:.2f}")) for at, rgb in chosen]
 
 
 def _require_size(path: Path, stream) -> None:  # type: ignore[no-untyped-def]

@@ -5,12 +5,17 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats.pictures import open_picture
 from gsmap.types.localization import Photo
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from PIL.Image import Image
 
 _MIN_INTRINSIC_PX, _MAX_INTRINSIC_PX = 0.01, 1_000_000
 
@@ -56,18 +61,64 @@ def read_photo(
         NotFoundError: the file or its mask does not exist.
         InputError, MissingDependencyError: the photo or its mask cannot be read (`open_picture`).
     """
-    from PIL import ImageOps
-
     path, lens = Path(path), lens or Lens()
     if not path.is_file():
         raise NotFoundError(f"there is no photo {path}", code="file_not_found")
 
     with open_picture(path) as picture:
-        focal_35mm = picture.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
-        ImageOps.exif_transpose(picture, in_place=True)
-        rgb = np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB"))
-    photo = make_photo(rgb, lens, focal_35mm, path.name)
+        photo = make_photo(*_upright(picture, in_place=True), lens, path.name)
     return photo if masks is None else replace(photo, known=read_mask(path, masks, photo.size_px))
+
+
+def photo_in_memory(picture: Image | ArrayLike, lens: Lens | None = None, name: str = "photo") -> Photo:
+    """Return a photo of an image in memory.
+
+    Args:
+        picture: a PIL image, turned upright by its EXIF orientation; or pixels (H, W), (H, W, 3) or (H, W, 4), in uint8
+            or as floats in [0, 1], RGB; alpha is ignored.
+        name: for messages.
+
+    Raises:
+        InputError: pixels of another shape or type, or floats out of range.
+    """
+    from PIL.Image import Image
+
+    lens = lens or Lens()
+    if isinstance(picture, Image):
+        return make_photo(*_upright(picture, in_place=False), lens, name)
+    pixels = np.asarray(picture)
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=2)
+    if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
+        raise InputError(
+            f"{name}: an image is an array (height, width, 3), got {np.shape(picture)}", code="shape_mismatch"
+        )
+    pixels = pixels[..., :3]
+    if np.issubdtype(pixels.dtype, np.floating):
+        if not (pixels.min() >= 0 and pixels.max() <= 1):  # NaN, too
+            raise InputError(f"{name}: floats of an image lie in [0, 1]; or pass uint8", code="out_of_range")
+        pixels = (pixels * 255 + 0.5).astype(np.uint8)
+    if pixels.dtype != np.uint8:
+        raise InputError(
+            f"{name}: an image has uint8 values, or floats in [0, 1], got {pixels.dtype}", code="wrong_type"
+        )
+    return make_photo(np.ascontiguousarray(pixels), None, lens, name)
+
+
+def _upright(picture: Image, *, in_place: bool) -> tuple[np.ndarray, object]:
+    """Return the pixels (H, W, 3) of a picture, turned by its EXIF orientation, and the focal length that EXIF states.
+
+    Args:
+        in_place: turn the picture itself, which takes less memory.
+    """
+    from PIL import ImageOps
+
+    focal_35mm = picture.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
+    if in_place:
+        ImageOps.exif_transpose(picture, in_place=True)
+    else:
+        picture = ImageOps.exif_transpose(picture)
+    return np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB")), focal_35mm
 
 
 def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_px: tuple[int, int]) -> np.ndarray:
@@ -103,7 +154,7 @@ def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_
     return known
 
 
-def make_photo(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str = "photo") -> Photo:
+def make_photo(rgb: np.ndarray, focal_35mm: object, lens: Lens, name: str = "photo") -> Photo:
     """Return a photo of pixels (H, W, 3), uint8, with intrinsics as specified, from EXIF, or by default.
 
     Args:

@@ -19,6 +19,7 @@ from gsmap.evaluate.registration import scene_centroid
 from gsmap.evaluate.renders import compare_renders, find_images
 from gsmap.export import manifest, tileset
 from gsmap.export.manifest import Manifest
+from gsmap.export.recipe import upright_back
 from gsmap.formats import tiles3d
 from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -218,7 +219,7 @@ class _Export:
             return None
         # Tiles of one export may differ in the pose by what `export.max_shift_m` lets pass: the fullest one decides.
         fullest = max(tiles, key=lambda tile: tile.num_gaussians)
-        return Gaussians.concatenate([self._read(tile.path) for tile in tiles]), fullest.poses[scene]
+        return Gaussians.concatenate([self._read(tile.path, tile.up) for tile in tiles]), fullest.poses[scene]
 
     def cover(self, scene: str, gaussians: Gaussians, min_opacity: float = 0.3) -> float:
         """Return the fraction of a scene's opaque Gaussians that lie within its tiles."""
@@ -229,12 +230,13 @@ class _Export:
             inside |= ((moved >= tile.bounds[0]) & (moved <= tile.bounds[1])).all(1)
         return float(inside.mean()) if len(opaque) else 0.0
 
-    def _read_file(self, path: str) -> Gaussians:
-        """Read a tile in the map frame; leaves of a 3D Tiles tree have z up, other files gsmap's axes."""
+    def _read_file(self, path: str, up: str) -> Gaussians:
+        """Read a tile in the map frame."""
         file = self._folder / path
         is_tileset = (file.parent / tileset.FILE_NAME).exists() if self._format is None else self._format == "3dtiles"
         content = tiles3d.read_content(file) if is_tileset and file.suffix == ".glb" else formats.read(file)
-        return content.about(np.zeros(3))
+        content = content.about(np.zeros(3))
+        return upright_back(content) if up == "y" else content
 
 
 def _pictures(scene: Scene, cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, Path]:

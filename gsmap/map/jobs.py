@@ -186,26 +186,38 @@ class TileMaker:
         location: location of the map.
         tile: the planned tile.
         method, params: the merger and its settings.
-        is_cut: true if only content within the tile's bounds belongs to it.
         budget_s: maximum wall time in seconds.
         captured_at: date of each scene.
         store: cache of reference views for other tiles.
         passing: dynamic content to leave out, by scene id.
         photos: reference photos, by scene id.
+        cache_key: key of the merged tile among those of earlier exports (`gsmap.map.merged_tiles`).
     """
 
     location: str
     tile: PlannedTile
     method: str
     params: Any
-    is_cut: bool
     budget_s: float | None
     captured_at: Mapping[str, str | None]
     store: ReferenceViewCache
     passing: Mapping[str, DynamicContent] = field(default_factory=dict)
     photos: Mapping[str, Sequence[StoredPhoto]] = field(default_factory=dict)
+    cache_key: str = ""
 
     def __call__(self, progress: Progress) -> MergeResult:
+        """Return the merged tile in map units, of an earlier export if it is cached."""
+        from gsmap.map import merged_tiles
+
+        if not self.cache_key:
+            return self._merge(progress)
+        found = merged_tiles.load(self.cache_key)
+        if found is None:
+            found = self._merge(progress)
+            merged_tiles.keep(self.cache_key, found, self.tile.poses)
+        return found
+
+    def _merge(self, progress: Progress) -> MergeResult:
         """Merge in metres and return the result in map units."""
         from gsmap.merge.overlap import clamp_inside
         from gsmap.merge.tile import LazyScene, merge_tile
@@ -225,7 +237,7 @@ class TileMaker:
             )
             for scene, pose in self.tile.poses.items()
         ]
-        bounds = self.tile.bounds if self.is_cut else None
+        bounds = self.tile.bounds if self.tile.is_cut else None
         found = merge_tile(
             lazy,
             self.method,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
@@ -20,12 +20,14 @@ from gsmap.map.metric_scales import metres_at
 from gsmap.map.progress_logging import log_progress
 from gsmap.map.shared_jobs import announce_work
 from gsmap.store import Store
-from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
+from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, SceneGraph, ScenePose, Sim3
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.base import Table
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
+
     from gsmap.map.objects import MapObjects
     from gsmap.map.photo_poses import LocalizePhotos
     from gsmap.map.settings import Settings
@@ -129,6 +131,34 @@ class Map(AbstractContextManager["Map"]):
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def __repr__(self) -> str:
+        names = [scene.name for scene in self.scenes()]
+        shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+        return f"Map({self.store.location!r}, {len(names)} scenes{': ' if names else ''}{shown})"
+
+    def __bool__(self) -> bool:
+        return True  # an empty map is one, too
+
+    def __len__(self) -> int:
+        """Return the number of living scenes."""
+        return len(self.scenes())
+
+    def __iter__(self) -> Iterator[Scene]:
+        """Iterate over the living scenes in the order of their ingest."""
+        return iter(self.scenes())
+
+    def __contains__(self, ref: object) -> bool:
+        """Return whether a living scene has this name or id."""
+        return any(ref in (scene.name, scene.id) for scene in self.scenes())
+
+    def __getitem__(self, ref: str) -> Scene:
+        """Return a living scene by name, id or the beginning of its id.
+
+        Raises:
+            NotFoundError: no such scene; a `LookupError`.
+        """
+        return self.store.scenes.get(ref)
 
     def close(self) -> None:
         self._workers.close()  # first: they have the map open
@@ -498,7 +528,7 @@ class Map(AbstractContextManager["Map"]):
 
     def localize(
         self,
-        *files: str | os.PathLike[str],
+        *files: str | os.PathLike[str] | np.ndarray | Image,
         intrinsics: str | Sequence[float] | None = None,
         focal: str | float | None = None,
         near: str | None = None,
@@ -517,6 +547,8 @@ class Map(AbstractContextManager["Map"]):
         What views are found by is made for every scene that lacks it, and kept unless the map is read-only.
 
         Args:
+            files: photos and scans; or photos in memory: PIL images, or RGB arrays (H, W, 3) in uint8 or as floats in
+                [0, 1]. The latter are called ``photo_0`` and so on, by their position.
             intrinsics: ``fx fy cx cy`` of all photos, in pixels of the upright image.
             focal: focal length in pixels, or ``auto`` to estimate it; default: EXIF.
             near: restrict to places that this scene shows, or to ``X,Y,Z,R`` around a point of the map.
@@ -622,8 +654,8 @@ class Map(AbstractContextManager["Map"]):
         self,
         out: str | os.PathLike[str],
         *,
-        format: str = "ply",
-        tile_size_m: float = 10.0,
+        format: str | None = None,
+        tile_size_m: float | None = None,
         bbox: Sequence[float] | None = None,
         merge: str | None = None,
         revision: int | None = None,
@@ -635,13 +667,18 @@ class Map(AbstractContextManager["Map"]):
         prefer: str | None = None,
         as_of: str | None = None,
         static: bool = False,
+        up: str | None = None,
         wait: bool = False,
     ) -> ExportReport:
         """Export merged tiles to a folder; unchanged tiles are kept.
 
+        Merged tiles are also kept in the user's cache folder, so that a further format or folder merges nothing again.
+
         Args:
-            format: suffix of the tiles' files, or a tree of levels: ``3dtiles`` or ``streamed-sog``.
-            tile_size_m: tile size in metres; 0 for one file per component.
+            format: suffix of the tiles' files, or a tree of levels: ``3dtiles`` or ``streamed-sog``; default: ``spz``,
+                or ``ply`` with ``provenance``.
+            tile_size_m: tile size in metres; 0 for one file per component; default: one file of a component whose
+                captures have at most 1.5 million Gaussians, and tiles of 10 m of a larger one.
             bbox: box ``x0 y0 z0 x1 y1 z1`` of the map to export, map unit.
             merge: ``tto``, ``voxel``, ``union``, ``distance``, or a plug-in's; default: the setting ``merge.method``.
             revision: revision of the poses; default: newest.
@@ -656,6 +693,8 @@ class Map(AbstractContextManager["Map"]):
                 out. Poses are those of the revision.
             static: export static content only, without objects that moved or were observed to be absent. Missing
                 comparisons of visits are made first.
+            up: vertical axis of the files: ``z``, that of the map, or ``y``, as viewers of the format expect it;
+                default: ``z`` for ``ply``, ``3dtiles`` and ``streamed-sog``, ``y`` for other formats.
             wait: wait while another export runs in the folder.
 
         Raises:
@@ -665,7 +704,7 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.stages.export import Request, export
 
         request = Request(
-            format=format,
+            format=format or ("ply" if provenance else "spz"),
             tile_size_m=tile_size_m,
             bbox=bbox,
             merge=merge,
@@ -678,6 +717,7 @@ class Map(AbstractContextManager["Map"]):
             prefer=prefer,
             as_of=as_of,
             static=static,
+            up=up,
         )
 
         def progress(fraction: float, text: str) -> None:
@@ -730,6 +770,14 @@ class Map(AbstractContextManager["Map"]):
     def metres(self, revision: int | None = None) -> dict[int, MetricScale]:
         """Return the metric scale of each component of a revision, by default the newest."""
         return metres_at(self.store, revision)
+
+    def poses(self, revision: int | None = None) -> dict[str, ScenePose]:
+        """Return the poses of a revision, by default the newest, by scene name; removed scenes by their id.
+
+        ``m.poses()["hall"].S_map_scene`` maps points of scene ``hall`` to the frame of its component.
+        """
+        graph, names = self.pose_graph(revision), {scene.id: scene.name for scene in self.scenes()}
+        return {names.get(scene, scene): pose for scene, pose in ({} if graph is None else graph.poses).items()}
 
     def pose_graph(self, revision: int | None = None) -> PoseGraph | None:
         """Return the poses of a revision, by default the newest; None before the first optimize."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from gsmap.errors import ConfigError, ReadOnlyError
 from gsmap.formats.scans import is_scan
 from gsmap.ingest.dates import CaptureDate, given_date, photo_date
-from gsmap.localize import Lens, read_clip, read_photo
+from gsmap.localize import Lens, photo_in_memory, read_clip, read_photo
 from gsmap.map.metric_scales import metre_notes, metres_at
 from gsmap.map.photo_changes import PhotoReporter, write_picture
 from gsmap.map.photos import PhotoObservation, localized_photo_of, small_jpeg
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from gsmap.map.settings import Settings
 
 Numbers = str | Sequence[float] | None
+Pictured = str | os.PathLike[str] | Any
+"""A file of a photo or scan, or a photo in memory: an array or a PIL image (`gsmap.localize.photo_in_memory`)."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class PhotoOptions:
 def localize_files(
     store: Store,
     settings: Settings,
-    files: Sequence[str | os.PathLike[str]],
+    files: Sequence[Pictured],
     *,
     intrinsics: Numbers,
     focal: str | float | None,
@@ -74,6 +77,7 @@ def localize_files(
     """Read and localize photos and scans; nothing is localized if a file cannot be read.
 
     Args:
+        files: files, or photos in memory, which are called ``photo_0`` and so on by their position.
         together: the photographs show one place.
         video: a video, in place of files.
         masks: folder with a mask for each photo; black pixels are ignored.
@@ -92,8 +96,15 @@ def localize_files(
     lens = parse_lens(intrinsics, focal)
     if video is not None:
         return _of_pictures(store, settings, frames_of(video, lens, settings), near, True, progress, options)
-    pictures = photos_of([path for path in files if depth is None and not is_scan(path)], lens, masks)
-    of_scans, notes = scan_rows(store, settings, files, depth, depth_scale, lens, near, progress)
+    paths = [one if is_path(one) else f"photo_{number}" for number, one in enumerate(files)]
+    if len(paths) != sum(map(is_path, files)) and (masks is not None or depth is not None):
+        raise ConfigError(
+            "--masks and --depth apply to photos by file: write the photo to a file", code="option_not_applicable"
+        )
+    in_memory = {paths[number]: one for number, one in enumerate(files) if not is_path(one)}
+    photos = [path for path in paths if depth is None and (path in in_memory or not is_scan(path))]
+    pictures = photos_of(photos, lens, masks, in_memory)
+    of_scans, notes = scan_rows(store, settings, paths, depth, depth_scale, lens, near, progress)
     report = LocalizeReport(results=())
     if pictures:
         report = _of_pictures(store, settings, pictures, near, together, progress, options)
@@ -103,7 +114,7 @@ def localize_files(
 
 
 def check_named(
-    files: Sequence[str | os.PathLike[str]],
+    files: Sequence[Pictured],
     video: str | os.PathLike[str] | None,
     masks: str | os.PathLike[str] | None = None,
 ) -> None:
@@ -117,10 +128,23 @@ def check_named(
 
 
 def photos_of(
-    files: Sequence[str | os.PathLike[str]], lens: Lens, masks: str | os.PathLike[str] | None = None
+    files: Sequence[str | os.PathLike[str]],
+    lens: Lens,
+    masks: str | os.PathLike[str] | None = None,
+    in_memory: Mapping[Any, Any] = MappingProxyType({}),
 ) -> list[tuple[str, Photo]]:
-    """Read photos by name, each with its mask if there is one."""
-    return [(os.fspath(path), read_photo(path, lens, masks)) for path in files]
+    """Read photos by name, each with its mask if there is one; those in memory are converted."""
+    return [
+        (os.fspath(path), photo_in_memory(in_memory[path], lens, path))
+        if path in in_memory
+        else (os.fspath(path), read_photo(path, lens, masks))
+        for path in files
+    ]
+
+
+def is_path(given: object) -> bool:
+    """Return whether an input names a file."""
+    return isinstance(given, (str, os.PathLike))
 
 
 def frames_of(video: str | os.PathLike[str], lens: Lens, settings: Settings) -> list[tuple[str, Photo]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from gsmap.map.changes import num_open
 from gsmap.map.metric_scales import map_metres
+from gsmap.map.reports.one_pair import is_one_pair, scenes_by_one_pair
 from gsmap.map.settings import Settings
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.describe import graph_keys, unthinned, without_graph
@@ -70,8 +71,16 @@ def status(store: Store, settings: Settings) -> MapStatus:
             add("dirty_tiles", count, verb, f"tiles in {target} that are out of date")
     poses = [pose for scene, pose in graph.poses.items() if scene in living]
     tentative = [pose for pose in poses if pose.status == "tentative"]
-    unconfirmed = [pair for pair in store.revisions.tentative() if living.issuperset(pair)]
-    add("tentative", len(tentative), _look(store, unconfirmed), "scenes placed by edges without an agreeing cycle")
+    alone = scenes_by_one_pair(store) if tentative else set()
+    held = store.revisions.tentative() if tentative else {}
+    pairs_of = {
+        one_pair: [pair for pair, edge in held.items() if living.issuperset(pair) and is_one_pair(edge) == one_pair]
+        for one_pair in (True, False)
+    }
+    in_doubt = [pose for pose in tentative if pose.scene not in alone]
+    add("tentative", len(in_doubt), _look(store, pairs_of[False] or pairs_of[True]), "scenes placed by a doubtful edge")
+    by_one = len(tentative) - len(in_doubt)
+    add("one_pair", by_one, _look(store, pairs_of[True]), "scenes placed by one pair, which nothing contradicts")
     judged = store.revisions.undecided(newest.number).get(newest.number, []) if newest else []
     undecided = [pair for pair in judged if living.issuperset(pair)]
     add("undecided", len(undecided), _look(store, undecided), "undecided edges: confirm or reject them")
@@ -95,6 +104,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
         components=components,
         islands=components,
         tentative=len(tentative),
+        one_pair=by_one,
         revision=newest.number if newest else None,
         metres_per_unit=next((one.metres_per_unit for one in metres.values() if one.is_known), None),
         metres=tuple(metre_row(component, one) for component, one in metres.items()),

@@ -49,12 +49,17 @@ def georeferenced_components(graph: PoseGraph | None, components: Collection[int
     return found
 
 
-def world_notes(found: Mapping[int, GeoreferencedComponent], format: str) -> tuple[str, ...]:
-    """Return remarks on the coordinates of exported tiles."""
+def world_notes(found: Mapping[int, GeoreferencedComponent], format: str, up: str | None = "z") -> tuple[str, ...]:
+    """Return remarks on the coordinates of exported tiles.
+
+    Args:
+        up: vertical axis of the files.
+    """
     if not found or format in _IN_THE_FILE:
         return ()
     named = ", ".join(sorted({one.frame.crs for one in found.values()}))
+    turned = ", turned to x, -z, y" if up == "y" else ""
     return (
-        f"tiles of {format} are in the map's frame, since the format has no room for coordinates in {named}: "
+        f"tiles of {format} are in the map's frame{turned}, since the format has no room for coordinates in {named}: "
         "tiles.json has S_world_map and S_ecef_map beside them; 3dtiles carries its place itself",
     )

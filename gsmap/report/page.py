@@ -230,7 +230,8 @@ def _doubt(report: Report) -> Markup | None:
     parts: list[Part] = []
     if doubtful:
         parts.append(
-            tag("p", "No cycle of other edges confirms a tentative edge: it may be correct, but needs a review. An "
+            tag("p", "No cycle of other edges confirms a tentative edge. If nothing contradicts it, its scene is "
+                "placed by one pair, which is correct far more often than not; a look settles it. An "
                 "undecided edge contradicts other edges, and gsmap cannot decide which is correct. Each row "
                 "shows one camera: the first scene, the second scene, and their differences in red. If walls and "
                 "furniture coincide, confirm the edge; if not, reject it.")
@@ -683,7 +684,8 @@ _GLOSSARY = (
     (
         "tentative",
         "A scene or edge that depends on registrations that nothing else confirms. It is drawn at its most likely "
-        "pose; do not measure across it before a review.",
+        "pose. Placed by one pair, it has nothing against it; otherwise it is in doubt: do not measure across it "
+        "before a review.",
     ),
     (
         "undecided",

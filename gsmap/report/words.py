@@ -153,7 +153,8 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
     if not scenes:
         return "empty", ("This map is empty: no capture has been ingested yet.",)
     placed = [row.name for row in scenes if row.status == "placed"]
-    tentative = [row.name for row in scenes if row.status == "tentative"]
+    tentative = [row.name for row in scenes if row.status == "tentative" and not row.one_pair]
+    one_pair = [row.name for row in scenes if row.one_pair]
     alone = [row.name for row in scenes if row.status == "isolated"]
     if report.revision is None:
         return "act", (
@@ -171,7 +172,7 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
             "or a review confirms each pose."
         )
     else:
-        sentences.append(f"The map holds {count(len(scenes), 'scene')}; no pose is confirmed.")
+        sentences.append(f"The map holds {count(len(scenes), 'scene')}; no pose is confirmed by a cycle of edges.")
     sigmas = sorted(
         (entry.position_sigma_m, entry.row.name) for entry in report.scenes if entry.position_sigma_m is not None
     )
@@ -191,6 +192,11 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
         rest = "rests" if len(tentative) == 1 else "rest"
         sentences.append(
             f"Doubtful: {some(tentative)} {rest} on edges that no cycle confirms; review them and confirm or reject."
+        )
+    if one_pair:
+        sentences.append(
+            f"Placed by one pair, which nothing contradicts: {some(one_pair)}; a capture that closes a loop, or a "
+            "review, would confirm it."
         )
     undecided = [edge.row.pair for edge in report.edges if edge.use == "undecided"]
     if undecided:
@@ -214,8 +220,8 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
     return ("look" if "look" in wants or tentative or undecided else "good"), tuple(sentences)
 
 
-def _wants(what: TodoKind) -> Literal["act", "look"]:
-    """Return ``act`` for a task of computation, ``look`` for a review by a person."""
+def _wants(what: TodoKind) -> Literal["act", "look", "good"]:
+    """Return ``act`` for a task of computation, ``look`` for a review by a person, ``good`` for what may stay."""
     match what:
         case "undescribed" | "unregistered" | "unsolved" | "set_aside" | "contradicted_priors":
             return "act"
@@ -223,6 +229,8 @@ def _wants(what: TodoKind) -> Literal["act", "look"]:
             return "look"
         case "world_outliers" | "untied" | "duplicates" | "isolated":
             return "look"
+        case "one_pair":
+            return "good"
         case _:
             assert_never(what)
 

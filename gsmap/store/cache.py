@@ -67,7 +67,7 @@ def keep(sha256: str, chunks: Iterable[bytes], what: str) -> Path:
                 file.write(chunk)
         if digest.hexdigest() != sha256:
             raise CorruptError(f"{what} differs from what gsmap wrote", code="bytes_differ")
-        _make_room(root)
+        make_room(root)
         os.replace(staged, root / sha256)
     finally:
         staged.unlink(missing_ok=True)
@@ -80,8 +80,8 @@ def drop(sha256: str) -> None:
         path.unlink(missing_ok=True)
 
 
-def _make_room(root: Path) -> None:
-    """Delete the least recently used files until the cache, including the staged file, is within its limit."""
+def make_room(root: Path) -> None:
+    """Delete the least recently used files of a folder until it, with the staged file, is within the limit."""
     kept = []
     for entry in os.scandir(root):
         with contextlib.suppress(FileNotFoundError):

@@ -204,11 +204,11 @@ class Revisions:
             judged = select(edges.c.target, edges.c.source).where(edges.c.until.is_(None), edges.c.since > number)
             return set(placed.scalars()), {(row.target, row.source) for row in connection.execute(judged)}
 
-    def tentative(self) -> tuple[tuple[str, str], ...]:
-        """Return (target, source) of the newest revision's edges that place scenes although no cycle confirms them."""
+    def tentative(self) -> dict[tuple[str, str], EdgeOutcome]:
+        """Return the newest revision's edges that place scenes although no cycle confirms them, by (target, source)."""
         newest = edges.c.until.is_(None) & (edges.c.use == "tentative")
         with self._catalog.read() as connection:
-            return tuple(_outcomes(connection, newest))
+            return dict(_outcomes(connection, newest))
 
     def undecided(self, number: int | None = None) -> PairsByRevision:
         """Return (target, source) of undecided edges by revision, for one revision or for all."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.types.tensors import to_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +95,23 @@ class Cameras:
         out[:, 0, 0], out[:, 1, 1] = self.intrinsics_px[:, 0], self.intrinsics_px[:, 1]
         out[:, 0, 2], out[:, 1, 2] = self.intrinsics_px[:, 2], self.intrinsics_px[:, 3]
         return out
+
+    def to_gsplat(self, device: str = "cpu") -> dict[str, Any]:
+        """Return the cameras as arguments of `gsplat.rasterization`: ``viewmats`` (C, 4, 4), ``Ks`` (C, 3, 3),
+        ``width`` and ``height``.
+
+        Raises:
+            InputError: no cameras, or images of several sizes: take one with ``cameras[i]``.
+            MissingDependencyError: torch is not installed.
+        """
+        if len(np.unique(self.sizes_px, axis=0)) != 1:
+            raise InputError(
+                "gsplat renders images of one size at once: take cameras of one size, such as cameras[0]",
+                code="shape_mismatch",
+            )
+        width, height = self.sizes_px[0].tolist()
+        arrays = {"viewmats": self.T_camera_frame, "Ks": self.K}
+        return {name: to_tensor(array, device) for name, array in arrays.items()} | {"width": width, "height": height}
 
     def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Cameras:
         """Return the cameras at an index, slice, boolean mask or integer array as a `Cameras`, also for one index."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.types.tensors import to_tensor
 
 FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 CHUNK_ROWS = 1 << 16
@@ -104,6 +106,26 @@ class Gaussians:
         out: np.ndarray = self.means + self.origin
         return out
 
+    def to_gsplat(self, device: str = "cpu") -> dict[str, Any]:
+        """Return the Gaussians as arguments of `gsplat.rasterization`, in its names and conventions.
+
+        ``means`` (N, 3) about ``origin``, ``quats`` (N, 4) ``wxyz``, ``scales`` (N, 3) and ``opacities`` (N,) after
+        their activations, and ``colors`` (N, K, 3), SH coefficients, all float32 tensors; and ``sh_degree``, an int::
+
+            gsplat.rasterization(**gaussians.to_gsplat("cuda"), **cameras.to_gsplat("cuda"))
+
+        Raises:
+            MissingDependencyError: torch is not installed.
+        """
+        tensors = {
+            "means": self.means,
+            "quats": self.quats,
+            "scales": self.scales,
+            "opacities": self.opacities,
+            "colors": self.sh,
+        }
+        return {name: to_tensor(array, device) for name, array in tensors.items()} | {"sh_degree": self.sh_degree}
+
     def about(self, origin: np.ndarray) -> Gaussians:
         """Return the same Gaussians with means relative to another origin (3,), which is given in the frame."""
         if np.array_equal(origin, self.origin):
@@ -151,4 +173,6 @@ class Gaussians:
         return cls(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, k, 3)))
 
     def __repr__(self) -> str:
-        return f"Gaussians(n={len(self)}, sh_degree={self.sh_degree})"
+        extent = np.ptp(self.means, axis=0) if len(self) else np.zeros(3)
+        size = " x ".join(f"{side:.3g}" for side in extent.tolist())
+        return f"Gaussians(n={len(self)}, sh_degree={self.sh_degree}, extent={size})"

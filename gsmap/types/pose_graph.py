@@ -82,6 +82,10 @@ class ScenePose:
     status: str
     covariance: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        at = f"scene={self.scene[:12]!r}, component={self.component}, status={self.status!r}"
+        return f"ScenePose({at}, S_map_scene={self.S_map_scene!r})"
+
 
 EDGE_USES = ("used", "tentative", "unused")
 
@@ -153,6 +157,10 @@ class PoseGraph:
     provenance: Provenance = field(default_factory=Provenance)
     notes: tuple[str, ...] = ()
     world: tuple[Georeference, ...] = ()
+
+    def __repr__(self) -> str:
+        components = len({pose.component for pose in self.poses.values()})
+        return f"PoseGraph({len(self.poses)} poses in {components} components, {len(self.outcomes)} edges)"
 
     def tie(self, component: int) -> Georeference | None:
         """Return the georeference of a component; None if the component has no observations of the world."""

@@ -49,6 +49,12 @@ class Scene:
     thinning: Thinning | None = None
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
+    def __repr__(self) -> str:
+        dated = f", captured_at={self.captured_at!r}" if self.captured_at else ""
+        size = " x ".join(f"{side:.3g}" for side in np.ptp(self.bounds, axis=0).tolist())
+        sizes = f"{self.num_gaussians} Gaussians, {self.num_cameras} cameras"
+        return f"Scene({self.name!r}, id={self.id[:12]!r}, {sizes}, extent={size}{dated})"
+
     def _repr_html_(self) -> str:
         facts = {
             "id": self.id,

@@ -26,6 +26,7 @@ class Tile:
         path: relative to the export's folder.
         sha256: of the file written.
         notes: remarks on how it was merged.
+        up: vertical axis of the file: ``z`` if it has the map's axes, ``y`` if it is turned (x, -z, y) for viewers.
     """
 
     key: str
@@ -38,3 +39,4 @@ class Tile:
     path: str = ""
     sha256: str = ""
     notes: tuple[str, ...] = ()
+    up: str = "z"

@@ -59,7 +59,7 @@ def made_site(captures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         m.ingest(captures, scale="known")
         m.update()
         m.optimize()
-        m.export(root / "tiles", tile_size_m=0, merge="union")
+        m.export(root / "tiles", format="ply", tile_size_m=0, merge="union")
     return root / "site.gsmap"
 
 

@@ -40,19 +40,25 @@ def test_update_ends_with_commands_that_run(site: Path, cli: Run) -> None:
 
 
 def test_edges_are_filtered_by_the_words_that_their_table_shows(site: Path, cli: Run) -> None:
-    assert pairs(cli, site, "tentative") == [{"left", "right"}]
+    assert "one pair" in cli("list", site, "edges").stdout
+    assert pairs(cli, site, "one pair") == pairs(cli, site, "one-pair") == [{"left", "right"}]
+    assert pairs(cli, site, "tentative") == [{"left", "right"}]  # the word of JSON
     assert pairs(cli, site, "accepted") == [{"left", "right"}]
-    assert pairs(cli, site, "used") == pairs(cli, site, "undecided") == []
+    assert pairs(cli, site, "used") == pairs(cli, site, "undecided") == pairs(cli, site, "unused") == []
+    scenes = cli("list", site, "scenes", "--status", "one-pair", "--json").json["scenes"]
+    assert {row["name"] for row in scenes} == {"left", "right"}
+    assert all(row["one_pair"] and row["status"] == "tentative" for row in scenes)
+    assert "2 placed by one pair, 0 in doubt" in cli("status", site).stdout
     refused = cli("list", site, "edges", "--status", "nice")
     assert refused.code == 2
     assert "tentative" in refused.stderr
 
 
 def test_a_confirmed_pair_is_no_longer_tentative(site: Path, cli: Run) -> None:
-    assert "tentative" not in cli("confirm", site, "left:right").stdout
+    assert "one pair" not in cli("confirm", site, "left:right").stdout
     assert cli("list", site, "edges", "--status", "used", "--json").json["edges"][0]["used"] is True
     assert pairs(cli, site, "tentative") == []
-    assert "tentative" in cli("confirm", site, "left:right", "--withdraw").stdout
+    assert "one pair" in cli("confirm", site, "left:right", "--withdraw").stdout
     assert pairs(cli, site, "tentative") == [{"left", "right"}]
     cli("confirm", site, "left:right")
     assert [step[0] for step in next_steps(cli("update", site).stdout)] == ["list"]  # the scene that is alone
@@ -69,5 +75,5 @@ def test_several_pairs_are_judged_on_the_page(site: Path) -> None:
     with gsmap.map.open(site) as m:
         m.add_edge("left:odd:one", Sim3(np.eye(3), np.array([9.0, 0, 0])), np.full(7, 0.01))
         m.optimize()
-        (row,) = [row for row in m.status().todo if row.what == "tentative"]
+        (row,) = [row for row in m.status().todo if row.what == "one_pair"]
     assert shlex.split(row.verb)[:2] == ["gsmap", "view"]

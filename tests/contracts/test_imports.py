@@ -71,7 +71,8 @@ HOMES = {
     "open3d": {"formats", "gsmap_synthetic"},
     "av": {"localize"},
     "pycolmap": {"formats", "localize"},
-    "torch": {"formats", "render"},
+    "torch": {"formats", "render", "types"},  # types: conversion only
+    "pandas": {"types"},
     "pxr": {"formats"},
     "tomlkit": {"settings"},
     "pyproj": {"world"},

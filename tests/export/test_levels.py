@@ -116,7 +116,7 @@ def test_a_level_that_is_no_better_than_the_next_is_left_out(tmp_path, monkeypat
     (tmp_path / "tiles.json").write_text("{}")
     tiles = []
     for i in range(4):
-        path = f"component_0/{i}.glb"
+        path = f"component_0/tile_{i:+04d}_+000_+000.glb"
         tiles3d.write_content(tmp_path / path, g[i::4])
         bounds = np.array([[i, 0, 0], [i + 1, 1, 1]], float)
         tiles.append(Tile(f"k{i}", 0, bounds, {"0" * 32: Sim3.identity()}, 100, {}, False, path, f"digest {i}", ()))
@@ -127,13 +127,13 @@ def test_a_level_that_is_no_better_than_the_next_is_left_out(tmp_path, monkeypat
         return levels.Level(finer[:count], 5.0 if len(finer) == 200 else upper_m)
 
     monkeypatch.setattr("gsmap.export.pyramid.make_level", make)
-    (file,) = write_tilesets(tmp_path, tiles, 1.0)
+    (file,) = write_tilesets(tmp_path, tiles)
     root = json.loads(file.read_text())["root"]
     assert len(list((tmp_path / "component_0" / "levels").iterdir())) == files
     leaves = [child["content"]["uri"] for child in root["children"] if "children" not in child]
-    assert leaves == ([] if files == 3 else ["0.glb", "1.glb", "2.glb", "3.glb"])
+    assert leaves == ([] if files == 3 else [f"tile_{i:+04d}_+000_+000.glb" for i in range(4)])
     assert root["geometricError"] == pytest.approx(upper_m if files == 1 else 7.5)
-    write_tilesets(tmp_path, tiles, 1.0)
+    write_tilesets(tmp_path, tiles)
     again = json.loads(file.read_text())["root"]
     assert again["geometricError"] == root["geometricError"]
     assert [c["content"] for c in again["children"]] == [c["content"] for c in root["children"]]
@@ -151,29 +151,29 @@ def test_a_tileset_says_how_its_levels_look_and_keeps_them(tmp_path, monkeypatch
     tiles = []
     for i, side in enumerate((-1.0, 0.0)):
         mine = g[(g.means[:, 0] >= side) & (g.means[:, 0] < side + 1)]
-        path = f"component_0/{i}.glb"
+        path = f"component_0/tile_{i:+04d}_+000_+000.glb"
         tiles3d.write_content(tmp_path / path, mine)
         bounds = np.array([[side, -1, -0.5], [side + 1, 1, 0.5]])
         poses = {"0" * 32: Sim3.identity()}
         tiles.append(Tile(f"k{i}", 0, bounds, poses, len(mine), {}, False, path, f"digest {i}", ()))
     made = []
     monkeypatch.setattr("gsmap.export.pyramid.make_level", lambda *a: made.append(a) or levels.make_level(*a))
-    (file,) = write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: before_it(16, seed=1), levels=QUICK)
+    (file,) = write_tilesets(tmp_path, tiles, cameras=lambda component: before_it(16, seed=1), levels=QUICK)
     first = json.loads(file.read_text())
     assert len(made) == 1
     assert first["root"]["extras"]["psnr_worst_db"] <= first["root"]["extras"]["psnr_db"]
     assert first["root"]["geometricError"] > 0
-    write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: before_it(16, seed=1), levels=QUICK)
+    write_tilesets(tmp_path, tiles, cameras=lambda component: before_it(16, seed=1), levels=QUICK)
     again = json.loads(file.read_text())
     assert again["root"]["extras"] == first["root"]["extras"]
     assert again["root"]["geometricError"] == first["root"]["geometricError"]
     assert len(made) == 1
-    write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: None, levels=replace(QUICK, steps=61))
+    write_tilesets(tmp_path, tiles, cameras=lambda component: None, levels=replace(QUICK, steps=61))
     assert len(made) == 2
     assert "extras" not in json.loads(file.read_text())["root"]
     # Levels that a GPU fitted are others, and do not stand for those of the CPU.
     monkeypatch.setattr("gsmap.export.pyramid.backend", lambda: "gsplat")
-    write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: None, levels=replace(QUICK, steps=61))
+    write_tilesets(tmp_path, tiles, cameras=lambda component: None, levels=replace(QUICK, steps=61))
     assert len(made) == 3
 
 
@@ -187,7 +187,7 @@ def test_a_tile_that_did_not_change_is_not_read_again_to_tell_its_box(tmp_path, 
     (tmp_path / "tiles.json").write_text("{}")
     tiles = []
     for i in range(8):
-        path = f"component_0/{i}.glb"
+        path = f"component_0/tile_{i:+04d}_+000_+000.glb"
         tiles3d.write_content(tmp_path / path, g[i::8])
         bounds = np.array([[i, 0, 0], [i + 1, 1, 1]], float)
         tiles.append(Tile(f"k{i}", 0, bounds, {"0" * 32: Sim3.identity()}, 50, {}, False, path, f"digest {i}", ()))
@@ -197,7 +197,7 @@ def test_a_tile_that_did_not_change_is_not_read_again_to_tell_its_box(tmp_path, 
 
     def boxes() -> dict[str, np.ndarray]:
         """Of the tiles, by name, in a tree written over them."""
-        (file,) = write_tilesets(tmp_path, tiles, 1.0, levels=replace(QUICK, views=0))
+        (file,) = write_tilesets(tmp_path, tiles, levels=replace(QUICK, views=0))
         todo, found = [json.loads(file.read_text())["root"]], {}
         while todo:
             node = todo.pop()
@@ -206,7 +206,7 @@ def test_a_tile_that_did_not_change_is_not_read_again_to_tell_its_box(tmp_path, 
         return {name: box for name, box in found.items() if "/" not in name}
 
     first = boxes()
-    assert set(first) == {f"{i}.glb" for i in range(8)} <= set(read)
+    assert set(first) == {f"tile_{i:+04d}_+000_+000.glb" for i in range(8)} <= set(read)
     assert len(read) == len(set(read))
     moved = replace(g[7::8], means=g[7::8].means + np.float32(2))
     tiles3d.write_content(tmp_path / tiles[7].path, moved)
@@ -214,7 +214,7 @@ def test_a_tile_that_did_not_change_is_not_read_again_to_tell_its_box(tmp_path, 
     read.clear()
     second = boxes()
     # It, its neighbour, and the levels above: of three.
-    assert {name for name in read if len(name) < 8} == {"6.glb", "7.glb"}
-    np.testing.assert_allclose(second["7.glb"][:3], first["7.glb"][:3] + 2, atol=1e-3)
+    assert {name for name in read if name.startswith("tile_")} == {tiles[6].path[12:], tiles[7].path[12:]}
+    np.testing.assert_allclose(second[tiles[7].path[12:]][:3], first[tiles[7].path[12:]][:3] + 2, atol=1e-3)
     for i in range(7):
-        np.testing.assert_allclose(second[f"{i}.glb"], first[f"{i}.glb"], atol=1e-9)
+        np.testing.assert_allclose(second[tiles[i].path[12:]], first[tiles[i].path[12:]], atol=1e-9)

@@ -6,6 +6,7 @@ from raising import raises
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.export import TileRecipe, dirty_reason, plan_tiles
+from gsmap.export import plan as planning
 from gsmap.export.cells import OrientedBoxes
 from gsmap.geometry.rotations import exp_so3
 from gsmap.merge import recipe_key
@@ -203,3 +204,64 @@ def test_a_tile_of_a_map_in_metres_is_named_as_it_always_was():
     (planned,) = plan_tiles({"a": at(0)}, {"a": BOX}, tile_size_m=0, metres_per_unit={0: 1.0})
     inputs = ["export 1", "format ply", "provenance False", "budget_s None", "component 0"]
     assert VOXEL.key(planned) == VOXEL.merge.of(*inputs, "extent [0, null, null]", "scene a").digest
+
+
+# --- automatic sizes -------------------------------------------------------------------------------------------------
+
+
+def test_a_component_that_viewers_load_at_once_is_one_tile_and_a_larger_one_is_not():
+    poses = {"a": at(0), "b": at(1.0), "c": at(0), "d": at(22.0)}
+    sizes = {"a": 700_000, "b": planning.MAX_WHOLE_GAUSSIANS - 700_000, "c": 1_000_000, "d": 500_001}
+    components = {"a": 0, "b": 0, "c": 1, "d": 1}
+    tiles = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=None, num_gaussians=sizes, components=components)
+    assert [(t.name, t.is_cut, t.num_input) for t in tiles if t.component == 0] == [
+        ("map", False, pytest.approx(planning.MAX_WHOLE_GAUSSIANS))
+    ]
+    cut = {t.name: t for t in tiles if t.component == 1}
+    # A storey, or a house, around the origin is in one tile: cells are centred on it.
+    assert set(cut) == {"tile_+000_+000_+000", "tile_+002_+000_+000"}
+    np.testing.assert_allclose(cut["tile_+000_+000_+000"].bounds, [[-5] * 3, [5] * 3])
+    assert {name: round(t.num_input) for name, t in cut.items()} == {
+        "tile_+000_+000_+000": 1_000_000,
+        "tile_+002_+000_+000": 500_001,
+    }
+    asked = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=10.0, components=components)
+    assert not {t.extent for t in asked} & {t.extent for t in tiles}
+
+
+def test_centred_tiles_cover_every_point_exactly_once():
+    rng = np.random.default_rng(1)
+    poses = {f"s{i}": at(*rng.uniform(-30, 30, 3), turn_rad=rng.uniform(0, 6), scale=1.5) for i in range(4)}
+    sizes = dict.fromkeys(poses, planning.MAX_WHOLE_GAUSSIANS)
+    tiles = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=None, num_gaussians=sizes)
+    assert len(tiles) > 3
+    for pose in poses.values():
+        points = pose.apply(rng.uniform(-1, 1, (500, 3)))
+        holds = [((points >= t.bounds[0]) & (points < t.bounds[1])).all(1) for t in tiles]
+        np.testing.assert_array_equal(np.sum(holds, axis=0), 1)
+    assert sum(t.num_input for t in tiles) == pytest.approx(sum(sizes.values()), rel=0.01)
+
+
+# --- axes ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("format", "up"), [("ply", "z"), ("3dtiles", "z"), ("streamed-sog", "z"), ("spz", "y"), ("glb", "y"), ("sog", "y")]
+)
+def test_the_vertical_axis_is_that_of_the_format(format, up):
+    assert TileRecipe(recipe_key("union"), format, up=None).up == up
+
+
+def test_another_axis_is_another_file_of_the_same_merge():
+    (planned,) = plan_tiles({"a": at(0)}, {"a": BOX}, tile_size_m=0)
+    recipes = [TileRecipe(recipe_key("union"), format, up=up) for format in ("ply", "spz") for up in ("y", "z")]
+    assert len({recipe.key(planned) for recipe in recipes}) == 4
+    assert len({recipe.merge_key(planned) for recipe in recipes}) == 1
+    (moved,) = plan_tiles({"a": at(1e-6)}, {"a": BOX}, tile_size_m=0)
+    assert moved.extent == planned.extent
+    assert recipes[0].merge_key(moved) != recipes[0].merge_key(planned)
+    assert recipes[0].key(moved) == recipes[0].key(planned)
+    with raises(ConfigError, code="unsupported_output"):
+        TileRecipe(recipe_key("union"), "3dtiles", up="y")
+    with raises(ConfigError, code="invalid_choice"):
+        TileRecipe(recipe_key("union"), "spz", up="x")

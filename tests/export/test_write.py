@@ -56,7 +56,7 @@ class Street:
             sources = [LazyScene(s, pose, lambda box, s=s: self.scenes[s]) for s, pose in planned.poses.items()]
             return merge_tile(sources, method, bounds=planned.bounds, progress=progress)
 
-        recipe = TileRecipe(recipe_key(method), format)
+        recipe = TileRecipe(recipe_key(method), format, up=options.pop("up", "z"))
         return export_tiles(plan, make, self.out, map_id=map_id, recipe=recipe, **options)
 
     def files(self):
@@ -223,3 +223,37 @@ def test_bad_options_are_refused_before_anything_is_written(street):
     (street.out.parent / "file").write_text("mine")
     with raises(StoreError, code="store"):
         Street(street.out.parent / "file" / "out").export()
+
+
+def test_files_for_viewers_have_the_map_s_up_where_trained_splats_have_it(street):
+    """Minus y, as `gsmap.formats` reads every format: y down in .ply, y up in .spz."""
+    z = street.export(method="union", up="z", tile_size_m=0)
+    straight = formats.read(street.out / z.tiles[0].path)
+    assert "up" not in json.loads((street.out / "tiles.json").read_text())["tiles"][0]
+    y = street.export(method="union", up="y", tile_size_m=0)
+    assert (y.recomputed, y.tiles[0].up) == (1, "y")
+    turned = formats.read(street.out / y.tiles[0].path)
+    np.testing.assert_array_equal(turned.means, straight.means[:, [0, 2, 1]] * [1, -1, 1])
+    (entry,) = json.loads((street.out / "tiles.json").read_text())["tiles"]
+    assert entry["up"] == "y"
+    np.testing.assert_array_equal(entry["bounds"], z.tiles[0].bounds)
+    assert street.export(method="union", up="y", tile_size_m=0).recomputed == 0
+
+
+def test_progress_counts_gaussians_rather_than_cells(street):
+    """Empty cells of a grid take no time, and a tile that is half done counts half."""
+    seen = []
+    street.export(method="union", progress=lambda fraction, text: seen.append(fraction))
+    assert seen == sorted(seen)
+    assert seen[-1] == pytest.approx(1.0)
+    from gsmap.export.write import _ProgressReport
+
+    said = []
+    report = _ProgressReport(lambda fraction, text: said.append((round(fraction, 3), text)), [0, 999, 1000])
+    report.tile_done(0)
+    report.within_tile(2, 0.5, "optimizing")
+    report.tile_done(1)
+    report.within_tile(2, 0.1, "late")  # never back
+    report.tile_done(2)
+    assert [fraction for fraction, _ in said] == [0.001, 0.243, 0.743, 0.743, 1.0]
+    assert said[1][1] == "tile 2 of at most 3: optimizing"

@@ -20,8 +20,8 @@ from gsmap.types import Change, ChangeReport, Gaussians
 from tools.make.tiny_encoder import image_encoder
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
-EXPORT = "export MAP OUT --merge union --tile-size 3"
-EXPORT_3DTILES = f"{EXPORT} --format 3dtiles"
+EXPORT = "export MAP OUT --format ply --merge union --tile-size 3"
+EXPORT_3DTILES = EXPORT.replace("ply", "3dtiles")
 
 
 @dataclass(frozen=True)

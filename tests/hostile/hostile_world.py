@@ -100,7 +100,7 @@ def make_world(root: Path) -> None:
         report, key = ChangeReport((chair,), 1.0, np.ones(3), ("dark",)), recipe_key(m.settings.change).of(a.id, b.id)
         m.store.changes.save(report, key, older=a.id, newer=b.id, S_newer_older=pose, S_frame_newer=pose)
         m.confirm("c1", "seen")
-        m.export(root / "tiles", merge="union", tile_size_m=0)
+        m.export(root / "tiles", format="ply", merge="union", tile_size_m=0)
     (root / "captures").mkdir()
     formats.write(root / "captures" / "c.ply", make_gaussians(5))
     home = root / "home"

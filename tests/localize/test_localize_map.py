@@ -20,7 +20,7 @@ from raising import raises
 import gsmap.map
 from gsmap.cli.app import run
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, ReadOnlyError, StoreError
-from gsmap.localize import Lens, index_recipe, read_photo
+from gsmap.localize import Lens, index_recipe, photo_in_memory, read_photo
 from gsmap.map.page_source import view_of
 from gsmap.map.settings import settings_of
 from gsmap.map.small_map import SmallLocalizer
@@ -54,6 +54,49 @@ def test_a_photo_in_a_file_is_placed(made, world) -> None:
     truth = S_map_scene @ world.S_world_scene.inverse() @ Sim3.from_matrix(world.poses[1])
     assert np.linalg.norm(row.T_map_camera[:3, 3] - truth.translation) < 0.05
     assert row.to_json()["S_map_scan"] is None
+
+
+def test_photos_in_memory_are_placed_like_files(made, world) -> None:
+    """The same pixels, as an array of bytes or floats or as a PIL image, beside a file: the same pose, in order."""
+    folder, lens, report = made
+    rgb = world.photos[1].rgb
+    given = [rgb, Image.fromarray(rgb), folder / "photo.png", rgb.astype(np.float32) / 255]
+    numbers = [float(value) for value in lens.split(",")]
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        rows = m.localize(*given, intrinsics=numbers).results
+        with raises(ConfigError, code="option_not_applicable"):
+            m.localize(rgb, masks=folder)
+    assert [row.file for row in rows] == ["photo_0", "photo_1", str(folder / "photo.png"), "photo_3"]
+    for row in rows:
+        np.testing.assert_array_equal(row.T_map_camera, report.results[0].T_map_camera)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "code"),
+    [
+        (np.zeros((4, 5, 2), np.uint8), "shape_mismatch"),
+        (np.zeros((0, 5, 3), np.uint8), "shape_mismatch"),
+        (np.full((4, 5, 3), 200.0), "out_of_range"),
+        (np.full((4, 5, 3), np.nan), "out_of_range"),
+        (np.zeros((4, 5, 3), np.int64), "wrong_type"),
+        ("a name", "shape_mismatch"),
+    ],
+)
+def test_what_is_no_image_in_memory_is_refused(pixels, code) -> None:
+    with raises(InputError, code=code):
+        photo_in_memory(pixels)
+
+
+def test_images_in_memory_are_rgb_and_upright() -> None:
+    grey = np.arange(20, dtype=np.uint8).reshape(4, 5)
+    np.testing.assert_array_equal(photo_in_memory(grey).rgb, np.repeat(grey[..., None], 3, axis=2))
+    with_alpha = np.dstack([np.full((4, 5, 3), 7, np.uint8), np.zeros((4, 5), np.uint8)])
+    assert (photo_in_memory(with_alpha).rgb == 7).all()
+    turned = Image.fromarray(np.dstack([grey] * 3))
+    turned.getexif()[0x0112] = 6  # to be turned clockwise
+    photo = photo_in_memory(turned)
+    np.testing.assert_array_equal(photo.rgb[..., 0], np.rot90(grey, -1))
+    assert turned.size == (5, 4)  # the caller's is as it was
 
 
 def test_features_are_made_once(made, monkeypatch) -> None:
@@ -147,9 +190,9 @@ def test_changes_are_told_and_drawn(copy, capsys) -> None:
         with Image.open(row.picture) as picture:
             assert picture.format == "PNG"
         assert m.photo_rows() == []
-        with raises(ConfigError, code="missing_option", match="--changes"):
+        with raises(ConfigError, code="missing_option", match="changes="):
             m.localize(folder / "changed.jpg", pictures=folder / "drawn")
-        with raises(ConfigError, code="missing_option", match="--add"):
+        with raises(ConfigError, code="missing_option", match="add="):
             m.localize(folder / "changed.jpg", captured_at="2026-01-01")
     with pytest.raises(SystemExit) as ended:
         run(["-q", "localize", str(folder / "c.gsmap"), str(folder / "changed.jpg"), "--intrinsics", lens, "--changes"])

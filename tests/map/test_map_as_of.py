@@ -50,7 +50,7 @@ def took_part(report: ExportReport) -> set[str]:
 
 def test_only_what_was_captured_by_then_takes_part(site: Map, tmp_path: Path) -> None:
     def export(as_of: str) -> ExportReport:
-        return site.export(tmp_path / "out", tile_size_m=0, merge="union", as_of=as_of)
+        return site.export(tmp_path / "out", format="ply", tile_size_m=0, merge="union", as_of=as_of)
 
     first = export("2026-06-29")
     assert (took_part(first), first.tiles[0].num_gaussians) == ({"may"}, 60)
@@ -64,12 +64,12 @@ def test_only_what_was_captured_by_then_takes_part(site: Map, tmp_path: Path) ->
         export("2026-05-31T14:59:59")
     with raises(ConfigError, code="invalid_date"):
         export("then")
-    everything = site.export(tmp_path / "out", tile_size_m=0, merge="union")
+    everything = site.export(tmp_path / "out", format="ply", tile_size_m=0, merge="union")
     assert (took_part(everything), everything.notes) == (set(DATES), ())
 
 
 def test_a_corrected_date_makes_tiles_of_the_past_again(site: Map, tmp_path: Path) -> None:
-    options = {"tile_size_m": 0, "merge": "tto", "as_of": "2026-06-30"}
+    options = {"format": "ply", "tile_size_m": 0, "merge": "tto", "as_of": "2026-06-30"}
     site.export(tmp_path / "out", **options)
     assert site.export(tmp_path / "out", **options).recomputed == 0
     site.edit("may", captured_at="2026-06-30T12:00")  # now the newer of the two
@@ -85,7 +85,7 @@ def test_a_corrected_date_makes_tiles_of_the_past_again(site: Map, tmp_path: Pat
 
 def test_whom_to_believe_is_part_of_how_a_tile_is_made(site: Map, tmp_path: Path) -> None:
     def export(**options: str) -> int:
-        return site.export(tmp_path / "out", tile_size_m=0, **options).recomputed
+        return site.export(tmp_path / "out", format="ply", tile_size_m=0, **options).recomputed
 
     assert export() == 1
     assert export(prefer="newest") == 0
@@ -95,14 +95,14 @@ def test_whom_to_believe_is_part_of_how_a_tile_is_made(site: Map, tmp_path: Path
     site.edit("may", captured_at="2026-08-01")
     assert export(prefer="both") == 0  # nobody wins, whatever the dates
     assert export() == 1
-    with raises(ConfigError, code="option_not_applicable", match="--prefer"):
+    with raises(ConfigError, code="option_not_applicable", match="prefer="):
         export(merge="distance", prefer="newest")
     with raises(ConfigError, code="invalid_choice", match="--prefer must be one of newest, best, both, got 'oldest'"):
         export(prefer="oldest")
 
 
 def test_remarks_on_how_a_tile_was_made_are_kept_and_told(site: Map, tmp_path: Path) -> None:
-    report = site.export(tmp_path / "out", tile_size_m=0)
+    report = site.export(tmp_path / "out", format="ply", tile_size_m=0)
     (tile,) = report.tiles
     assert any("1 of 4 captures have no date" in note for note in tile.notes)
     (kept,) = json.loads((tmp_path / "out" / "tiles.json").read_text())["tiles"]

@@ -207,5 +207,5 @@ def test_a_map_that_a_prior_puts_at_map_coordinates_is_not_exported_rounded(
         m.set_prior(Prior(row.id, Sim3(np.eye(3), LV95), np.array([np.inf] * 3 + [0.01] * 3 + [np.inf])))
         m.optimize()
         with raises(InputError, code="precision_loss") as refused:
-            m.export(tmp_path / "out", tile_size_m=0)
+            m.export(tmp_path / "out", format="ply", tile_size_m=0)
         assert "2683000" in str(refused.value)

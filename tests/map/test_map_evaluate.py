@@ -81,7 +81,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 {(ids["a"], ids["b"]): EdgeOutcome("used"), (ids["b"], ids["far"]): EdgeOutcome("used")},
             )
         )
-        m.export(root / "tiles", tile_size_m=2.0, merge="voxel")
+        m.export(root / "tiles", format="ply", tile_size_m=2.0, merge="voxel")
         content = Gaussians.concatenate([gsmap.read(p) for p in sorted((root / "tiles").rglob("*.ply"))])
         for name in WALLS:
             gaussians, cameras = m.read(name, frame="map")
@@ -197,7 +197,7 @@ def test_tiles_of_other_axes_are_turned_back(copy: Path, format: str) -> None:
 def test_an_export_of_a_part_says_that_it_is_one(copy: Path) -> None:
     with gsmap.open(copy / "site.gsmap") as m:
         box = np.concatenate([S_MAP_WORLD.apply(np.zeros(3)) - 0.3, S_MAP_WORLD.apply(np.zeros(3)) + 0.3])
-        m.export(copy / "part", tile_size_m=0, merge="union", bbox=box)
+        m.export(copy / "part", format="ply", tile_size_m=0, merge="union", bbox=box)
         rows = {row.scene_name: row for row in m.evaluate(copy / "truth", copy / "images", tiles=copy / "part").images}
     assert 0.01 < rows["a"].tiles_cover < 0.5
     assert rows["far"].tiles_psnr_db is None

@@ -90,7 +90,7 @@ def sighting(m: Map, number: int, name: str, pose: np.ndarray, when: str | None)
 
 
 def export(m: Map, out: Path, **options) -> ExportReport:
-    return m.export(out, **{"tile_size_m": 0, "merge": "tto"} | options)
+    return m.export(out, **{"format": "ply", "tile_size_m": 0, "merge": "tto"} | options)
 
 
 def reproduced(report: ExportReport) -> int:

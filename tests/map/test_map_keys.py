@@ -154,7 +154,7 @@ def test_other_settings_make_other_graphs_and_edges_and_going_back_adopts_the_fi
     assert watched.graph_keys() == graphs
     assert watched.edge_key() == edge
     np.testing.assert_array_equal(watched.edge().S_target_source.matrix(), pose)
-    assert watched.todo().keys() <= {"tentative"}
+    assert watched.todo().keys() <= {"tentative", "one_pair"}
 
 
 def test_settings_of_register_leave_the_graphs(watched: Watched) -> None:
@@ -229,16 +229,16 @@ def test_another_date_of_a_capture_makes_again_what_depends_on_dates(watched: Wa
     m = watched.map
     m.with_settings({"merge.mergers.tto.steps": 1})
     for merge in ("tto", "voxel"):
-        assert m.export(tmp_path / merge, tile_size_m=0, merge=merge).recomputed == 1
+        assert m.export(tmp_path / merge, format="ply", tile_size_m=0, merge=merge).recomputed == 1
     assert "dirty_tiles" not in watched.todo()
     m.edit("capture_a", captured_at="2024-05-31")
     assert watched.todo()["dirty_tiles"] == 1
     assert [row.verb for row in m.status().todo if row.what == "dirty_tiles"] == [
-        f"gsmap export {m.store.folder} {tmp_path / 'tto'} --tile-size 0 --merge tto"
+        f"gsmap export {m.store.folder} {tmp_path / 'tto'} --format ply --tile-size 0 --merge tto"
     ]
     m.edit("capture_a", name="hall", tags=["spring"])
     assert watched.todo()["dirty_tiles"] == 1
-    made = {merge: m.export(tmp_path / merge, tile_size_m=0, merge=merge) for merge in ("tto", "voxel")}
+    made = {merge: m.export(tmp_path / merge, format="ply", tile_size_m=0, merge=merge) for merge in ("tto", "voxel")}
     assert {merge: (row.recomputed, row.reused) for merge, row in made.items()} == {"tto": (1, 0), "voxel": (0, 1)}
     assert "dirty_tiles" not in watched.todo()
 

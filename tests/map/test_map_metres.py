@@ -75,7 +75,7 @@ def made(captures: list[DemoCapture], tmp_path: Path) -> Iterator[Made]:
 
 def exported(m: Map, out: Path, **options: object) -> tuple[Gaussians, list[np.ndarray]]:
     """What an export holds, in metres, and the bounds of its tiles."""
-    result = m.with_settings(QUICK).export(out, **options)  # type: ignore[arg-type]
+    result = m.with_settings(QUICK).export(out, **{"format": "ply"} | options)  # type: ignore[arg-type]
     metres = next(iter(m.metres().values())).metres_per_unit
     parts = [formats.read(out / tile.path) for tile in result.tiles if tile.path]
     return scale_gaussians(Gaussians.concatenate(parts), metres), [tile.bounds * metres for tile in result.tiles]
@@ -99,7 +99,7 @@ def test_an_export_is_the_same_whatever_the_unit(made: Made, tmp_path: Path, mer
 def test_gaussians_of_a_tile_lie_in_it_in_the_unit_of_the_map(made: Made, tmp_path: Path) -> None:
     m = made((UNIT, UNIT))
     m.edit("capture_a", metres_per_unit=UNIT)
-    for tile in m.export(tmp_path / "out", merge="union", tile_size_m=1.5).tiles:
+    for tile in m.export(tmp_path / "out", format="ply", merge="union", tile_size_m=1.5).tiles:
         if tile.path:
             means = formats.read(tmp_path / "out" / tile.path).means
             assert (means >= tile.bounds[0]).all()
@@ -127,14 +127,16 @@ def test_components_have_a_metre_each(made: Made) -> None:
 def test_it_is_told_everywhere_and_may_be_taken_back(made: Made, tmp_path: Path) -> None:
     m = made((UNIT, UNIT))
     assert m.status().metres_per_unit is None
-    assert any("its metric scale is unknown" in note for note in m.export(tmp_path / "out", merge="union").notes)
+    assert any(
+        "its metric scale is unknown" in note for note in m.export(tmp_path / "out", format="ply", merge="union").notes
+    )
     m.edit("capture_a", metres_per_unit=UNIT)
     status, shown = m.status(), m.show_scene("capture_b")
     assert status.metres_per_unit == pytest.approx(UNIT)
     assert [(row.component, row.metre_known_by) for row in status.metres] == [(0, "told")]
     assert (shown.metres_per_unit, shown.metre_known_by) == (pytest.approx(UNIT), "told")
     assert [fact.value for fact in m.show_scene("capture_a").history if fact.fact == "metres_per_unit"] == ["0.3"]
-    result = m.export(tmp_path / "out", merge="union")
+    result = m.export(tmp_path / "out", format="ply", merge="union")
     assert result.notes == ()
     written = json.loads((tmp_path / "out" / "tiles.json").read_text())
     (component,) = written["components"]
@@ -167,21 +169,21 @@ def test_another_metre_makes_tiles_again_and_the_same_does_not(made: Made, tmp_p
     m = made((UNIT, UNIT))
     m.edit("capture_a", metres_per_unit=UNIT)
     out = tmp_path / "out"
-    first = m.export(out, merge="voxel", tile_size_m=0)
-    assert m.export(out, merge="voxel", tile_size_m=0).recomputed == 0
+    first = m.export(out, format="ply", merge="voxel", tile_size_m=0)
+    assert m.export(out, format="ply", merge="voxel", tile_size_m=0).recomputed == 0
     m.edit("capture_a", metres_per_unit=2 * UNIT)
     assert [row.what for row in m.status().todo if row.what == "dirty_tiles"] == ["dirty_tiles"]
-    again = m.export(out, merge="voxel", tile_size_m=0)
+    again = m.export(out, format="ply", merge="voxel", tile_size_m=0)
     assert again.recomputed == 1
     assert again.tiles[0].num_gaussians > first.tiles[0].num_gaussians  # the same voxel is half as long in the map
 
 
 def test_a_tile_of_a_map_in_metres_has_the_key_it_always_had(made: Made, tmp_path: Path) -> None:
     m = made((1.0, 1.0))
-    first = m.export(tmp_path / "out", merge="voxel", tile_size_m=0)
+    first = m.export(tmp_path / "out", format="ply", merge="voxel", tile_size_m=0)
     assert m.metres()[0].known_by == "unknown"
     m.edit("capture_a", metres_per_unit=1.0)
-    again = m.export(tmp_path / "out", merge="voxel", tile_size_m=0)
+    again = m.export(tmp_path / "out", format="ply", merge="voxel", tile_size_m=0)
     assert (first.recomputed, again.recomputed) == (1, 0)
     # What the folder says of the metre is of today all the same.
     assert json.loads((tmp_path / "out" / "tiles.json").read_text())["components"][0]["metre_known_by"] == "told"

@@ -440,7 +440,7 @@ PLACES = {
 
 def exported(m: Map, out: Path, **options: object) -> dict[str, int]:
     """How many Gaussians an export has in each of the places."""
-    m.export(out, merge="union", tile_size_m=0, **options)
+    m.export(out, format="ply", merge="union", tile_size_m=0, **options)
     means = formats.read(out / "component_0" / "map.ply").means
     return {name: num_near(means, *box) for name, box in PLACES.items()}
 
@@ -451,10 +451,12 @@ def test_static_leaves_out_what_came_and_went_and_keeps_the_rest(site: Map, tmp_
     assert whole["table"] > 200
     assert static["table"] < 0.02 * whole["table"]
     assert static["stool"] < 0.02 * whole["stool"]
-    report = site.export(tmp_path / "static", merge="union", tile_size_m=0, static=True)
+    report = site.export(tmp_path / "static", format="ply", merge="union", tile_size_m=0, static=True)
     assert report.reused == 1, "nothing changed since"
     assert any("2 of 3 objects are left out" in note for note in report.notes)
-    assert site.export(tmp_path / "static", merge="union", tile_size_m=0).recomputed == 1, "another content"
+    assert site.export(tmp_path / "static", format="ply", merge="union", tile_size_m=0).recomputed == 1, (
+        "another content"
+    )
 
 
 @pytest.mark.parametrize(

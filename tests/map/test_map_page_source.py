@@ -325,10 +325,10 @@ def test_a_map_that_is_read_only_is_shown_and_exported(
         assert m.setting_rows()
         m.write_poses(tmp_path / "poses.json", "json")
         caplog.set_level("WARNING", logger="gsmap.export")
-        made = m.export(tmp_path / "out", merge="union", tile_size_m=0)
+        made = m.export(tmp_path / "out", format="ply", merge="union", tile_size_m=0)
         assert made.recomputed == 1
         assert "read-only" in caplog.text
-        assert m.export(tmp_path / "out", merge="union", tile_size_m=0).reused == 1
+        assert m.export(tmp_path / "out", format="ply", merge="union", tile_size_m=0).reused == 1
         with raises(StoreError, code="not_writable"):
             m.remove("hall")
     assert site.tile_rows() == []
@@ -403,7 +403,7 @@ def test_what_cannot_be_asked_for_changes_nothing(
         site.prune(-1)
     assert site.revision_rows()[-1].dropped_at is None
     with raises(ConfigError, code="too_many_tiles"):
-        site.export(tmp_path / "out", tile_size_m=1e-300)
+        site.export(tmp_path / "out", format="ply", tile_size_m=1e-300)
     choices = r"'doc': choose one of compressed\.ply, glb, ply, .*sog, splat, .*3dtiles, streamed-sog"
     with raises(ConfigError, code="unsupported_output", match=choices):
         site.export(tmp_path / "out", format="doc")

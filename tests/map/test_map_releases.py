@@ -131,7 +131,7 @@ def test_its_branches_and_tags_open(site: Path) -> None:
 
 
 def test_it_is_exported_edited_and_updated(opened: Map, tmp_path: Path) -> None:
-    first = opened.export(tmp_path / "tiles", tile_size_m=0, merge="voxel")
+    first = opened.export(tmp_path / "tiles", format="ply", tile_size_m=0, merge="voxel")
     assert sum(tile.num_gaussians for tile in first.tiles) > 0
     names = [row.name for row in opened.scene_rows()]
     opened.edit(names[0], note="seen again", tags=["later"])
@@ -143,7 +143,7 @@ def test_it_is_exported_edited_and_updated(opened: Map, tmp_path: Path) -> None:
     assert len(opened.scene_rows()) == len(names) + 1
     todo = {row.what for row in opened.status().todo}
     assert not todo & {"undescribed", "stale_graphs", "stale_edges", "unsolved", "stale_poses"}
-    opened.export(tmp_path / "tiles", tile_size_m=0, merge="voxel")
+    opened.export(tmp_path / "tiles", format="ply", tile_size_m=0, merge="voxel")
     opened.remove("newcomer")
     opened.prune(keep_revisions=1)
     assert opened.check().problems == ()

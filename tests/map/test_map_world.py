@@ -194,7 +194,7 @@ def test_bad_input_changes_nothing(site: Site, tmp_path: Path) -> None:
             (file("EPSG:999999", lines[1]), ConfigError, "invalid_crs", "EPSG:999999"),
             (file("EPSG:25832+7837", lines[1]), ConfigError, "grid_missing", "needs the grid"),
             (Request(crs="EPSG:25832"), InputError, "not_georeferenced", "EPSG:25832"),
-            (Request(), ConfigError, "nothing_requested", "--gcp"),
+            (Request(), ConfigError, "nothing_requested", "gcp="),
             (Request(check=["P9"]), NotFoundError, "observation_not_found", "'P9'"),
             (Request(bars=[("0,0,0", "site-000:0,0,0", 2.0)]), ConfigError, "moving_frame", "'0,0,0'"),
             (Request(bars=[("site-000:0,0,0", "site-000:1,0,0", -2.0)]), ConfigError, "invalid_observation", "-2"),

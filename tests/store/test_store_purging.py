@@ -217,8 +217,8 @@ def test_tiles_made_with_it_go(place, tmp_path):
     out, gone, foreign = (tmp_path / n for n in ("out", "gone", "foreign"))
     with gsmap.map.open(place) as m:
         for target in (out, gone):
-            m.export(target, tile_size_m=0, merge="union")
-        m.export(foreign, tile_size_m=0, merge="union")
+            m.export(target, format="ply", tile_size_m=0, merge="union")
+        m.export(foreign, format="ply", tile_size_m=0, merge="union")
         shutil.rmtree(gone)
         text = json.loads((foreign / "tiles.json").read_text())
         (foreign / "tiles.json").write_text(json.dumps({**text, "map_id": "0" * 32}))
@@ -236,7 +236,7 @@ def test_tiles_made_with_it_go(place, tmp_path):
         assert json.loads((out / "tiles.json").read_text())["tiles"] == []
         assert sorted(foreign.rglob("*")) == kept
         assert finds(out, NAME, report.scene_id) == []
-        m.export(out, tile_size_m=0, merge="union")
+        m.export(out, format="ply", tile_size_m=0, merge="union")
         assert len(list(out.rglob("*.ply"))) == 1
 
 
@@ -244,7 +244,7 @@ def test_tiles_made_with_it_go(place, tmp_path):
 def test_a_folder_whose_disk_failed_is_cleaned_by_the_same_command(place, tmp_path, monkeypatch, code):
     make(place)
     with gsmap.map.open(place) as m:
-        m.export(tmp_path / "out", tile_size_m=0, merge="union")
+        m.export(tmp_path / "out", format="ply", tile_size_m=0, merge="union")
         failing = [OSError(code, os.strerror(code))]
         remove = purge.remove_file
 
@@ -267,7 +267,7 @@ def test_a_tile_outside_the_folder_stays(place, tmp_path):
     victim = tmp_path / "component_0" / "precious.ply"
     victim.write_bytes(b"precious")
     with gsmap.map.open(place) as m:
-        m.export(tmp_path / "out", tile_size_m=0, merge="union")
+        m.export(tmp_path / "out", format="ply", tile_size_m=0, merge="union")
         file = tmp_path / "out" / "tiles.json"
         for odd in ("../component_0/precious.ply", str(victim)):
             text = json.loads(file.read_text())
@@ -321,7 +321,7 @@ def _die_at(path, step, pipe):
 def test_killed_anywhere_the_same_command_finishes(tmp_path, start, stride):
     secret = make(tmp_path / "first.gsmap")
     with gsmap.map.open(tmp_path / "first.gsmap") as m:
-        m.export(tmp_path / "tiles", tile_size_m=0, merge="union")
+        m.export(tmp_path / "tiles", format="ply", tile_size_m=0, merge="union")
     deaths = 0
     for step in range(1, 1000, stride):
         path = tmp_path / "site.gsmap"
@@ -421,7 +421,7 @@ def test_files_that_an_export_had_still_to_delete_go(place, tmp_path):
     secret = make(place)
     out = tmp_path / "out"
     with gsmap.map.open(place) as m:
-        m.export(out, tile_size_m=0, merge="union")
+        m.export(out, format="ply", tile_size_m=0, merge="union")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("gsmap.export.write._remove_doomed", lambda *a: None)
             m.remove(secret)

@@ -78,7 +78,7 @@ def tree(count: int, params: Params) -> None:
         tiles, cameras = [], []
         for i, (x, y) in enumerate((x, y) for x in range(side) for y in range(side)):
             g = room(i, count // side**2, np.array([10.0 * x, 10.0 * y, 0]))
-            path = f"component_0/{x}_{y}.glb"
+            path = f"component_0/tile_{x:+04d}_{y:+04d}_+000.glb"
             tiles3d.write_content(out / path, g)
             low = np.array([10.0 * x, 10.0 * y, -1])
             bounds = np.stack([low, low + 10])
@@ -91,7 +91,7 @@ def tree(count: int, params: Params) -> None:
         all_cameras = Cameras(poses, intrinsics, np.tile([320, 240], (len(poses), 1)))
         print(f"{count:,} Gaussians in {len(tiles)} tiles, {len(poses)} cameras", flush=True)
         before = cpu_s()
-        (file,) = write_tilesets(out, tiles, 10.0, cameras=lambda component: all_cameras, levels=params)
+        (file,) = write_tilesets(out, tiles, cameras=lambda component: all_cameras, levels=params)
         took = cpu_s() - before
         levels = [json.loads(file.read_text())["root"]]
         for node in levels:

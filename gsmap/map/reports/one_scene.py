@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from gsmap.map.reports.one_pair import scenes_by_one_pair
 from gsmap.map.reports.pairs import edges_of_scene
-from gsmap.map.reports.scenes import row_of_scene
+from gsmap.map.reports.scenes import any_tentative, row_of_scene
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
@@ -38,7 +39,16 @@ def scene_report(
     metre = (metres or {}).get(pose.component, MetricScale()) if pose else None
     noted = next((fact.value for fact in reversed(facts) if fact.kind == "note"), "")
     return SceneReport(
-        **vars(row_of_scene(scene, placed, graph.num_nodes if graph else None, noted, metres)),
+        **vars(
+            row_of_scene(
+                scene,
+                placed,
+                graph.num_nodes if graph else None,
+                noted,
+                metres,
+                one_pair=any_tentative(placed) and scene.id in scenes_by_one_pair(store),
+            )
+        ),
         origin=scene.source,
         sh_degree=scene.sh_degree,
         num_cameras=scene.num_cameras,

@@ -7,7 +7,8 @@ from typing import Any
 
 from gsmap.map.date_filter import is_after, parse_moment
 from gsmap.map.reports.common import names, one_of
-from gsmap.map.reports.scenes import scene_rows
+from gsmap.map.reports.one_pair import ONE_PAIR
+from gsmap.map.reports.scenes import scene_rows, spelled
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.reason_codes import reason, reason_code
 from gsmap.store import Store
@@ -20,8 +21,10 @@ _FEW = 1000  # scenes that one query names; beyond, all outcomes are read
 EDGE_STATUSES = ("accepted", "rejected", "no_match")
 EDGE_USES: Mapping[str, Callable[[EdgeRow], bool]] = {
     "used": lambda row: row.used is True,
-    "tentative": lambda row: row.used == "tentative",
+    ONE_PAIR: lambda row: row.use == ONE_PAIR,
+    "tentative": lambda row: row.used == "tentative",  # as JSON has it: those of one pair, too
     "undecided": lambda row: row.undecided,
+    "unused": lambda row: row.use == "unused",
 }
 """Words for what the last optimize made of an edge; edges are filtered by them, too."""
 
@@ -47,6 +50,7 @@ def edge_rows(
     Raises:
         ConfigError: no such status, or a date that is none.
     """
+    status = None if status is None else spelled(status)
     one_of(status, (*EDGE_STATUSES, *EDGE_USES))
     since = None if after is None else parse_moment(after)
     inside = None

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmap.map.date_filter import end_of_date, is_after, is_until, parse_moment
 from gsmap.map.reports.common import one_of
+from gsmap.map.reports.one_pair import ONE_PAIR, scenes_by_one_pair
 from gsmap.map.reports.world import world_positions
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
@@ -15,7 +16,7 @@ from gsmap.types import Scene, ScenePose, Sim3
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows.scenes import IngestRow, PoseRow, SceneRow
 
-SCENE_STATUSES = ("ingested", "described", "placed", "tentative", "isolated")
+SCENE_STATUSES = ("ingested", "described", "placed", ONE_PAIR, "tentative", "isolated")
 
 
 @snapshot_read
@@ -44,6 +45,7 @@ def scene_rows(
     Raises:
         ConfigError: no such status, or a date that is none.
     """
+    status = None if status is None else spelled(status)
     one_of(status, SCENE_STATUSES)
     since = None if after is None else parse_moment(after)
     until = None if as_of is None else end_of_date(as_of)
@@ -52,15 +54,18 @@ def scene_rows(
     placed, nodes = store.revisions.poses(*(among or ())), store.graphs.node_counts()
     said = store.scenes.latest_notes()
     system, found = world_positions(store, placed)
+    alone = scenes_by_one_pair(store) if any_tentative(placed) else set()
     rows = [
-        row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres, found, system)
+        row_of_scene(
+            scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres, found, system, scene.id in alone
+        )
         for scene in store.scenes.list(among=among)
     ]
     return [
         row
         for row in rows
         if (component is None or row.component == component)
-        and (status is None or row.status == status)
+        and (status is None or status in (row.status, row.standing))
         and (since is None or is_after(row.captured_at or row.ingested_at, since))
         and (tag is None or tag in row.tags)
         and (until is None or is_until(row.captured_at, until))
@@ -72,7 +77,18 @@ def scene_row(store: Store, scene: Scene, metres: Mapping[int, MetricScale]) -> 
     """Return the row of a scene."""
     placed, nodes = store.revisions.poses(scene.id), store.graphs.node_counts()
     note, (system, found) = store.scenes.latest_notes().get(scene.id, ""), world_positions(store, placed)
-    return row_of_scene(scene, placed, nodes.get(scene.id), note, metres, found, system)
+    by_one_pair = any_tentative(placed) and scene.id in scenes_by_one_pair(store)
+    return row_of_scene(scene, placed, nodes.get(scene.id), note, metres, found, system, by_one_pair)
+
+
+def any_tentative(placed: Mapping[str, ScenePose]) -> bool:
+    return any(pose.status == "tentative" for pose in placed.values())
+
+
+def spelled(word: str) -> str:
+    """Return a status as tables print it; hyphens and underscores stand for spaces where that is a status."""
+    spaced = word.replace("-", " ").replace("_", " ")
+    return spaced if spaced == ONE_PAIR else word
 
 
 def row_of_scene(
@@ -83,6 +99,7 @@ def row_of_scene(
     metres: Mapping[int, MetricScale] | None = None,
     in_world: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
     system: tuple[str, str] | None = None,
+    one_pair: bool = False,
 ) -> SceneRow:
     pose = placed.get(scene.id)
     metre = metres.get(pose.component) if metres and pose else None
@@ -97,6 +114,7 @@ def row_of_scene(
         captured_at=scene.captured_at,
         status=pose.status if pose else ("ingested" if num_nodes is None else "described"),
         ingested_at=scene.ingested_at,
+        one_pair=one_pair,
         scale_policy=scene.scale_policy,
         tags=scene.tags,
         note=note,

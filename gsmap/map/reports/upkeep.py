@@ -42,6 +42,7 @@ def export_report(store: Store, out: Path, made: ExportResult, notes: Sequence[s
         reused=made.reused,
         removed=made.removed,
         notes=tuple(notes),
+        up=next((tile.up for tile in made.tiles if tile.path), "z"),
     )
 
 

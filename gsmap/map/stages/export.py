@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsmap.durable import remove_file
 from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, NotFoundError, ReadOnlyError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
-from gsmap.export.pyramid import TreeLayout, is_stale
+from gsmap.export.pyramid import TreeLayout, is_stale, remove_tree_files
 from gsmap.export.streamed_sog import StreamedSog, write_streams
-from gsmap.export.tileset import Tiles3D, write_tilesets
+from gsmap.export.tileset import Tiles3D, write_tilesets, write_whole_map
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.map.date_filter import end_of_date, is_until, undated_note
 from gsmap.map.jobs import TileMaker
@@ -55,10 +56,11 @@ class Request:
         prefer: preferred capture where captures disagree; None for the merger's setting.
         as_of: use only scenes dated at or before this.
         static: export static content only.
+        up: vertical axis of the files; None for the format's default.
     """
 
-    format: str = "ply"
-    tile_size_m: float = 10.0
+    format: str = "spz"
+    tile_size_m: float | None = None
     bbox: Sequence[float] | None = None
     merge: str | None = None
     revision: int | None = None
@@ -70,6 +72,7 @@ class Request:
     prefer: str | None = None
     as_of: str | None = None
     static: bool = False
+    up: str | None = None
 
     def options(self) -> list[str]:
         """Return the options of ``gsmap export`` for this request."""
@@ -97,7 +100,10 @@ _OPTIONS = {
     "prefer": "--prefer",
     "as_of": "--as-of",
     "static": "--static",
+    "up": "--up",
 }
+_TILES_SHARE = 0.8  # of an export's time, where a tree is written over the tiles
+_OLDER_SETTINGS = {"up": "z"}  # of exports recorded before an option existed
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +149,12 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
     if request.prefer is not None:
         params = with_prefer(method, params, request.prefer)
     recipe = TileRecipe(
-        recipe_key(method, params), request.format, request.provenance, request.budget_s, request.uncompressed
+        recipe_key(method, params),
+        request.format,
+        request.provenance,
+        request.budget_s,
+        request.uncompressed,
+        up=request.up,
     )
     _check(request, recipe)
     revision = store.revisions.newest_number() if request.revision is None else request.revision
@@ -169,11 +180,12 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
     metres = {component: metre for component, metre in metres.items() if component in exported}
     notes += metre_notes(metres)
     world = georeferenced_components(graph, exported)
-    notes += world_notes(world, request.format)
+    notes += world_notes(world, request.format, recipe.up)
     tiles = plan_tiles(
         {scene: pose.S_map_scene for scene, pose in placed.items()},
         {scene: found.bounds for scene, found in scenes.items()},
         tile_size_m=request.tile_size_m,
+        num_gaussians={scene: found.num_gaussians for scene, found in scenes.items()},
         components={scene: pose.component for scene, pose in placed.items()},
         bbox=None if request.bbox is None else np.reshape(np.asarray(request.bbox, float), (2, 3)),
         reach_m=reach_m(method, params),
@@ -262,13 +274,14 @@ def export(
     with folder_lock(out, wait=wait, waiting=waiting), store.leases.announce("export", f"export {out.resolve()}"):
         if waited:
             planned = plan(store, request, settings, known)  # the map may have other poses now
-        return _export(store, out, request, planned, settings, progress), planned.notes
+        result, note = _export(store, out, request, planned, settings, progress)
+        return result, (*planned.notes, *[note] * bool(note))
 
 
 def _export(
     store: Store, out: Path, request: Request, planned: ExportPlan, settings: Settings, progress: Progress
-) -> ExportResult:
-    """Export into a locked folder."""
+) -> tuple[ExportResult, str]:
+    """Export into a locked folder; return the result and a remark on its trees."""
     asked = plain(asdict(replace(request, merge=planned.method)))
     number: list[int] = []
     refused = "" if store.catalog.writable else f"{store.location} is read-only"
@@ -292,7 +305,7 @@ def _export(
     with note_interruption(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
         result = export_tiles(
             planned.tiles,
-            partial(_maker, store, planned, request, settings),
+            partial(_maker, store, planned, settings),
             out,
             map_id=store.id,
             recipe=planned.recipe,
@@ -302,20 +315,32 @@ def _export(
             params=settings.export,
             run=lambda job, arguments: run_jobs(job, arguments, settings.engine),
             made=noted,
-            progress=progress,
+            progress=(lambda fraction, text: progress(_TILES_SHARE * fraction, text))
+            if planned.recipe.is_tree
+            else progress,
         )
     _put_aside(store, out, planned, result)
     layout: TreeLayout = Tiles3D(not request.uncompressed) if planned.recipe.is_tileset else StreamedSog()
     if planned.recipe.is_tree and is_stale(out, result.tiles, layout):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
         S_ecef_map = {component: one.S_ecef_map for component, one in planned.world.items()}
-        tree = out, result.tiles, request.tile_size_m, in_metres_of
         cameras, levels = partial(_cameras, store, planned), settings.export.levels
+        progress(_TILES_SHARE, "levels of detail")
         if planned.recipe.is_tileset:
             packed = not request.uncompressed
-            write_tilesets(*tree, S_ecef_map=S_ecef_map, compressed=packed, cameras=cameras, levels=levels)
+            write_tilesets(
+                out,
+                result.tiles,
+                in_metres_of,
+                S_ecef_map=S_ecef_map,
+                compressed=packed,
+                cameras=cameras,
+                levels=levels,
+            )
         else:
-            write_streams(*tree, cameras=cameras, levels=levels)
+            write_streams(out, result.tiles, cameras=cameras, levels=levels)
+    tree_note = _finish_trees(out, planned, result)
+    progress(1.0, "")
     if store.catalog.writable:
         refused = ""
         try:  # record what an interrupted or unrecorded export wrote
@@ -330,19 +355,36 @@ def _export(
             refused = str(error)
     if refused:
         _log.warning("%s: the map does not know all of this export, so gsmap status cannot watch %s", refused, out)
-    return result
+    return result, tree_note
 
 
-def _maker(
-    store: Store, planned: ExportPlan, request: Request, settings: Settings, tile: PlannedTile, folder: str
-) -> TileMaker:
+def _finish_trees(out: Path, planned: ExportPlan, result: ExportResult) -> str:
+    """Write the tileset of the whole folder; delete the trees of a format that the folder had before."""
+    own = {"3dtiles": Tiles3D.file_name, "streamed-sog": StreamedSog.file_name}.get(planned.recipe.format)
+    with_files = sorted({tile.component for tile in result.tiles if tile.path})
+    for component in with_files:
+        folder = f"component_{component}"
+        others = [name for name in (Tiles3D.file_name, StreamedSog.file_name) if name != own]
+        if own is None:
+            remove_tree_files(out, folder, others)
+        else:
+            remove_file(out, folder, *others)
+    if planned.recipe.is_tileset and with_files:
+        return write_whole_map(out, with_files, planned.world.keys())
+    remove_file(out, Tiles3D.file_name)
+    return ""
+
+
+def _maker(store: Store, planned: ExportPlan, settings: Settings, tile: PlannedTile, folder: str) -> TileMaker:
+    thinned = {scene: one.thinning.thinned_at for scene, one in planned.scenes.items() if one.thinning is not None}
+    about = [store.id, planned.recipe.merge_key(tile), {scene: thinned.get(scene) for scene in tile.poses}]
     return TileMaker(
         store.location,
         tile,
         planned.method,
         planned.params,
-        is_cut=request.tile_size_m > 0 or request.bbox is not None,
-        budget_s=request.budget_s,
+        budget_s=planned.recipe.budget_s,
+        cache_key=text_digest(canonical(plain(about))),
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
         store=ReferenceViewCache(folder, settings.export.max_shared_bytes),
         passing={scene: planned.passing[scene] for scene in tile.poses if scene in planned.passing},
@@ -395,7 +437,8 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
     found: dict[str, tuple[int, Request]] = {}
     known = {one.name for one in fields(Request)}
     for target in store.exports.targets():
-        request = Request(**{key: value for key, value in newest[target].settings.items() if key in known})
+        stored = _OLDER_SETTINGS | newest[target].settings
+        request = Request(**{key: value for key, value in stored.items() if key in known})
         try:
             planned = plan(store, request, settings)
         except GsmapError:
@@ -419,9 +462,9 @@ def _check(request: Request, recipe: TileRecipe) -> None:
         raise ConfigError(
             f"the budget must be a positive number of seconds, got {request.budget_s}", code="invalid_budget"
         )
-    if recipe.is_tree and not request.tile_size_m > 0:
+    if recipe.is_tree and request.tile_size_m is not None and not request.tile_size_m > 0:
         raise ConfigError(
-            f"{recipe.format} is a tree of tiles: give --tile-size in metres, or use {recipe.suffix} for one file",
+            f"{recipe.format} is a tree of tiles: leave --tile-size out, or use {recipe.suffix} for one file",
             code="unsupported_output",
         )
 

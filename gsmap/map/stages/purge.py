@@ -22,11 +22,11 @@ from gsmap.durable import (
 from gsmap.errors import BusyError, DiskError, DiskFullError, GsmapError, NotFoundError, of_system
 from gsmap.export.lock import folder_lock
 from gsmap.export.manifest import FILE_NAME, Manifest
-from gsmap.export.pyramid import LEVELS_FOLDER, is_stale
+from gsmap.export.pyramid import LEVELS_FOLDER, is_stale, remove_tree_files
 from gsmap.export.streamed_sog import StreamedSog
 from gsmap.export.tileset import Tiles3D
 from gsmap.export.write import leftovers
-from gsmap.map import small_map
+from gsmap.map import merged_tiles, small_map
 from gsmap.map.comparison_pictures import FILE_NAME as PICTURES
 from gsmap.map.comparison_pictures import PictureFolder
 from gsmap.map.page_export import SITE, remove_site, site_files, site_owner
@@ -100,6 +100,10 @@ def _finish(store: Store, begun: Purge) -> Purge:
     if num_files := levels.num_files(begun.scene):
         begun = purging.record_files(store, begun, str(levels.root), num_files)
         levels.forget(begun.scene)
+    if cached := merged_tiles.files_of(begun.scene):
+        begun = purging.record_files(store, begun, str(merged_tiles.folder()), len(cached))
+        for path in cached:
+            path.unlink(missing_ok=True)
     for target in begun.receipt["pending"]["targets"]:
         try:
             out = Path(target)
@@ -181,9 +185,9 @@ def _clean(store: Store, out: Path, begun: Purge) -> Purge:
         manifest.tiles, manifest.doomed = kept, paths
         manifest.save(out)
     for folder in stale:
-        for tree in _TREES:
-            remove_file(out, folder, tree.file_name)  # first: it names the levels, which the next export makes again
-        remove_tree(out, folder, LEVELS_FOLDER)
+        remove_tree_files(out, folder, [tree.file_name for tree in _TREES])  # the next export makes them again
+    if stale:
+        remove_file(out, Tiles3D.file_name)
     for path in paths:
         remove_file(out, *path.split("/"))
     for folder in _component_folders(out):

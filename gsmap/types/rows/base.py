@@ -5,16 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from gsmap.types.notebook import html_facts, html_table
+from gsmap.errors import MissingDependencyError
+from gsmap.types.notebook import html_facts, html_table, short
 from gsmap.types.plain import plain
 from gsmap.types.sim3 import Sim3
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 SCHEMA = 2
 """The number under ``schema`` in all JSON output; it is raised whenever a key is removed or changes its meaning."""
+_MAX_LINES = 20  # of a table's representation: the rest is counted
+_MAX_TEXT = 60  # characters of a text in a row's representation
+_FEW = 4  # items of a value that are shown
 
 
 class Row:
@@ -31,6 +38,17 @@ class Row:
         """Return the values of this row's line in a table, in the order of ``columns``."""
         return [getattr(self, name) for name in self.columns]
 
+    def __init_subclass__(cls) -> None:
+        # `dataclass` leaves one that the class has as it is.
+        cls.__repr__ = cls.__dict__.get("__repr__", Row.__repr__)  # type: ignore[method-assign]
+
+    def __repr__(self) -> str:
+        """Return one line with what tables show of the row; long values are shortened."""
+        names = self.columns or [field.name for field in fields(self)]  # type: ignore[arg-type]
+        values = ((name, getattr(self, name)) for name in names)
+        shown = ", ".join(f"{name}={_short(value)}" for name, value in values if value is not None and value != "")
+        return f"{type(self).__name__}({shown})"
+
     def _repr_html_(self) -> str:
         names = self.columns or {field.name: field.name for field in fields(self)}  # type: ignore[arg-type]
         return html_facts(type(self).__name__, [(heading, getattr(self, name)) for name, heading in names.items()])
@@ -41,11 +59,49 @@ class Row:
     __hash__ = None  # type: ignore[assignment]
 
 
+def _short(value: Any) -> str:
+    """Return a value for a one-line representation."""
+    if isinstance(value, str):
+        text = short(value)
+        return repr(text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}...")
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, np.ndarray):
+        return (
+            np.array2string(value, precision=3, suppress_small=True)
+            if value.ndim == 1 and value.size <= _FEW
+            else (f"array{value.shape}")
+        )
+    if isinstance(value, (tuple, list)) and len(value) > _FEW:
+        return f"<{len(value)} items>"
+    return repr(value)
+
+
 R = TypeVar("R", bound=Row)
 
 
 class Table(list[R]):
     """A list of rows that a notebook shows as a table."""
+
+    def to_pandas(self) -> DataFrame:
+        """Return a `pandas.DataFrame` with a line per row: what tables show, then the other fields, values as they are.
+
+        Arrays and poses are objects. Without rows, there are no columns.
+
+        Raises:
+            MissingDependencyError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise MissingDependencyError("a data frame needs pandas: pip install 'gsmap[pandas]'") from error
+        names = dict.fromkeys((*self[0].columns, *(field.name for field in fields(self[0])))) if self else ()  # type: ignore[arg-type]
+        return pandas.DataFrame([{name: getattr(row, name) for name in names} for row in self])
+
+    def __repr__(self) -> str:
+        lines = [repr(row) for row in self[:_MAX_LINES]]
+        more = [f"... {len(self) - _MAX_LINES} more"] if len(self) > _MAX_LINES else []
+        return "[" + ",\n ".join([*lines, *more]) + "]"
 
     def _repr_html_(self) -> str:
         return html_table(self[0].columns, self) if self else "<p>none</p>"

@@ -113,10 +113,11 @@ class ExportReport(Row):
     Args:
         out: export folder.
         tiles: tiles in the folder.
-        recomputed: number of tiles that were made.
-        reused: number of unchanged tiles.
+        recomputed: number of files that were made.
+        reused: number of unchanged files.
         removed: number of deleted files.
         notes: remarks on the input; each tile has remarks on itself.
+        up: vertical axis of the files: ``z``, that of the map, or ``y``, as viewers of the format expect it.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -132,3 +133,4 @@ class ExportReport(Row):
     reused: int
     removed: int
     notes: tuple[str, ...] = ()
+    up: str = "z"

@@ -20,6 +20,7 @@ TodoKind = Literal[
     "stale_poses",
     "dirty_tiles",
     "tentative",
+    "one_pair",
     "undecided",
     "changes",
     "contradicted_priors",
@@ -33,6 +34,7 @@ TodoKind = Literal[
 
 _FOR_A_PERSON: tuple[TodoKind, ...] = (
     "tentative",
+    "one_pair",
     "undecided",
     "changes",
     "contradicted_priors",
@@ -50,10 +52,11 @@ class TodoRow(Row):
     Args:
         what: ``undescribed`` scenes; ``stale_graphs`` of other settings or versions; ``unregistered`` scenes;
             ``stale_edges``; ``unsolved`` (inputs newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export;
-            ``tentative`` scenes; ``undecided`` edges; unreviewed ``changes``; ``contradicted_priors``;
-            ``world_outliers`` (contradicting observations of the world); ``untied`` components without a place in the
-            world; ``duplicates`` (pairs of the same capture); ``isolated`` scenes; ``set_aside`` (quarantined jobs,
-            retried by name, and unreadable captures, retried when given again).
+            ``tentative`` scenes in doubt; scenes that ``one_pair`` places, which nothing contradicts; ``undecided``
+            edges; unreviewed ``changes``; ``contradicted_priors``; ``world_outliers`` (contradicting observations of
+            the world); ``untied`` components without a place in the world; ``duplicates`` (pairs of the same capture);
+            ``isolated`` scenes; ``set_aside`` (quarantined jobs, retried by name, and unreadable captures, retried when
+            given again).
         count: number of items; 1 for ``unsolved``, ``stale_poses`` and ``set_aside``.
         verb: command that resolves it.
         meaning: description.
@@ -111,6 +114,7 @@ class MapStatus(Row):
         components: number of connected components of the newest poses.
         islands: the number of components under an older name.
         tentative: number of scenes placed by edges without an agreeing cycle.
+        one_pair: number of these that single pairs place, which nothing contradicts.
         revision: number of the newest revision; null before the first.
         metres_per_unit: metres per unit of the largest component; null if unknown.
         metres: metric scale of every component.
@@ -130,6 +134,7 @@ class MapStatus(Row):
     components: int
     islands: int
     tentative: int
+    one_pair: int = 0
     revision: int | None
     metres_per_unit: float | None
     metres: tuple[MetricScaleRow, ...] = ()

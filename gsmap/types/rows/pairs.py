@@ -64,12 +64,24 @@ class EdgeRow(PairRef):
     columns: ClassVar[Mapping[str, str]] = {
         "pair": "pair",
         "status": "status",
-        "used": "used",
+        "use": "use",
         "overlap": "overlap",
         "num_inliers": "inliers",
         "scale": "scale",
         "reason": "reason",
     }
+
+    @property
+    def use(self) -> str:
+        """``used``, ``one pair`` (it places a scene alone, and nothing contradicts it), ``tentative`` (in doubt),
+        ``undecided``, ``unused``, or empty if it is not accepted: the words by which edges are filtered."""
+        if self.undecided:
+            return "undecided"
+        if self.used == "tentative":
+            return "one pair" if self.reason_code == "unconfirmed" else "tentative"
+        if self.used:
+            return "used"
+        return "unused" if self.status == "accepted" else ""
 
     status: str
     reason: str

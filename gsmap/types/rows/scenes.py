@@ -41,6 +41,7 @@ class SceneRow(Row):
         captured_at: capture date, ISO 8601 with zone; null if unknown.
         status: ``ingested``, ``described``, or by the newest poses ``placed``, ``tentative`` (placed by edges without
             an agreeing cycle) or ``isolated``.
+        one_pair: true if it is tentative only because single pairs place it, which nothing contradicts.
         ingested_at: time of the ingest, ISO 8601 with zone.
         scale_policy: ``known`` (its unit is the metre), ``unknown`` or ``auto``.
         tags: tags.
@@ -59,7 +60,7 @@ class SceneRow(Row):
     columns: ClassVar[Mapping[str, str]] = {
         "name": "scene",
         "id": "id",
-        "status": "status",
+        "standing": "status",
         "component": "component",
         "num_gaussians": "Gaussians",
         "num_nodes": "nodes",
@@ -77,6 +78,7 @@ class SceneRow(Row):
     S_map_scene: Sim3 | None
     captured_at: str | None
     status: str
+    one_pair: bool = False
     ingested_at: str | None = None
     scale_policy: str = "auto"
     tags: tuple[str, ...] = ()
@@ -87,6 +89,11 @@ class SceneRow(Row):
     crs: str | None = None
     heights: str | None = None
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def standing(self) -> str:
+        """The status in a word of tables: ``one pair`` for a tentative scene that nothing puts in doubt."""
+        return "one pair" if self.one_pair else self.status
 
     @property
     def in_world(self) -> str | None:
