@@ -1,9 +1,9 @@
-"""The command line: one file per verb. The only room that prints or exits."""
+"""The command line, with one file per verb; no other room prints or exits."""
 
 from __future__ import annotations
 
 COLLECT_AFTER = 100_000
-"""Allocated objects between two runs of the garbage collector."""
+"""Number of allocations between two runs of the garbage collector."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The ``gsmap`` program: collects the verbs and turns errors into one line and an exit code.
+"""The ``gsmap`` program, which collects the verbs and turns each error into one line and an exit code.
 
 Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 done except for quarantined jobs or captures; 130 after Ctrl-C,
 143 after SIGTERM, 129 after SIGHUP (`gsmap.cli.stopping`).
@@ -90,7 +90,7 @@ def _root(
 
 
 def build(verbs: Sequence[str] = VERBS) -> typer.Typer:
-    """Return the typer application with these verbs attached."""
+    """Return the typer application with these verbs."""
     app = typer.Typer(
         name="gsmap",
         help="Map-management database for 3D Gaussian Splatting: merge many captures into one maintained map.",
@@ -114,7 +114,7 @@ def build(verbs: Sequence[str] = VERBS) -> typer.Typer:
 
 @on_command_line()
 def run(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit with its code; typer itself exits with 2 on wrong usage.
+    """Run the command line and exit with its exit code; typer exits with 2 if the usage is wrong.
 
     Args:
         arguments: Command-line arguments; default: those of the process.
@@ -161,7 +161,7 @@ _OUT_OF_MEMORY = "there is not enough memory: close other programs, raise the li
 
 
 def _internal_error(error: Exception) -> str:
-    """Describe an error that gsmap did not raise on purpose in one line, and write its traceback to a log file."""
+    """Describe an unexpected error in one line, and write its traceback to a log file."""
     logging.getLogger("gsmap.cli").info("internal error", exc_info=error)  # shown with -v
     text = str(error).strip().partition("\n")[0]
     about = f"gsmap {__version__}, Python {platform.python_version()}, {platform.platform()}\n"

@@ -25,7 +25,8 @@ def command(
         bool, typer.Option("--verify", help="Read every stored byte again, and send damaged files again.")
     ] = False,
     keep: Annotated[
-        int | None, typer.Option("--keep", metavar="N", help="Delete all but the newest N snapshots afterwards.")
+        int | None,
+        typer.Option("--keep", metavar="N", help="After the backup, delete all snapshots except the newest N."),
     ] = None,
     list: Annotated[
         bool, typer.Option("--list", help="Only list the snapshots and save nothing; MAP may be missing.")

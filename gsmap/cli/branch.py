@@ -1,4 +1,4 @@
-"""gsmap branch: a second catalog over the same arrays."""
+"""gsmap branch: create a second catalog that shares the arrays of a map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def command(
     list_all: Annotated[bool, typer.Option("--list", help="List the branches of the map.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Create a branch of a map: a second catalog over the same arrays. Open it as MAP@NAME in any command.
+    """Create a branch of a map: a second catalog that shares the arrays. Open it as MAP@NAME in any command.
 
     Changes to a branch do not affect the map; `gsmap merge MAP MAP@NAME` merges them into it. Without NAME, the
     branches are listed.

@@ -1,4 +1,4 @@
-"""gsmap changes: differences between captures."""
+"""gsmap changes: show the differences between captures."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ def command(
     ] = None,
     since: Annotated[
         str | None,
-        typer.Option("--since", metavar="DATE", help="Show only changes that captures after this date reveal."),
+        typer.Option("--since", metavar="DATE", help="Show only changes whose newer capture is after this date."),
     ] = None,
     between: Annotated[
         tuple[str, str] | None,
         typer.Option(
-            "--between", metavar="D1 D2", help="Show only changes that captures after D1 and up to D2 reveal."
+            "--between", metavar="D1 D2", help="Show only changes whose newer capture is after D1 and not after D2."
         ),
     ] = None,
     as_of: AsOf = None,
     min_confidence: Annotated[
-        float, typer.Option("--min-confidence", min=0, max=1, help="Show only changes of at least this confidence.")
+        float, typer.Option("--min-confidence", min=0, max=1, help="Show only changes with at least this confidence.")
     ] = 0.0,
     pictures: Annotated[
         str | None,

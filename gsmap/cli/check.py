@@ -14,11 +14,13 @@ def command(
     map: MapPath,
     accept_catalog: Annotated[
         bool,
-        typer.Option("--accept-catalog", help="First accept a catalog that something other than gsmap has changed."),
+        typer.Option(
+            "--accept-catalog", help="First accept the current catalog, even if another program has changed it."
+        ),
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Read every byte of the map and compare it with its digest. Exit code 1 if anything is damaged.
+    """Read every byte of the map and compare it with the stored digests. The exit code is 1 if anything is damaged.
 
     Example: `gsmap check site.gsmap`
     """

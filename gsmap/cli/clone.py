@@ -1,4 +1,4 @@
-"""gsmap clone: a second map with the same content."""
+"""gsmap clone: create a second map with the same content."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def command(
     new: Annotated[str, typer.Argument(metavar="NEW", help="The map to create.", show_default=False)],
     json: AsJson = False,
 ) -> None:
-    """Create a second map with the same content, a new id and its own further history.
+    """Create a second map with the same content and a new id, which then changes independently.
 
     Array files, which never change, are shared through hard links if the file system supports them, and copied
     otherwise. Exports and backups stay with the first map.

@@ -14,11 +14,11 @@ def command(
     what: Annotated[
         str, typer.Argument(metavar="A:B|CHANGE", help="Pair of scenes, by names or ids, or a change such as c12.")
     ],
-    note: Annotated[str, typer.Option("--note", help="Reason; kept in the history.")] = "",
+    note: Annotated[str, typer.Option("--note", help="Reason of the review, which the history keeps.")] = "",
     withdraw: Annotated[
         bool,
         typer.Option(
-            "--withdraw", help="Withdraw the last review, or the measured edge (`gsmap edge`) if there is none."
+            "--withdraw", help="Withdraw the last review, or, without a review, the measured edge (`gsmap edge`)."
         ),
     ] = False,
     json: AsJson = False,

@@ -1,4 +1,4 @@
-"""Output of the verbs: data on stdout, progress and notes on stderr.
+"""Print the output of verbs: data on stdout, progress and notes on stderr.
 
 Names, notes and paths may come from untrusted files and maps, so all printed text passes `escaped`.
 """
@@ -40,19 +40,26 @@ Sets = Annotated[
 AsOf = Annotated[
     str | None,
     typer.Option(
-        "--as-of", metavar="DATE", help="Use only captures dated at or before this, ISO 8601; a day counts to its end."
+        "--as-of",
+        metavar="DATE",
+        help="Use only captures dated at or before this ISO 8601 time; a date without time includes the whole day.",
     ),
 ]
 Preset = Annotated[str | None, typer.Option("--preset", help="Preset of settings for this run: `default` or `paper`.")]
 Executor = Annotated[
     str | None,
     typer.Option(
-        "--executor", help="Run jobs on this machine (`local`) or a cluster (`dask`); default: $GSMAP_EXECUTOR."
+        "--executor",
+        help="Run jobs on this machine (`local`) or a cluster (`dask`); default: environment variable GSMAP_EXECUTOR.",
     ),
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option("--scheduler", metavar="URL", help="Dask scheduler, tcp://HOST:8786; default: $GSMAP_SCHEDULER."),
+    typer.Option(
+        "--scheduler",
+        metavar="URL",
+        help="Address of the Dask scheduler, tcp://HOST:8786; default: environment variable GSMAP_SCHEDULER.",
+    ),
 ]
 
 
@@ -60,7 +67,7 @@ Scheduler = Annotated[
 
 
 class _Stderr(logging.StreamHandler[Any]):
-    """Log handler that writes to the current ``sys.stderr``, which progress bars replace while they are drawn."""
+    """A log handler that writes to the current ``sys.stderr``, which progress bars replace while they are drawn."""
 
     def format(self, record: logging.LogRecord) -> str:
         return escaped(super().format(record), lines=True)
@@ -82,7 +89,7 @@ def start_logging(verbose: int, quiet: bool) -> None:
 
 
 def say(text: str) -> None:
-    """Print a note for the user on stderr; silent with ``-q``."""
+    """Print a note for the user on stderr, unless ``-q`` is given."""
     if logging.getLogger("gsmap").isEnabledFor(logging.WARNING):
         print(escaped(text), file=sys.stderr, flush=True)
 
@@ -136,7 +143,7 @@ def print_json_error(code: str, message: str) -> None:
 
 
 def expect_json() -> None:
-    """Forget that JSON was printed: a new command begins."""
+    """Forget that JSON was printed, as a new command begins."""
     global _has_printed_json
     _has_printed_json = False
 
@@ -161,7 +168,7 @@ def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
 
 
 def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> None:
-    """Print fields of rows as a table on stdout, numbers right-aligned; a pipe gets every column in full."""
+    """Print fields of rows as a table on stdout, with numbers right-aligned; a pipe gets all columns at full width."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -203,7 +210,7 @@ def _print_lines(title: str, headings: list[str], cells: list[list[str]], numeri
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
-    """Print facts on stdout, one per line, without those that are None or empty."""
+    """Print facts on stdout, one per line; leave out facts that are None or empty."""
     from rich.table import Table
     from rich.text import Text
 
@@ -266,7 +273,7 @@ _left: list[QuarantineRecord] = []
 
 
 def left() -> str:
-    """Return a sentence on the jobs and captures quarantined since the last call; empty if there are none."""
+    """Return a sentence on the jobs and captures that were quarantined since the last call; empty without any."""
     if not _left:
         return ""
     from gsmap.store.quarantine import CAPTURE
@@ -321,7 +328,7 @@ def progress_bars() -> Iterator[StageProgress | None]:
 
 
 def _progress_lines() -> StageProgress:
-    """Return a callback for pipes: one line whenever the subject of the work changes, and at the end of each stage."""
+    """Return a callback for pipes, which prints a line whenever the current work changes and when a stage ends."""
     last: dict[str, str] = {}
 
     def progress(stage: str, fraction: float, text: str = "") -> None:

@@ -15,7 +15,8 @@ def command(
     local: Annotated[
         bool,
         typer.Option(
-            "--local", help="Subtract an offset from all positions, and print it; for formats of single precision."
+            "--local",
+            help="Subtract an offset from all positions, and print the offset; for formats with single precision.",
         ),
     ] = False,
     json: AsJson = False,
@@ -40,7 +41,7 @@ def command(
     if step:
         say(f"{source} stores positions in single precision, rounded to {step:g} at this distance from the origin")
     if offset.any():
-        say(f"positions in {target} are those in {source} minus {' '.join(f'{value:.15g}' for value in offset)}")
+        say(f"positions in {target} equal those in {source} minus {' '.join(f'{value:.15g}' for value in offset)}")
     if json:
         report = ConvertReport(
             input=source,

@@ -1,4 +1,4 @@
-"""gsmap demo: the whole workflow on small synthetic captures."""
+"""gsmap demo: run the whole workflow on small synthetic captures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 
 def command(
-    folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Working folder; created if missing.")] = "gsmap-demo",
+    folder: Annotated[
+        str, typer.Argument(metavar="[DIR]", help="Working folder, which is created if it is missing.")
+    ] = "gsmap-demo",
     seed: Annotated[int, typer.Option("--seed", help="Random seed of the flat and the camera paths.")] = 0,
     json: AsJson = False,
 ) -> None:

@@ -20,7 +20,7 @@ def command(
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Compute missing scene graphs, and damaged ones of the scenes given by name.
+    """Compute missing scene graphs; for scenes given by name, also replace damaged graphs.
 
     Example: `gsmap describe site.gsmap`
     """

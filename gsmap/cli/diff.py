@@ -1,4 +1,4 @@
-"""gsmap diff: differences of scene poses between two revisions."""
+"""gsmap diff: show the differences of scene poses between two revisions."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def command(
             "scale was measured, of its logarithm.",
         ),
     ],
-    note: Annotated[str, typer.Option("--note", help="How the pose was measured; kept in the history.")] = "",
+    note: Annotated[str, typer.Option("--note", help="Description of the measurement, which the history keeps.")] = "",
     json: AsJson = False,
 ) -> None:
     """Add your own measurement of the pose of scene B in scene A. The next optimize uses it like other edges.
@@ -78,7 +78,7 @@ def read_pose(path: Path) -> Sim3:
 
 
 def read_sigmas(text: str, pose: Sim3) -> np.ndarray:
-    """Parse ``DEG,M[,SCALE]`` into (7,) standard deviations [rotation (3, rad), translation (3), log scale].
+    """Parse ``DEG,M[,SCALE]`` to standard deviations (7,): rotation (3, rad), translation (3), log scale.
 
     Raises:
         ConfigError: The text is not two or three positive numbers, or the pose has a scale and the text has none.

@@ -1,4 +1,4 @@
-"""gsmap edit: a scene's name, date, note, tags and unit; an object's name, label and note."""
+"""gsmap edit: change the name, date, note, tags and unit of a scene, or the name, label and note of an object."""
 
 from __future__ import annotations
 
@@ -35,10 +35,14 @@ def command(
     ] = None,
     same_as: Annotated[
         str | None,
-        typer.Option("--same-as", metavar="OBJECT", help="Merge the object with this one; `none` separates them."),
+        typer.Option(
+            "--same-as",
+            metavar="OBJECT",
+            help="Mark the object as the same as this object; `none` separates them again.",
+        ),
     ] = None,
     author: Annotated[
-        str, typer.Option("--author", metavar="NAME", help="Author of the edit; kept in the history.")
+        str, typer.Option("--author", metavar="NAME", help="Author of the edit, which the history keeps.")
     ] = "",
     json: AsJson = False,
 ) -> None:
@@ -82,7 +86,7 @@ def command(
 
 
 def _metres(text: str) -> float:
-    """Parse a positive number; 0 for `none`."""
+    """Parse a positive number; return 0 for `none`."""
     from gsmap.errors import ConfigError
 
     try:

@@ -1,4 +1,4 @@
-"""gsmap evaluate: errors of edges, poses and renders against ground truth."""
+"""gsmap evaluate: compute the errors of edges, poses and renders against ground truth."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def command(
     max_rre: Annotated[
         float | None,
         typer.Option(
-            "--max-rre", metavar="DEG", help="Rotation error above which an edge counts as wrong; default: 1."
+            "--max-rre", metavar="DEG", help="Largest rotation error of an edge that counts as correct; default: 1."
         ),
     ] = None,
     max_rte: Annotated[
         float | None,
         typer.Option(
-            "--max-rte", metavar="M", help="Translation error above which an edge counts as wrong; default: 0.05."
+            "--max-rte", metavar="M", help="Largest translation error of an edge that counts as correct; default: 0.05."
         ),
     ] = None,
     truth_sigma: Annotated[
@@ -42,7 +42,7 @@ def command(
         typer.Option(
             "--truth-sigma",
             metavar="DEG M",
-            help="Standard deviations of the true pose of a scene, in degrees and metres.",
+            help="Standard deviations of the true scene poses, in degrees and metres.",
         ),
     ] = None,
     json: AsJson = False,

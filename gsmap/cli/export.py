@@ -1,4 +1,4 @@
-"""gsmap export: tiles of the merged map."""
+"""gsmap export: write tiles of the merged map."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ class Up(StrEnum):
 
 def command(
     map: MapPath,
-    out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; a later export to it updates it.")],
+    out: Annotated[
+        str, typer.Argument(metavar="OUT", help="Folder to write; a later export to the same folder updates it.")
+    ],
     format: Annotated[
         str | None,
         typer.Option(
@@ -63,7 +65,9 @@ def command(
     ] = None,
     bbox: Annotated[
         tuple[float, float, float, float, float, float] | None,
-        typer.Option("--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Export only this box of the map, in map units."),
+        typer.Option(
+            "--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Export only the part of the map in this box, in map units."
+        ),
     ] = None,
     merge: Annotated[
         str | None,
@@ -74,14 +78,17 @@ def command(
     ] = None,
     component: Annotated[int | None, typer.Option("--component", help="Export only this connected component.")] = None,
     steps: Annotated[
-        int | None, typer.Option("--steps", help="Optimization steps per tile; default: by its size.")
+        int | None,
+        typer.Option(
+            "--steps", help="Number of optimization steps per tile; default: depends on the size of the tile."
+        ),
     ] = None,
     budget: Annotated[
         str | None,
         typer.Option(
             "--budget",
             metavar="SECONDS|SIZE",
-            help="Time limit per tile in seconds; tiles cut short are marked. With --for localize: a size, as 50MB.",
+            help="Time limit per tile in seconds; tiles that reach it are marked. With --for localize: a size as 50MB.",
         ),
     ] = None,
     purpose: Annotated[
@@ -102,7 +109,7 @@ def command(
         str | None,
         typer.Option(
             "--prefer",
-            help="Capture to keep where captures disagree: newest, best (best-observed) or both; default: newest.",
+            help="Capture to show where captures disagree: newest, best (the best-observed) or both; default: newest.",
         ),
     ] = None,
     as_of: AsOf = None,
@@ -112,7 +119,9 @@ def command(
             "--static", help="Export static content only, without objects that moved, appeared or disappeared."
         ),
     ] = False,
-    wait: Annotated[bool, typer.Option("--wait", help="Wait for another export to OUT to end; default: fail.")] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait until another export to OUT has ended; default: fail.")
+    ] = False,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
@@ -226,6 +235,6 @@ def _seconds(text: str) -> float:
         return float(text)
     except ValueError:
         raise ConfigError(
-            f"--budget takes seconds per tile, got {text!r}; pass a size with --for localize only",
+            f"--budget must be a number of seconds per tile, got {text!r}; a size such as 50MB needs --for localize",
             code="invalid_budget",
         ) from None

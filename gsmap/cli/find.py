@@ -1,4 +1,4 @@
-"""gsmap find: search objects of all captures."""
+"""gsmap find: search for objects in all captures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def command(
         ),
     ] = None,
     at: Annotated[
-        str | None, typer.Option("--at", metavar="X,Y,Z", help="Search for the objects at this point of the map.")
+        str | None,
+        typer.Option("--at", metavar="X,Y,Z", help="Search for objects like the one at this point of the map."),
     ] = None,
     top: Annotated[int, typer.Option("--top", help="Maximum number of hits.")] = 10,
     pictures: Annotated[
@@ -38,7 +39,7 @@ def command(
     preset: Preset = None,
     json: AsJson = False,
 ) -> None:
-    """Find objects in all captures by name, description, picture, example or point. Hits have a place and dates.
+    """Find objects in all captures by name, description, picture, example or point. Each hit has a place and dates.
 
     Example: `gsmap find site.gsmap --like monday:12 --pictures found`
     """
@@ -64,4 +65,4 @@ def _point(text: str | None) -> list[float] | None:
     try:
         return None if text is None else [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise ConfigError(f"--at takes three numbers such as 1.5,0,2, got {text!r}", code="invalid_point") from error
+        raise ConfigError(f"--at needs three numbers such as 1.5,0,2, got {text!r}", code="invalid_point") from error

@@ -29,7 +29,7 @@ def command(
         typer.Option(
             "--photos",
             metavar="DIR",
-            help="Folder of photos named by --gcp that belong to no capture; they are localized first.",
+            help="Folder of photos that --gcp names and that belong to no capture; these photos are localized first.",
         ),
     ] = None,
     exif: Annotated[
@@ -37,7 +37,7 @@ def command(
         typer.Option(
             "--exif",
             metavar="DIR",
-            help="Folder of the captures' photos with EXIF positions; repeated file names need a subfolder per scene.",
+            help="Folder of the captures' photos with EXIF positions; equal file names need one subfolder per scene.",
         ),
     ] = None,
     scale_bar: Annotated[
@@ -50,7 +50,9 @@ def command(
     ] = None,
     check: Annotated[
         str | None,
-        typer.Option("--check", metavar="NAME,...", help="Control points to hold out as check points; '' for none."),
+        typer.Option(
+            "--check", metavar="NAME,...", help="Names of control points to hold out as check points; '' for none."
+        ),
     ] = None,
     sigma: Annotated[
         float | None,
@@ -71,10 +73,12 @@ def command(
         typer.Option(
             "--photo-size",
             metavar="WIDTH HEIGHT",
-            help="Size of the photos marked in --gcp, if larger than the photos of the capture.",
+            help="Size of the photos in which --gcp marks points, if larger than the photos of the capture.",
         ),
     ] = None,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove observations: those of --name, or all.")] = False,
+    remove: Annotated[
+        bool, typer.Option("--remove", help="Remove the observations that --name lists, or all observations.")
+    ] = False,
     name: Annotated[
         list[str] | None,
         typer.Option("--name", help="With --remove: name of a control point, photo or scale bar; may be repeated."),

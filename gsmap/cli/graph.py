@@ -1,4 +1,4 @@
-"""gsmap graph: objects of the map and their relations."""
+"""gsmap graph: show the objects of the map and their relations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ def command(
     out: Annotated[str | None, typer.Argument(metavar="[OUT]", help="File to write.")] = None,
     format: Annotated[
         str | None,
-        typer.Option("--format", help="`json` (as --json) or `graphml`; default: by the suffix of OUT."),
+        typer.Option(
+            "--format", help="Format of OUT: `json` (as --json prints it) or `graphml`; default: by the suffix of OUT."
+        ),
     ] = None,
     sets: Sets = None,
     preset: Preset = None,

@@ -1,4 +1,4 @@
-"""gsmap history: objects at a place over time."""
+"""gsmap history: show the objects at a place over time."""
 
 from __future__ import annotations
 

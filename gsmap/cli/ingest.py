@@ -13,12 +13,14 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 Paths = Annotated[list[str] | None, typer.Argument(metavar="FILE_OR_FOLDER...", help="Files or folders of captures.")]
 CamerasFile = Annotated[
-    str | None, typer.Option("--cameras", help="Camera file of the capture; only with one capture.")
+    str | None, typer.Option("--cameras", help="Camera file of the capture; only for a single capture.")
 ]
-Name = Annotated[str | None, typer.Option("--name", help="Name of the scene; only with one capture.")]
+Name = Annotated[str | None, typer.Option("--name", help="Name of the scene; only for a single capture.")]
 CapturedAt = Annotated[
     str | None,
-    typer.Option("--captured-at", help="Date of all these captures, ISO 8601; default: as found beside each."),
+    typer.Option(
+        "--captured-at", help="Date of all these captures, ISO 8601; default: the date found beside each capture."
+    ),
 ]
 Scale = Annotated[
     str,
@@ -49,7 +51,7 @@ def command(
     no_create: NoCreate = False,
     json: AsJson = False,
 ) -> None:
-    """Add scenes to MAP, with the cameras found beside them. Creates MAP if it is missing; skips scenes it has.
+    """Add scenes to MAP, with the cameras found beside them. Creates a missing MAP; skips scenes that MAP has already.
 
     Example: `gsmap ingest site.gsmap monday.ply tuesday/`
     """
@@ -98,7 +100,7 @@ def makes_map(
 
 
 def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
-    """Refuse a capture, or a folder of captures, in the place of MAP, and suggest the right command.
+    """Raise an error if a capture or a folder of captures is given in place of MAP, and suggest the correct command.
 
     The suggested map is one named after it, or the only map in the working folder.
 
@@ -124,6 +126,6 @@ def refuse_capture_as_map(verb: str, map: str, paths: Sequence[str]) -> None:
     meant = ["gsmap", verb, guess, map, *(path for path in paths if path not in named)]
     also = f" (MAP is one of {', '.join(near)})" if len(near) > 1 else ""
     raise ConfigError(
-        f"{map} holds captures and is not a map; MAP comes first. Did you mean: {shlex.join(meant)}{also}",
+        f"{map} holds captures and is not a map, but MAP must come first. Did you mean: {shlex.join(meant)}{also}",
         code="map_argument_first",
     )

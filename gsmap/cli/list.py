@@ -1,4 +1,4 @@
-"""gsmap list: tables of scenes, edges, revisions, tiles and photos."""
+"""gsmap list: list scenes, edges, revisions, tiles or photos."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def command(
         typer.Option(
             "--after",
             metavar="DATE",
-            help="List only scenes captured, edges registered or revisions computed after this, ISO 8601.",
+            help="List only scenes captured, edges registered or revisions computed after this ISO 8601 time.",
         ),
     ] = None,
     tag: Annotated[

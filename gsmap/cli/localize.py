@@ -50,24 +50,31 @@ def command(
     ] = None,
     together: Annotated[
         bool,
-        typer.Option("--together", help="Localize the photos of one place jointly: localized photos help the others."),
+        typer.Option(
+            "--together",
+            help="Localize photos of one place jointly, so that localized photos help with the remaining photos.",
+        ),
     ] = False,
     video: Annotated[
-        str | None, typer.Option("--video", metavar="FILE", help="Localize the sharpest frames of this video jointly.")
+        str | None, typer.Option("--video", metavar="FILE", help="Localize the sharpest frames of this video, jointly.")
     ] = None,
     masks: Annotated[
         str | None,
         typer.Option(
             "--masks",
             metavar="DIR",
-            help="Folder of masks as in COLMAP, PHOTO.jpg.png, black where pixels are to be ignored.",
+            help="Folder of masks as in COLMAP: PHOTO.jpg.png, black at pixels to be ignored.",
         ),
     ] = None,
     depth: Annotated[
         str | None,
-        typer.Option("--depth", metavar="PNG", help="Depth image of the view of the single photo; needs --intrinsics."),
+        typer.Option(
+            "--depth",
+            metavar="PNG",
+            help="Depth image of the same view as the photo (one photo only); needs --intrinsics.",
+        ),
     ] = None,
-    depth_scale: Annotated[float, typer.Option("--depth-scale", help="Depth values per metre.")] = 1000.0,
+    depth_scale: Annotated[float, typer.Option("--depth-scale", help="Number of depth units per metre.")] = 1000.0,
     changes: Annotated[
         bool, typer.Option("--changes", help="Show where localized photos differ from the map.")
     ] = False,
@@ -106,7 +113,8 @@ def command(
     if is_small(map):
         if changes or add or pictures is not None or captured_at is not None or depth is not None:
             raise ConfigError(
-                "a small map only localizes photos: for --changes, --add and --depth use the map it was exported from",
+                "a small map can only localize photos: for --changes, --add and --depth, use the map from which it was "
+                "exported",
                 code="not_in_small_map",
             )
         with progress_bars() as progress:

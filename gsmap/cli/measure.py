@@ -9,7 +9,7 @@ import typer
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table, say, say_heights
 
 TAKES_POINTS = True
-_POINT = "X,Y,Z in the map; SCENE:X,Y,Z; SCENE:CAMERA@COLUMN,ROW; world:X,Y,Z or EPSG:N:X,Y,Z."
+_POINT = "The first point: X,Y,Z in the map; SCENE:X,Y,Z; SCENE:CAMERA@COLUMN,ROW; world:X,Y,Z or EPSG:N:X,Y,Z."
 
 
 def command(
@@ -24,11 +24,13 @@ def command(
     ] = None,
     crs: Annotated[
         str | None,
-        typer.Option("--crs", metavar="EPSG:N", help="CRS of the printed world coordinates; default: that of the map."),
+        typer.Option(
+            "--crs", metavar="EPSG:N", help="CRS of the printed world coordinates; default: the CRS of the map."
+        ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Measure the distance of two points in metres, with its standard deviation.
+    """Measure the distance between two points in metres, with its standard deviation.
 
     Example: `gsmap measure site.gsmap monday:1.2,0.4,2.0 monday:0007.jpg@812,410`
     """

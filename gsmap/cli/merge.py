@@ -11,9 +11,7 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 def command(
     map: MapPath,
-    source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="The map, branch or tag to merge; it is not changed.")
-    ],
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Map, branch or tag to merge, which is not changed.")],
     json: AsJson = False,
 ) -> None:
     """Merge another map into MAP: its scenes, scene graphs, edges, annotations, reviews and revisions.

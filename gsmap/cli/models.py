@@ -1,4 +1,4 @@
-"""gsmap models: ONNX models with which a map describes its scenes."""
+"""gsmap models: manage the ONNX models of a map."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def add(
         ),
     ],
     path: Annotated[
-        str, typer.Argument(metavar="FILE", help="The .onnx file; for `clip-tokenizer` the tokenizer.json.")
+        str, typer.Argument(metavar="FILE", help="The .onnx file, or the tokenizer.json for `clip-tokenizer`.")
     ],
     preset: Annotated[
         str,
@@ -33,11 +33,11 @@ def add(
         ),
     ] = "clip",
     reference: Annotated[
-        bool, typer.Option("--reference", help="Store the path and digest instead of a copy of the file.")
+        bool, typer.Option("--reference", help="Store the path and digest of the file instead of a copy.")
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Check a model, copy it into the map, and use it in every later describe.
+    """Check a model, copy it to the map, and use it from now on.
 
     Example: `gsmap models add site.gsmap clip mobilenet.onnx --preset imagenet`
     """

@@ -19,7 +19,7 @@ def _row_type(row: str) -> RowType:
 
 @dataclass(frozen=True)
 class OneRow:
-    """The fields of one row or report beside ``schema``."""
+    """A JSON object with ``schema`` and the fields of one row or report."""
 
     row: str
 
@@ -39,11 +39,11 @@ class _KeyedRow:
 
 
 class ManyRows(_KeyedRow):
-    """A list of rows under a key beside ``schema``."""
+    """A JSON object with ``schema`` and, under a key, a list of rows."""
 
 
 class OptionalRow(_KeyedRow):
-    """A row, or null, under a key beside ``schema``."""
+    """A JSON object with ``schema`` and, under a key, a row or null."""
 
 
 Object = OneRow | ManyRows | OptionalRow

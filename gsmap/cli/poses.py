@@ -14,7 +14,8 @@ def command(
     out: Annotated[
         str | None,
         typer.Argument(
-            metavar="[OUT]", help="File to write (for colmap a folder); one per component if there are several."
+            metavar="[OUT]",
+            help="File to write (for colmap, a folder); a map with several components gets one file for each.",
         ),
     ] = None,
     format: Annotated[
@@ -28,7 +29,9 @@ def command(
     crs: Annotated[
         str | None,
         typer.Option(
-            "--crs", metavar="EPSG:N", help="CRS of the world coordinates; default: that of `gsmap georeference`."
+            "--crs",
+            metavar="EPSG:N",
+            help="CRS of the world coordinates; default: the CRS given to `gsmap georeference`.",
         ),
     ] = None,
     json: AsJson = False,

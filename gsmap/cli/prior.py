@@ -24,24 +24,34 @@ def command(
     sigma: Annotated[
         float,
         typer.Option(
-            "--sigma", help="Standard deviation of the position per axis, in map units; of a world position in metres."
+            "--sigma",
+            help="Standard deviation of the position per axis, in map units, or in metres for a world position.",
         ),
     ] = 1.0,
     latitude: Annotated[
         float | None, typer.Option("--latitude", help="Latitude of the origin of the scene frame, in degrees north.")
     ] = None,
-    longitude: Annotated[float | None, typer.Option("--longitude", help="Its longitude, in degrees east.")] = None,
+    longitude: Annotated[
+        float | None, typer.Option("--longitude", help="Longitude of the origin of the scene frame, in degrees east.")
+    ] = None,
     height: Annotated[
-        float | None, typer.Option("--height", help="Its height in metres above the WGS 84 ellipsoid (not sea level).")
+        float | None,
+        typer.Option(
+            "--height",
+            help="Height of the origin of the scene frame, in metres above the WGS 84 ellipsoid (not sea level).",
+        ),
     ] = None,
     scale: Annotated[
-        float | None, typer.Option("--scale", help="Map units per scene unit, with a standard deviation of 1 %.")
+        float | None,
+        typer.Option(
+            "--scale", help="Number of map units per scene unit, to which a standard deviation of 1 % is assigned."
+        ),
     ] = None,
     up: Annotated[
         tuple[float, float, float] | None,
         typer.Option("--up", metavar="X Y Z", help="Direction opposite to gravity, in the scene frame."),
     ] = None,
-    anchor: Annotated[bool, typer.Option("--anchor", help="Make the scene frame the map frame.")] = False,
+    anchor: Annotated[bool, typer.Option("--anchor", help="Use the scene frame as the map frame.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Remove the prior.")] = False,
     json: AsJson = False,
 ) -> None:

@@ -14,7 +14,10 @@ def command(
     map: MapPath,
     keep_revisions: Annotated[
         int | None,
-        typer.Option("--keep-revisions", help="Keep the poses of the newest N revisions only; older ones stay listed."),
+        typer.Option(
+            "--keep-revisions",
+            help="Keep only the poses of the newest N revisions; older revisions stay listed without poses.",
+        ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be deleted.")] = False,
     json: AsJson = False,
@@ -37,7 +40,7 @@ def command(
 
 
 def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Return first and last number of each run of consecutive numbers."""
+    """Return the first and the last number of each run of consecutive numbers."""
     out: list[tuple[int, int]] = []
     for number in sorted(numbers):
         if out and number == out[-1][1] + 1:

@@ -18,7 +18,7 @@ def command(
             "--pairs",
             metavar="auto|all|A:B|FILE",
             help="`auto` (candidates), `all`, one pair `A:B`, or a file with one pair per line, `A B` or `A:B`; "
-            "pairs given by name are registered again.",
+            "pairs given explicitly are registered again.",
         ),
     ] = "auto",
     sets: Sets = None,

@@ -24,7 +24,9 @@ def command(
     ] = False,
     photo: Annotated[
         bool,
-        typer.Option("--photo", help="Remove a photo kept by `localize --add`, given by file, number (p3) or digest."),
+        typer.Option(
+            "--photo", help="Remove a photo kept by `localize --add`; name it by file, number (p3) or digest."
+        ),
     ] = False,
     json: AsJson = False,
 ) -> None:
@@ -63,7 +65,7 @@ def command(
 
 
 def _tell(report: PurgeReport, map: str) -> None:
-    """Print the remaining steps and their commands."""
+    """Print the steps that remain after a purge, with their commands."""
     for name in report.branches:
         say(f"{name} still has the scene: gsmap remove {map} {report.scene_id} --purge --branches")
     for name in report.backups:
@@ -75,4 +77,4 @@ def _tell(report: PurgeReport, map: str) -> None:
     for name in report.mentions:
         say(f"{name} mentions the scene; annotations by people are kept")
     if report.linked_files:
-        say("a clone, or a map that the scene was merged or split into, shares its files through hard links")
+        say("a clone, or a map into which the scene was merged or split, shares the scene's files through hard links")

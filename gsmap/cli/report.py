@@ -1,4 +1,4 @@
-"""gsmap report: a summary of the map as one HTML page."""
+"""gsmap report: write a summary of the map as one HTML page."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 def command(
     map: MapPath,
-    out: Annotated[str, typer.Argument(metavar="OUT.html", help="Page to write; replaces an older report.")],
+    out: Annotated[str, typer.Argument(metavar="OUT.html", help="Page to write, which replaces an older report.")],
     since: Annotated[
-        str | None, typer.Option("--since", metavar="DATE", help="Also list what is new since this date, ISO 8601.")
+        str | None, typer.Option("--since", metavar="DATE", help="Also list additions since this ISO 8601 date.")
     ] = None,
-    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw doubtful pairs and changes.")] = True,
+    pictures: Annotated[
+        bool, typer.Option("--pictures/--no-pictures", help="Draw pictures of doubtful pairs and of changes.")
+    ] = True,
     json: AsJson = False,
 ) -> None:
     """Write a self-contained HTML page that shows the map, doubtful edges and open tasks.

@@ -18,7 +18,7 @@ def command(
         typer.Option(
             "--at",
             metavar="TIME|SNAPSHOT",
-            help="Restore the last snapshot at or before this time, or the snapshot of this name.",
+            help="Restore the newest snapshot at or before this time, or the snapshot with this name.",
         ),
     ] = None,
     catalog: Annotated[

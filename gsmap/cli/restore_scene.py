@@ -11,7 +11,9 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 def command(
     map: MapPath,
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Last name, id, or start of the id.")],
+    scene: Annotated[
+        str, typer.Argument(metavar="SCENE", help="Last name of the scene, its id, or the start of its id.")
+    ],
     source: Annotated[
         str | None,
         typer.Option(

@@ -1,4 +1,4 @@
-"""gsmap settings: settings with their values and meanings."""
+"""gsmap settings: show and change settings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def command(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Show the settings of a map, or change some in its `settings.toml`. Affected results are computed again.
+    """Show the settings of a map, or change some in its `settings.toml`. Affected results become stale.
 
     Example: `gsmap settings site.gsmap --set register.verdict.max_log_nfa=-6`
     """

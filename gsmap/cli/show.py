@@ -1,4 +1,4 @@
-"""gsmap show: details of a scene, a pair or a change."""
+"""gsmap show: show the details of a scene, a pair or a change."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def _print_pair(pair: PairReport) -> None:
         "overlap": pair.overlap,
         "inliers": f"{pair.num_inliers} of {pair.num_correspondences} correspondences",
         "proposer": pair.proposer,
-        "clique": None if pair.exact else "not proved largest",
+        "clique": None if pair.exact else "not proved to be the largest clique",
         "residual chi2": pair.residual_chi2,
         "seconds": pair.seconds,
         "evidence": pair.evidence,
@@ -178,7 +178,7 @@ def _pose(pose: Sim3 | None) -> str | None:
 
 
 def _captured(scene: SceneReport) -> str | None:
-    """Format the capture date and its source."""
+    """Format the capture date of a scene, with its source."""
     if scene.captured_at is None:
         return None
     authors = [fact.author for fact in scene.history if fact.fact == "captured_at"]

@@ -13,17 +13,17 @@ def command(
     map: MapPath,
     out: Annotated[str, typer.Argument(metavar="OUT", help="The map to create.")],
     island: Annotated[
-        int | None, typer.Option("--island", "--component", help="Take the scenes of this connected component.")
+        int | None, typer.Option("--island", "--component", help="Copy the scenes of this connected component.")
     ] = None,
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
             "--box",
             metavar="X0 Y0 Z0 X1 Y1 Z1",
-            help="Take the scenes that reach into this box of the component --island; default: of the largest.",
+            help="Copy the scenes that reach into this box of the component --island; default: the largest component.",
         ),
     ] = None,
-    by_name: Annotated[bool, typer.Option("--scenes", help="Take the scenes named after OUT.")] = False,
+    by_name: Annotated[bool, typer.Option("--scenes", help="Copy the scenes named after OUT.")] = False,
     scenes: Annotated[list[str] | None, typer.Argument(metavar="[SCENES]...", help="Names or ids of scenes.")] = None,
     json: AsJson = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""gsmap status: open tasks of a map."""
+"""gsmap status: show the open tasks of a map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Handling of signals that stop a run: Ctrl-C, ``kill``, a closed terminal.
+"""Handle the signals that stop a run: Ctrl-C, ``kill``, a closed terminal.
 
 The first signal raises an exception in the main thread, so that every ``finally`` runs: staged files are deleted,
 workers killed and leases released. Then one line names the results that are kept. Native code handles no signal before
@@ -24,7 +24,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignal(BaseException):
-    """Stop requested by a signal. Stages add notes on the results that are kept (`BaseException.add_note`)."""
+    """A stop that a signal requested. Stages add notes on the results that are kept (`BaseException.add_note`)."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(signum)
@@ -33,7 +33,7 @@ class StopSignal(BaseException):
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Context in which a stop signal ends the process with one line and the exit code that shells use."""
+    """Make a stop signal within the block end the process with one line and the exit code that shells use."""
     from gsmap._native import StopWatch
 
     read_end, write_end = os.pipe()
@@ -50,7 +50,7 @@ def stoppable() -> Iterator[None]:
         raise StopSignal(stopped[0])
 
     def raise_later(found: sys.UnraisableHookArgs) -> None:
-        """Raise the exception again that came in a finalizer or a callback, where none can be raised."""
+        """Raise the stop again if a signal came in a finalizer or a callback, from which no exception can propagate."""
         if isinstance(found.exc_value, StopSignal):
             signal.signal(signal.SIGALRM, raise_again)
             signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)

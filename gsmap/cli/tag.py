@@ -1,4 +1,4 @@
-"""gsmap tag: a read-only snapshot of a map under a name."""
+"""gsmap tag: create a read-only state of a map under a name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""gsmap thin: reduce captures that newer ones supersede."""
+"""gsmap thin: reduce captures that newer captures supersede."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ def command(
         float | None, typer.Option("--keep-days", help="Do not thin captures of the last N days.")
     ] = None,
     budget: Annotated[
-        str | None, typer.Option("--budget", help="Stop when the captures fit into this size, such as 2GiB.")
+        str | None,
+        typer.Option("--budget", help="Stop thinning when all captures together fit into this size, such as 2GiB."),
     ] = None,
     now: Annotated[
         str | None,
@@ -35,7 +36,7 @@ def command(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be thinned.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Reduce old captures whose surfaces newer captures show. Poses, edges and annotations are kept.
+    """Drop Gaussians of old captures where newer captures show the same surface. Keeps poses, edges and annotations.
 
     A thinned capture takes about a sixth of the bytes, and its exports differ by at most 0.1 dB. Its scene graph is
     deleted, with its objects in `gsmap graph`: other scenes are registered with the newer captures instead. To undo
@@ -59,11 +60,11 @@ def command(
         say(f"{report.num_undated} undated captures are not thinned; gsmap edit MAP SCENE --captured-at DATE sets one")
     print(f"{'captures would take' if dry_run else 'captures take'} {report.num_bytes / 1e6:.1f} MB")
     if not report.fits:
-        say(f"that is more than {budget}: no other capture can be thinned")
+        say(f"this is more than the budget of {budget}, but no other capture can be thinned")
 
 
 def parse_size(text: str) -> int:
-    """Parse a size such as ``500MB``, ``2GiB`` or ``1.5G`` into bytes.
+    """Parse a size such as ``500MB``, ``2GiB`` or ``1.5G``; return bytes.
 
     Raises:
         ConfigError: The text is not a size.
@@ -74,5 +75,5 @@ def parse_size(text: str) -> int:
         return int(float(number) * _UNITS[unit])
     except (ValueError, KeyError, OverflowError) as error:
         raise ConfigError(
-            f"a size is a number and a unit, such as 500MB or 2GiB, got {text!r}", code="invalid_size"
+            f"a size must be a number and a unit, such as 500MB or 2GiB, got {text!r}", code="invalid_size"
         ) from error

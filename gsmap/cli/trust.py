@@ -16,7 +16,7 @@ def command(
     yes: Annotated[bool, typer.Option("--yes", help="Trust the server without a prompt.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Show the catalog server of a map, and allow gsmap to connect to it with your password from now on.
+    """Show the catalog server of a map, and allow gsmap to connect to that server with your password from now on.
 
     Example: `gsmap trust site.gsmap`
     """

@@ -29,7 +29,7 @@ def command(
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Ingest captures, then describe, register and optimize what is missing. Creates MAP if it is missing.
+    """Ingest captures, then compute all missing scene graphs, edges and poses. Creates MAP if it is missing.
 
     Example: `gsmap update house.gsmap captures/*.ply`
     """
@@ -87,7 +87,7 @@ def print_map(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
 
 
 def print_rows_of(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
-    """Print a table of scenes and a table of edges with reasons, each only if it has rows."""
+    """Print a table of scenes and a table of edges with reasons; leave out an empty table."""
     columns = {
         "name": "scene",
         "standing": "status",

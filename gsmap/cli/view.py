@@ -36,7 +36,7 @@ def command(
             "--tiles", metavar="DIR", help="Also show the 3D Tiles in this folder, to which the map was exported."
         ),
     ] = None,
-    read_only: Annotated[bool, typer.Option("--read-only", help="Disable reviews and edits on the page.")] = False,
+    read_only: Annotated[bool, typer.Option("--read-only", help="Do not allow reviews and edits on the page.")] = False,
     export: Annotated[
         Path | None,
         typer.Option(
@@ -45,7 +45,7 @@ def command(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Serve a page on this machine that shows the map, until Ctrl-C.
+    """Serve a page that shows the map, on this machine, until Ctrl-C.
 
     The page shows the captures at every level of detail, edges with their evidence, changes, objects and revisions,
     and takes reviews.

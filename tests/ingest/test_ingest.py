@@ -45,7 +45,7 @@ def test_cameras_of_its_own_name(tmp_path):
     a, b = read_captures(tmp_path)
     assert (a.name, len(a.cameras), a.cameras.synthesised) == ("monday", 4, False)
     assert (b.name, b.cameras.synthesised) == ("tuesday", True)
-    assert any("cameras.json was not taken" in note for note in b.notes)
+    assert any("cameras.json was not used" in note for note in b.notes)
     assert any("synthesised" in note for note in b.notes)
     assert a.source == str(tmp_path / "monday.ply")
 

@@ -121,7 +121,7 @@ def test_a_map_with_something_to_do_is_not_in_order(what: TodoKind) -> None:
 
 def test_nothing_checks_edges_in_no_loop() -> None:
     chain = report(scene("a"), scene("b"), scene("c"), edges=(edge("a", "b"), edge("b", "c")))
-    assert "nothing checks them" in page(chain)
+    assert "nothing checks these edges" in page(chain)
     loop = replace(chain, edges=(*chain.edges, edge("a", "c", chi2=8.0)))
     assert "7 of their measured values are redundant" in page(loop)
     assert "Variance factor 2 (1 is expected)" in page(loop)
