@@ -78,7 +78,7 @@ def _acquire(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> tu
             os.close(handle)
             if not wait:
                 raise BusyError(
-                    f"{owner} is exporting to {out}; retry later, or pass --wait",
+                    f"{out}: {owner} is exporting to it; retry later, or pass --wait",
                     code="export_busy",
                 ) from None
             if waiting is not None and not reported:

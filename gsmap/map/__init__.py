@@ -1,4 +1,4 @@
-"""The map interface: read from the store, call a pure stage, save. `Map` is the facade, `stages` holds the work."""
+"""The interface to maps: read from the store, call a pure stage, save the result. `Map` is a facade over `stages`."""
 
 from gsmap.map.catalog_trust import catalog_of, trust
 from gsmap.map.map import Map, accept_catalog, create, migrate, open, open_or_create, restore, snapshots

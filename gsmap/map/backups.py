@@ -1,4 +1,4 @@
-"""Back up, restore and clone a map, reported as rows."""
+"""Back up, restore and clone a map, and report the results as rows."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def snapshot_row(one: _backup.Snapshot) -> SnapshotRow:
 
 
 def _moment(at: str | None) -> dict[str, str | None]:
-    """Return ``at`` as a UTC time if it is a date, else as the name of a snapshot."""
+    """Return ``at`` as a UTC time if it is a date, and unchanged if it is the name of a snapshot."""
     if at is None or (len(at) > 16 and "Z-" in at):
         return {"snapshot": at}
     try:

@@ -13,7 +13,7 @@ from gsmap.types.rows.trust import TrustReport
 
 
 def catalog_of(path: str | os.PathLike[str]) -> TrustReport:
-    """Report the server that a map names and whether this user trusts it; nothing is connected to.
+    """Report the server that a map names, and whether this user trusts that server, without connecting to it.
 
     Raises:
         NotFoundError: no such map.
@@ -61,7 +61,7 @@ def _remembered(folder: Path) -> trusting.CatalogAddress:
         raise NotFoundError(f"no map at {display_name(folder)}", code="map_not_found")
     if not (folder / trusting.URL_FILE).exists():
         raise ConfigError(
-            f"{folder} has no catalog.url: its catalog is in the folder, and there is nothing to trust",
+            f"{folder} has no catalog.url: its catalog is in the folder, so there is no server to trust",
             code="nothing_to_trust",
         )
     return trusting.read_address(folder)

@@ -1,4 +1,4 @@
-"""Changes between visits as typed rows, in the current map frame."""
+"""Report changes between visits as typed rows, in the current map frame."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ def parse_change_id(text: str) -> int:
     number = change_number(text)
     if number is None:
         raise NotFoundError(
-            f"no change {text!r}: change ids are c1, c2, ... (gsmap changes MAP)", code="change_not_found"
+            f"there is no change {text!r}: change ids are c1, c2, ... (gsmap changes MAP lists them)",
+            code="change_not_found",
         )
     return number
 
@@ -53,8 +54,8 @@ def parse_change_id(text: str) -> int:
 def filter_by_date(
     asked: ComparisonPlan, since: str | None, between: Sequence[str] | None, as_of: str | None
 ) -> ComparisonPlan:
-    """Keep the pairs whose newer scene was captured after ``since`` (or after the first and at or before the second of
-    ``between``), and at or before ``as_of``. An end without a time of day is the end of that day.
+    """Keep the pairs whose newer scene was captured after ``since`` (or within ``between``) and not after ``as_of``. An
+    end without a time of day is the end of that day.
 
     Raises:
         ConfigError: a date that is none, two ways of saying since when, or an end before its beginning.
@@ -196,7 +197,7 @@ def _row(
     placed: PoseGraph | None,
     metres: Mapping[int, MetricScale],
 ) -> dict[str, Any]:
-    """Return the fields of a `ChangeRow`, moved from the map frame of the comparison to the current one."""
+    """Return the fields of a `ChangeRow`, transformed from the map frame of the comparison to the current map frame."""
     pose = placed.poses.get(one.newer) if placed is not None else None
     S_map_frame = None if pose is None else pose.S_map_scene @ one.S_frame_newer.inverse()
     box = None if S_map_frame is None else moved_box(change.box, S_map_frame)

@@ -1,4 +1,4 @@
-"""Draw images of changes and pairs into a folder, with an index of the shown scenes for purges."""
+"""Draw images of changes and pairs into a folder, and index the scenes that they show, for purges."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ _MAX_BYTES = 1 << 26
 
 @dataclass
 class PictureFolder:
-    """The index of a folder of images: ids of the shown scenes by file."""
+    """The index of a folder of images: the ids of the scenes that each file shows."""
 
     map_id: str
     scenes: dict[str, list[str]] = field(default_factory=dict)
 
     @classmethod
     def load(cls, folder: Path, map_id: str) -> PictureFolder:
-        """Load the index; empty if the folder is empty or missing.
+        """Load the index of a folder; return an empty index if the folder is empty or missing.
 
         Raises:
             ConfigError: it holds something else, or pictures of another map.
@@ -90,7 +90,7 @@ class PictureFolder:
 
 
 def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageProgress) -> dict[str, str]:
-    """Draw each change before and after; return the files by change id.
+    """Draw the place before and after each change; return the files by change id.
 
     Args:
         rows: changes of pairs that have a place in the map.
@@ -117,7 +117,7 @@ def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageP
 
 
 def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
-    """Draw both scenes of a pair from the same cameras under the pose of its edge; None if it has none.
+    """Draw both scenes of a pair from the same cameras, by the pose of the pair's edge; return None without a pose.
 
     Raises:
         ConfigError, InputError: see `PictureFolder.load`.
@@ -137,7 +137,7 @@ def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
 
 
 def picture_of_pair(store: Store, a: str, b: str, side_px: int = 320) -> np.ndarray | None:
-    """Render both scenes of a pair (ids) from the same cameras, (H, W, 3) uint8; None if its edge has no pose.
+    """Render both scenes of a pair (ids) from the same cameras, (H, W, 3) uint8; None if the pair's edge has no pose.
 
     Args:
         side_px: longer side of each view.
@@ -179,12 +179,14 @@ def pair_views(store: Store, edge: Registration) -> PairViews:
 
 
 def picture_of_change(store: Store, row: ChangeRow, side_px: int = 320) -> np.ndarray | None:
-    """Render a change before and after, (H, W, 3) uint8; None if it has no place. Errors as `picture_of_pair`."""
+    """Render the place before and after a change, (H, W, 3) uint8; None without a position. Raises as
+    `picture_of_pair`.
+    """
     return None if row.box_m is None else PairRenderer(store, row.older, row.newer).picture(row, side_px)
 
 
 def save_picture(picture: np.ndarray, path: str | os.PathLike[str]) -> None:
-    """Write an image (H, W, 3) uint8; the suffix gives the format.
+    """Write an image (H, W, 3) uint8 in the format of the path's suffix.
 
     Raises:
         ConfigError: a suffix that no picture has.
@@ -244,7 +246,7 @@ def _save(drawn: np.ndarray, path: Path) -> None:
 
 
 class PairRenderer:
-    """Renders all changes of a pair of scenes, which are read once."""
+    """A renderer of all changes of a pair of scenes, which reads both scenes once."""
 
     def __init__(self, store: Store, older: str, newer: str) -> None:
         graph = store.revisions.get()
@@ -259,7 +261,7 @@ class PairRenderer:
         _save(self.picture(row), path)
 
     def picture(self, row: ChangeRow, side_px: int = 320) -> np.ndarray:
-        """Render a change before and after, (H, W, 3) uint8."""
+        """Render the place before and after a change, (H, W, 3) uint8."""
         from gsmap.view.change_picture import draw_change
 
         change = change_arrays(self._store, parse_change_id(row.id))
@@ -273,13 +275,13 @@ def _placed(store: Store, scene: str, S: Sim3) -> PosedScene:
 
 
 def _note(store: Store, folder: Path) -> None:
-    """Record the folder in the catalog, as exports are."""
+    """Record the folder in the catalog, like the folder of an export."""
     if (refused := note_target(store, folder, {"pictures": True})) is not None:
         _log.warning("%s: the folder is not recorded in the map, so a purge will not find these images", refused)
 
 
 def note_target(store: Store, path: Path, settings: Mapping[str, Any]) -> str | None:
-    """Record a folder or file that shows scenes, so that a purge finds it; return why that failed, or None."""
+    """Record a folder or file that shows scenes, so that a purge finds it; return the reason for a failure, or None."""
     if str(path.resolve()) in {one.target for one in store.exports.list()}:
         return None
     if not store.catalog.writable:

@@ -1,4 +1,4 @@
-"""Filter scenes by the dates that a user gives."""
+"""Filter scenes by the dates that a user specifies."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def is_until(text: str | None, until: datetime) -> bool:
 
 
 def undated_note(scenes: Sequence[Scene], as_of: str) -> str:
-    """Return a remark on the undated scenes that an earlier state of the map leaves out; empty if there are none."""
+    """Return a note on undated scenes, which an earlier state of the map leaves out; empty without undated scenes."""
     names = [scene.name for scene in scenes if scene.captured_at is None]
     if not names:
         return ""

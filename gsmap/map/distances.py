@@ -1,4 +1,4 @@
-"""Measure the distance of two points of a map, with its uncertainty."""
+"""Measure the distance between two points of a map, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsmap.types.world import Georeference, WorldFrame
 
 @dataclass(frozen=True, eq=False)
 class _LocatedPoint:
-    """A specified point with its map and world coordinates.
+    """A point that the user specified, with its map and world coordinates.
 
     Args:
         component: component of ``map``; None for a point of the world.
@@ -37,7 +37,7 @@ class _LocatedPoint:
 def measure(
     store: Store, a: str, b: str, settings: Settings, *, component: int | None = None, crs: str | None = None
 ) -> MeasureReport:
-    """Measure the distance of two points in metres and its standard deviation; see `gsmap.map.specified_points`.
+    """Measure the distance between two points in metres, with its standard deviation; see `gsmap.map.specified_points`.
 
     Points of one component are measured in its frame, by its metre; those of two in the world, if both are tied to it.
 
@@ -64,7 +64,9 @@ def measure(
     frame = next((tie.frame for tie in graph.world if tie.S_world_map is not None), None)
     notes = []
     if any(one.scene is None for one in said):
-        notes.append("points of the map or world are taken as exact: sigma covers the map only")
+        notes.append(
+            "points given in the map or the world count as exact, so that sigma contains only the errors of the map"
+        )
     one, two = placed
     in_world = any(end.place.crs is not None for end in placed)
     if one.component is not None and one.component == two.component and not in_world:
@@ -163,7 +165,7 @@ def _apart(a: np.ndarray | None, b: np.ndarray | None) -> float:
 
 
 def _direction(to: np.ndarray | None, of: np.ndarray | None) -> np.ndarray:
-    """Return the (3,) unit vector from one point to another; zeros if they coincide."""
+    """Return the unit vector (3,) from one point to another; zeros if the points coincide."""
     assert to is not None
     assert of is not None
     span = to - of
@@ -184,7 +186,7 @@ class _PoseUncertainty:
         return pose_inputs(self.store, self.settings)
 
     def joint(self, component: int | None, scenes: list[str]) -> np.ndarray | None:
-        """Return the joint covariance of the world and these scenes; None if it cannot be computed."""
+        """Return the joint covariance of the georeference and these scenes; None if it cannot be computed."""
         given = self._given
         return optimize.joint_covariance(self.graph, given.edges, given.priors, given.survey, scenes, component or 0)
 
@@ -219,7 +221,7 @@ def _world_variance(solved: _PoseUncertainty, placed: list[_LocatedPoint]) -> fl
 
 
 def _world_covariance(solved: _PoseUncertainty, end: _LocatedPoint) -> np.ndarray | None:
-    """Return the (3, 3) covariance of a point in the world frame, zeros for a point given there; None if unknown."""
+    """Return the covariance (3, 3) of a point in the world frame: zeros if it was given there, None if unknown."""
     if end.place.crs is not None:
         return np.zeros((3, 3))
     tie = None if end.component is None else solved.graph.tie(end.component)
@@ -242,7 +244,7 @@ def _world_covariance(solved: _PoseUncertainty, end: _LocatedPoint) -> np.ndarra
 
 
 def _turn(graph: PoseGraph, end: _LocatedPoint) -> np.ndarray:
-    """Return the (3, 3) scale and rotation of the frame in which a point was given."""
+    """Return the matrix (3, 3) of scale and rotation of the frame in which a point was given."""
     if end.place.scene is None:
         return np.eye(3)
     S = graph.poses[end.place.scene].S_map_scene
@@ -250,7 +252,7 @@ def _turn(graph: PoseGraph, end: _LocatedPoint) -> np.ndarray:
 
 
 def _moves(point: np.ndarray) -> np.ndarray:
-    """Return the (3, 7) Jacobian of a point with respect to the pose of its frame."""
+    """Return the Jacobian (3, 7) of a point with respect to the pose of the point's frame."""
     from gsmap.geometry.rotations import skew
 
     return np.concatenate([-skew(point[None])[0], np.eye(3), point[:, None]], axis=1)

@@ -1,4 +1,4 @@
-"""Evaluate a map against ground truth with the metrics of the field; loads the data for `gsmap.evaluate`."""
+"""Evaluate a map against ground truth: load the data, and compute the metrics with `gsmap.evaluate`."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def poses(
     S_scene_world = {s.id: found for s in scenes if (found := _read_truth(Path(truth), s.name)) is not None}
     if not S_scene_world:
         raise NotFoundError(
-            f"no truth for any scene in {truth}: it needs NAME.json with T_scene_world for each scene", code="no_truth"
+            f"{truth} has no true pose of any scene: put a NAME.json with T_scene_world there for each scene",
+            code="no_truth",
         )
 
     def judged(scene: Scene) -> EvaluatedScene:
@@ -76,14 +77,14 @@ def _solid(store: Store, S_scene_world: Mapping[str, Sim3], scene: str) -> np.nd
 
 def _read_truth(folder: Path, name: str) -> Sim3 | None:
     if not folder.is_dir():
-        raise NotFoundError(f"no folder of truth at {folder}", code="folder_not_found")
+        raise NotFoundError(f"there is no folder of true poses at {folder}", code="folder_not_found")
     path = folder / f"{name}.json"
     if not path.exists():
         return None
     try:
         return Sim3.from_matrix(np.array(json.loads(path.read_text())["T_scene_world"], dtype=float))
     except (OSError, *MALFORMED) as error:
-        raise InputError(f"{path} holds no T_scene_world, a 4x4 similarity: {error}", code="invalid_truth") from error
+        raise InputError(f"{path} needs a T_scene_world, a 4x4 similarity: {error}", code="invalid_truth") from error
 
 
 def images(
@@ -152,13 +153,15 @@ def images(
             )
         )
     if not rows:
-        raise NotFoundError(f"no image in {folder} is named like a camera of a scene", code="image_not_found")
+        raise NotFoundError(f"no image in {folder} has the name of a scene's camera", code="image_not_found")
     progress(1.0, "")
     return tuple(rows)
 
 
 def _union_of(store: Store, scenes: list[Scene]) -> Callable[[Scene], tuple[Gaussians, Sim3] | None]:
-    """Return a function that gives the union of a scene with its overlapping neighbours, and the scene's pose in it."""
+    """Return a function that computes the union of a scene with its overlapping neighbours, and the scene's pose in
+    it.
+    """
     graph = store.revisions.get()
     placed = {s.id: graph.poses[s.id] for s in scenes if graph is not None and s.id in graph.poses}
     boxes = {s.id: _map_box(s.bounds, placed[s.id]) for s in scenes if s.id in placed}
@@ -179,7 +182,7 @@ def _union_of(store: Store, scenes: list[Scene]) -> Callable[[Scene], tuple[Gaus
 
 
 def _map_box(bounds: np.ndarray, pose: ScenePose) -> np.ndarray:
-    """Return the (2, 3) box of a scene in the map frame."""
+    """Return the box (2, 3) of a scene in the map frame."""
     corners = pose.S_map_scene.apply(box_corners(bounds))
     return np.stack([corners.min(0), corners.max(0)])
 
@@ -213,7 +216,7 @@ class _Export:
         self._read = lru_cache(_TILES_KEPT)(self._read_file)
 
     def content(self, scene: str) -> tuple[Gaussians, Sim3] | None:
-        """Return all tiles of a scene and the scene's pose as of the export; None if it has none."""
+        """Return all tiles of a scene, and the scene's pose at the time of the export; None without tiles."""
         tiles = [tile for tile in self._tiles.get(scene, []) if tile.path]
         if not tiles:
             return None
@@ -240,7 +243,7 @@ class _Export:
 
 
 def _pictures(scene: Scene, cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, Path]:
-    """Return the photos by camera index, from the scene's own folder if there is one."""
+    """Return the photos of a scene by camera index, from a folder of the scene's name if one exists."""
     own = Path(folder) / scene.name
     try:
         return find_images(cameras, own if own.is_dir() else folder)

@@ -56,8 +56,9 @@ def _opened(location: str, inode: int) -> Store:
 
 
 def _catalog_file(path: str) -> tuple[str, int]:
-    """Return the absolute location of a map and the inode of its catalog file. The inode tells maps apart that lie
-    at one path one after the other; an open file keeps its inode."""
+    """Return the absolute location of a map and the inode of its catalog file. The inode distinguishes maps that were
+    at the same path at different times; an open file keeps its inode.
+    """
     location = path if remote_map.is_remote(path) else os.path.abspath(path)
     try:
         return location, (branches.locate(location).folder / sqlite.FILE).stat().st_ino
@@ -67,7 +68,7 @@ def _catalog_file(path: str) -> tuple[str, int]:
 
 @lru_cache(maxsize=4)
 def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
-    """Load the view of a scene for registration. Pairs come ordered by scene, so a small cache saves most reads."""
+    """Load a scene for registration. Pairs come ordered by scene, so that a small cache saves most reads."""
     from gsmap.register import SceneView
 
     store = _store(path)
@@ -132,7 +133,7 @@ def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> Po
 
 
 def _read(path: str, scene_id: str, passing: DynamicContent | None, bounds: np.ndarray | None) -> Gaussians:
-    """Read the Gaussians of a scene that reach into a box of its frame, without dynamic content."""
+    """Read the Gaussians of a scene that reach into a box in the scene frame, without dynamic content."""
     return _store(path).scenes.gaussians(scene_id, bounds, _left_out(path, scene_id, passing))
 
 
@@ -147,7 +148,7 @@ def _left_out(path: str, scene_id: str, passing: DynamicContent | None) -> np.nd
 
 @lru_cache(maxsize=8)
 def _without(path: str, scene_id: str, passing: DynamicContent) -> np.ndarray:
-    """Return the rows of dynamic content, cached, since neighbouring tiles need the same scenes."""
+    """Return the rows of dynamic content; the answer is cached, as neighbouring tiles need the same scenes."""
     from gsmap.map import static_filter
 
     return static_filter.dynamic_rows(_store(path), scene_id, passing)

@@ -1,4 +1,4 @@
-"""`Map`, the facade of gsmap: every verb of the command line as a method."""
+"""`Map`, the facade of gsmap, with each verb of the command line as a method."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def open(path: str | os.PathLike[str], progress: StageProgress | None = None) ->
 
 
 def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
-    """Open a map, or create it if there is none."""
+    """Open a map, or create it if it is missing."""
     return open(path, progress) if Store.exists(path) else create(path, progress)
 
 
@@ -86,7 +86,7 @@ def restore(
     *,
     catalog_url: str | None = None,
 ) -> RestoreReport:
-    """Restore a map from a backup (``gsmap restore DEST MAP``), whole or not at all, with its id.
+    """Restore a map from a backup (``gsmap restore DEST MAP``) with its id; after an error, no partial map remains.
 
     Args:
         target: the backup: a folder, ``file:///folder`` or ``s3://bucket/prefix``.
@@ -168,7 +168,9 @@ class Map(AbstractContextManager["Map"]):
 
     @cached_property
     def settings(self) -> Settings:
-        """The settings in force: defaults, the map's preset and settings, then those of this run (`with_settings`)."""
+        """The settings in force: defaults, changed by the map's preset, its settings, and settings of this run
+        (`with_settings`).
+        """
         from gsmap.map.settings import map_settings
 
         return map_settings(self.store.folder, *self._run)
@@ -204,7 +206,7 @@ class Map(AbstractContextManager["Map"]):
     def change_settings(
         self, values: Mapping[str, Any] | None = None, *, preset: str | None = None, unset: Sequence[str] = ()
     ) -> None:
-        """Change the map's own settings (``gsmap settings MAP --set``), all or none."""
+        """Change the settings stored with the map (``gsmap settings MAP --set``), all or none."""
         from gsmap.map.settings import write_settings
 
         with self.store.catalog.lock():
@@ -227,7 +229,7 @@ class Map(AbstractContextManager["Map"]):
         scale: str = "auto",
         supersedes: str | None = None,
     ) -> Table[IngestRow]:
-        """Add captures from files and folders, or one from memory. Each is validated before it is written.
+        """Add captures from files and folders, or one capture from memory; validate each capture before writing it.
 
         Of several, those that cannot be read are set aside: they are named in the logs (``gsmap.map``), by `status` and
         in ``store.quarantine.encountered``, and tried again whenever they are given. Other files are skipped with a
@@ -255,7 +257,7 @@ class Map(AbstractContextManager["Map"]):
             found, _ = readers(captures, **options)
             if len(found) != 1:
                 raise ConfigError(
-                    f"--supersedes takes one capture, {len(found)} were found: name one",
+                    f"--supersedes needs one capture, but {len(found)} captures were found: name one of them",
                     code="many_captures",
                 )
             with announce_work(self.store, "ingest"):
@@ -267,7 +269,7 @@ class Map(AbstractContextManager["Map"]):
         return Table(reports.ingest_row(one.scene, new=one.new, dated=one.dated, notes=one.notes) for one in added)
 
     def describe(self, *scenes: str) -> Table[GraphRow]:
-        """Make the scene graphs that the current recipe lacks.
+        """Compute the scene graphs that are missing for the current recipe.
 
         Args:
             scenes: restrict to these scenes, and repeat damaged graphs.
@@ -338,7 +340,7 @@ class Map(AbstractContextManager["Map"]):
         return reports.revision_row(self.store, number)
 
     def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
-        """Ingest captures, then describe, register and optimize what is missing; report what changed.
+        """Ingest captures, then compute missing scene graphs, edges and poses; report what changed.
 
         Args:
             captured_at: as in `ingest`.
@@ -349,7 +351,7 @@ class Map(AbstractContextManager["Map"]):
 
         if captured_at is not None and not captures:
             raise ConfigError(
-                "--captured-at needs captures: name their files, or correct a scene with gsmap edit",
+                "--captured-at needs captures: name their files, or change the date of a scene with gsmap edit",
                 code="option_not_applicable",
             )
         before = reports.history_position(self.store)
@@ -365,7 +367,7 @@ class Map(AbstractContextManager["Map"]):
         return reports.update_report(self.store, ingested, before, self.metres)
 
     def set_prior(self, prior: Prior) -> PriorRow | None:
-        """Set the pose prior of a scene (GPS, survey, an anchor), replacing the previous one; see `Prior`.
+        """Set the pose prior of a scene (GPS, survey, an anchor) in place of the previous prior; see `Prior`.
 
         Raises:
             InputError: what `optimize` could not use; nothing is noted.
@@ -377,7 +379,7 @@ class Map(AbstractContextManager["Map"]):
         return reports.prior_row(self.store, self.store.scenes.get(prior.scene))
 
     def remove_prior(self, scene: str) -> None:
-        """Remove the surveyed world position of a scene if it has one, else its pose prior."""
+        """Remove the surveyed world position of a scene or, without one, its pose prior."""
         from gsmap.map.stages.georeference import forget_position
 
         if not forget_position(self.store, scene):
@@ -439,7 +441,8 @@ class Map(AbstractContextManager["Map"]):
         return changes.change_detail(self.store, changes.parse_change_id(name))
 
     def read_change(self, name: str) -> Change:
-        """Return a change (``c12``) with its arrays, map frame: voxels, and rows of the Gaussians of both captures.
+        """Return a change (``c12``) with its arrays: voxels in the map frame, and rows of the Gaussians of both
+        captures.
 
         Raises:
             NotFoundError: no change is called so, it is no longer found, or has no place now.
@@ -467,7 +470,7 @@ class Map(AbstractContextManager["Map"]):
         return as_networkx(compute_objects(self.store, self.settings, self._progress))
 
     def write_graph(self, out: str | os.PathLike[str], format: str = "json") -> ObjectsReport:
-        """Write the objects as ``json`` or ``graphml``, whole or not at all."""
+        """Write the objects as ``json`` or ``graphml``; after an error, no partial file remains."""
         from gsmap.map.objects import compute_objects, objects_report, write_graph
 
         known = compute_objects(self.store, self.settings, self._progress)
@@ -490,7 +493,7 @@ class Map(AbstractContextManager["Map"]):
         return history_report(compute_objects(self.store, self.settings, self._progress), place, box)
 
     def is_object(self, ref: str) -> bool:
-        """Return true if a text names an object (``o12``) and no scene."""
+        """Return true if a text is the id or name of an object (such as ``o12``) and not of a scene."""
         from gsmap.store.objects import number_of
 
         return number_of(ref) is not None and ref not in {scene.name for scene in self.scenes()}
@@ -628,7 +631,7 @@ class Map(AbstractContextManager["Map"]):
         scale: str | None = None,
         near: str | None = None,
     ) -> ScanRow:
-        """Localize a point cloud, mesh, splat or depth image; nothing is stored.
+        """Localize a point cloud, mesh, splat or depth image, without storing anything.
 
         Args:
             file: ``.ply .pcd .xyz .las .laz .obj .stl .glb``, any splat, or (with ``intrinsics``) a depth picture.
@@ -728,7 +731,7 @@ class Map(AbstractContextManager["Map"]):
         return reports.export_report(self.store, Path(out), made, (*told, *notes))
 
     def static_content(self) -> tuple[MapObjects, tuple[str, ...]]:
-        """Compare all visits and return the objects of the map, with notes on visits that are left out."""
+        """Compare all visits, and return the objects of the map with notes on visits that are left out."""
         from gsmap.map.objects import compute_objects
         from gsmap.map.stages.change import compare, missing_comparisons, plan_comparisons
 
@@ -764,7 +767,7 @@ class Map(AbstractContextManager["Map"]):
     # --- look --------------------------------------------------------------------------------------------------------
 
     def scenes(self) -> list[Scene]:
-        """List the living scenes in the order of their ingest."""
+        """List the living scenes, in the order of ingest."""
         return self.store.scenes.list()
 
     def metres(self, revision: int | None = None) -> dict[int, MetricScale]:
@@ -784,7 +787,7 @@ class Map(AbstractContextManager["Map"]):
         return self.store.revisions.get(revision)
 
     def read(self, ref: str, *, frame: str = "scene") -> tuple[Gaussians, Cameras]:
-        """Read Gaussians and cameras of a scene, in its own frame or in the ``map`` frame of its component.
+        """Read the Gaussians and cameras of a scene, in the scene frame or in the ``map`` frame of its component.
 
         Raises:
             NotFoundError: no such scene, or no pose for it yet.
@@ -795,7 +798,9 @@ class Map(AbstractContextManager["Map"]):
         if frame == "scene":
             return gaussians, cameras
         if frame != "map":
-            raise ConfigError(f"a scene is read in frame 'scene' or 'map', got {frame!r}", code="invalid_choice")
+            raise ConfigError(
+                f"the frame to read a scene in must be 'scene' or 'map', got {frame!r}", code="invalid_choice"
+            )
         graph = self.pose_graph()
         if graph is None or scene.id not in graph.poses:
             raise NotFoundError(
@@ -843,8 +848,9 @@ class Map(AbstractContextManager["Map"]):
         return Table(reports.model_rows(self.store))
 
     def pose_rows(self, crs: str | None = None) -> Table[PoseRow]:
-        """List the poses of all placed scenes (``gsmap poses MAP``) in the map and in the world (``crs``; default:
-        the map's)."""
+        """List the poses of all placed scenes (``gsmap poses MAP``) in the map and the world (``crs``, default: the
+        map's CRS).
+        """
         return Table(reports.pose_rows(self.store, crs))
 
     def status(self) -> MapStatus:
@@ -880,7 +886,7 @@ class Map(AbstractContextManager["Map"]):
         return replace(report, picture=draw_pair(self.store, Path(pictures), *scenes))
 
     def _graph_of(self, scene: Scene) -> tuple[SceneGraph | None, str]:
-        """Return a scene's graph by the settings in force, else its newest one, with a remark on that choice."""
+        """Return a scene's graph by the settings in force, or else its newest graph and a note on that choice."""
         from gsmap.map.stages.describe import graph_keys
 
         graph, note = None, "its graph was made by other settings or another version: run gsmap update"
@@ -894,7 +900,9 @@ class Map(AbstractContextManager["Map"]):
         return newest, "" if newest is None else note
 
     def diff(self, before: int, after: int) -> Table[PoseChangeRow]:
-        """List how each scene moved between two revisions (``gsmap diff MAP R1 R2``), measured at its centre."""
+        """List how each scene moved between two revisions (``gsmap diff MAP R1 R2``), measured at the scene's
+        centre.
+        """
         return Table(reports.pose_change_rows(self.store, before, after))
 
     def evaluate(
@@ -952,7 +960,7 @@ class Map(AbstractContextManager["Map"]):
     def view(
         self, *, port: int = 0, tiles: str | os.PathLike[str] | None = None, read_only: bool = False
     ) -> ViewServer:
-        """Serve a page to view and review the map (``gsmap view MAP``), on this machine only, until closed.
+        """Serve a page to view and review the map (``gsmap view MAP``), on this machine only, until it is closed.
 
         Args:
             tiles: folder of exported 3D Tiles to show beside the scenes.
@@ -971,7 +979,7 @@ class Map(AbstractContextManager["Map"]):
         return ViewServer(page_source, cache_folder(), settings.view, port=port)
 
     def write_site(self, folder: str | os.PathLike[str], *, tiles: str | os.PathLike[str] | None = None) -> ViewReport:
-        """``gsmap view MAP --export DIR``: the page as files that any web server can host.
+        """Write the page as files that any web server can host (``gsmap view MAP --export DIR``).
 
         In a new folder it appears whole or not at all. ``gsmap-site.json`` lists its files; others are never touched.
 
@@ -1033,13 +1041,13 @@ class Map(AbstractContextManager["Map"]):
         a, b = self._pair(pair)
         if (picture := picture_of_pair(self.store, a.id, b.id)) is None:
             raise NotFoundError(
-                f"{a.name}:{b.name} has no pose to draw both captures in: gsmap why MAP A:B explains it",
+                f"{a.name}:{b.name} has no pose by which both captures could be drawn: gsmap why MAP A:B explains it",
                 code="no_pose_of_pair",
             )
         save_picture(picture, path)
 
     def draw_change(self, name: str, path: str | os.PathLike[str]) -> None:
-        """Draw a change before and after (``gsmap show MAP c12 --picture``).
+        """Draw the place before and after a change (``gsmap show MAP c12 --picture``).
 
         Raises:
             NotFoundError: no such change, or it has no place now.
@@ -1099,7 +1107,7 @@ class Map(AbstractContextManager["Map"]):
         if request is not None or remove is not None:
             with announce_work(self.store, "georeference"):
                 if remove is not None:
-                    notes = (f"{take_back(self.store, remove)} observations were taken back",)
+                    notes = (f"{take_back(self.store, remove)} observations were removed",)
                 solution = None
                 if request is not None:
                     told, solution = georeference(self.store, request, self.settings, localise)
@@ -1121,7 +1129,7 @@ class Map(AbstractContextManager["Map"]):
         survey_position(self.store, scene, position, crs, sigma_m, self.settings)
 
     def measure(self, a: str, b: str, *, component: int | None = None, crs: str | None = None) -> MeasureReport:
-        """Measure the distance of two points in metres (``gsmap measure MAP A B``).
+        """Measure the distance between two points in metres (``gsmap measure MAP A B``).
 
         Args:
             a, b: ``X,Y,Z`` (map), ``SCENE:X,Y,Z``, ``SCENE:CAMERA@COLUMN,ROW`` or ``world:X,Y,Z``.
@@ -1146,7 +1154,7 @@ class Map(AbstractContextManager["Map"]):
         metres_per_unit: float | None = None,
         author: str = "",
     ) -> SceneRow:
-        """Edit a scene's name, date, notes and tags (``gsmap edit MAP SCENE``); earlier ones stay in its history.
+        """Edit a scene's name, date, notes and tags (``gsmap edit MAP SCENE``); its history keeps earlier values.
 
         Args:
             captured_at: ISO 8601, UTC if it has no zone; ``none`` removes the date.
@@ -1170,7 +1178,7 @@ class Map(AbstractContextManager["Map"]):
         return reports.scene_row(self.store, scene, self.metres())
 
     def photo_rows(self) -> list[PhotoRow]:
-        """List the stored photos (``gsmap list MAP photos``), oldest first, by the newest poses."""
+        """List the stored photos (``gsmap list MAP photos``), oldest first, with positions by the newest poses."""
         from gsmap.map.photos import photo_rows
 
         return photo_rows(self.store)
@@ -1193,20 +1201,21 @@ class Map(AbstractContextManager["Map"]):
         return row
 
     def branch(self, name: str) -> BranchRow:
-        """Make a branch (``gsmap branch MAP NAME``): another catalog over the same arrays; `open` it as
-        ``MAP@NAME``."""
+        """Make a branch (``gsmap branch MAP NAME``), a second catalog for the same arrays; `open` it as
+        ``MAP@NAME``.
+        """
         from gsmap.map.map_operations import branch_row
 
         return branch_row(self.store.branches.make(name))
 
     def tag(self, name: str) -> BranchRow:
-        """Make a tag (``gsmap tag MAP NAME``): the current state, read-only; `open` it as ``MAP@NAME``."""
+        """Make a tag (``gsmap tag MAP NAME``), the current state as read-only; `open` it as ``MAP@NAME``."""
         from gsmap.map.map_operations import branch_row
 
         return branch_row(self.store.branches.make(name, tag=True))
 
     def branches(self, kind: str | None = None) -> Table[BranchRow]:
-        """List branches and tags, or those of one kind (``branch``, ``tag``)."""
+        """List the branches and tags, or only one kind (``branch`` or ``tag``)."""
         from gsmap.map.map_operations import branch_row
 
         rows = [branch_row(branch) for branch in self.store.branches.list()]
@@ -1230,7 +1239,7 @@ class Map(AbstractContextManager["Map"]):
         return row
 
     def merge(self, source: str | os.PathLike[str]) -> MergeReport:
-        """Merge another map, branch or tag into this map (``gsmap merge MAP SOURCE``); nothing is computed."""
+        """Merge another map, branch or tag into this map (``gsmap merge MAP SOURCE``), without computing anything."""
         from gsmap.map import map_operations
 
         return map_operations.merge(self.store, source)
@@ -1256,7 +1265,7 @@ class Map(AbstractContextManager["Map"]):
         return map_operations.split(self.store, out, map_operations.chosen(self.store, island, box, scenes))
 
     def purge(self, ref: str, *, branches: bool = False) -> PurgeReport:
-        """Delete a scene for good (``gsmap remove MAP SCENE --purge``): rows, arrays, and tiles made with it.
+        """Delete a scene permanently, with its rows, arrays and tiles (``gsmap remove MAP SCENE --purge``).
 
         Args:
             branches: also purge the map's other branches and tags; else they are listed.
@@ -1267,7 +1276,7 @@ class Map(AbstractContextManager["Map"]):
         return purge_report(purge(self.store, ref, branches=branches))
 
     def restore_scene(self, ref: str, source: str | os.PathLike[str] | None = None) -> SceneRow:
-        """Restore a removed scene (``gsmap restore-scene MAP SCENE``), or copy one from another map (``source``).
+        """Restore a removed scene (``gsmap restore-scene MAP SCENE``), or copy a scene from another map (``source``).
 
         With ``source``, arrays of it that are here and damaged are mended.
         """
@@ -1292,7 +1301,7 @@ class Map(AbstractContextManager["Map"]):
         dry_run: bool = False,
         now: str | None = None,
     ) -> ThinReport:
-        """Store superseded captures in compact form (``gsmap thin MAP``), oldest first, and free the space.
+        """Store superseded captures in compact form (``gsmap thin MAP``), oldest first, and free space.
 
         Args:
             keep_days: captures of this many days before ``now`` stay whole.
@@ -1308,7 +1317,7 @@ class Map(AbstractContextManager["Map"]):
             return thin(self.store, Request(keep_days, budget_bytes, dry_run, now), self.settings, self._progress)
 
     def backup(self, target: str | os.PathLike[str], *, verify: bool = False, keep: int | None = None) -> BackupReport:
-        """Back up the map (``gsmap backup MAP DEST``) while others use it; only new data is sent.
+        """Back up the map (``gsmap backup MAP DEST``) while other processes use it; send only new data.
 
         Args:
             target: a folder, ``file:///folder`` or ``s3://bucket/prefix``, for this map alone.
@@ -1329,7 +1338,7 @@ class Map(AbstractContextManager["Map"]):
         return backups.clone(self.store, path, lambda f, text: self._progress("clone", f, text))
 
     def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
-        """Add an ONNX model: checked, then copied (or referenced) and used by later describes."""
+        """Check an ONNX model, and copy it to the map (or reference it) for every later describe."""
         from gsmap.map import models
 
         models.add(self.store, kind, path, preset, copy, self.settings.describe.object.limits)

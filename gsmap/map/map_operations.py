@@ -1,4 +1,4 @@
-"""Operations on whole maps, as rows: branches and tags, merge, split, restored scenes, purge receipts."""
+"""Operate on whole maps and report rows: branches and tags, merge, split, restored scenes, purge receipts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def branch_row(branch: Branch) -> BranchRow:
 
 
 def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
-    """Merge everything of another map into this one; see `gsmap.store.merging.merge`."""
+    """Merge all data of another map into this map; see `gsmap.store.merging.merge`."""
     with Store.open(source, "r") as other:
         merged = merging.merge(store, other)
     return MergeReport(
@@ -66,7 +66,7 @@ def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
 
 
 def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> SplitReport:
-    """Make a map of some scenes (ids), whole or not at all; see `gsmap.store.merging.split`."""
+    """Make a map of some scenes (ids); see `gsmap.store.merging.split`. After an error, no partial map remains."""
     folder = Path(out).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise StoreError(f"{out} exists: choose another name", code="already_exists")
@@ -91,7 +91,7 @@ def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> S
 
 
 def chosen(store: Store, island: int | None, box: Sequence[float] | None, scenes: Sequence[str] | None) -> list[str]:
-    """Return the ids of the scenes of a component, in a box, or named.
+    """Return the ids of scenes, which are chosen by component, by box or by name.
 
     Raises:
         ConfigError: none of these is asked for, or scenes and another one.
@@ -112,13 +112,14 @@ def chosen(store: Store, island: int | None, box: Sequence[float] | None, scenes
     if not inside:
         known = sorted({pose.component for pose in placed})
         raise NotFoundError(
-            f"no placed scene of {store.location} lies there: its components are {known}", code="no_placed_scene"
+            f"no placed scene of {store.location} lies there: the components of the map are {known}",
+            code="no_placed_scene",
         )
     return [pose.scene for pose in inside]
 
 
 def restore_scene(store: Store, ref: str, source: str | os.PathLike[str] | None) -> Scene:
-    """Restore a removed scene, or copy one from another map."""
+    """Restore a removed scene, or copy a scene from another map."""
     if source is None:
         return store.scenes.restore(ref)
     with Store.open(source, "r") as other:
@@ -128,7 +129,7 @@ def restore_scene(store: Store, ref: str, source: str | os.PathLike[str] | None)
 
 
 def purge_report(purged: Sequence[tuple[str, Purge]]) -> PurgeReport:
-    """Return the receipt of a purge over all catalogs that held the scene."""
+    """Return the receipt of a purge over all catalogs that had the scene."""
 
     def every(key: str) -> tuple[str, ...]:
         return tuple(dict.fromkeys(text for _, one in purged for text in one.receipt[key]))

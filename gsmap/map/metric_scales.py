@@ -24,7 +24,7 @@ def metres_at(store: Store, revision: int | None = None) -> dict[int, MetricScal
 
 
 def map_metres(store: Store, graph: PoseGraph | None) -> dict[int, MetricScale]:
-    """Return the metric scale of every component, the largest first; no array is read.
+    """Return the metric scale of every component, the largest component first, without reading arrays.
 
     Scenes removed since count as long as the poses are those that they took part in.
     """
@@ -73,7 +73,7 @@ def metres_of_scenes(store: Store, graph: PoseGraph) -> dict[str, float]:
 
 
 def metre_notes(metres: Mapping[int, MetricScale]) -> tuple[str, ...]:
-    """Return remarks on the metric scales of components, each once."""
+    """Return the notes on metric scales, each note once with its components."""
     components: dict[str, list[int]] = {}
     for component, metre in metres.items():
         if metre.note:

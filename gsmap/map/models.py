@@ -1,4 +1,4 @@
-"""The ONNX models of a map: checked when added, used by every later describe."""
+"""The ONNX models of a map, which are checked when they are added."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmap.types.model import ModelLimits, ModelSpec, Tensor
 def add(
     store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool, limits: ModelLimits
 ) -> ModelSpec:
-    """Check a model and store it under its kind, replacing the previous one; see `check_model` for the errors."""
+    """Check a model and store it in place of the previous model of its kind; see `check_model` for the errors."""
     spec = check_model(kind, path, preset, limits)
     store.models.add(kind, path, kind=kind, options=spec.to_json(), copy=copy)
     return spec

@@ -1,4 +1,4 @@
-"""Apply the names, labels, notes and merges that people gave to objects."""
+"""Apply the annotations that people gave objects: names, labels, notes and merges."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmap.types import MapObject, ObjectAnnotations, Scene
 def why_distinct(one: MapObject, other: MapObject, scenes: Mapping[str, Scene]) -> str:
     """Return the reason why two objects cannot be the same; empty if they can."""
     if one.component != other.component:
-        return "they lie in two components, which nothing ties to each other"
+        return "they lie in two components, whose relative pose is unknown"
     shown = {sighting.scene for sighting in one.sightings if sighting.thing >= 0}
     both = [s.scene for s in other.sightings if s.thing >= 0 and s.scene in shown and one is not other]
     return f"{scenes[both[0]].name} shows both" if both else ""
@@ -45,14 +45,14 @@ def apply_annotations(
             places = [scenes[scene].name for scene in store.objects.places(number) if scene in scenes]
             if places:
                 called = f" ({said.name or said.label})" if said.name or said.label else ""
-                notes.append(f"{name}{called} is not found any more; it was segmented in {few(places)}")
+                notes.append(f"{name}{called} is not found any more; it was a segment of {few(places)}")
     return [of[thing.id] for thing in objects if thing.id in of], joined, notes
 
 
 def _end_of(
     start: str, words: Mapping[str, ObjectAnnotations], of: Mapping[str, MapObject], joined: Mapping[str, str]
 ) -> str:
-    """Follow ``same_as`` annotations to an existing object; empty if there is none."""
+    """Follow ``same_as`` annotations to an existing object; return an empty text without one."""
     at, passed = start, set[str]()
     while at and at not in of and at not in passed:
         passed.add(at)
@@ -61,8 +61,9 @@ def _end_of(
 
 
 def _as_one(one: MapObject, other: MapObject) -> MapObject:
-    """Join two objects of one component into the first. If neither is a segment of a scene, the observation of the
-    object seen nearest in time counts."""
+    """Join two objects of one component into the first. For a scene in which neither object has a segment, keep the
+    observation of the object that was seen nearest in time.
+    """
     shown = [[i for i, s in enumerate(thing.sightings) if s.thing >= 0] for thing in (one, other)]
     sightings = []
     for i, pair in enumerate(zip(one.sightings, other.sightings, strict=True)):

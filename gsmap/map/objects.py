@@ -1,4 +1,4 @@
-"""The objects of a map: compute them from scene graphs, report them as rows, export them."""
+"""Compute the objects of a map from scene graphs, report them as rows, and export them."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class MapObjects:
 
     @cached_property
     def rooms_of(self) -> dict[str, str]:
-        """Room id of each object, by object id; objects without a known room are left out."""
+        """Room id of each object with a known room, by object id."""
         out = {}
         for thing in self.objects:
             level, mine = self.rooms.get(thing.component, (np.eye(3), ()))
@@ -134,7 +134,9 @@ class MapObjects:
             found = [one for one in self.objects if one.id.startswith(text)]
         if len(found) != 1:
             why = (
-                f"{', '.join(one.id for one in found)} are called so" if found else "no object of the map is called so"
+                f"{', '.join(one.id for one in found)} all have this name"
+                if found
+                else "no object of the map has this name"
             )
             raise NotFoundError(f"{text}: {why}; gsmap graph MAP lists them", code="object_not_found")
         return found[0]
@@ -190,7 +192,7 @@ def compute_objects(
 
 
 def _numbered(store: Store, parts: Sequence[ComponentObjects]) -> list[MapObject]:
-    """Number the objects of all components, and store new objects if the map is writable."""
+    """Assign numbers to the objects of all components, and store new objects if the map is writable."""
     new = [part for part in parts if part.places is not None]
     made: dict[int, Sequence[MapObject]] = {
         part.component: [replace(thing, component=part.component) for thing in part.made.objects] for part in parts
@@ -260,7 +262,7 @@ def edit_object(
         target, mine = known.named(same_as), known.named(f"o{number}")
         other = number_of(target.id)
         if why := why_distinct(mine, target, known.scenes):
-            raise InputError(f"o{number} and {target.id} cannot be one: {why}", code="objects_differ")
+            raise InputError(f"o{number} and {target.id} cannot be the same object: {why}", code="objects_differ")
     store.objects.edit(
         number,
         name=name,
@@ -302,7 +304,7 @@ def history_report(known: MapObjects, place: str | None, box: Sequence[float] | 
     """
     if (place is None) == (box is None):
         raise ConfigError(
-            "give one place: an object's id, a point X,Y,Z, or --box with six numbers", code="nothing_requested"
+            "specify one place: the id of an object, a point X,Y,Z, or --box with six numbers", code="nothing_requested"
         )
     if place is not None and not ("," in place and _POINT.fullmatch(place)):
         chosen = [known.named(place)]
@@ -328,7 +330,7 @@ def history_report(known: MapObjects, place: str | None, box: Sequence[float] | 
         for thing in chosen
         for sighting in thing.sightings
     ]
-    notes = known.notes if chosen else (*known.notes, "no thing was ever told apart there")
+    notes = known.notes if chosen else (*known.notes, "no object was ever found there")
     words = [
         ObjectFactRow(object=thing.id, at=fact.created_at, fact=fact.kind, value=fact.value, author=fact.author)
         for thing in chosen
@@ -344,18 +346,22 @@ def history_report(known: MapObjects, place: str | None, box: Sequence[float] | 
 
 
 def _area(place: str | None, box: Sequence[float] | None) -> np.ndarray:
-    """Return the (2, 3) corners of a point or box."""
+    """Return the corners (2, 3) of a point or a box."""
     try:
         numbers = (
             [float(part) for part in place.split(",")] if place is not None else [float(part) for part in box or ()]
         )
     except ValueError as error:
-        raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {place!r}", code="invalid_point") from error
+        raise ConfigError(
+            f"a point needs three numbers such as 1.5,0,2, got {place!r}", code="invalid_point"
+        ) from error
     if len(numbers) != (3 if place is not None else 6) or not np.isfinite(numbers).all():
-        raise ConfigError("a point is X,Y,Z; a box is six numbers, its lowest and highest corner", code="invalid_point")
+        raise ConfigError(
+            "a point needs X,Y,Z; a box needs six numbers, its lowest and its highest corner", code="invalid_point"
+        )
     corners = np.array(numbers).reshape(-1, 3)
     if (corners[0] > corners[-1]).any():
-        raise ConfigError("the lowest corner of a box comes before the highest", code="invalid_box")
+        raise ConfigError("the lowest corner of a box must come before its highest corner", code="invalid_box")
     return np.array([corners[0], corners[-1]])
 
 
@@ -396,13 +402,15 @@ def as_networkx(known: MapObjects) -> Any:
 
 
 def write_graph(known: MapObjects, out: str | os.PathLike[str], format: str) -> Path:
-    """Write the scene graph of the map, whole or not at all.
+    """Write the objects of the map as a graph; after an error, no partial file remains.
 
     Raises:
         ConfigError: another format than ``json`` (what ``--json`` prints) and ``graphml``.
     """
     if format not in FORMATS:
-        raise ConfigError(f"the graph is written as {' or '.join(FORMATS)}, got {format!r}", code="invalid_choice")
+        raise ConfigError(
+            f"the format of the graph must be {' or '.join(FORMATS)}, got {format!r}", code="invalid_choice"
+        )
     path = Path(out)
     if format == "json":
         write_text_output(path, json.dumps({"schema": SCHEMA, **objects_report(known).to_json()}, indent=1))

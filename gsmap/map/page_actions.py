@@ -19,7 +19,7 @@ _MAX_NOTE = 2_000
 
 
 class EditableMap(Protocol):
-    """The methods of `gsmap.map.Map` that actions use."""
+    """The part of `gsmap.map.Map` that actions use."""
 
     @property
     def store(self) -> Store: ...
@@ -48,7 +48,7 @@ def actions_of(opened: EditableMap) -> dict[str, Action]:
 def _review(review: Callable[[str, str], object], said: Mapping[str, Any]) -> None:
     note = _text(said, "note", may_be_empty=True)
     if len(note) > _MAX_NOTE:
-        raise InputError(f"a note has at most {_MAX_NOTE} characters", code="invalid_request")
+        raise InputError(f"a note may have at most {_MAX_NOTE} characters", code="invalid_request")
     review(_text(said, "what"), note)
 
 
@@ -60,10 +60,10 @@ def _prior(opened: EditableMap, said: Mapping[str, Any]) -> None:
         matrix = np.array(said.get("S_map_scene"), np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"S_map_scene is a matrix of four rows of four numbers: {error}", code="invalid_pose"
+            f"S_map_scene must be a matrix of four rows of four numbers: {error}", code="invalid_pose"
         ) from error
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError("S_map_scene is a matrix of four rows of four finite numbers", code="invalid_pose")
+        raise InputError("S_map_scene must be a matrix of four rows of four finite numbers", code="invalid_pose")
     S = Sim3.from_matrix(matrix)
     graph = opened.pose_graph()
     pose = None if graph is None else graph.poses.get(scene.id)

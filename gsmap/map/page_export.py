@@ -1,4 +1,4 @@
-"""Write the page of a map as files; only its own files are replaced, and a purge finds them."""
+"""Write the page of a map as files. An export replaces only files of the page, and a purge finds these files."""
 
 from __future__ import annotations
 
@@ -80,7 +80,9 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
             code="out_of_range",
         )
     if path.suffix.lower() not in _SUFFIXES:
-        raise ConfigError(f"a page in one file ends with .html, not {path.name or path}", code="wrong_suffix")
+        raise ConfigError(
+            f"the name of a page in one file must end with .html, not be {path.name or path}", code="wrong_suffix"
+        )
     if not path.parent.is_dir():
         raise NotFoundError(f"cannot write {path}: {path.parent} does not exist", code="folder_not_found")
     if path.exists() and not is_stream(path) and owner_of(path) != store.id:
@@ -112,13 +114,13 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
 
 
 def site_owner(folder: Path) -> str | None:
-    """Return the id of the map whose page a folder holds; None if it holds none."""
+    """Return the id of the map whose page is in a folder; None without a page."""
     said = _marker(folder)
     return None if said is None else said[0]
 
 
 def remove_site(folder: Path) -> int:
-    """Delete the files of a page and the folders that are empty then; return the number of files. Other files stay.
+    """Delete the files of a page, no other files, and folders that become empty; return the number of files.
 
     Raises:
         ConfigError: it was written by a gsmap that kept no list of its files.
@@ -134,7 +136,7 @@ def remove_site(folder: Path) -> int:
 
 
 def site_files(folder: Path) -> list[str]:
-    """List the files of a page except `SITE`, relative to its folder; empty if it holds no page.
+    """List the files of a page except `SITE`, relative to its folder; empty if the folder has no page.
 
     Raises:
         ConfigError: it was written by a gsmap that kept no list of its files.
@@ -152,7 +154,9 @@ def site_files(folder: Path) -> list[str]:
 
 
 def _marker(folder: Path) -> tuple[str, list[str] | None] | None:
-    """Return the map id and files of the page in a folder (files None for an old page without a list); else None."""
+    """Return the map id and the files of the page in a folder (None for an old page without a list); None without a
+    page.
+    """
     try:
         with open(open_file(folder / SITE), "rb") as file:
             said = json.loads(file.read(_MAX_BYTES))
@@ -168,7 +172,7 @@ def _marker(folder: Path) -> tuple[str, list[str] | None] | None:
 
 
 def _mark(map_id: str, files: Sequence[str]) -> bytes:
-    """Return the content of `SITE`.
+    """Return the content of the file `SITE`.
 
     Args:
         files: all other files that gsmap wrote; no other file is ever touched.
@@ -177,9 +181,9 @@ def _mark(map_id: str, files: Sequence[str]) -> bytes:
 
 
 def _check_folder(store: Store, folder: Path) -> None:
-    """Refuse a folder with anything but this map's page."""
+    """Raise an error for a folder with any files except a page of this map."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise ConfigError(f"{folder} is not a folder: give an empty or a new one", code="not_a_folder")
+        raise ConfigError(f"{folder} is not a folder: name an empty or a new folder", code="not_a_folder")
     remove_staged(folder, store.id)
     if folder.is_dir() and any(folder.iterdir()) and site_owner(folder) != store.id:
         raise ConfigError(
@@ -190,12 +194,12 @@ def _check_folder(store: Store, folder: Path) -> None:
 
 
 def _in_order(files: Iterable[str]) -> list[str]:
-    """Sort files for replacement: files that name others come after these, `_ENTRIES` last."""
+    """Sort files for replacement: a file comes after the files that it refers to, `_ENTRIES` last."""
     return sorted(files, key=lambda path: (_ENTRIES.index(path) if path in _ENTRIES else -1, path))
 
 
 def _put(staged: Path, folder: Path, map_id: str, made: Sequence[str]) -> None:
-    """Move a page to its folder: a new folder at once, an existing page file by file.
+    """Move a page to its folder, as a whole to a new folder or file by file over an existing page.
 
     Whenever that ends, the folder's list has every file of the earlier page and of this one that is there.
 
@@ -231,24 +235,24 @@ def _write_marker(folder: Path, map_id: str, files: Sequence[str]) -> None:
 
 
 def _check_free(folder: Path, path: str, is_ours: bool) -> None:
-    """Refuse to replace anything but a file of the page."""
+    """Raise an error if a file to replace does not belong to the page."""
     *above, _ = path.split("/")
     refuse_links(folder, *above)
     for depth in range(1, len(above) + 1):
         at = folder.joinpath(*above[:depth])
         if os.path.lexists(at) and not is_folder(at):
             raise ConfigError(
-                f"{at} is not of the page, and a folder of it has to go there: move it away", code="folder_not_empty"
+                f"{at} does not belong to the page, which needs a folder there: move it away", code="folder_not_empty"
             )
     place = folder / path
     if os.path.lexists(place) and not (is_ours and is_file(place)):
         raise ConfigError(
-            f"{place} is not of the page, and a file of it has to go there: move it away", code="folder_not_empty"
+            f"{place} does not belong to the page, which needs a file there: move it away", code="folder_not_empty"
         )
 
 
 def _remove(folder: Path, files: Sequence[str]) -> None:
-    """Delete files of a page and the folders below ``folder`` that are empty then."""
+    """Delete files of a page, and folders below ``folder`` that become empty."""
     for path in files:
         remove_file(folder, *path.split("/"))
     above = {tuple(path.split("/")[:depth]) for path in files for depth in range(1, path.count("/") + 1)}

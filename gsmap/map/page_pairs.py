@@ -1,4 +1,4 @@
-"""Explain a pair on the page: the steps with their thresholds, and matching landmarks."""
+"""Explain a pair on the page: its steps with their thresholds, and matching landmarks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LAYERS = ("landmarks", "landmarks:1", "objects")
 
 
 def pair_detail(store: Store, settings: Settings, a: Scene, b: Scene, S_map_target: Sim3) -> dict[str, Any]:
-    """Return the `EdgeDetail` of a pair without its ends and views.
+    """Return the `EdgeDetail` of a pair, without its scenes and views.
 
     Args:
         S_map_target: the shown pose of the target.
@@ -45,8 +45,8 @@ def pair_detail(store: Store, settings: Settings, a: Scene, b: Scene, S_map_targ
 def correspondences(
     store: Store, pair: tuple[str, str], S_target_source: Sim3, S_map_target: Sim3
 ) -> list[list[list[float]]]:
-    """Return mutually nearest landmarks of both graphs within a quarter of a metre under the edge's pose; map frame by
-    the target's pose, the target's point and the source's.
+    """Return pairs of landmarks, one per graph, that are mutually nearest and within 0.25 m under the edge's pose: the
+    target's and the source's points, in the map frame by the target's pose.
 
     Those that registration chose its pose by are not kept; these are what bears it out.
     """

@@ -1,4 +1,4 @@
-"""Serve a map to the page of `gsmap.view`; every request reads one state of the catalog."""
+"""Provide a map to the page of `gsmap.view`; every request reads one state of the catalog."""
 
 from __future__ import annotations
 
@@ -150,7 +150,8 @@ class MapPageSource:
         stored, names = self._store.registrations.get(target, source), self.pair_cameras(target, source)
         if stored is None or not names:
             raise NotFoundError(
-                "this pair has no pose to draw both scenes in, or is too large to be drawn here", code="no_pose_of_pair"
+                "this pair has no pose by which both scenes could be drawn, or is too large to be drawn here",
+                code="no_pose_of_pair",
             )
         seen = pair_views(self._store, stored.registration)
         looks = [looks_at(seen.target, seen.source, one.resized(_PICTURE_PX), seen.unit_m) for one in seen.cameras]
@@ -215,7 +216,7 @@ class MapPageSource:
 
     def merged(self, component: int) -> Path:
         if component not in self._merged:
-            raise NotFoundError(f"no merged tiles of component {component} were given", code="no_tiles")
+            raise NotFoundError(f"the page was started without merged tiles of component {component}", code="no_tiles")
         return self._merged[component]
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -241,7 +242,7 @@ class MapPageSource:
 
 @snapshot_read
 def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset()) -> ViewMap:
-    """Return the scenes at their newest poses with edges, changes and photos; no array is read."""
+    """Return the scenes at their newest poses, with edges, changes and photos, without reading arrays."""
     placed = store.revisions.get()
     poses = placed.poses if placed else {}
     graphs = store.graphs.list()
@@ -300,8 +301,9 @@ def _scene(
 
 
 def content_key(scene: Scene, tree: TreeParams) -> str:
-    """Return the key of a scene's levels of detail. It begins with the scene's id and changes when the scene is
-    thinned or the levels are made otherwise."""
+    """Return the key of a scene's levels of detail. It begins with the scene's id, and changes when the scene is
+    thinned or its levels are computed in another way.
+    """
     thinned = "" if scene.thinning is None else f"-t{text_digest(scene.thinning.thinned_at)[:8]}"
     return f"{scene.id}{thinned}-v{VERSION}-{text_digest(canonical(tree))[:8]}"
 
@@ -339,7 +341,7 @@ def _edges(store: Store, placed: PoseGraph | None) -> list[ViewEdge]:
 
 
 def _changes(store: Store, settings: Settings, placed: PoseGraph | None, living: set[str]) -> list[ViewChange]:
-    """Return the stored changes; nothing is compared."""
+    """Return the stored changes, without comparing scenes."""
     if placed is None:
         return []
     report = changes_report(
@@ -409,9 +411,7 @@ def merged_tilesets(store: Store, out: Path) -> dict[int, Path]:
     folders = {tile.component: out / tile.path.split("/")[0] for tile in manifest.tiles.values() if tile.path}
     found = {component: folder for component, folder in folders.items() if (folder / FILE_NAME).is_file()}
     if not found:
-        raise ConfigError(
-            f"{out} holds no 3D Tiles: gsmap export MAP {out} --format 3dtiles makes them", code="no_tiles"
-        )
+        raise ConfigError(f"{out} has no 3D Tiles: run gsmap export MAP {out} --format 3dtiles", code="no_tiles")
     return found
 
 

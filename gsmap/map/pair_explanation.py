@@ -1,4 +1,4 @@
-"""Explain why a pair is, or is not, an edge of the map, and what would decide it."""
+"""Explain why a pair is, or is not, an edge of the map, and what would decide an open case."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gsmap.types.rows.pairs import ExplanationStep, PairExplanation, PairReport
 
 @snapshot_read
 def explain_pair(store: Store, settings: Settings, a: Scene, b: Scene) -> PairExplanation:
-    """List every step of a pair from stored results; nothing is computed again."""
+    """List every step of a pair from stored results, without computing anything again."""
     pair = pair_report(store, a, b)
     is_tried = pair.status != "never registered"
     rank, untried = _retrieval(store, settings, a, b)
@@ -38,8 +38,9 @@ def explain_pair(store: Store, settings: Settings, a: Scene, b: Scene) -> PairEx
 
 
 def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[str, str]:
-    """Return the best rank of the pair in retrieval, and why ``--pairs auto`` did not try it; by the rules of
-    `gsmap.map.stages.register`."""
+    """Return the best rank of the pair in retrieval, and the reason why ``--pairs auto`` did not try the pair, by the
+    rules of `gsmap.map.stages.register`.
+    """
     params, names = settings.retrieve, {a.id: a.name, b.id: b.name}
     keys = keys_of_lookups(graph_keys(store, (a, b), settings), params)
     lookups = {one.scene: one for one in store.indexes.lookups(list(names))}
@@ -54,10 +55,10 @@ def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[st
         first, scene, score = listed[0]
         rank = f": no. {first} of what {names[scene]} was paired with, score {score:.3g}"
     if any(scene not in lookups or lookups[scene].key != keys[scene] for scene in names):
-        return rank, "the next gsmap update looks for scenes that show what they show"
+        return rank, "the next gsmap update retrieves candidates for these scenes"
     held, enough = (
         _held(store, settings),
-        f"{params.max_edges_per_scene} edges without doubt (retrieve.max_edges_per_scene)",
+        f"{params.max_edges_per_scene} edges that are not doubtful (retrieve.max_edges_per_scene)",
     )
     askers = {scene for first, scene, _ in listed if first <= params.top_k}
     is_open = {
@@ -65,20 +66,20 @@ def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[st
         for one in askers
     }
     if any(is_open.values()):
-        return rank, "the next gsmap update tries it"
+        return rank, "the next gsmap update tries the pair"
     if askers:
-        return rank, f"left out to save time: both had {enough} by then, and these tied them over another scene"
+        return rank, f"left out to save time: both scenes already had {enough}, which connected them over another scene"
     if neighbours({scene: at for scene, at in placed_scenes(store).items() if scene in names}, params):
         if PairSchedule((), (), held, params).is_redundant(a.id, b.id):
-            return rank, f"left out to save time: both have {enough}, and these tie them over another scene"
-        return rank, "the map's poses let them touch, and gsmap update tries the nearest of such pairs"
+            return rank, f"left out to save time: both scenes have {enough}, which connect them over another scene"
+        return rank, "the scenes touch in the map, and gsmap update tries the nearest of such pairs"
     if listed or any(len(one.candidates) >= KEPT * params.top_k for one in lookups.values()):
         return rank, f"other scenes are more promising, and the first {params.top_k} are tried (retrieve.top_k)"
-    return rank, "retrieval found nothing that both show"
+    return rank, "retrieval found nothing that both scenes show"
 
 
 def _held(store: Store, settings: Settings) -> list[tuple[str, str]]:
-    """Return the pairs with a usable edge that is not doubtful."""
+    """Return the pairs that have a usable edge without doubt."""
     bar = settings.optimize.max_disagreement
     return [
         (one.target, one.source)
@@ -105,7 +106,7 @@ def _steps(pair: PairReport, settings: Settings) -> list[ExplanationStep]:
 
 
 def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -> list[ExplanationStep]:
-    """Return the evidence of the pose, each with its threshold."""
+    """Return the evidence for the pose, each item with its threshold."""
     figures: Mapping[str, Any] = pair.evidence
 
     def known(figure: str) -> float | None:
@@ -135,7 +136,12 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
         ExplanationStep(name="colour significance", value=known("colour_t")),
         free_space,
         held("probability", "probability", bars.min_probability, at_least=True, note=", of all of these"),
-        held("disagreement", "disagreement", max_disagreement, note=" of what both saw, or it is in doubt"),
+        held(
+            "disagreement",
+            "disagreement",
+            max_disagreement,
+            note=" of the surface that both saw, or the edge is doubtful",
+        ),
     ]
 
 
@@ -150,17 +156,21 @@ def _advice(pair: PairReport, steps: Mapping[str, ExplanationStep], untried: str
     in_doubt = "disagreement" in failed
     if in_doubt and pair.status == "accepted":
         return (
-            "a place that changed, or another that looks alike: one capture that walks from what "
-            f"{a} shows to what {b} shows, or that passes what only one of them has, tells; dates do too "
-            f"(gsmap edit {at} SCENE --captured-at DATE); where you know it: gsmap confirm or reject {at} {pair.pair}"
+            "either the place changed, or two places look alike; to decide, add a capture that walks from what "
+            f"{a} shows to what {b} shows, or date both captures "
+            f"(gsmap edit {at} SCENE --captured-at DATE); if you know the answer: gsmap confirm or reject {at} "
+            f"{pair.pair}"
         )
     if pair.status == "accepted":
         return (
-            f"a further capture that overlaps both {a} and {b} closes a loop that bears it out or "
-            f"contradicts it; where you know it: gsmap confirm or reject {at} {pair.pair}"
+            f"a further capture that overlaps both {a} and {b} closes a loop that confirms or "
+            f"contradicts the edge; if you know the answer: gsmap confirm or reject {at} {pair.pair}"
         )
     if "coinciding cells" in failed or pair.status == "no_match":
-        return f"a capture of the way from {a} to {b} that shares about a third of either"
+        return f"add a capture of the way from {a} to {b} that shares about a third with each"
     if "free-space violation" in failed or in_doubt:
-        return f"two places that look alike, or one that changed a lot: gsmap confirm {at} {pair.pair} where you know"
-    return f"a capture that shows more of what {a} and {b} share, from both sides"
+        return (
+            "either two places look alike, or one place changed a lot; if you know that it is one place: "
+            f"gsmap confirm {at} {pair.pair}"
+        )
+    return f"add a capture that shows more of what {a} and {b} share, from both sides"

@@ -31,7 +31,7 @@ _OTHER = (235, 140, 20)
 
 
 class PhotoReporter:
-    """Compares localized photos with the map; objects and reference views are loaded on first use."""
+    """Compares localized photos with the map, and loads objects and reference views on first use."""
 
     def __init__(self, localizer: Localizer, progress: StageProgress) -> None:
         self._localizer, self._progress = localizer, progress
@@ -83,7 +83,7 @@ class PhotoReporter:
         return PhotoObservation(found, rows, tuple(notes))
 
     def observed_objects(self, row: LocalizeRow, told: PhotoObservation) -> list[PhotoObjectObservation]:
-        """Return the objects that a localized photo shows or shows to be absent, map frame."""
+        """Return the objects that a localized photo shows, and those whose absence it shows, in the map frame."""
         if self.known is None or row.component is None:
             return []
         held = self._localizer
@@ -115,7 +115,7 @@ _LITTLE = 0.2
 
 
 def nearest_object(known: MapObjects | None, component: int, position: np.ndarray, unit: float) -> MapObject | None:
-    """Return the present object whose box is nearest to a point, if it is near enough."""
+    """Return the present object whose box is nearest to a point; None if no box is near enough."""
     if known is None:
         return None
     best, far = None, _NEAR_M / unit

@@ -74,7 +74,7 @@ def localize_files(
     depth_scale: float = 1000.0,
     options: PhotoOptions | None = None,
 ) -> LocalizeReport:
-    """Read and localize photos and scans; nothing is localized if a file cannot be read.
+    """Read and localize photos and scans; if a file cannot be read, raise an error before localizing any.
 
     Args:
         files: files, or photos in memory, which are called ``photo_0`` and so on by their position.
@@ -118,7 +118,7 @@ def check_named(
     video: str | os.PathLike[str] | None,
     masks: str | os.PathLike[str] | None = None,
 ) -> None:
-    """Refuse photos together with a video, neither of them, and masks for a video."""
+    """Raise an error for photos together with a video, for neither, and for masks of a video."""
     if video is not None and masks is not None:
         raise ConfigError(
             "--masks apply to photos by name: frames of a video have no names", code="option_not_applicable"
@@ -257,7 +257,7 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
     """
     if intrinsics is not None and focal is not None:
         raise ConfigError(
-            "give one of --intrinsics and --focal: intrinsics include the focal length", code="conflicting_options"
+            "pass --intrinsics or --focal, not both, as intrinsics include the focal length", code="conflicting_options"
         )
     if intrinsics is not None:
         parts = intrinsics.split(",") if isinstance(intrinsics, str) else intrinsics
@@ -265,7 +265,7 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
             fx, fy, cx, cy = (float(part) for part in parts)
         except ValueError:
             raise ConfigError(
-                f"intrinsics are four numbers fx,fy,cx,cy, got {intrinsics!r}", code="invalid_intrinsics"
+                f"--intrinsics needs four numbers fx,fy,cx,cy, got {intrinsics!r}", code="invalid_intrinsics"
             ) from None
         return Lens((fx, fy, cx, cy))
     if focal is None:
@@ -275,7 +275,9 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
     try:
         return Lens(focal_px=float(focal))
     except ValueError:
-        raise ConfigError(f"a focal length is auto or pixels, got {focal!r}", code="invalid_intrinsics") from None
+        raise ConfigError(
+            f"--focal must be auto or a number of pixels, got {focal!r}", code="invalid_intrinsics"
+        ) from None
 
 
 def row_of(names: Mapping[str, str], file: str, found: LocalizationResult, seconds: float) -> LocalizeRow:

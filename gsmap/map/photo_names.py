@@ -13,8 +13,9 @@ from gsmap.errors import InputError
 
 _Camera = tuple[str, int]
 _Rank = tuple[bool, bool, int, bool]
-"""How well a photo fits a camera: the scene's name is a folder above it; no folder contradicts the camera's name; parts
-of the path that agree; the suffix agrees."""
+"""Rank of a photo for a camera, higher is better: a folder above the photo has the scene's name; no folder contradicts
+the camera's name; number of path parts that agree; the suffix agrees.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ def match_photos(photos: Collection[str], names: Mapping[str, Sequence[str]], wh
 
 
 def rows_of_photo(names: Sequence[str], photo: str) -> list[int]:
-    """Return the rows of a scene's cameras that a photo's name may mean; one if it is unambiguous."""
+    """Return the rows of a scene's cameras that a photo may belong to; one row if its name is unambiguous."""
     exact = [row for row, name in enumerate(names) if name == photo]
     if exact:
         return exact
@@ -93,7 +94,7 @@ def rows_of_photo(names: Sequence[str], photo: str) -> list[int]:
 
 
 def _drop_other_folders(ranked: dict[str, dict[_Camera, _Rank]]) -> dict[str, str]:
-    """Remove from ``ranked`` the photos that folders exclude; return them with a photo in the expected folder."""
+    """Remove from ``ranked`` the photos that folders exclude; return each with a photo in the expected folder."""
     best: dict[str, tuple[tuple[bool, bool], str]] = {}
     for photo, ranks in ranked.items():
         for (scene, _), rank in ranks.items() if len(_parts(photo)) > 1 else ():
@@ -125,7 +126,7 @@ def _one_photo_each(
     names: Mapping[str, Sequence[str]],
     where: Mapping[str, str],
 ) -> dict[str, str]:
-    """Keep the best photo of each camera in ``chosen``; return the removed photos with the kept one."""
+    """Keep the best photo of each camera in ``chosen``; return each removed photo with the photo that was kept."""
     photos_of: dict[_Camera, list[str]] = {}
     for photo, camera in chosen.items():
         photos_of.setdefault(camera, []).append(photo)
@@ -148,7 +149,7 @@ def _one_photo_each(
 
 
 def _is_same_photo(a: Sequence[str], b: Sequence[str]) -> bool:
-    """Return true if two paths name one photo: one is the tail of the other, apart from a missing suffix."""
+    """Return true if two paths name the same photo: one path is the tail of the other, apart from a missing suffix."""
     whole, _, same = _agreement(a, b)
     return whole and (same or _stem(a[-1]) in (a[-1], b[-1]))
 
@@ -162,7 +163,7 @@ def _agreement(photo: Sequence[str], camera: Sequence[str]) -> tuple[bool, int, 
 
 
 def _scene_of(folders: Sequence[str], scenes: Mapping[tuple[str, ...], str]) -> str | None:
-    """Return the scene named like the deepest folder; None if there is none."""
+    """Return the scene with the name of the deepest possible folder; None without one."""
     sizes = sorted({len(name) for name in scenes}, reverse=True)
     for end in range(len(folders), 0, -1):
         for size in sizes:

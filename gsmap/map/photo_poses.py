@@ -36,11 +36,11 @@ class PhotoPose:
 
 
 LocalizePhotos = Callable[[Sequence[str]], dict[str, PhotoPose]]
-"""Photos by their names as the files have them, to those that were placed; the others are left out."""
+"""A function that maps the names of photos, as the files have them, to the poses of photos that were localized."""
 
 
 class PhotoPoseRow(Protocol):
-    """The fields of a localization row that are used here."""
+    """The fields of a localization row that `photo_pose_of` uses."""
 
     @property
     def file(self) -> str: ...
@@ -67,7 +67,7 @@ def photo_localizer(store: Store, localize: Callable[..., Any], folder: str | os
     """
     root = Path(folder)
     if not root.is_dir():
-        raise NotFoundError(f"no folder of photos at {root}", code="folder_not_found")
+        raise NotFoundError(f"there is no folder of photos at {root}", code="folder_not_found")
 
     def localise(names: Sequence[str]) -> dict[str, PhotoPose]:
         files = {name: root / name for name in names if _inside(root, name)}
@@ -88,8 +88,8 @@ def photo_localizer(store: Store, localize: Callable[..., Any], folder: str | os
 def photo_pose_of(
     row: PhotoPoseRow, size_px: tuple[int, int], poses: Mapping[str, ScenePose], ids: Mapping[str, str]
 ) -> PhotoPose | None:
-    """Return the pose of a photo in the frame of its best supporting scene; None if it was refused. The photo moves
-    with that scene when poses change.
+    """Return the pose of a photo in the frame of its best supporting scene, with which the photo moves when poses
+    change; None if the photo was refused.
 
     A photo is tied to what it was found by: when the map is bent, it moves with that scene.
 
@@ -116,7 +116,7 @@ def _inside(root: Path, name: str) -> bool:
 
 
 def _size(path: Path) -> tuple[int, int]:
-    """Return width and height of the upright image."""
+    """Return the width and height of the upright image."""
     from PIL import ImageOps
 
     with open_picture(path) as picture:

@@ -1,4 +1,4 @@
-"""Photos stored in a map: their object observations and their poses, as rows."""
+"""Report the photos stored in a map as rows, and derive their object observations."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def objects_in_photo(
     graph_of: Callable[[str], SceneGraph | None],
     poses: Mapping[str, Sim3],
 ) -> list[PhotoObjectObservation]:
-    """Return which objects of its component a localized photo shows, and which it shows to be absent.
+    """Return the objects of its component that a localized photo shows, and the objects whose absence it shows.
 
     An object is in sight where the map, seen from the photo, shows its surface: where something the map has stands
     before it nothing is said, and neither where something new does.
@@ -150,7 +150,7 @@ def objects_in_photo(
 def _points(
     thing: MapObject, graph_of: Callable[[str], SceneGraph | None], poses: Mapping[str, Sim3]
 ) -> np.ndarray | None:
-    """Return the (K, 3) surface samples of an object from the newest scene that shows it, map frame."""
+    """Return surface samples (K, 3) of an object, in the map frame, from the newest scene that shows the object."""
     for sighting in reversed(thing.sightings):
         if sighting.state != "seen" or sighting.thing < 0:
             continue
@@ -201,7 +201,7 @@ def add_photo_observations(
 
 
 def _at(objects: Sequence[MapObject], component: int, at: np.ndarray, near: float) -> int | None:
-    """Return the index of the object at a point; of several the one whose box centre is nearest."""
+    """Return the index of the object at a point; among several objects, the one with the nearest box centre."""
     best, far = None, np.inf
     for number, thing in enumerate(objects):
         if thing.component != component:

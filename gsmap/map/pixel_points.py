@@ -12,7 +12,7 @@ from gsmap.types import Cameras, Gaussians
 
 
 def camera_of(cameras: Cameras, name: str, scene_name: str) -> Cameras:
-    """Return a camera of a scene by its name or its photo's name, with or without folders and suffix.
+    """Return a camera of a scene by the camera's name or its photo's name, with or without folders and suffix.
 
     Raises:
         NotFoundError: none, or several.
@@ -31,7 +31,7 @@ def camera_of(cameras: Cameras, name: str, scene_name: str) -> Cameras:
 def surface_at(
     gaussians: Gaussians, camera: Cameras, pixel: np.ndarray, sigma_share: float
 ) -> tuple[float, float] | None:
-    """Return the depth along z of the surface at a pixel and its standard deviation; None if there is none.
+    """Return the depth along z of the surface at a pixel, and its standard deviation; None without a surface.
 
     The standard deviation is that of splats around surfaces (a share of the depth), and how thick the surface is.
 
@@ -41,7 +41,7 @@ def surface_at(
     width, height = camera.sizes_px[0].tolist()
     if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
         raise InputError(
-            f"pixel {pixel[0]:g},{pixel[1]:g} lies outside of camera {camera.names[0]} ({width}x{height})",
+            f"pixel {pixel[0]:g},{pixel[1]:g} lies outside of the image of camera {camera.names[0]} ({width}x{height})",
             code="pixel_outside",
         )
     pose = camera.T_frame_camera[0]
@@ -54,7 +54,7 @@ def surface_at(
 
 
 def ray_of(intrinsics_px: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Return the (3,) direction of a pixel in the camera frame, with z = 1."""
+    """Return the direction (3,) of a pixel in the camera frame, with z = 1."""
     fx, fy, cx, cy = intrinsics_px
     return np.array([(pixel[0] - cx) / fx, (pixel[1] - cy) / fy, 1.0])
 
@@ -62,7 +62,7 @@ def ray_of(intrinsics_px: np.ndarray, pixel: np.ndarray) -> np.ndarray:
 def picked_point(
     store: Store, scene: str, camera_name: str, pixel: np.ndarray, sigma_share: float, sigma_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (3,) scene point that a pixel of a camera shows, and its (3, 3) covariance.
+    """Return the scene point (3,) that a pixel of a camera shows, and its covariance (3, 3).
 
     Raises:
         NotFoundError: no such camera, or nothing is to be seen there.

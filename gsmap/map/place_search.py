@@ -29,7 +29,7 @@ _SAME_PLACE_M = 0.5  # nodes of no object that are nearer than this are one plac
 
 @dataclass(frozen=True)
 class Request:
-    """A search request; exactly one of the first four is set.
+    """A search request; exactly one of its first four fields is set.
 
     Args:
         text: text, for an embedder with a text encoder.
@@ -49,13 +49,13 @@ class Request:
         given = [value for value in (self.text, self.picture, self.like, self.at) if value is not None]
         if len(given) != 1:
             raise ConfigError(
-                "give one query: text, --picture FILE, --like SCENE:NODE or --at X,Y,Z",
+                "specify one query: text, --picture FILE, --like SCENE:NODE or --at X,Y,Z",
                 code="nothing_requested",
             )
         if self.text is not None and not self.text.strip():
             raise ConfigError("the query text is empty", code="nothing_requested")
         if self.at is not None and (len(self.at) != 3 or not np.isfinite(self.at).all()):
-            raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {list(self.at)}", code="invalid_point")
+            raise ConfigError(f"a point needs three numbers such as 1.5,0,2, got {list(self.at)}", code="invalid_point")
         if self.top < 1:
             raise ConfigError(f"--top must be at least 1, got {self.top}", code="out_of_range")
 
@@ -100,7 +100,7 @@ class _SearchIndex:
 
 @dataclass(frozen=True, eq=False)
 class _QueryVector:
-    """A query embedding (F,), and (F,) bool mask of the features that the query determines."""
+    """A query embedding (F,), with a mask (F,) that is True for features that the query determines."""
 
     features: np.ndarray
     told: np.ndarray
@@ -153,7 +153,7 @@ def find_places(
 def _called(
     store: Store, request: Request, settings: Settings, progress: StageProgress
 ) -> tuple[FindReport, list[np.ndarray]] | None:
-    """Return the objects whose name or label contains all query words; None if there is none.
+    """Return the objects whose name or label contains all query words; None without such objects.
 
     Of several those come first whose name is just what was asked for, then those that are there still.
     """
@@ -260,7 +260,7 @@ def _embedder(store: Store, recipe: str) -> str:
 
 
 def _require_same_meaning(index: _SearchIndex, descriptor: str) -> None:
-    """Refuse graphs whose embeddings come from another embedder than the query."""
+    """Raise an error if the graphs and the query were embedded by different embedders."""
     layers = [graph.layers["objects"] for graph in index.graphs.values() if "objects" in graph.layers]
     if not layers:
         raise NotFoundError(
@@ -277,7 +277,7 @@ def _require_same_meaning(index: _SearchIndex, descriptor: str) -> None:
 
 
 def _shown(store: Store, request: Request, settings: Settings) -> _QueryVector | None:
-    """Return the embedding of the query's text or image; None for a query by object or point."""
+    """Return the embedding of a query's text or image; None for a query by object or point."""
     params, specs = settings.describe.object, models.specs(store)
     if request.text is not None:
         try:
@@ -318,7 +318,7 @@ def _asked(store: Store, request: Request, index: _SearchIndex) -> Sequence[Obje
     graph, row = index.graphs.get(scene.id), int(number)
     if graph is None:
         raise NotFoundError(
-            f"scene {scene.name} has no graph of the recipe that answers: run gsmap update first", code="no_graph"
+            f"scene {scene.name} has no graph of the recipe that is searched: run gsmap update first", code="no_graph"
         )
     layer = graph.layers.get("objects")
     if layer is None or row >= len(layer):
@@ -335,7 +335,7 @@ def _asked(store: Store, request: Request, index: _SearchIndex) -> Sequence[Obje
 
 
 def _thing_at(point: np.ndarray, component: int, index: _SearchIndex, scene: str | None = None) -> MapObject | None:
-    """Return the object at a point (3,) of the map; None if there is none.
+    """Return the object at a point (3,) of the map; None without an object there.
 
     Args:
         scene: restrict the search to the segment of this scene.
@@ -354,7 +354,7 @@ def _thing_at(point: np.ndarray, component: int, index: _SearchIndex, scene: str
 
 
 def _samples(index: _SearchIndex, sighting: ObjectObservation) -> np.ndarray:
-    """Return the (K, 3) surface samples of a segment, map frame and unit."""
+    """Return the surface samples (K, 3) of a segment, in the map's frame and unit."""
     things = index.graphs[sighting.scene].segments
     assert things is not None
     end = int(things.sample_counts[: sighting.thing + 1].sum())
@@ -368,7 +368,7 @@ def _samples(index: _SearchIndex, sighting: ObjectObservation) -> np.ndarray:
 def _by_likeness(
     index: _SearchIndex, query: Sequence[ObjectObservation], top: int
 ) -> tuple[list[FindHit], list[MapObject | None]]:
-    """Rank objects by their similarity to one object, itself first."""
+    """Rank objects by their similarity to one object, beginning with that object."""
     looks: dict[str, list[find.SegmentDescriptor]] = {}
     for scene, graph in index.graphs.items():
         if graph.segments is not None and graph.up is not None:
@@ -389,7 +389,7 @@ def _by_likeness(
 
 
 def _by_embedding(index: _SearchIndex, asked: _QueryVector, top: int) -> tuple[list[FindHit], list[MapObject | None]]:
-    """Rank objects and unassigned nodes by their best matching node."""
+    """Rank objects, each by its best matching node, and nodes that belong to no object."""
     scenes, rows, owners, points, scores = [], [], [], [], []
     places: list[MapObject | None] = list(index.objects)
     number = {thing.id: i for i, thing in enumerate(index.objects)}
@@ -442,7 +442,7 @@ def _by_embedding(index: _SearchIndex, asked: _QueryVector, top: int) -> tuple[l
 
 
 def _thing_of(index: _SearchIndex, scene: str, positions: np.ndarray) -> np.ndarray:
-    """Return (M,) the segment of a scene that contains each point (M, 3) of its frame, -1 for none."""
+    """Return the segment (M,) of a scene that contains each point (M, 3) of the scene frame; -1 for no segment."""
     from scipy.spatial import cKDTree
 
     things = index.graphs[scene].segments
@@ -454,7 +454,7 @@ def _thing_of(index: _SearchIndex, scene: str, positions: np.ndarray) -> np.ndar
 
 
 def _box(index: _SearchIndex, hit: FindHit, thing: MapObject | None) -> np.ndarray:
-    """Return the (2, 3) box around a hit, in the scene that matched best."""
+    """Return the box (2, 3) around a hit, in the scene that matched best."""
     half = _SAME_PLACE_M / 2 / index.known.metres.get(hit.component, 1.0)
     if thing is None:
         return np.array([hit.position - half, hit.position + half])

@@ -32,7 +32,7 @@ _log = logging.getLogger("gsmap.map")
 
 @snapshot_read
 def write_poses(store: Store, out: Path, format: str, crs: str | None = None) -> list[Path]:
-    """Write the newest poses of all placed scenes; returns the files or folders written.
+    """Write the newest poses of all placed scenes; return the written files or folders.
 
     - ``tum``: a line per scene after a comment with its name, ``T_map_scene`` (a scale is left out: the format has
       none), at the time of capture in Unix seconds where all scenes have a date, else at 0, 1, 2, ... in the order of
@@ -52,7 +52,9 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
         InputError: a pose that the format cannot say, or several components for one pipe.
     """
     if format not in FORMATS:
-        raise ConfigError(f"poses are written as {', '.join(FORMATS)}, got {format!r}", code="invalid_choice")
+        raise ConfigError(
+            f"the format of poses must be one of {', '.join(FORMATS)}, got {format!r}", code="invalid_choice"
+        )
     graph = store.revisions.get()
     scenes = {scene.id: scene for scene in store.scenes.list()}
     placed = [pose for scene, pose in (graph.poses if graph else {}).items() if scene in scenes]
@@ -123,7 +125,7 @@ def _write_tum(path: Path, members: Sequence[ScenePose], scenes: Mapping[str, Sc
 
 
 def _distinct(times_s: Sequence[float]) -> list[float]:
-    """Return sorted times in which equal ones are spread towards the next one, at most a second apart."""
+    """Return sorted times in which equal times are spread towards the next time, at most a second apart."""
     groups = [(time_s, len(list(same))) for time_s, same in groupby(times_s)]
     out: list[float] = []
     for i, (time_s, count) in enumerate(groups):
@@ -150,7 +152,7 @@ def _write_g2o(
 
 
 def _unit(path: Path, metre: MetricScale) -> tuple[float, str]:
-    """Return the factor from component units to output units, and a remark on the unit."""
+    """Return the factor from component units to output units, and a note on the unit."""
     if not metre.is_rough:
         return metre.metres_per_unit, f"lengths in metres ({metre.text()} of the map)"
     remark = f"lengths in the unit of the map: {metre.text()}"
@@ -159,7 +161,7 @@ def _unit(path: Path, metre: MetricScale) -> tuple[float, str]:
 
 
 def _moved(S: Sim3, factor: float) -> Sim3:
-    """Scale the lengths of a pose on both sides."""
+    """Multiply the lengths of both frames of a pose by a factor."""
     return Sim3(S.rotation, S.translation * factor, S.scale)
 
 

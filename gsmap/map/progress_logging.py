@@ -1,4 +1,4 @@
-"""Log progress: one line at INFO under ``gsmap.<stage>`` for every finished step."""
+"""Log one line at INFO under ``gsmap.<stage>`` for every finished step."""
 
 from __future__ import annotations
 

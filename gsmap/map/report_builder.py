@@ -91,7 +91,7 @@ _KINDS = {
 def write_report(
     store: Store, settings: Settings, path: Path, since: str | None, pictures: bool, progress: StageProgress
 ) -> WrittenReport:
-    """Write a map's report to a file, whole or not at all.
+    """Write a map's report to a file; after an error, no partial file remains.
 
     Args:
         since: report only what is new since this date, ISO 8601; None for everything.
@@ -121,10 +121,11 @@ def write_report(
 
 
 def check_target(path: Path) -> None:
-    """Refuse a file to which no report may be written; see `write_report` for the errors."""
+    """Raise an error for a path to which no report may be written; see `write_report` for the errors."""
     if path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(
-            f"a report is an HTML page: name a file that ends with .html, not {path.name or path}", code="wrong_suffix"
+            f"a report is an HTML page: name a file that ends with .html instead of {path.name or path}",
+            code="wrong_suffix",
         )
     if path.is_dir():
         raise ConfigError(
@@ -314,7 +315,7 @@ class _ReportBuilder:
         ]
         plan = make_plan(shown, lines, _up(state, scenes, poses), metre)
         if plan is None:
-            return replace(island, note="where its scenes show anything is not known")
+            return replace(island, note="the content of its scenes cannot be located")
         plan, note = self._picture(plan, poses, found)
         return replace(island, plan=plan, note=note)
 
@@ -327,7 +328,7 @@ class _ReportBuilder:
             parts = [transform_gaussians(gaussians, pose.S_map_scene) for gaussians, pose in whole]
             eyes = np.concatenate([pose.S_map_scene.apply(r.eyes) for r, pose in zip(found, poses, strict=True)])
             picture, kind = top_picture(parts, plan, eyes, px), "rendered"
-            note = "Below, the Gaussians from straight above, ceilings off."
+            note = "The picture shows the Gaussians from straight above, without ceilings."
         else:
             marks = [
                 pose.S_map_scene.apply(read.points)
@@ -335,15 +336,15 @@ class _ReportBuilder:
                 if read.kind == "landmarks"
             ]
             if not marks:
-                return plan, "Outlines are boxes around what the scenes hold."
+                return plan, "Outlines are boxes around the Gaussians of the scenes."
             picture, kind = density_picture(np.concatenate(marks), plan, px), "landmarks"
-            note = "Below, where the landmarks of its graphs lie."
+            note = "The picture shows the landmarks of the scene graphs."
         return (replace(plan, picture=picture, picture_kind=kind), note) if picture else (plan, "")
 
     # --- pictures ----------------------------------------------------------------------------------------------------
 
     def _pairs(self, made: Report) -> tuple[PairPicture, ...]:
-        """Draw the most doubtful pairs."""
+        """Draw pictures of the most doubtful pairs."""
         sizes_ = {entry.row.id: entry.row.num_gaussians for entry in made.scenes}
         doubtful = [edge for edge in made.edges if edge.use in ("undecided", "tentative")]
         doubtful.sort(key=lambda edge: (-edge.doubt, edge.row.pair))
@@ -367,7 +368,7 @@ class _ReportBuilder:
         return tuple(out)
 
     def _changes(self, state: _CatalogState) -> tuple[ChangePicture, ...]:
-        """Draw the changes of highest confidence."""
+        """Draw pictures of the changes with the highest confidence."""
         found = [] if state.changes is None else [row for row in state.changes.changes if row.box_m is not None]
         sizes_ = {scene.id: scene.num_gaussians for scene in state.scenes}
         found = [
@@ -443,7 +444,7 @@ def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState
 
 
 def _known_changes(store: Store, settings: Settings, since: str | None) -> ChangesReport:
-    """Return the stored changes; nothing is compared."""
+    """Return the stored changes, without comparing scenes."""
     asked = filter_by_date(plan_comparisons(store, settings), since, None, None)
     return changes_report(store, settings, asked, min_confidence=settings.change.min_confidence)
 

@@ -1,4 +1,4 @@
-"""Localize the scans among the inputs of `gsmap localize` and report them as photo rows."""
+"""Localize the scans among the inputs of `gsmap localize`, and report them as rows of photos."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def scan_rows(
 
 
 def _row(file: str, row: ScanRow) -> LocalizeRow:
-    """Convert a scan row to a photo row; `Map.localize_scan` returns all fields."""
+    """Convert a row of a scan to a row of a photo; `Map.localize_scan` returns all fields."""
     evidence = {"num_points": float(row.num_points), "coloured": float(row.coloured)}
     if row.sigma_deg is not None and row.sigma_m is not None:
         evidence |= {"sigma_deg": row.sigma_deg, "sigma_m": row.sigma_m}

@@ -12,10 +12,10 @@ from gsmap.types.retrieval import IndexedScene
 from gsmap.types.segments import InMemory, merged, to_merge
 
 AT_ONCE = 64
-"""Scenes whose rows are made at a time: some megabytes."""
+"""Number of scenes whose rows are computed at a time, which take some megabytes."""
 
 PATIENCE = 8
-"""Times that others may change an index while it is read, or that a damaged one is made anew."""
+"""Number of attempts to read an index, in case other processes change it or it is damaged and rebuilt."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class SceneIndex:
             )
 
     def forget_damaged(self) -> bool:
-        """Drop unreadable segments, so that `update` builds them again; return true if there were any."""
+        """Drop unreadable segments, so that `update` builds them again; return true if any was dropped."""
         damaged = [segment.id for segment in self.segments() if _is_damaged(segment)]
         self.store.indexes.forget(damaged)
         return bool(damaged)

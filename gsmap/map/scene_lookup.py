@@ -1,4 +1,4 @@
-"""Look scenes up in the retrieval index, which is updated first and rebuilt where it is damaged."""
+"""Look up scenes in the retrieval index, after updating it and rebuilding damaged parts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsmap.types.segments import InMemory, Segment
 
 _AT_ONCE = 16  # scenes that ask together: what they find is in memory, some 7 MB of each
 KEPT = 2
-"""Times as many candidates are kept as are tried, to be shown."""
+"""Ratio of candidates that are kept, for display, to candidates that are tried."""
 
 
 def look_up_scenes(
@@ -58,7 +58,7 @@ def look_up_scenes(
 def look_up_graph(
     store: Store, graphs: Mapping[str, RecipeKey], graph: SceneGraph, params: retrieve.Params
 ) -> list[Candidate]:
-    """Look up a graph that is not in the map; nothing is stored and the index stays unchanged.
+    """Look up a graph that is not in the map, without storing it or changing the index.
 
     Args:
         graphs: graph key of every indexed scene; scenes missing in the index are read.

@@ -66,11 +66,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "merge.mergers.tto.prefer": "both",
     },
 }
-"""Settings by the name of a preset; what a preset does not name has its default."""
+"""Settings of each preset by name; all other settings have their defaults."""
 
 
 class _Section:
-    """A field of `Settings` whose module is imported, and whose default is made, on first use."""
+    """A field of `Settings`; its module is imported, and its default is created, on first use."""
 
     def __init__(self, module: str) -> None:
         self._module = module
@@ -91,7 +91,7 @@ class _Section:
 
 
 def _params_of(module: str) -> Any:
-    """Return a field that holds the ``Params`` of a module."""
+    """Return a field for the ``Params`` of a module."""
     return _Section(module)
 
 
@@ -139,7 +139,7 @@ class Settings:
 
 
 def settings_of(values: Mapping[str, Any], preset: str | None = None) -> Settings:
-    """Return the defaults, changed by a preset and then by values by dotted name.
+    """Return the defaults, changed by a preset and then by ``values``, which have dotted names.
 
     Raises:
         ConfigError: no such preset or setting, or a value that does not fit.
@@ -151,7 +151,7 @@ def settings_of(values: Mapping[str, Any], preset: str | None = None) -> Setting
 
 
 def read_settings(folder: Path) -> tuple[str, dict[str, Any]]:
-    """Read the preset of a map and its own settings by dotted name, unknown names included.
+    """Read the preset of a map and its own settings by dotted name, including unknown names.
 
     Raises:
         ConfigError: ``settings.toml`` cannot be read.
@@ -164,11 +164,13 @@ def read_settings(folder: Path) -> tuple[str, dict[str, Any]]:
 
 
 _WARNED: set[tuple[Path, str]] = set()
-"""File and name of the settings that were reported as unknown, each once."""
+"""File and name of each unknown setting that was reported already."""
 
 
 def _known(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a file that exist; warn once of each other one, so that a map of an older gsmap opens."""
+    """Return the known settings of a file; warn once about each unknown setting, so that maps of an older gsmap
+    open.
+    """
     defaults, path = Settings(), folder / FILE_NAME
     unknown = [name for name in values if not contains(defaults, name)]
     for name in unknown:
@@ -185,12 +187,12 @@ def _known(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_of_the_run(name: str) -> bool:
-    """Return true for a setting that may start jobs on another machine: a map may come from a stranger."""
+    """Return true for a setting that may start jobs on other machines, which a map from a stranger must not choose."""
     return name.startswith("engine.") and not name.startswith("engine.executors.local.")
 
 
 def map_settings(folder: Path, run_preset: str | None, run_values: Mapping[str, Any]) -> Settings:
-    """Return the settings in force: defaults, the map's preset and settings, then those of a run.
+    """Return the settings in force: defaults, changed by the map's preset, its settings, and the settings of a run.
 
     Args:
         run_preset: replaces the preset and the settings of the map.
@@ -237,7 +239,7 @@ def write_settings(
     unknown = [name for name in drop if name not in old]
     if unknown:
         raise ConfigError(
-            f"{unknown[0]} is not set in {folder / FILE_NAME}: nothing to unset",
+            f"{unknown[0]} is not set in {folder / FILE_NAME}, so it has its default already",
             code="setting_not_changed",
         )
     _combined(folder, preset or old_preset, kept, values)

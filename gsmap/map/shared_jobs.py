@@ -20,19 +20,22 @@ from gsmap.types.progress import StageProgress
 _log = logging.getLogger("gsmap.map")
 
 _WORTH_S = 1.0
-"""How much work is leased in one transaction: jobs of several seconds one by one, so that none lies idle in one process
-while another has nothing to do; hundreds of quick ones a few at a time, so that leasing them costs little."""
+"""Seconds of work that are leased in one transaction. Long jobs are leased one by one, so that no job waits in one
+process while another is idle; quick jobs a few at a time, so that leases cost little.
+"""
 _AT_MOST = 16
 
 TOGETHER_S = 1.0
-"""Results of quick jobs that come within it are kept in one transaction: each by itself costs a dozen statements."""
+"""Seconds within which results of quick jobs are stored in one transaction, as each transaction costs a dozen
+statements.
+"""
 
 POLL_S = 0.5
-"""How often those who wait look whether the others have finished or dropped something; one small read each time."""
+"""Seconds between checks by a waiting process whether other processes have finished or dropped jobs."""
 
 
 class SharedJobs:
-    """The jobs of one stage, keyed by their results.
+    """The jobs of one stage, by the keys of their results.
 
     Args:
         store: the store of the map.
@@ -71,7 +74,8 @@ class SharedJobs:
     def results(
         self, run: Callable[[Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
     ) -> Generator[tuple[str, Any], None, None]:
-        """Yield (key, result) of the jobs that this process runs, until all jobs are done. Close the generator.
+        """Yield (key, result) of the jobs that this process runs, until all jobs are done. The caller must close the
+        generator.
 
         Each result must be kept, and `saved` told, before the next is asked for.
 
@@ -85,7 +89,7 @@ class SharedJobs:
     def batches(
         self, run: Callable[[Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]], together_s: float | None = None
     ) -> Generator[list[tuple[str, Any]], None, None]:
-        """Yield results in batches that arrive within some seconds (`TOGETHER_S`); see `results`.
+        """Yield results in batches of those that arrive within ``together_s`` seconds; see `results`.
 
         Whoever is killed loses that much work, who is interrupted or fails none.
         """
@@ -133,7 +137,7 @@ class SharedJobs:
         self._tell(text)
 
     def _leave_out(self, again: bool) -> None:
-        """Skip quarantined jobs, or release them if they are requested again."""
+        """Skip quarantined jobs, or release them from quarantine if they were requested again."""
         before = {one.what: one for one in self._set_aside.list()}
         known = [key for key in self._keys if self._lease(key) in before]
         if again and known:
@@ -167,7 +171,7 @@ class SharedJobs:
         self._progress(self._stage, 1 - self._left / len(self._keys), text)
 
     def _begin(self, begun: list[str]) -> Iterator[tuple[Any, ...]]:
-        """Yield the arguments of jobs that this process has leased, as long as there are free jobs."""
+        """Lease free jobs and yield their arguments, until no job is free."""
 
         def done(leases: Collection[str]) -> set[str]:
             return {self._lease(key) for key in self._settled([lease.partition(" ")[2] for lease in leases])}
@@ -240,7 +244,7 @@ def announce_work(store: Store, task: str) -> Iterator[None]:
 
 @contextmanager
 def note_interruption(kept: Callable[[], str]) -> Iterator[None]:
-    """Add a note of what is stored to an interruption (`BaseException.add_note`); errors stay as they are."""
+    """Add a note on stored results to an interruption (`BaseException.add_note`), but not to errors."""
     try:
         yield
     except BaseException as stopped:

@@ -105,7 +105,7 @@ def export_small(
     progress: StageProgress,
     known: MapObjects | None = None,
 ) -> SmallMapReport:
-    """Write a small map; it appears whole or not at all.
+    """Write a small map; after an error, no partial map remains.
 
     Args:
         budget_bytes: maximum size of all files together.
@@ -120,7 +120,7 @@ def export_small(
         raise StoreError(f"{out} exists: choose another name", code="already_exists")
     if settings.localize.extractor != "sift":
         raise ConfigError(
-            "a small map cannot store a model: export it with the built-in features (--set localize.extractor=sift)",
+            "a small map cannot contain a model: export it with the built-in features (--set localize.extractor=sift)",
             code="small_map_extractor",
         )
     localizer = Localizer(store, settings, progress)
@@ -191,7 +191,7 @@ class _SceneContent:
 
     @property
     def num_bytes(self) -> int:
-        """Packed size before coarser rounding."""
+        """Packed size in bytes, before coarser rounding."""
         features = packed_features.pack(self.features, self.step, self.first)
         return len(_npz(features)) + len(_npz(packed_gaussians.pack(self.gaussians)))
 
@@ -218,7 +218,7 @@ def _scene_content(localizer: Localizer, scene: str, passing: static_filter.Dyna
 
 
 def _removed(store: Store, scene: str) -> np.ndarray | bool:
-    """Return a mask of the Gaussians that later changes show to be gone; false if nothing was compared."""
+    """Return a mask that is True for Gaussians that disappeared in later changes; all False without comparisons."""
     out: np.ndarray | bool = False
     for comparison in store.changes.current():
         if comparison.older != scene or not comparison.changes:
@@ -233,7 +233,7 @@ def _removed(store: Store, scene: str) -> np.ndarray | bool:
 
 
 def _packed(localizer: Localizer, whole: _SceneContent, num_bytes: float) -> tuple[bytes, SmallSceneRow]:
-    """Pack a scene into about ``num_bytes``: round more coarsely first, then merge Gaussians."""
+    """Pack a scene in about ``num_bytes``: first round values more coarsely, then merge Gaussians."""
     shown = whole.gaussians
     all_features = _npz(packed_features.pack(whole.features, whole.step, whole.first))
     part = reduction.FEATURES_FRACTION * num_bytes / len(all_features)
@@ -428,7 +428,7 @@ class SmallLocalizer(Localizer):
     def _id_of(self, name: str) -> str:
         found = [one.id for one in self.small.values() if name in (one.name, one.id)]
         if not found:
-            raise NotFoundError(f"no scene is called {name!r} in {self.folder}", code="scene_not_found")
+            raise NotFoundError(f"{self.folder} has no scene called {name!r}", code="scene_not_found")
         return found[0]
 
     def _small_gaussians(self, scene: str) -> Gaussians:
@@ -448,7 +448,7 @@ class SmallLocalizer(Localizer):
             raise _corrupt(self.folder / f"{scene}.npz", error) from error
 
     def _arrays(self, scene: str, names: Sequence[str]) -> tuple[dict[str, np.ndarray], int]:
-        """Return arrays of a scene's verified file, and the size of the file."""
+        """Return arrays from a scene's file after verifying it, and the size of the file."""
         import hashlib
 
         path = self.folder / f"{scene}.npz"
@@ -487,14 +487,14 @@ def _unpacked(path: Path, content: bytes, names: Sequence[str]) -> dict[str, np.
         entries = [stored.getinfo(f"{name}.npy") for name in names]
         for entry in entries:
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(f"{entry.filename} is packed in a way that gsmap does not use")
+                raise ValueError(f"{entry.filename} has a compression that gsmap does not use")
             with stored.open(entry) as file:
                 if np.lib.format.read_magic(file) != (1, 0):
                     raise ValueError(f"{entry.filename} has another header than gsmap writes")
                 shape, _, dtype = np.lib.format.read_array_header_1_0(file)
                 size = math.prod(shape) * dtype.itemsize
                 if dtype.hasobject or min(shape, default=0) < 0 or size != entry.file_size - file.tell():
-                    raise ValueError(f"{entry.filename} does not hold what its header claims")
+                    raise ValueError(f"the content of {entry.filename} does not match its header")
             claimed += size
         check_size(path, claimed, len(content))
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
@@ -505,7 +505,7 @@ def _read_header(path: Path) -> dict[str, Any]:
     try:
         told = json.loads(_read_file(path, _MAX_JSON))
         if told["format"] != _FORMAT or not isinstance(told["version"], int):
-            raise ValueError("it is of another format")
+            raise ValueError("it has another format")
     except (OSError, MemoryError, *MALFORMED) as error:
         raise _corrupt(path, error) from error
     if told["version"] != _VERSION:

@@ -1,4 +1,4 @@
-"""Localize photos in a small map, which is read only."""
+"""Localize photos in a small map, without changing it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def localize_small(
     scans = [os.fspath(path) for path in files if is_scan(path)]
     if scans:
         raise ConfigError(
-            f"{scans[0]} is a scan: a small map places photographs alone; ask the map that it is of",
+            f"{scans[0]} is a scan, but a small map can only localize photos: use the map from which it was exported",
             code="not_in_small_map",
         )
     lens, settings = parse_lens(intrinsics, focal), settings_of(dict(values or {}), preset)

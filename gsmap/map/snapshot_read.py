@@ -1,4 +1,4 @@
-"""Read the catalog as of one transaction, whatever other processes write meanwhile."""
+"""Read the catalog as of one transaction, even if other processes write meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parse points given by the user: in the map, in a scene, at a pixel of a camera, or in the world."""
+"""Parse points that the user specifies: in the map, in a scene, at a pixel of a camera, or in the world."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CRS = re.compile(r"(?i)(world|[a-z]+:\d+(?:\+\d+)?):([^:]*)")
 
 @dataclass(frozen=True, eq=False)
 class SpecifiedPoint:
-    """A point given by the user.
+    """A point that the user specified.
 
     Args:
         said: the text.
@@ -40,7 +40,7 @@ class SpecifiedPoint:
 
 
 def parse_point(store: Store, text: str) -> SpecifiedPoint:
-    """Parse a point.
+    """Parse a point in any of its forms.
 
     Raises:
         ConfigError: it is none of the ways to give one.
@@ -68,7 +68,7 @@ def parse_point(store: Store, text: str) -> SpecifiedPoint:
 
 
 def parse_scene_point(store: Store, text: str) -> SpecifiedPoint:
-    """Parse a point of a scene, which keeps its place when the poses change."""
+    """Parse a point given in a scene, which moves with the scene when poses change."""
     found = parse_point(store, text)
     if found.scene is None:
         raise ConfigError(

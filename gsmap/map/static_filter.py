@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from gsmap.map.objects import MapObjects
 
 _OF_THINGS = ("appeared", "disappeared", "moved", "replaced")
-"""Kinds of changes that are of things; what was repainted stays, and so does what is lit otherwise."""
+"""Kinds of changes that concern objects; recoloured surfaces and other lighting are static content."""
 
 _SAME_PLACE = 0.1  # of a thing that stayed, the box that one capture shows holds this much of that of the next
 
 
 @dataclass(frozen=True)
 class DynamicContent:
-    """The segments and changes of one scene that are not static; `dynamic_rows` gives their Gaussians.
+    """The segments and changes of one scene that are not static; `dynamic_rows` returns their Gaussians.
 
     Args:
         graph: key of the graph with the segments; empty if there are none.
@@ -46,7 +46,7 @@ class DynamicContent:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the content; empty if there is none."""
+        """Digest of the dynamic content; empty without dynamic content."""
         if not self.things and not self.changes:
             return ""
         return text_digest(canonical([self.graph, self.things, [change[1:] for change in self.changes], self.told]))
@@ -61,7 +61,9 @@ def is_dynamic(thing: MapObject) -> bool:
 
 
 def _shared(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the fraction of the smaller of two boxes (2, 3) that the other contains; flat boxes count by faces."""
+    """Return the fraction of the smaller of two boxes (2, 3) that the larger contains; flat boxes count by their
+    faces.
+    """
     thin = 1e-3 * np.maximum(a[1] - a[0], b[1] - b[0]).max()
     a, b = (np.array([box[0] - thin, box[1] + thin]) for box in (a, b))
     both = np.clip(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0, None).prod()
@@ -69,7 +71,7 @@ def _shared(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def find_dynamic_content(store: Store, known: MapObjects) -> dict[str, DynamicContent]:
-    """Return the dynamic content of each placed scene, by scene id; only the catalog is read."""
+    """Return the dynamic content of each placed scene, by scene id, reading only the catalog."""
     graphs = {graph.scene: graph.key for graph in store.graphs.list()}
     things: dict[str, set[int]] = {}
     for thing in known.objects:
@@ -102,12 +104,12 @@ def find_dynamic_content(store: Store, known: MapObjects) -> dict[str, DynamicCo
 
 
 def _has_rows(scene: Scene) -> bool:
-    """Return true if changes have valid row numbers in a scene; an older gsmap thinned scenes without a row map."""
+    """Return true if row numbers of changes are valid in a scene, unlike in a scene that an older gsmap thinned."""
     return scene.thinning is None or scene.thinning.has_row_map
 
 
 def dynamic_rows(store: Store, scene: str, passing: DynamicContent) -> np.ndarray:
-    """Return (N,) bool, the dynamic Gaussians of a scene.
+    """Return a mask (N,) that is True for the dynamic Gaussians of a scene.
 
     Raises:
         NotFoundError: its segments or changes were pruned meanwhile.
@@ -135,7 +137,7 @@ def dynamic_rows(store: Store, scene: str, passing: DynamicContent) -> np.ndarra
 
 
 def dynamic_notes(known: MapObjects, passing: Mapping[str, DynamicContent]) -> list[str]:
-    """Return remarks on the dynamic content that is left out."""
+    """Return notes on the dynamic content that is left out."""
     gone = [thing for thing in known.objects if is_dynamic(thing)]
     once = sum(thing.looks < 2 for thing in known.objects)
     called = [thing.words.name or thing.words.label or thing.id for thing in gone]

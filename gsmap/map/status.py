@@ -1,4 +1,4 @@
-"""List what a map lacks, what is stale, and what needs a person's decision."""
+"""List the missing and stale results of a map, and the decisions that a person has to make."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from gsmap.types.rows.maps import MapStatus, MetricScaleRow, TodoKind, TodoRow
 
 @snapshot_read
 def status(store: Store, settings: Settings) -> MapStatus:
-    """Report the status of a map (``gsmap status MAP``) from the catalog; nothing is computed."""
+    """Report the status of a map (``gsmap status MAP``) from the catalog, without computing anything."""
     at = shlex.quote(store.location)
     update = f"gsmap update {at} --no-create"
     scenes = store.scenes.summaries()
@@ -89,11 +89,21 @@ def status(store: Store, settings: Settings) -> MapStatus:
     outweighed = [scene for scene in (newest.provenance.contradicted_priors if newest else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that contradict the edges")
     contrary = sum(row.use == "outlier" for tie in graph.world for row in tie.residuals)
-    add("world_outliers", contrary, f"gsmap georeference {at}", "observations of the world that contradict the others")
+    add(
+        "world_outliers",
+        contrary,
+        f"gsmap georeference {at}",
+        "observations of the world that contradict other observations",
+    )
     untied = sum(bool(tie.problem) for tie in graph.world)
     add("untied", untied, f"gsmap georeference {at}", "components that are not georeferenced")
     twice = store.registrations.current_with_note(SAME_CAPTURE)
-    add("duplicates", len(twice), f"gsmap list {at} edges", "pairs that are the same capture twice: remove one of each")
+    add(
+        "duplicates",
+        len(twice),
+        f"gsmap list {at} edges",
+        "pairs of scenes from the same capture: remove one scene of each pair",
+    )
     isolated = [pose for pose in poses if pose.status == "isolated"]
     add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes without edges to others")
     metres = map_metres(store, graph)
@@ -153,7 +163,7 @@ def lease_rows(leases: Sequence[Lease]) -> tuple[LeaseRow, ...]:
 
 
 def _add_unsolved(store: Store, settings: Settings, add: Callable[[TodoKind, int, str, str], None], verb: str) -> None:
-    """Add an entry if the newest poses are out of date, with the reason."""
+    """Add an entry with the reason if the newest poses are out of date."""
     given = pose_basis(store, settings)
     newest = store.revisions.newest()
     if not given.scenes or (newest is not None and newest.key == given.key.digest):

@@ -1,4 +1,4 @@
-"""Selection of the pairs of visits that are compared for changes: each visit with the latest ones before it."""
+"""Select the pairs of visits that are compared for changes: each visit with the latest visits before it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class Params:
     def __post_init__(self) -> None:
         if not 0 < self.min_new_fraction <= 1:
             raise ConfigError(
-                f"visits.min_new_fraction must be a share in (0, 1], got {self.min_new_fraction}", code="out_of_range"
+                f"visits.min_new_fraction must be a fraction in (0, 1], got {self.min_new_fraction}",
+                code="out_of_range",
             )
         if not self.max_earlier_visits >= 0:
             raise ConfigError(
@@ -65,12 +66,12 @@ class Visit:
     metres_per_unit: float = 1.0
 
     def box(self) -> np.ndarray:
-        """Return the (2, 3) box around its box, map frame."""
+        """Return the axis-aligned box (2, 3) around the visit's box, in the map frame."""
         return moved_box(self.bounds, self.S_map_scene)
 
 
 def pairs_of_visits(visits: Sequence[Visit], params: Params) -> list[tuple[str, str]]:
-    """Return pairs (older, newer) of scene ids: every visit with the latest earlier ones that together cover it.
+    """Return pairs (older, newer) of scene ids: every visit with its latest earlier visits that together cover it.
 
     Not all pairs, as changes over several visits follow from those between consecutive ones. Only boxes are used, and
     no array is read; scenes of one moment are one visit, and not compared.
@@ -96,7 +97,7 @@ def pairs_of_visits(visits: Sequence[Visit], params: Params) -> list[tuple[str, 
 
 
 def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3) -> bool:
-    """Return whether the relative pose of two visits differs from ``S_newer_older`` by more than the tolerance."""
+    """Return true if the relative pose of two visits differs from ``S_newer_older`` by more than the tolerance."""
     now = newer.S_map_scene.inverse() @ older.S_map_scene
     turn = now.rotation @ S_newer_older.rotation.T
     sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
@@ -112,7 +113,7 @@ def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3) -> bool:
 
 
 def _samples(visit: Visit) -> np.ndarray:
-    """Return (N, 3) points throughout a visit's box, map frame."""
+    """Return points (N, 3) on a grid in a visit's box, in the map frame."""
     low, high = np.asarray(visit.bounds, dtype=np.float64)
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     grid = np.array(np.meshgrid(steps, steps, steps, indexing="ij")).reshape(3, -1).T

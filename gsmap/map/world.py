@@ -50,7 +50,7 @@ def georeferenced_components(graph: PoseGraph | None, components: Collection[int
 
 
 def world_notes(found: Mapping[int, GeoreferencedComponent], format: str, up: str | None = "z") -> tuple[str, ...]:
-    """Return remarks on the coordinates of exported tiles.
+    """Return notes on the coordinates of exported tiles.
 
     Args:
         up: vertical axis of the files.

@@ -235,7 +235,7 @@ def test_pairs_and_changes_are_drawn_on_demand(site: Path, cli: Run, tmp_path: P
         (tmp_path / "one.png").unlink()
     done = cli("show", site, "left:odd:one", "--picture", tmp_path / "none.png")
     assert done.code == 1
-    assert "has no pose to draw" in done.stderr
+    assert "has no pose by which" in done.stderr
     assert cli("show", site, "left:right", "--picture", tmp_path / "one.xyz").code == 2
 
 

@@ -106,7 +106,7 @@ def test_another_frame_is_refused_and_changes_nothing(site: Path, cli: Run, tmp_
 def test_one_new_capture_at_a_time(site: Path, captures: Path, cli: Run, tmp_path: Path) -> None:
     several = cli("ingest", site, captures, "--supersedes", "left")
     assert several.code == 2
-    assert "--supersedes takes one capture, 3 were found" in several.stderr
+    assert "--supersedes needs one capture, but 3 captures were found" in several.stderr
     same = cli("ingest", site, captures / "left.ply", "--supersedes", "left", "--scale", "known")
     assert same.code == 1
     assert "is in the map already" in same.stderr

@@ -95,9 +95,9 @@ def test_hits_are_drawn(site: Map, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_found_is_said(site: Map, tmp_path: Path) -> None:
-    with raises(ConfigError, code="nothing_requested", match="give one query"):
+    with raises(ConfigError, code="nothing_requested", match="specify one query"):
         site.find()
-    with raises(ConfigError, code="nothing_requested", match="give one query"):
+    with raises(ConfigError, code="nothing_requested", match="specify one query"):
         site.find("red", at=[0, 0, 0])
     with raises(ConfigError, code="invalid_point", match="three numbers"):
         site.find(at=[0, np.nan, 0])

@@ -113,7 +113,7 @@ def test_places_are_told_by_object_by_point_and_by_box(site: Map) -> None:
     assert len(everything.objects) == len(site.objects().objects) == 3
     nothing = site.history("2,1.5,1.5")
     assert nothing.objects == ()
-    assert "no thing" in nothing.notes[-1]
+    assert "no object was ever found" in nothing.notes[-1]
     for place, box in ((None, None), ("abcd1234", [0] * 6), ("1,2", None), (None, [1, 0, 0, 0, 1, 1])):
         with pytest.raises(ConfigError):
             site.history(place, box=box)

@@ -165,7 +165,7 @@ def test_pairs_are_not_tried_where_the_map_is_rigid(made: Described, tmp_path: P
         assert sum(count or 0 for count in left.values()) == 6 - len(tried)
         untried = next(f"{a}:{b}" for a in NAMES for b in NAMES if a < b and frozenset((a, b)) not in tried)
         (why,) = [step for step in m.why(untried).steps if step.name == "retrieval"]
-        assert "edges without doubt" in str(why.value)
+        assert "edges that are not doubtful" in str(why.value)
         assert not why.passed
         # They share a place, and were left out for cost: that is the advice, and no word of nothing that they share.
         assert "left out to save time" in m.why(untried).advice

@@ -1,4 +1,4 @@
-"""Helpers shared by all reports: names by id, checked filters, pairs."""
+"""Helpers for all reports: names by id, checked filters, pairs."""
 
 from __future__ import annotations
 
@@ -67,5 +67,5 @@ def checked_pair(a: Scene, b: Scene) -> tuple[Scene, Scene]:
         ConfigError: they are one.
     """
     if a.id == b.id:
-        raise ConfigError(f"{a.name} is given twice: name two different scenes", code="same_scene")
+        raise ConfigError(f"both scenes of the pair are {a.name}: name two different scenes", code="same_scene")
     return a, b

@@ -26,7 +26,7 @@ EDGE_USES: Mapping[str, Callable[[EdgeRow], bool]] = {
     "undecided": lambda row: row.undecided,
     "unused": lambda row: row.use == "unused",
 }
-"""Words for what the last optimize made of an edge; edges are filtered by them, too."""
+"""Words for the use of an edge by the last optimize, by which edges can also be filtered."""
 
 
 @snapshot_read
@@ -85,7 +85,7 @@ def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
 
 @snapshot_read
 def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
-    """Return the current edge of a pair, or a ``never registered`` row."""
+    """Return the current edge of a pair, or a row with the status ``never registered``."""
     current = store.registrations.get(a.id, b.id)
     return EdgeRow(**_never_registered(a, b)) if current is None else _edge_rows(store, [current], a.id)[0]
 

@@ -27,7 +27,7 @@ def revision_rows(store: Store) -> list[RevisionRow]:
 
 
 def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionRow]:
-    """Keep the revisions made after a date (ISO 8601); all if it is None.
+    """Keep the revisions that were made after a date (ISO 8601); keep all if the date is None.
 
     Raises:
         ConfigError: a date that is none.
@@ -99,7 +99,7 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
 
 @dataclass(frozen=True)
 class HistoryPosition:
-    """A position in a map's history: newest revision and registration (0 before the first), and graphs."""
+    """A position in a map's history: its newest revision and registration (0 before the first), and its graphs."""
 
     revision: int
     registration: int

@@ -98,7 +98,7 @@ def check_report(found: CheckResult) -> CheckReport:
 
 
 def prune_report(pruned: PruneResult, dry_run: bool) -> PruneReport:
-    """Return what was, or would be, reclaimed."""
+    """Return the data that a prune reclaimed, or would reclaim."""
     return PruneReport(
         dry_run=dry_run,
         scene_names=tuple(pruned.scenes),

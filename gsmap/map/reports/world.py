@@ -50,7 +50,7 @@ def world_report(store: Store, *, stale: bool, notes: Sequence[str] = ()) -> Wor
 
 
 def _sea_level_note(survey: Survey) -> list[str]:
-    """Return a remark if only EXIF heights above sea level give the map's height."""
+    """Return a note if the map's height comes from EXIF heights above sea level alone."""
     sigmas = [fix.sea_level_sigma_m for fix in survey.fixes]
     if not sigmas or min(sigmas) == 0 or any(not point.check for point in survey.points):
         return []

@@ -1,1 +1,1 @@
-"""The stages, one file each: read from the store, call a pure stage, save the result under its recipe."""
+"""The stages, one per file: each reads from the store, calls a pure stage, and saves the result under its recipe."""

@@ -41,7 +41,7 @@ class ComparisonPlan:
 
 
 def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = None) -> ComparisonPlan:
-    """Choose the pairs of visits to compare (`gsmap.map.visits`), or one given pair; no array is read.
+    """Choose the pairs of visits to compare (`gsmap.map.visits`), or one given pair, without reading arrays.
 
     Raises:
         NotFoundError: the map has no poses yet, or a scene that is named has no place.
@@ -85,19 +85,21 @@ def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene]
     older, newer = sorted((visits[scene.id] for scene in pair), key=lambda visit: visit.when)
     if older.when == newer.when:
         raise InputError(
-            f"{pair[0].name} and {pair[1].name} have the same date: which one is newer is not known",
+            f"{pair[0].name} and {pair[1].name} have the same date, so it is unknown which one is newer",
             code="order_unknown",
         )
     if older.component != newer.component:
         raise InputError(
-            f"{pair[0].name} and {pair[1].name} lie in two components: nothing ties one to the other",
+            f"{pair[0].name} and {pair[1].name} lie in two components, so their relative pose is unknown",
             code="different_components",
         )
     return ComparisonPlan(visits, [(older.scene, newer.scene)], ())
 
 
 def missing_comparisons(store: Store, asked: ComparisonPlan, settings: Settings) -> list[tuple[str, str]]:
-    """Return the pairs without a current comparison: new, by another recipe, or at other poses."""
+    """Return the pairs without a current comparison: new pairs, and pairs compared by another recipe or at other
+    poses.
+    """
     done = {(one.older, one.newer) for one in _valid(store.changes.current(), asked, settings)}
     return [pair for pair in asked.pairs if pair not in done]
 

@@ -1,4 +1,4 @@
-"""Describe stage: make the scene graphs that the current recipe lacks."""
+"""Describe stage: compute the scene graphs that are missing for the current recipe."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ def graph_keys(store: Store, scenes: Sequence[AnyScene], settings: Settings) -> 
 
 
 def without_graph(store: Store, keys: Mapping[str, RecipeKey]) -> list[str]:
-    """Return the ids of scenes without a graph under their key, in the order of the keys; no array is read."""
+    """Return the ids of scenes without a graph under their key, in the order of the keys, without reading arrays."""
     present = store.graphs.stored_keys(keys.values())
     return [scene for scene, key in keys.items() if key.digest not in present]
 
 
 def unthinned(scenes: Sequence[AnyScene]) -> list[AnyScene]:
-    """Return the scenes that are described by default; thinned ones are not."""
+    """Return the scenes that are described by default, which are all but the thinned scenes."""
     return [scene for scene in scenes if scene.thinning is None]
 
 
 def describe(
     store: Store, scenes: Sequence[AnyScene], settings: Settings, progress: StageProgress, *, verify: bool = False
 ) -> dict[str, RecipeKey]:
-    """Make the missing graphs; return the key of each scene's graph, without quarantined ones.
+    """Compute the missing graphs; return the key of each scene's graph, except of quarantined scenes.
 
     Args:
         verify: read stored graphs, repeat damaged ones and retry quarantined ones.

@@ -75,7 +75,7 @@ class Request:
     up: str | None = None
 
     def options(self) -> list[str]:
-        """Return the options of ``gsmap export`` for this request."""
+        """Return the command-line options of ``gsmap export`` for this request."""
         default = Request()
         words: list[str] = []
         for name, option in _OPTIONS.items():
@@ -108,7 +108,7 @@ _OLDER_SETTINGS = {"up": "z"}  # of exports recorded before an option existed
 
 @dataclass(frozen=True, eq=False)
 class ExportPlan:
-    """The tiles of an export and how each is made.
+    """The tiles of an export, and the instructions to make each tile.
 
     Args:
         revision: revision of the poses.
@@ -200,7 +200,7 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
 def _photos(
     store: Store, tiles: Sequence[PlannedTile], within_m: float | None, as_of: str | None
 ) -> dict[tuple[int, str], list[StoredPhoto]]:
-    """Return the stored photos that may show each tile, in an order independent of when they were added.
+    """Return the stored photos that may show each tile, in an order that does not depend on when they were added.
 
     Args:
         within_m: distance from a tile's bounds within which cameras count; None if the merger takes no photos.
@@ -248,7 +248,7 @@ def export(
     wait: bool = False,
     known: MapObjects | None = None,
 ) -> tuple[ExportResult, tuple[str, ...]]:
-    """Plan the tiles, make the dirty ones, write them, and record their recipes in the store.
+    """Plan the tiles, make and write the dirty tiles, and record their recipes in the store.
 
     A map that was opened for reading, or whose disk is full, is exported too; then only the folder's own manifest says
     what was made.
@@ -398,7 +398,7 @@ def _by_scene(photos: Sequence[StoredPhoto]) -> dict[str, tuple[StoredPhoto, ...
 
 
 def _cameras(store: Store, planned: ExportPlan, component: int) -> Cameras | None:
-    """Return the cameras of all scenes of a component, in its frame; None if there are none."""
+    """Return the cameras of all scenes of a component, in the component's frame; None without cameras."""
     poses = {scene: S for tile in planned.tiles if tile.component == component for scene, S in tile.poses.items()}
     found = [transform_cameras(store.scenes.cameras(scene), S) for scene, S in sorted(poses.items())]
     found = [cameras for cameras in found if len(cameras)]
@@ -412,7 +412,7 @@ def _cameras(store: Store, planned: ExportPlan, component: int) -> Cameras | Non
 
 
 def _put_aside(store: Store, out: Path, planned: ExportPlan, result: ExportResult) -> None:
-    """Record the tiles of this folder that could not be made, replacing earlier records."""
+    """Record the tiles of this folder that could not be made, in place of earlier records."""
     about = escaped(str(out.resolve()))
     now = {f"tile {planned.recipe.key(tile)}": (tile, reason) for tile, reason in result.set_aside}
     for tile, reason in now.values():
@@ -427,8 +427,8 @@ def _put_aside(store: Store, out: Path, planned: ExportPlan, result: ExportResul
 
 
 def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Request]]:
-    """Return, for each export folder, the number of tiles that repeating its last export would make or remove, and
-    that export's row.
+    """Return, for each export folder, the number of tiles that a repeated export would make or remove, and the row of
+    the last export.
 
     Read from the catalog alone, which does not say which tiles are empty: new ones are not counted. A folder whose
     export named a revision stays as it is, whatever the map does.
@@ -457,7 +457,7 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
 
 
 def _check(request: Request, recipe: TileRecipe) -> None:
-    """Refuse invalid options before anything is read."""
+    """Raise an error for invalid options before reading any data."""
     if request.budget_s is not None and not request.budget_s > 0:
         raise ConfigError(
             f"the budget must be a positive number of seconds, got {request.budget_s}", code="invalid_budget"
@@ -491,7 +491,7 @@ def _placed(store: Store, revision: int | None, component: int | None) -> tuple[
 
 
 def _as_of(scenes: dict[str, Scene], as_of: str) -> tuple[dict[str, Scene], tuple[str, ...]]:
-    """Return the scenes dated at or before a date, and a remark on undated ones."""
+    """Return the scenes dated at or before a date, and a note on undated scenes."""
     until = end_of_date(as_of)
     found = {scene: one for scene, one in scenes.items() if is_until(one.captured_at, until)}
     note = undated_note(list(scenes.values()), as_of)

@@ -30,7 +30,7 @@ from gsmap.world.params import BAR_SIGMA_FRACTION, DEPTH_SIGMA_FRACTION, PIXEL_S
 from gsmap.world.survey import check_area, frame_for, in_frame
 
 SURVEYED = "survey"
-"""The name of a fix that says where a scene's origin lies."""
+"""The name of a position fix that gives the position of a scene's origin."""
 
 
 _OTHER_DAYS = 2  # more than clocks and zones are off, and than a night that a survey goes over
@@ -63,7 +63,7 @@ class Request:
 
 @dataclass(eq=False)
 class _NewObservations:
-    """Observations to store, and remarks for the user."""
+    """Observations to store, and notes for the user."""
 
     items: list[Observation] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -72,7 +72,7 @@ class _NewObservations:
 def georeference(
     store: Store, request: Request, settings: Settings, localise: LocalizePhotos | None = None
 ) -> tuple[tuple[str, ...], Solution | None]:
-    """Read, check and solve observations, then store them; nothing is stored if any of them is wrong.
+    """Read observations, check them, solve the poses with them, and store them; if one is wrong, store none.
 
     Args:
         localise: localizes photos that are not cameras of a scene.
@@ -106,7 +106,7 @@ def georeference(
     _refuse_unreachable(before, frame or before.frame, places)
     if not noted.items:
         raise ConfigError(
-            "say what ties the map to the world: --gcp FILE, --exif DIR, --scale-bar A B METRES",
+            "specify observations of the world: --gcp FILE, --exif DIR or --scale-bar A B METRES",
             code="nothing_requested",
         )
     solution = _solved(store, noted.items, settings)
@@ -168,7 +168,7 @@ def forget_position(store: Store, ref: str) -> bool:
 
 
 def _refuse_unreachable(before: Survey, frame: WorldFrame | None, new: Sequence[ControlPoint | PositionFix]) -> None:
-    """Raise if PROJ cannot transform an observation to the map's CRS."""
+    """Raise an error if PROJ cannot transform an observation to the map's CRS."""
     points = tuple(one for one in (*before.points, *new) if isinstance(one, ControlPoint))
     fixes = tuple(one for one in (*before.fixes, *new) if isinstance(one, PositionFix))
     in_frame(Survey(frame, points, (), fixes))
@@ -179,7 +179,7 @@ def _origin(frame: WorldFrame) -> np.ndarray:
 
 
 def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | PositionFix]) -> WorldFrame | None:
-    """Return the world frame to store; None if it stays or cannot be chosen yet."""
+    """Return the world frame to store; None if the stored frame stays or no frame can be chosen yet."""
     known = before.frame
     if known is not None and (crs_text is None or crs(crs_text).text == known.crs):
         return None
@@ -291,7 +291,7 @@ def _pixel(
 
 
 class _Cameras:
-    """The real cameras of all scenes, read once."""
+    """The real (not synthesized) cameras of all scenes, which are read once."""
 
     def __init__(self, store: Store) -> None:
         scenes = {scene.name: (scene.id, store.scenes.cameras(scene.id)) for scene in store.scenes.list()}
@@ -302,13 +302,13 @@ class _Cameras:
         return match_photos(photos, {name: one.names for name, (_, one) in self._of_scene.items()}, photos)
 
     def __getitem__(self, camera: tuple[str, int]) -> tuple[str, Cameras]:
-        """A scene's id and one of its cameras, by the scene's name and row."""
+        """Return the id of a scene and one of its cameras, by the scene's name and the camera's row."""
         scene, cameras = self._of_scene[camera[0]]
         return scene, cameras[[camera[1]]]
 
 
 def _with_depth(store: Store, image: ImagePoint) -> ImagePoint:
-    """Add the rendered depth to an image point that only one photo shows."""
+    """Add a rendered depth to the observation of a control point that only one photo shows."""
     size = np.ceil(np.maximum(image.pixel + 1, 2 * image.intrinsics_px[2:])).astype(np.int64)
     camera = Cameras(image.T_scene_camera[None], image.intrinsics_px[None], size[None], (image.image,))
     try:
@@ -320,12 +320,12 @@ def _with_depth(store: Store, image: ImagePoint) -> ImagePoint:
 
 
 def _hold_out(before: Survey, names: set[str], noted: _NewObservations) -> None:
-    """Choose the check points among stored and new points."""
+    """Mark some of the stored and new control points as check points."""
     fresh = {one.name for one in noted.items if isinstance(one, ControlPoint)}
     known = fresh | {point.name for point in before.points}
     if unknown := sorted(names - known):
         raise NotFoundError(
-            f"no control point is called {unknown[0]!r}: {', '.join(sorted(known)[:8]) or 'there is none'}",
+            f"there is no control point called {unknown[0]!r}: {', '.join(sorted(known)[:8]) or 'there is none'}",
             code="observation_not_found",
         )
     for point in before.points:
@@ -387,7 +387,7 @@ def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, n
 
 
 def _refuse_moved(before: Survey, photos: Sequence[tuple[str, PositionFix]]) -> None:
-    """Raise if a photo matched by file name lies far from the known position of that camera."""
+    """Raise an error if a photo that was matched by file name lies far from the known position of its camera."""
     known = {(fix.name, fix.scene): fix for fix in before.fixes if fix.crs == WGS84}
     again = [(photo, known[fix.name, fix.scene], fix) for photo, fix in photos if (fix.name, fix.scene) in known]
     if not again:
@@ -407,7 +407,7 @@ def _refuse_moved(before: Survey, photos: Sequence[tuple[str, PositionFix]]) -> 
 
 
 def _refuse_other_days(store: Store, photos: Sequence[tuple[str, PositionFix]]) -> None:
-    """Raise if all photos matched to a scene by file name were taken on other days."""
+    """Raise an error if all photos that were matched to a scene by file name were taken on other days."""
     of_scene: dict[str, list[str]] = {}
     for photo, fix in photos:
         of_scene.setdefault(fix.scene, []).append(photo)
@@ -433,7 +433,9 @@ def _refuse_other_days(store: Store, photos: Sequence[tuple[str, PositionFix]]) 
 
 def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None) -> ScaleBar:
     if not (np.isfinite(metres) and metres > 0):
-        raise ConfigError(f"a scale bar is so many metres long, got {metres:g}", code="invalid_observation")
+        raise ConfigError(
+            f"the length of a scale bar must be a positive number of metres, got {metres:g}", code="invalid_observation"
+        )
     ends: list[SpecifiedPoint] = [parse_scene_point(store, text) for text in (a, b)]
     scenes = (str(ends[0].scene), str(ends[1].scene))
     sigmas = [float(np.sqrt(np.trace(end.covariance) / 3)) for end in ends]
@@ -447,7 +449,7 @@ def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None) -> 
 
 
 def take_back(store: Store, names: Iterable[str]) -> int:
-    """Remove observations by name, or all of them with the CRS; return their number.
+    """Remove observations by name, or all observations with the CRS; return their number.
 
     Raises:
         NotFoundError: one of the names is none.

@@ -76,7 +76,7 @@ def ingest(
     scale: str,
     progress: StageProgress,
 ) -> list[IngestResult]:
-    """Ingest every capture found; see `gsmap.map.Map.ingest`."""
+    """Ingest every capture that is found in ``sources``; see `gsmap.map.Map.ingest`."""
     dates = {scene.id: scene.captured_at for scene in store.scenes.list()}
     found, search = readers(sources, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
     skipped, bad, good = list(search.skipped), list(search.unreadable), list[Path]()
@@ -105,12 +105,12 @@ def ingest(
 
 
 def _is_named(one: CaptureReader, sources: Sequence[Source]) -> bool:
-    """Return true if a capture's file itself, and not a folder around it, was given."""
+    """Return true if the user named a capture's file itself, not a folder that contains the file."""
     return one.path in [Path(source) for source in sources if not isinstance(source, Gaussians)]
 
 
 def _set_aside(store: Store, bad: Sequence[SkippedPath], done: Sequence[Path]) -> None:
-    """Record unreadable captures for `gsmap status`, and drop records of repaired or deleted ones.
+    """Record unreadable captures for `gsmap status`, and drop records of repaired or deleted captures.
 
     Args:
         done: files and folders that were searched; their other captures are in the map.
@@ -147,7 +147,7 @@ def check_captures(
     captured_at: str | None = None,
     scale: str = "auto",
 ) -> None:
-    """Refuse invalid captures before a map is created.
+    """Raise an error for invalid captures before a map is created.
 
     Raises:
         NotFoundError, InputError, ConfigError: see `gsmap.map.Map.ingest`.
@@ -165,7 +165,7 @@ def readers(
     captured_at: str | None,
     scale: str,
 ) -> tuple[list[CaptureReader], SearchResult]:
-    """Find captures; return a reader of each, and the search result; see `gsmap.map.Map.ingest`."""
+    """Find captures; return a reader for each capture, and the search result; see `gsmap.map.Map.ingest`."""
     given_date(captured_at)  # refuses what is none before anything is searched
     check_scale(scale)
     memory = [source for source in sources if isinstance(source, Gaussians)]
@@ -186,7 +186,7 @@ def readers(
     found = search.captures
     if len(found) > 1 and (cameras is not None or name is not None):
         raise ConfigError(
-            f"cameras and name are for one capture, {len(found)} were found: ingest them one by one",
+            f"cameras and name apply to one capture, but {len(found)} captures were found: ingest them one by one",
             code="many_captures",
         )
     options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale_policy": scale}

@@ -1,4 +1,4 @@
-"""Localize stage: make missing view features, then localize photos with them."""
+"""Localize stage: compute missing view features, then localize photos with them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _KEPT = 12  # scenes whose arrays stay in memory while photographs come: about a
 
 @dataclass(frozen=True)
 class SearchRegion:
-    """The region in which photos are searched.
+    """The region of the map in which the photos are expected.
 
     Args:
         scene: restrict to places that this scene (id) shows; None if a point is given.
@@ -71,12 +71,14 @@ def near_of(text: str, id_of: Callable[[str], str]) -> SearchRegion:
     except ValueError:
         return SearchRegion(id_of(text))
     if len(numbers) != 4 or not np.isfinite(numbers).all() or numbers[3] <= 0:
-        raise ConfigError(f"near is a scene, or X,Y,Z,R with a radius above 0, got {text!r}", code="invalid_point")
+        raise ConfigError(
+            f"--near must be a scene, or X,Y,Z,R with a radius above 0, got {text!r}", code="invalid_point"
+        )
     return SearchRegion(None, (numbers[0], numbers[1], numbers[2]), numbers[3])
 
 
 class Localizer:
-    """The placed scenes of a map, ready to localize photos; arrays are loaded on demand.
+    """The placed scenes of a map, ready to localize photos, with arrays that are loaded on demand.
 
     Args:
         store: the store of the map.
@@ -121,7 +123,7 @@ class Localizer:
         self.extractor: Extractor = method.make(specs, self.params.extractors[self.params.extractor])
 
     def _scene_index(self) -> SceneIndex:
-        """Return the index of the scenes with features; quarantined jobs leave scenes without."""
+        """Return the index of the scenes with features; scenes of quarantined jobs have no features."""
         kept = self.store.view_features.stored_keys(self.keys.values())
         return SceneIndex(
             self.store,
@@ -161,7 +163,7 @@ class Localizer:
         return new_segment(found)
 
     def _query(self, near: SearchRegion | None, ask: Callable[[ViewIndex], _Said]) -> _Said:
-        """Query the index; once more after a repair if it was changed or damaged meanwhile."""
+        """Query the index; if it was changed or damaged meanwhile, repair it and query once more."""
         try:
             return ask(self.index if near is None else localizing_near(self, near))
         except (NotFoundError, CorruptError) as error:
@@ -195,7 +197,7 @@ class Localizer:
         return found
 
     def _use(self, scene: str) -> None:
-        """Mark a scene's arrays as used, and drop those used longest ago."""
+        """Mark a scene's arrays as used, and drop the least recently used arrays."""
         self._used = [one for one in self._used if one != scene] + [scene]
         while len(self._used) > _KEPT:
             self.placed[self._used.pop(0)].drop()
@@ -222,7 +224,7 @@ class Localizer:
 
 
 def _within(found: LocalizationResult, near: SearchRegion | None) -> LocalizationResult:
-    """Return the result, refused if it lies outside the search region.
+    """Return the result, which is refused if it lies outside the search region.
 
     A person who says where photographs are from rules out what is elsewhere.
     """

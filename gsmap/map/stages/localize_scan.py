@@ -1,4 +1,4 @@
-"""Localize a scan: register it with scenes of the map without storing it."""
+"""Localize a scan: register it with scenes of the map, without storing anything."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class _ScanQuery:
 
 
 def localize_scan(store: Store, request: Request, settings: Settings, progress: StageProgress) -> ScanRow:
-    """Localize a scan in the map by the scenes that show it; nothing is written.
+    """Localize a scan in the map by registering it with scenes, without writing anything.
 
     It is described by the recipe of the map's graphs, the index tells the likeliest scenes, and it is registered with
     each of these as any pair is. All are asked, however many show it: one that shows it elsewhere says that the map
@@ -161,7 +161,9 @@ def _read(request: Request, settings: Settings) -> _ScanQuery:
     if scans.holds_splat(request.file):
         captures = read_captures(request.file, scale_policy=request.scale or "auto")
         if len(captures) != 1:
-            raise ConfigError(f"{request.file} holds {len(captures)} captures: name one of them", code="many_captures")
+            raise ConfigError(
+                f"{request.file} contains {len(captures)} captures: name one of them", code="many_captures"
+            )
         capture = captures[0]
         notes = capture.notes
         gaussians, cameras = capture.gaussians, capture.cameras

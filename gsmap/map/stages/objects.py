@@ -60,7 +60,7 @@ def objects_of_components(
     *,
     make: bool = True,
 ) -> tuple[PoseGraph, dict[str, Scene], dict[int, float], list[ComponentObjects], list[str]]:
-    """Return newest poses, placed scenes, metres per unit, the objects of each component, and notes."""
+    """Return the newest poses, the placed scenes, the metres per unit, the objects of each component, and notes."""
     placed = store.revisions.get()
     if placed is None:
         raise NotFoundError(
@@ -126,7 +126,7 @@ def objects_of_components(
 def _key(
     store: Store, settings: Settings, captures: Sequence[Scene], described: Mapping[str, str], unit: float
 ) -> RecipeKey:
-    """Return the key of a component's objects; no array is read."""
+    """Return the key of a component's objects, without reading arrays."""
     ids = {scene.id for scene in captures}
     told = [
         f"{one.key} {one.created_at} {[change.status == 'rejected' for change in one.changes]}"
@@ -167,7 +167,7 @@ def _made(
     sets: Sequence[ObjectSet],
     told: Progress,
 ) -> ComponentObjects:
-    """Compute the objects of a component; earlier observations are reused where they are still valid.
+    """Compute the objects of a component, reusing earlier observations that are still valid.
 
     Args:
         poses: ``S_map_scene`` of its scenes, oldest first.
@@ -236,7 +236,7 @@ _SHAPE = ("means", "quats", "log_scales", "logit_opacities")
 
 
 def _rooms(store: Store, settings: Settings, poses: Mapping[str, Sim3], up: np.ndarray, unit: float) -> list[Room]:
-    """Return the rooms in the level frame of ``up``, in metres; nothing is rendered.
+    """Return the rooms in the level frame of ``up``, in metres, without rendering.
 
     Args:
         unit: metres per map unit.
@@ -259,7 +259,7 @@ def _digest(things: Segments) -> str:
 
 
 def _when(scene: Scene) -> tuple[bool, float, str]:
-    """Return a sort key: dated scenes by date, then undated ones by arrival."""
+    """Return a sort key: dated scenes by date, then undated scenes by arrival."""
     if scene.captured_at is None:
         return True, 0.0, scene.ingested_at or ""
     return False, parse_moment(scene.captured_at).timestamp(), scene.ingested_at or ""

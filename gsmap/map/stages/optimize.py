@@ -29,7 +29,7 @@ from gsmap.world.survey import in_frame
 
 @dataclass(frozen=True, eq=False)
 class PoseBasis:
-    """Everything that identifies the poses of a map, without the measurements of the edges.
+    """Everything that determines the poses of a map, by id, without the measurements of the edges.
 
     Args:
         scenes: scene ids in order of arrival.
@@ -51,7 +51,7 @@ class PoseBasis:
 
     @cached_property
     def key(self) -> RecipeKey:
-        """Recipe key with all of these as inputs."""
+        """Recipe key that has all of the basis as inputs."""
         return self.key_of(self.scenes)
 
     def key_of(self, scenes: Collection[str]) -> RecipeKey:
@@ -68,7 +68,7 @@ class PoseBasis:
 
 @snapshot_read
 def pose_basis(store: Store, settings: Settings, observed: Survey | None = None) -> PoseBasis:
-    """Read what identifies the poses; microseconds per scene.
+    """Read the basis of the poses, in microseconds per scene.
 
     Args:
         observed: replaces the stored observations of the world.
@@ -113,7 +113,7 @@ def _with_edges(store: Store, basis: PoseBasis) -> PoseInputs:
 
 
 def _edges(store: Store, basis: PoseBasis, among: Collection[str] | None = None) -> list[Edge]:
-    """Return the usable edges, or those among some scenes."""
+    """Return the usable edges, of all scenes or between some scenes."""
     return [
         Edge(
             target=stored.registration.target,
@@ -151,7 +151,7 @@ class _IncrementalInputs:
 
 @snapshot_read
 def _inputs(store: Store, settings: Settings) -> PoseInputs | _IncrementalInputs:
-    """Read the inputs of a solve; for a map that only has grown, those around the new scenes."""
+    """Read the inputs of a solve; for a map that only has grown, only the inputs around the new scenes."""
     basis, newest = pose_basis(store, settings), store.revisions.newest()
     if newest is not None and (previous := store.revisions.get(newest.number)) is not None:
         near, rim = solver.surroundings(basis.scenes, list(basis.named), previous, settings.optimize)
@@ -161,12 +161,12 @@ def _inputs(store: Store, settings: Settings) -> PoseInputs | _IncrementalInputs
 
 
 def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool:
-    """Return true if two scenes are known to be of about the same time."""
+    """Return true if two scenes are known to have been captured at about the same time."""
     return a is not None and b is not None and abs(a - b).total_seconds() < 3600 * hours
 
 
 def _ups(store: Store, living: Sequence[SceneSummary], settings: Settings) -> dict[str, np.ndarray]:
-    """Return the up direction of each scene by its current graph, else its newest one."""
+    """Return the up direction of each scene by its current graph or, without one, by its newest graph."""
     said = store.graphs.frames()
     times = Counter(graph.scene for graph in said)
     several = [scene for scene in living if times[scene.id] > 1]
@@ -209,7 +209,7 @@ class Solution:
 
 
 def solve_observed(store: Store, settings: Settings, observed: Survey) -> Solution | None:
-    """Solve all poses with other observations of the world; None if the newest revision has these.
+    """Solve all poses with the given observations of the world; None if the newest revision used the same observations.
 
     Nothing is kept: `solve` keeps it.
     """
@@ -241,7 +241,7 @@ def _grow(store: Store, given: _IncrementalInputs, settings: Settings, progress:
 
 
 def solve(store: Store, settings: Settings, progress: StageProgress, solution: Solution | None = None) -> bool:
-    """Optimize unless the newest revision is current; return true if there is a new one.
+    """Optimize unless the newest revision is current; return true if a new revision was stored.
 
     One process does it at a time: others wait, and then need not.
 

@@ -1,4 +1,4 @@
-"""Purge stage: delete a scene for good from the map, its branches on request, and export folders."""
+"""Purge stage: delete a scene permanently from the map, from export folders and, on request, from branches."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def _clean_staged(store: Store, out: Path, begun: Purge) -> tuple[Purge, list[st
 
 
 def _passing(error: OSError | GsmapError) -> type[GsmapError] | None:
-    """Return the error class of a temporary failure to clean a folder; None if the folder is unreachable."""
+    """Return the error class of a temporary failure to clean a folder; None if the folder cannot be reached at all."""
     kind = of_system(error) if isinstance(error, OSError) else type(error)
     return kind if kind in (DiskFullError, DiskError, BusyError) else None
 

@@ -1,4 +1,4 @@
-"""Register stage: choose pairs and register those that lack a result of the current recipe."""
+"""Register stage: choose pairs, and register the pairs without a result of the current recipe."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Pairs = str | Path | Sequence[Pair]
 def register(
     store: Store, pairs: Pairs, settings: Settings, progress: StageProgress, known: RegisteredPairs | None = None
 ) -> list[Registration]:
-    """Register the given pairs; ``auto`` and ``all`` skip pairs already registered by this recipe.
+    """Register pairs; ``auto`` and ``all`` skip pairs that the current recipe has registered already.
 
     A result that this recipe made before, under settings that were changed meanwhile, becomes the pair's current one
     again without being computed. The target of a pair is the scene of lower id, however the pair was named: an edge is
@@ -84,7 +84,7 @@ class _RegistrationContext:
         return self.recipe.of(self.graphs[target].digest, self.graphs[source].digest)
 
     def register(self, pairs: Sequence[Pair], after: int, *, again: bool = False) -> list[Registration]:
-        """Register pairs, shared with other processes.
+        """Register pairs, sharing the work with other processes.
 
         Args:
             after: ignore registrations up to this number.
@@ -110,7 +110,7 @@ class _RegistrationContext:
 
 
 class RegisteredPairs:
-    """The pairs registered by the current recipe, in either direction (old maps hold both).
+    """The pairs registered by the current recipe, in either direction (old maps may have both).
 
     What it made before, under settings that were changed meanwhile, is made current again. Looked at once more, only
     those pairs are judged of which something else stands by now.
@@ -205,7 +205,7 @@ def _keys(work: _RegistrationContext, pair: Pair) -> tuple[str, str]:
 
 
 def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> list[Registration]:
-    """Register the candidates of retrieval, round by round, and the stale pairs.
+    """Register candidates of retrieval round by round, and stale pairs.
 
     Only scenes that have not been looked up by this recipe are, and nothing is read of the others.
     """
@@ -249,7 +249,7 @@ def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> 
 
 
 def num_stale(pairs: Iterable[tuple[str, str]], graphs: Mapping[str, RecipeKey], settings: Settings) -> int:
-    """Count the edges made by other settings or versions; measured edges are never stale.
+    """Count the edges that other settings or versions computed; manually measured edges are never stale.
 
     Args:
         pairs: pairs with the key of their current registration, see
@@ -304,7 +304,7 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
-        raise NotFoundError(f"no file of pairs at {path}", code="file_not_found") from error
+        raise NotFoundError(f"there is no file of pairs at {path}", code="file_not_found") from error
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read pairs from {path}: {error}", code="invalid_pairs_file") from error
     pairs = []
@@ -317,7 +317,7 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
         except NotFoundError as error:
             if len(text.split()) != 2 and ":" not in text:
                 raise InputError(
-                    f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r}",
+                    f"{path}, line {number}: a pair must be written as A B or A:B, got {line.strip()!r}",
                     code="invalid_pairs_file",
                 ) from error
             raise NotFoundError(f"{path}, line {number}: {error}", code=error.code) from error
@@ -334,7 +334,7 @@ def _pair_on(store: Store, text: str) -> tuple[Scene, Scene]:
 
 
 def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _RegistrationContext) -> list[Pair]:
-    """Return the given pairs as (target, source), sorted within each, without repetition."""
+    """Return the given pairs as (target, source), sorted within each pair, without repetition."""
     if isinstance(pairs, Path):
         named = read_pairs(store, pairs)
     elif isinstance(pairs, str):
@@ -355,7 +355,7 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Registration
 
 
 def placed_scenes(store: Store) -> dict[str, ScenePosition]:
-    """Return centre and radius of each placed scene, to find neighbours."""
+    """Return the centre and radius of each placed scene, by which neighbours are found."""
     bounds, poses = store.scenes.bounds(), store.revisions.poses()
     scenes = [scene for scene in poses if scene in bounds]
     if not scenes:

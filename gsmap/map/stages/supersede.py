@@ -45,7 +45,7 @@ class SupersedeResult:
 
 @dataclass(frozen=True, eq=False)
 class _CarriedEdge:
-    """An edge of the replaced scene, rewritten for the new one.
+    """An edge of the replaced scene, rewritten for the new scene.
 
     Args:
         edge: the registration to store under the key; None as key for a measured edge.
@@ -61,7 +61,7 @@ class _CarriedEdge:
 def supersede(
     store: Store, capture: Capture, ref: str, settings: Settings, progress: StageProgress, *, named: bool
 ) -> SupersedeResult:
-    """Replace a scene by a capture, whole or not at all; see `gsmap.map.Map.ingest`.
+    """Replace a scene by a capture, completely or not at all; see `gsmap.map.Map.ingest`.
 
     Args:
         ref: the scene to replace.
@@ -77,7 +77,7 @@ def supersede(
     coming = replace(old, id=scene_id(capture.gaussians, capture.cameras), scale_policy=capture.scale_policy)
     if any(coming.id == scene.id for scene in store.scenes.list()):
         raise InputError(
-            f"the capture to supersede {old.name} is in the map already: there is nothing to put in place",
+            f"the capture to supersede {old.name} is in the map already, so it cannot replace a scene",
             code="already_in_map",
         )
     progress("ingest", 0.0, f"comparing with {old.name}")
@@ -109,14 +109,14 @@ def supersede(
                 store.registrations.review(one.edge.target, one.edge.source, one.review, one.note)
     progress("ingest", 1.0, f"{scene.name} in the place of {old.id[:12]}")
     held = [one.edge.status for one in carried if one.edge.S_target_source is not None]
-    notes = [f"it took the place of scene {old.id[:12]} ({old.name})"]
+    notes = [f"it replaced scene {old.id[:12]} ({old.name})"]
     if held:
         notes.append(f"{held.count('accepted')} of {len(held)} edges hold: gsmap optimize {store.location} uses them")
     return SupersedeResult(scene, tuple(notes))
 
 
 def _about(capture: Capture, old: Scene) -> Capture:
-    """Return the capture about the origin of the scene to replace, if both have one."""
+    """Return the capture relative to the origin of the scene to replace, if both have an origin."""
     shift = capture.gaussians.origin - old.origin
     if not (capture.gaussians.origin.any() and old.origin.any() and shift.any()):
         return capture
@@ -134,7 +134,7 @@ def _describe(store: Store, new_id: str, capture: Capture, settings: Settings) -
 
 
 def _view(store: Store, scene: Scene, settings: Settings) -> SceneView:
-    """Return a scene for registration; a missing graph is computed and not stored."""
+    """Return a scene for registration; compute a missing graph without storing it."""
     gaussians, cameras = store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id)
     graph = store.graphs.load(scene.id, graph_keys(store, [scene], settings)[scene.id])
     if graph is None:
@@ -144,10 +144,10 @@ def _view(store: Store, scene: Scene, settings: Settings) -> SceneView:
 
 
 def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings: Settings) -> None:
-    """Refuse a capture that is not aligned with the scene to replace."""
+    """Raise an error for a capture that is not aligned with the scene to replace."""
     as_they_lie = Proposal("superseding", Sim3.identity(), with_scale=False, num_inliers=0)
     found = registering.check_pose(old_view, new_view, as_they_lie, settings.register)
-    advice = "ingest it without --supersedes, and registration finds where it lies"
+    advice = "ingest it without --supersedes, so that registration finds its pose"
     if found.status != "accepted" or found.S_target_source is None:
         raise InputError(
             f"the capture does not lie where scene {old.name} lies ({found.reason}): {advice}",
@@ -165,7 +165,7 @@ def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings:
 def _carried(
     store: Store, old: Scene, coming: Scene, view: SceneView, settings: Settings, progress: StageProgress
 ) -> Iterator[_CarriedEdge]:
-    """Yield the edges of the replaced scene for the new one; poses are verified, not searched."""
+    """Yield the edges of the replaced scene for the new scene; poses are verified, not searched."""
     living = {scene.id: scene for scene in store.scenes.list()}
     known = [stored for stored in store.registrations.current() if old.id in _ends(stored)]
     recipe = recipe_key(settings.register)

@@ -1,4 +1,4 @@
-"""Thin stage: store superseded scenes in compact form, the oldest first."""
+"""Thin stage: store superseded scenes in compact form, oldest first."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         NotFoundError: the map has no poses.
     """
     if request.keep_days is None and request.budget_bytes is None:
-        raise ConfigError("give --keep-days DAYS, --budget SIZE, or both", code="nothing_requested")
+        raise ConfigError("pass --keep-days DAYS, --budget SIZE, or both", code="nothing_requested")
     if not (request.keep_days or 0) >= 0 or (request.budget_bytes or 0) < 0:
         raise ConfigError("days and sizes must not be negative", code="out_of_range")
     graph = store.revisions.get()
@@ -65,7 +65,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         before = now - timedelta(days=request.keep_days or 0)
     except OverflowError as error:
         raise ConfigError(
-            f"no date lies {request.keep_days:g} days before today: give fewer days", code="date_out_of_range"
+            f"no date lies {request.keep_days:g} days before today: pass fewer days", code="date_out_of_range"
         ) from error
     known = [scene for scene in dated if scene.id in graph.poses]
     sizes = {scene: _num_bytes(store, scene) for scene in living}
@@ -134,7 +134,7 @@ def _present(store: Store, dated: Sequence[Scene]) -> datetime:
 
 
 THINGS = RecipeKey("thin", "things", {"things": 1})
-"""Recipe of the graph of a thinned capture: the things that it showed when it was whole, and no layer."""
+"""Recipe of the graph of a thinned capture, which keeps the segments of the whole capture but no node layers."""
 
 
 def _keep_things(store: Store, graph: SceneGraph | None) -> None:
@@ -214,7 +214,7 @@ def _row(scene: Scene, before: int, after: int, seen: float, why: str, fidelity:
 
 
 def _num_bytes(store: Store, scene: str) -> int:
-    """Return the size of a scene's arrays and graphs."""
+    """Return the size of a scene's arrays and graphs in bytes."""
     return store.scenes.num_bytes(scene) + store.graphs.num_bytes(scene)
 
 
@@ -228,6 +228,6 @@ def _moment(text: str) -> datetime:
         moment = datetime.fromisoformat(text)
     except ValueError as error:
         raise ConfigError(
-            f"a time is ISO 8601 such as 2026-05-31T14:00:00+02:00, got {text!r}", code="invalid_date"
+            f"a time must be in ISO 8601, such as 2026-05-31T14:00:00+02:00, got {text!r}", code="invalid_date"
         ) from error
     return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
