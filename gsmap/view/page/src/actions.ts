@@ -55,10 +55,10 @@ export async function load(): Promise<MapSummary | null> {
 /** Another state of the map: what was chosen stays, where it is still there. */
 export function setMap(map: MapSummary): void {
   const { state } = page;
-  const islands = map.components.map((one) => one.component);
+  const components = map.components.map((one) => one.component);
   const before = state.map?.scenes.find((scene) => scene.component === state.component)?.id;
   const moved = before ? derive.sceneOf(map, before)?.component : undefined;
-  const component = moved ?? (islands.includes(state.component) ? state.component : (islands[0] ?? 0));
+  const component = moved ?? (components.includes(state.component) ? state.component : (components[0] ?? 0));
   const hasMerged = Boolean(derive.componentOf(map, component)?.merged);
   const kept = (side: Side): Side => (hasMerged ? side : { ...side, source: "scenes" });
   const { selection } = state;
@@ -98,7 +98,7 @@ export const dismiss = (id: number) => page.set({ notices: page.state.notices.fi
 
 const aims: (() => void)[] = [];
 
-export function island(component: number): void {
+export function showComponent(component: number): void {
   if (component === page.state.component) return;
   const blank: Side = { source: "scenes", hidden: new Set() };
   page.set({
@@ -270,15 +270,15 @@ export function select(selection: Selection | null, fly = true): void {
   const { map } = page.state;
   page.set({ selection, view: 0, drag: null, folded: false });
   if (!map || !selection) return;
-  const at = islandOf(map, selection);
+  const at = componentOfSelection(map, selection);
   if (at !== null && at !== page.state.component) {
-    island(at);
+    showComponent(at);
     page.set({ selection });
   }
   if (fly) flyToSelected(selection);
 }
 
-function islandOf(map: MapSummary, { kind, key }: Selection): number | null {
+function componentOfSelection(map: MapSummary, { kind, key }: Selection): number | null {
   if (kind === "scene") return derive.sceneOf(map, key)?.component ?? null;
   if (kind === "change") return map.changes.find((one) => one.id === key)?.component ?? null;
   if (kind === "photo") return map.photos.find((one) => one.file === key)?.component ?? null;

@@ -32,7 +32,7 @@ export interface MapState {
   state: string;
 }
 
-/** One island. A scene that nothing placed is an island of its own. */
+/** One component. A scene that nothing placed is a component of its own. */
 export interface Component {
   component: number;
   num_scenes: number;

@@ -50,7 +50,7 @@ export function visible(state: State, side: Side, poses: RevisionPoses | null): 
   return out;
 }
 
-/** Scenes of the island that fit every word of the query: in name, date, tag or status. */
+/** Scenes of the component that fit every word of the query: in name, date, tag or status. */
 export function listedScenes(state: State): SceneEntry[] {
   const { map, component, sceneQuery } = state;
   if (!map) return [];
@@ -63,7 +63,7 @@ export function listedScenes(state: State): SceneEntry[] {
   });
 }
 
-/** Days on which captures of the island were made, in order. */
+/** Days on which captures of the component were made, in order. */
 export function captureDays(state: State): string[] {
   const scenes = state.map?.scenes.filter((scene) => scene.component === state.component) ?? [];
   return [...new Set(scenes.flatMap((scene) => (scene.captured_at ? [scene.captured_at.slice(0, 10)] : [])))].sort();
@@ -78,11 +78,11 @@ const IS_IN: Record<EdgeFilter, (edge: EdgeEntry) => boolean> = {
   all: () => true,
 };
 
-const inIsland = (state: State, edge: EdgeEntry) =>
+const isInComponent = (state: State, edge: EdgeEntry) =>
   [edge.target, edge.source].some((index) => state.map?.scenes[index]?.component === state.component);
 
 export const countEdges = (state: State, filter: EdgeFilter) =>
-  state.map?.edges.filter((edge) => inIsland(state, edge) && IS_IN[filter](edge)).length ?? 0;
+  state.map?.edges.filter((edge) => isInComponent(state, edge) && IS_IN[filter](edge)).length ?? 0;
 
 /** The edges of the list, the most doubtful first. The selected one stays, so that a review does not take it away. */
 export function listedEdges(state: State): EdgeEntry[] {
@@ -91,14 +91,14 @@ export function listedEdges(state: State): EdgeEntry[] {
   const words = state.edgeQuery.toLowerCase().split(/\s+/).filter(Boolean);
   const listed = map.edges.filter((edge) => {
     if (isSelected(state, "edge", edgeKey(map, edge))) return true;
-    if (!inIsland(state, edge) || !IS_IN[state.edgeFilter](edge)) return false;
+    if (!isInComponent(state, edge) || !IS_IN[state.edgeFilter](edge)) return false;
     const names = `${map.scenes[edge.target]?.name} ${map.scenes[edge.source]?.name} ${edge.reason}`.toLowerCase();
     return words.every((word) => names.includes(word));
   });
   return listed.sort((a, b) => b.doubt - a.doubt || a.target - b.target || a.source - b.source);
 }
 
-/** Changes of the island until the date looked at, the newest first. */
+/** Changes of the component until the date looked at, the newest first. */
 export function listedChanges(state: State): ChangeEntry[] {
   const { map, component, until, changeFilter } = state;
   const shown = (one: ChangeEntry) =>

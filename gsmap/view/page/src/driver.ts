@@ -22,7 +22,7 @@ function detailOf(state: State): EdgeDetail | null {
 }
 
 /** One call of the stage, made when what it is told differs from last time. */
-class Told<T> {
+class StageCall<T> {
   private last: T | undefined;
   constructor(
     private readonly isSame: (a: T, b: T) => boolean,
@@ -50,36 +50,38 @@ const OF_TAB: Partial<Record<Overlay, Tab>> = { edges: "review", objects: "thing
 
 /** Keeps the stage at what the state says from now on. */
 export function drive(stage: Stage): () => void {
-  const shown = new Told<{ map: MapSummary; component: number }>(
+  const shown = new StageCall<{ map: MapSummary; component: number }>(
     (a, b) => a.map === b.map && a.component === b.component,
     ({ map, component }) => stage.show(map, component),
   );
-  const visible = new Told<ReadonlySet<number>>(sameSet, (scenes) => stage.setVisible(scenes));
-  const source = new Told<State["left"]["source"]>(is, (name) => stage.setSource(name));
-  const split = new Told<{ at: number; scenes: ReadonlySet<number>; source: "scenes" | "merged" } | null>(
+  const visible = new StageCall<ReadonlySet<number>>(sameSet, (scenes) => stage.setVisible(scenes));
+  const source = new StageCall<State["left"]["source"]>(is, (name) => stage.setSource(name));
+  const split = new StageCall<{ at: number; scenes: ReadonlySet<number>; source: "scenes" | "merged" } | null>(
     (a, b) => a === b || (!!a && !!b && a.at === b.at && a.source === b.source && sameSet(a.scenes, b.scenes)),
     (value) => stage.setSplit(value),
   );
-  const clip: Told<State["clip"]> = new Told<State["clip"]>(alike, (box) =>
+  const clip: StageCall<State["clip"]> = new StageCall<State["clip"]>(alike, (box) =>
     stage.setClip(box, (now) => {
       clip.heard(now);
       page.set({ clip: now });
     }),
   );
-  const ceiling = new Told<boolean>(is, (value) => stage.setCeiling(value));
-  const overlays = OVERLAYS.map((name) => [name, new Told<boolean>(is, (on) => stage.setOverlay(name, on))] as const);
-  const changes = new Told<ReturnType<typeof derive.listedChanges>>(
+  const ceiling = new StageCall<boolean>(is, (value) => stage.setCeiling(value));
+  const overlays = OVERLAYS.map(
+    (name) => [name, new StageCall<boolean>(is, (on) => stage.setOverlay(name, on))] as const,
+  );
+  const changes = new StageCall<ReturnType<typeof derive.listedChanges>>(
     (a, b) => a.length === b.length && a.every((one, i) => one === b[i]),
     (list) => stage.setChanges(list),
   );
-  const detail = new Told<EdgeDetail | null>(is, (value) => stage.setCorrespondences(value));
-  const poses = new Told<RevisionPoses | null>(is, (value) => stage.setPoses(value));
-  const dragging = new Told<string | null>(is, (id) => {
+  const detail = new StageCall<EdgeDetail | null>(is, (value) => stage.setCorrespondences(value));
+  const poses = new StageCall<RevisionPoses | null>(is, (value) => stage.setPoses(value));
+  const dragging = new StageCall<string | null>(is, (id) => {
     const index = page.state.map?.scenes.findIndex((scene) => scene.id === id) ?? -1;
     if (id === null || index < 0) stage.drag(null);
     else stage.drag(index, (S_map_scene) => actions.dragged(S_map_scene));
   });
-  const theme = new Told<boolean>(is, (dark) => stage.setTheme(dark));
+  const theme = new StageCall<boolean>(is, (dark) => stage.setTheme(dark));
   let things: unknown = null;
 
   const sync = () => {

@@ -1,4 +1,4 @@
-// What is looked at: the island, its scenes or their merged tiles, what is drawn over them.
+// What is looked at: the component, its scenes or their merged tiles, what is drawn over them.
 import { css, html, nothing } from "lit";
 import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
@@ -65,7 +65,7 @@ export class Look extends Panel {
           flex: none;
           order: -1;
         }
-        .island {
+        .component {
           order: -2;
         }
         dl.facts {
@@ -85,8 +85,8 @@ export class Look extends Panel {
     if (!map) return nothing;
     const component = derive.componentOf(map, state.component);
     return html`
-      <section class="island stack">
-        ${this.island(map.components)} ${component ? this.facts(component) : nothing}
+      <section class="component stack">
+        ${this.componentChoice(map.components)} ${component ? this.facts(component) : nothing}
       </section>
       ${state.split || component?.merged ? this.sources(component) : nothing}
       ${state.clip ? html`<gs-clip></gs-clip>` : nothing}
@@ -107,11 +107,11 @@ export class Look extends Panel {
     `;
   }
 
-  private island(components: readonly Component[]) {
+  private componentChoice(components: readonly Component[]) {
     if (components.length < 2) return nothing;
     return html`<label
-      ><span class="muted">Island</span>
-      <select @change=${(event: Event) => actions.island(Number((event.target as HTMLSelectElement).value))}>
+      ><span class="muted">Component</span>
+      <select @change=${(event: Event) => actions.showComponent(Number((event.target as HTMLSelectElement).value))}>
         ${components.map(
           (one, index) =>
             html`<option value=${one.component} ?selected=${one.component === this.state.component}>

@@ -33,12 +33,12 @@ const MARKS: Record<ReturnType<typeof derive.standing>, string> = {
 const SAID = { confirm: "confirmed", reject: "rejected" };
 
 const NONE: Record<EdgeFilter, string> = {
-  doubtful: "Nothing is in doubt on this island. “All” lists every pair that was tried.",
+  doubtful: "Nothing is in doubt on this component. “All” lists every pair that was tried.",
   tentative: "No tentative edge: every scene is held by a loop, or by a review.",
   undecided: "No undecided edge: no two groups of edges contradict each other.",
   rejected: "No pair was rejected.",
   reviewed: "No pair has been reviewed yet.",
-  all: "No pair of this island was tried yet: gsmap register tries them.",
+  all: "No pair of this component was tried yet: gsmap register tries them.",
 };
 
 /** How an edge stands, as a coloured mark of its own shape with its word. */

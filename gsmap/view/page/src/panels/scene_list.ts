@@ -1,4 +1,4 @@
-// The scenes of the island: found by name, date, tag or status; shown, hidden, alone, flown to.
+// The scenes of the component: found by name, date, tag or status; shown, hidden, alone, flown to.
 import { css, html, nothing } from "lit";
 import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";

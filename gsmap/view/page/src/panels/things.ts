@@ -86,7 +86,7 @@ export class Things extends Panel {
         );
         return listed.length
           ? this.list("Objects", listed, (one) => one.id, this.object, "object")
-          : html`<p class="empty">No object of this island fits.</p>`;
+          : html`<p class="empty">No object of this component fits.</p>`;
       },
     );
   }

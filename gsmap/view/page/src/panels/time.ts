@@ -62,7 +62,7 @@ export class Time extends Panel {
       return html`<section>
         <h3>${has}</h3>
         <p class="muted">
-          No capture of this island has a date. <kbd>gsmap edit MAP SCENE --captured-at DATE</kbd> gives it one.
+          No capture of this component has a date. <kbd>gsmap edit MAP SCENE --captured-at DATE</kbd> gives it one.
         </p>
       </section>`;
     const last = days.length - 1;
@@ -145,14 +145,14 @@ export class Time extends Panel {
   private changes() {
     const { state } = this;
     const changes = derive.listedChanges(state);
-    const inIsland = state.map?.changes.filter((one) => one.component === state.component) ?? [];
+    const ofComponent = state.map?.changes.filter((one) => one.component === state.component) ?? [];
     const chosen = state.selection?.kind === "change" ? state.selection.key : null;
     const count = (name: ChangeFilter) =>
-      inIsland.filter((one) => (name === "all" || one.status === name) && derive.isBy(one.at, state.until)).length;
+      ofComponent.filter((one) => (name === "all" || one.status === name) && derive.isBy(one.at, state.until)).length;
     return html`<section>
       <h3>What changed</h3>
       ${
-        inIsland.length
+        ofComponent.length
           ? html`<div class="chips" role="group" aria-label="Which changes">
               ${CHANGE_FILTERS.map(
                 (name) =>
@@ -179,7 +179,7 @@ export class Time extends Panel {
             ></gs-listing>`
           : html`<p class="empty">
               ${
-                inIsland.length
+                ofComponent.length
                   ? state.until === null
                     ? "None of this kind."
                     : `None until ${day(state.until)}.`

@@ -17,10 +17,10 @@ import type {
 import type { ChangeEntry } from "../contract";
 import { ClipBox } from "./clip";
 import { BUDGET, Loader } from "./loader";
-import type { Budget, Placed, Sixteen } from "./loader";
+import type { Budget, TreePlacement, Sixteen } from "./loader";
 import { boxLines, CHANGE_COLOURS, COLOURS, crossLines, ellipsoidLines, frustumLines, Overlays } from "./overlays";
 import type { Lines } from "./overlays";
-import { Painter } from "./splats";
+import { SplatRenderer } from "./splats";
 import type { Overlay, Pick, Source, Stage, StageOptions, StageState, Standpoint } from "./stage";
 import { View } from "./view";
 
@@ -34,7 +34,7 @@ const SHORTEST_MS = 50;
 const LONGEST_MS = 2000;
 /** How far up a room reaches that is drawn without its ceiling: of what its scene shows, from the floor. */
 const CEILING_AT = 0.72;
-/** Islands of at most so many scenes are first seen from where their captures were made. */
+/** Components of at most so many scenes are first seen from where their captures were made. */
 const STAND_INSIDE = 8;
 
 interface Split {
@@ -63,7 +63,7 @@ class View3D implements Stage {
   private readonly scene = new Scene();
   private readonly splats = new Group();
   private readonly overlays = new Overlays();
-  private readonly painter: Painter;
+  private readonly splatRenderer: SplatRenderer;
   private readonly view: View;
   private readonly clip: ClipBox;
   private readonly timer = new Timer();
@@ -100,13 +100,13 @@ class View3D implements Stage {
     this.budget = { ...BUDGET, ...options.budget };
     this.renderer = new WebGLRenderer({ canvas, antialias: false, alpha: false, powerPreference: "high-performance" });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, MAX_PIXEL_RATIO));
-    this.painter = new Painter(this.renderer);
+    this.splatRenderer = new SplatRenderer(this.renderer);
     this.view = new View(canvas, this.draw);
     this.clip = new ClipBox(canvas, this.view.camera, () => {
       this.cut();
       this.draw();
     });
-    this.scene.add(this.painter.spark, this.splats, this.overlays.group, this.clip.group);
+    this.scene.add(this.splatRenderer.spark, this.splats, this.overlays.group, this.clip.group);
     this.setTheme(true);
     canvas.addEventListener("webglcontextlost", this.onLost);
     canvas.addEventListener("pointerdown", this.onDown);
@@ -120,8 +120,8 @@ class View3D implements Stage {
   // ---- what is shown ----------------------------------------------------------------------------------------------
 
   show(map: MapSummary, component: number): void {
-    const island = map.components.find((one) => one.component === component);
-    if (!island) return;
+    const shown = map.components.find((one) => one.component === component);
+    if (!shown) return;
     const isOther = !this.map || this.component !== component;
     const before = this.loader;
     this.map = map;
@@ -134,8 +134,8 @@ class View3D implements Stage {
     if (!this.isVisibleKnown) this.visible = new Set(map.scenes.keys());
     this.dragged = null;
     this.loader = new Loader(map, component, this.splats, this.budget, this.refreshLater, this.fail, before);
-    const box = new Box3(new Vector3(...island.box[0]), new Vector3(...island.box[1]));
-    this.view.setWorld(island.up, box.getSize(new Vector3()).length(), 1 / (island.metres_per_unit || 1));
+    const box = new Box3(new Vector3(...shown.box[0]), new Vector3(...shown.box[1]));
+    this.view.setWorld(shown.up, box.getSize(new Vector3()).length(), 1 / (shown.metres_per_unit || 1));
     this.state.phase = "ready";
     this.place();
     this.drawOverlays();
@@ -221,7 +221,7 @@ class View3D implements Stage {
     return written ? this.poseOf(scene).clone().multiply(written.clone().invert()) : new Matrix4();
   }
 
-  private isOfIsland(scene: number): boolean {
+  private isInComponent(scene: number): boolean {
     if (!this.revision) return this.map?.scenes[scene]?.component === this.component;
     return this.revision.scenes.some((one) => one.scene === scene && one.component === this.component);
   }
@@ -233,7 +233,7 @@ class View3D implements Stage {
     const left = hasMerged ? this.source : "scenes";
     const right = split ? (hasMerged ? split.source : "scenes") : left;
     const poses = new Map(this.revision?.scenes.map((one) => [one.scene, one]));
-    const placed: Placed[] = map.scenes.map((scene, i) => {
+    const placed: TreePlacement[] = map.scenes.map((scene, i) => {
       const then = poses.get(i);
       const component = this.revision ? then?.component : scene.component;
       const isHere = component === this.component;
@@ -248,20 +248,20 @@ class View3D implements Stage {
       return { pose, sides: (isLeft ? 1 : 0) + (isRight ? 2 : 0) };
     });
     loader.place(placed, hasMerged ? (left === "merged" ? 1 : 0) + (right === "merged" ? 2 : 0) : 0);
-    this.painter.setSplit(split ? split.at * this.renderer.domElement.width : null);
+    this.splatRenderer.setSplit(split ? split.at * this.renderer.domElement.width : null);
     this.refresh();
   }
 
-  /** Lowest and highest along the island's up of what is drawn, and the box of it. */
+  /** Lowest and highest along the component's up of what is drawn, and the box of it. */
   private seenBox(): Box3 {
     const out = new Box3();
     this.map?.scenes.forEach((scene, i) => {
-      if (!this.isOfIsland(i)) return;
+      if (!this.isInComponent(i)) return;
       if (!this.visible.has(i) && !this.split?.scenes.has(i)) return;
       out.union(new Box3(new Vector3(...scene.box[0]), new Vector3(...scene.box[1])).applyMatrix4(this.poseOf(i)));
     });
-    const island = this.map?.components.find((one) => one.component === this.component);
-    if (out.isEmpty() && island) out.set(new Vector3(...island.box[0]), new Vector3(...island.box[1]));
+    const shown = this.map?.components.find((one) => one.component === this.component);
+    if (out.isEmpty() && shown) out.set(new Vector3(...shown.box[0]), new Vector3(...shown.box[1]));
     return out;
   }
 
@@ -273,13 +273,13 @@ class View3D implements Stage {
       const up = this.view.camera.up;
       let [low, high] = [Infinity, -Infinity];
       this.map.scenes.forEach((scene, i) => {
-        if (!this.isOfIsland(i) || !this.visible.has(i)) return;
+        if (!this.isInComponent(i) || !this.visible.has(i)) return;
         const [floor, top] = this.heights(scene, i, up);
         [low, high] = [Math.min(low, floor), Math.max(high, top)];
       });
       if (high > low) ceiling = new Vector4(up.x, up.y, up.z, low + CEILING_AT * (high - low));
     }
-    this.painter.setCuts(clip, ceiling);
+    this.splatRenderer.setCuts(clip, ceiling);
   }
 
   /** Where floor and ceiling of a scene are along a direction; by its box, which a turned frame makes too high, where
@@ -321,7 +321,7 @@ class View3D implements Stage {
     this.view.standAtCamera(T_map_camera, intrinsics, size);
   }
 
-  /** A small island is first seen as its captures saw it: from above, a room is its ceiling. */
+  /** A small component is first seen as its captures saw it: from above, a room is its ceiling. */
   private async standInside(): Promise<void> {
     const { map, component } = this;
     const scenes = map?.scenes.filter((scene) => scene.component === component) ?? [];
@@ -359,7 +359,7 @@ class View3D implements Stage {
     if (!width || !height) return;
     this.renderer.setSize(width, height, false);
     this.view.resize(width, height);
-    if (this.split) this.painter.setSplit(this.split.at * canvas.width);
+    if (this.split) this.splatRenderer.setSplit(this.split.at * canvas.width);
     this.refresh();
   };
 
@@ -412,7 +412,7 @@ class View3D implements Stage {
     }
     if (this.isStale && !this.isPreparing) void this.prepare();
     this.clip.update();
-    this.painter.draw(this.scene, camera, camera.near);
+    this.splatRenderer.draw(this.scene, camera, camera.near);
     this.state.frames++;
     this.count();
     if (this.isMoving) this.draw();
@@ -427,7 +427,7 @@ class View3D implements Stage {
     this.isStale = false;
     const start = performance.now();
     try {
-      await this.painter.prepare(this.scene, this.view.camera);
+      await this.splatRenderer.prepare(this.scene, this.view.camera);
     } catch (error) {
       this.fail(error instanceof Error ? error.message : String(error));
     }
@@ -490,9 +490,9 @@ class View3D implements Stage {
   private drawOverlays(): void {
     const { map, shownOverlays: on, overlays } = this;
     if (!map) return;
-    const here = map.scenes.map((_, i) => i).filter((i) => this.isOfIsland(i) && this.isSeen(i));
-    const island = map.components.find((one) => one.component === this.component);
-    const unit = 1 / (island?.metres_per_unit || 1);
+    const here = map.scenes.map((_, i) => i).filter((i) => this.isInComponent(i) && this.isSeen(i));
+    const shown = map.components.find((one) => one.component === this.component);
+    const unit = 1 / (shown?.metres_per_unit || 1);
     const isHere = (component: number) => component === this.component;
     const middle = (i: number) => new Vector3(...(map.scenes[i]?.middle as Vector)).applyMatrix4(this.movedBy(i));
 
@@ -663,7 +663,7 @@ class View3D implements Stage {
     const line = this.overlays.pick(camera, x, y, rect.width, rect.height);
     if (line) return { point: line.point.toArray(), scene: line.lines.scene ?? null, thing: line.lines.thing ?? null };
     const k = canvas.width / rect.width;
-    const hit = this.painter.pick(camera, Math.floor(x * k), Math.floor(y * k), canvas.width, canvas.height);
+    const hit = this.splatRenderer.pick(camera, Math.floor(x * k), Math.floor(y * k), canvas.width, canvas.height);
     if (!hit) return null;
     const ray = new Raycaster();
     ray.setFromCamera(new Vector2((2 * x) / rect.width - 1, 1 - (2 * y) / rect.height), camera);
@@ -671,7 +671,7 @@ class View3D implements Stage {
     camera.getWorldDirection(forward);
     const distance = hit.depth / ray.ray.direction.dot(forward);
     const point = ray.ray.origin.clone().addScaledVector(ray.ray.direction, distance);
-    const owner = this.painter.owner(hit.splat);
+    const owner = this.splatRenderer.owner(hit.splat);
     const scene = owner && this.loader ? this.loader.sceneOf(owner.tile, owner.index) : -1;
     return { point: point.toArray(), scene: scene >= 0 ? scene : null, thing: null };
   }
@@ -742,7 +742,7 @@ class View3D implements Stage {
     this.loader?.dispose();
     this.overlays.dispose();
     this.view.dispose();
-    this.painter.dispose();
+    this.splatRenderer.dispose();
     this.renderer.dispose();
   }
 }

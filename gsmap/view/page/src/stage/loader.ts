@@ -18,7 +18,7 @@ export interface Budget {
 export const BUDGET: Budget = { splats: 2_000_000, bytes: 600 << 20, errorPx: 0.5, requests: 6 };
 
 /** What is seen: where the eye is and how large things get. */
-export interface Sight {
+export interface Viewpoint {
   viewProjection: Matrix4;
   eye: Vector3;
   focalPx: number;
@@ -26,7 +26,7 @@ export interface Sight {
 }
 
 /** Where each tree lies and whether it is drawn: 1 left of a split, 2 right of it, 3 both, 0 not at all. */
-export interface Placed {
+export interface TreePlacement {
   pose: Matrix4;
   sides: number;
 }
@@ -40,7 +40,7 @@ interface DrawnOverview {
 /** A new overview is fetched when it has so many times the splats of the one that is there. */
 const WORTH_FETCHING = 1.5;
 
-interface Asked {
+interface TileRequest {
   tree: Tree;
   tile: Tile | null; // whose finer tiles are asked for; null: the root
   rank: number; // 0 matters most
@@ -63,9 +63,9 @@ export class Loader {
   private active = 0;
   private tick = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
-  private queue: (Tile | Asked)[] = []; // what matters most first
+  private queue: (Tile | TileRequest)[] = []; // what matters most first
   private waiting = 0; // trees that are wanted and still being made
-  private readonly placed: Placed[];
+  private readonly placed: TreePlacement[];
   private readonly asWritten: Matrix4[];
 
   /**
@@ -137,7 +137,7 @@ export class Loader {
   }
 
   /** Takes where scenes lie and which are drawn where. */
-  place(placed: readonly Placed[], merged: number): boolean {
+  place(placed: readonly TreePlacement[], merged: number): boolean {
     let changed = false;
     placed.forEach(({ pose, sides }, i) => {
       const own = this.placed[i];
@@ -164,14 +164,14 @@ export class Loader {
   }
 
   /** Chooses anew for what is seen; returns whether other splats are drawn than before. */
-  update(sight: Sight): boolean {
+  update(viewpoint: Viewpoint): boolean {
     this.tick++;
     const roots: Tile[] = [];
     const treesAsked: Tree[] = [];
     const drawn = [...this.trees.keys()].filter((i) => this.placed[i]?.sides).map((i) => this.trees[i] as Tree);
     if (this.merged && this.table.sides(this.merged.row)) drawn.push(this.merged);
     for (const tree of drawn) {
-      tree.see(sight.viewProjection, sight.eye);
+      tree.see(viewpoint.viewProjection, viewpoint.eye);
       const share = this.shares.get(tree);
       if (share) roots.push(share);
       else if (tree.root) roots.push(tree.root);
@@ -181,7 +181,7 @@ export class Loader {
     const errorOf = (tile: Tile): number => {
       let error = errors.get(tile);
       if (error === undefined) {
-        error = tile.tree.errorPx(tile, sight.focalPx, sight.nearest);
+        error = tile.tree.errorPx(tile, viewpoint.focalPx, viewpoint.nearest);
         errors.set(tile, error);
       }
       return error;
@@ -204,16 +204,17 @@ export class Loader {
     for (const root of roots) want(root, false);
     const loading = [...this.loading];
     for (const tile of loading) if (!wanted.includes(tile)) tile.aborter?.abort();
-    const asked: Asked[] = [
+    const asked: TileRequest[] = [
       ...treesAsked.map((tree) => ({ tree, tile: null })),
       ...this.cut.unknown.map((tile) => ({ tree: tile.tree, tile })),
     ].map((one, rank) => ({ ...one, rank }));
     const now = performance.now();
-    const isDue = ({ tree, tile }: Asked) =>
+    const isDue = ({ tree, tile }: TileRequest) =>
       tile?.external
         ? tile.state !== "loading"
         : tree.state === "none" || (tree.state === "waiting" && tree.retryAt <= now);
-    const worth = (one: Tile | Asked) => (one instanceof Tile ? errorOf(one) : one.tile ? errorOf(one.tile) : Infinity);
+    const worth = (one: Tile | TileRequest) =>
+      one instanceof Tile ? errorOf(one) : one.tile ? errorOf(one.tile) : Infinity;
     this.queue = [...missing, ...asked.filter(isDue)].sort((a, b) => worth(b) - worth(a));
     this.waiting = asked.filter(
       ({ tree, tile }) => !tile?.external && tree.state === "waiting" && tree.retryAt > now,
@@ -234,7 +235,7 @@ export class Loader {
     this.shown = shown;
     for (const [tree, share] of this.shares) {
       const i = tree.row / 2;
-      const placed = this.placed[i] as Placed;
+      const placed = this.placed[i] as TreePlacement;
       const written = this.overview?.written[i] ?? (this.asWritten[i] as Matrix4);
       const moved = new Matrix4().multiplyMatrices(placed.pose, written.clone().invert());
       changed = this.table.set(tree.row + 1, moved, shown.has(share) ? placed.sides : 0) || changed;
@@ -332,7 +333,7 @@ export class Loader {
     before.ready.clear();
   }
 
-  private async fetchTree({ tree, tile, rank }: Asked): Promise<void> {
+  private async fetchTree({ tree, tile, rank }: TileRequest): Promise<void> {
     const external = tile?.external;
     if (external) tile.state = "loading";
     else tree.state = "loading";

@@ -217,7 +217,7 @@ export class SplatTile extends SplatGenerator {
 }
 
 /** Spark, drawing by gsmap's conventions. */
-export class Painter {
+export class SplatRenderer {
   readonly spark: SparkRenderer;
   private readonly uniforms = {
     nearest: { value: 0.01 },

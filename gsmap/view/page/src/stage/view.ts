@@ -53,7 +53,7 @@ export class View {
     return !this.still.matches;
   }
 
-  /** Takes the island's up and size. */
+  /** Takes the component's up and size. */
   setWorld(up: Vector, size: number, unit: number): void {
     this.size = size;
     this.camera.up.set(...up).normalize();
