@@ -1,4 +1,4 @@
-"""Shared parts of the tools: arguments, CPU time and memory, captures of known truth, notes and tables."""
+"""Shared parts of the tools: arguments, CPU time and memory, notes and tables."""
 
 from __future__ import annotations
 

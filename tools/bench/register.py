@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import os
 
+from tools import harness
 from tools.harness import argument_parser, say, timed
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -276,8 +277,7 @@ def contexts_apart(pairs: list[tuple[Capture, Capture, float]]) -> str:
 
 def print_table(rows: list[dict]) -> None:
     heads = "posed", "fine", "coarse", "wrong", "apart", "told", "median", "worst", "scale", "CPU_s", "max"
-    widths = 11, 10, 10, 6, 9, 5, 16, 16, 7, 7, 7
-    print(f"{'method':22s}" + "".join(f"{h:>{w}s}" for h, w in zip(heads, widths, strict=True)))
+    lines = []
     for r in rows:
         s, places = r["summary"], r["places"].values()
         cells = [f"{s['num_estimated']} of {s['num_pairs']}"]
@@ -288,7 +288,8 @@ def print_table(rows: list[dict]) -> None:
         cells += [r["told"] if r["scored"] and r["apart"] else ""]
         cells += [f"{s[f'{k}_rre_deg']:.2f}d {100 * s[f'{k}_centroid_m']:.1f}cm" for k in ("median", "worst")]
         cells += [f"{s['mean_rse']:.2%}", f"{r['cpu_s']:.2f}", f"{r['cpu_s_max']:.2f}"]
-        print(f"{r['method']:22s}" + "".join(f"{c!s:>{w}s}" for c, w in zip(cells, widths, strict=True)))
+        lines.append([r["method"], *cells])
+    harness.print_table(["method", *heads], lines)
     print(
         "posed: of the pairs that overlap by 25 % or more; fine, coarse: of those, by place, within 1 deg and 5 cm, "
         "within 5 deg and 30 cm; wrong: poses of any pair of one place beyond coarse; apart: wrong poses among pairs "

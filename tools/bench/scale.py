@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import os
 
-from tools.harness import argument_parser, timed
+from tools.harness import argument_parser, print_table, timed
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GSMAP_WORKERS"):
     os.environ[_name] = "1"
@@ -182,13 +182,14 @@ def parts() -> AbstractContextManager[Spent]:
 
 def table(scenes: Sequence[int], rows: Sequence[dict[str, float]]) -> None:
     """A line for each figure, with the exponent of its growth over the last decade."""
-    print(f"{'':52}" + "".join(f"{num:>12,}" for num in scenes) + "    exponent")
+    lines = []
     for name in dict.fromkeys(name for row in rows for name in row):
         values = [row.get(name, float("nan")) for row in rows]
         grown = ""
         if len(values) > 1 and min(values[-2:]) > 0:
-            grown = f"{np.log(values[-1] / values[-2]) / np.log(scenes[-1] / scenes[-2]):12.2f}"
-        print(f"{name:52}" + "".join(f"{value:>12,.6g}" for value in values) + grown)
+            grown = f"{np.log(values[-1] / values[-2]) / np.log(scenes[-1] / scenes[-2]):.2f}"
+        lines.append([name, *(f"{value:,.6g}" for value in values), grown])
+    print_table(["", *(f"{num:,}" for num in scenes), "exponent"], lines)
 
 
 def _straight(i: int) -> list[float]:

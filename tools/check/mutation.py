@@ -12,7 +12,6 @@ change that makes no difference). Prints the share that is killed, by module, an
 
 from __future__ import annotations
 
-import argparse
 import ast
 import gc
 import inspect
@@ -33,6 +32,8 @@ from typing import Any
 
 import pytest
 
+from tools.harness import argument_parser
+
 ROOT = Path(__file__).resolve().parents[2]
 
 _SKIPPED = ("BitOr", "RemoveDecorator")
@@ -45,7 +46,7 @@ _STARTS_A_PROCESS = {"os.fork", "os.posix_spawn", "subprocess.Popen", "socket.co
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("--room", required=True)
     parser.add_argument("tests", nargs="*", help="files of tests; default: those of the room")
     parser.add_argument("--module", action="append", help="of the room, such as backup/saving; default: all of them")
