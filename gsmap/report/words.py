@@ -220,17 +220,15 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
     return ("look" if "look" in wants or tentative or undecided else "good"), tuple(sentences)
 
 
-def _wants(what: TodoKind) -> Literal["act", "look", "good"]:
-    """Return ``act`` for a task of computation, ``look`` for a review by a person, ``good`` for what may stay."""
+def _wants(what: TodoKind) -> Literal["act", "look"]:
+    """Return ``act`` for a task of computation, ``look`` for a review by a person."""
     match what:
         case "undescribed" | "unregistered" | "unsolved" | "set_aside" | "contradicted_priors":
             return "act"
         case "stale_graphs" | "stale_edges" | "stale_poses" | "dirty_tiles" | "tentative" | "undecided" | "changes":
             return "look"
-        case "world_outliers" | "untied" | "duplicates" | "isolated":
+        case "world_outliers" | "untied" | "duplicates" | "isolated" | "one_pair":
             return "look"
-        case "one_pair":
-            return "good"
         case _:
             assert_never(what)
 
