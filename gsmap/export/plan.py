@@ -122,13 +122,13 @@ def plan_tiles(
         _require_near(component, boxes.around, metres)
         reach = reach_m / metres
         counts = np.array([(num_gaussians or {}).get(scene, 0) for scene in members], dtype=np.float64)
-        whole = list(_in_one(boxes, bbox, reach))
+        uncut = list(_in_one(boxes, bbox, reach))
         edge_m, centred = tile_size_m, False
         if edge_m is None:
-            is_large = any(counts[rows].sum() > MAX_WHOLE_GAUSSIANS for _, _, rows in whole)
+            is_large = any(counts[rows].sum() > MAX_WHOLE_GAUSSIANS for _, _, rows in uncut)
             edge_m, centred = (AUTO_TILE_M, True) if is_large else (0.0, False)
         for cell, bounds, reaching in (
-            _in_cells(boxes, Grid(edge_m / metres, bbox, max_tiles, centred), reach) if edge_m else whole
+            _in_cells(boxes, Grid(edge_m / metres, bbox, max_tiles, centred), reach) if edge_m else uncut
         ):
             name = "map" if cell is None else "tile_" + "_".join(f"{c:+04d}" for c in cell)
             place = json.dumps([edge_m, cell, None if bbox is None else bbox.tolist(), *["centred"] * centred])

@@ -67,7 +67,7 @@ def keep(key: str, result: MergeResult, scenes: Collection[str]) -> None:
         try:
             with open(staged, "xb") as file:
                 about = {"facts": np.array(facts), "scenes": np.array(sorted(scenes))}
-                np.savez(file, origin=result.origin.astype(np.int32), **about, **arrays)
+                np.savez(file, origin=result.origin.astype(np.int32), **about, **arrays)  # type: ignore[arg-type]
             cache.make_room(root)
             os.replace(staged, root / f"{key}{_SUFFIX}")
         finally:

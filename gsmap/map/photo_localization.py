@@ -135,7 +135,7 @@ def photos_of(
 ) -> list[tuple[str, Photo]]:
     """Read photos by name, each with its mask if there is one; those in memory are converted."""
     return [
-        (os.fspath(path), photo_in_memory(in_memory[path], lens, path))
+        (os.fspath(path), photo_in_memory(in_memory[path], lens, os.fspath(path)))
         if path in in_memory
         else (os.fspath(path), read_photo(path, lens, masks))
         for path in files
