@@ -20,9 +20,9 @@ class Params:
             smaller and coarser.
         min_area_m2: Smallest area in square metres, at least 0, of a change that is reported; larger drops small
             changes.
-        min_moved_fraction: Smallest fraction in [0, 1] of an object's points in each scene that must fit the object's
-            points in the other scene for a move to be reported; larger reports fewer moves, and more pairs of a
-            disappeared and an appeared object.
+        min_moved_fraction: Smallest fraction in [0, 1] of an object's points in each scene that must fit its points in
+            the other scene for the object to be reported as moved; larger reports fewer moves, and more
+            pairs of an object that disappeared and one that appeared.
         min_confidence: Smallest probability in [0, 1] of a change that is reported; larger drops doubtful changes.
     """
 

@@ -11,7 +11,7 @@ RowType = type[Row]
 
 
 def _row_type(row: str) -> RowType:
-    """Import a row by module and class in `gsmap.types.rows`: a verb loads those alone that it prints."""
+    """Import a row class by its module in `gsmap.types.rows`: a verb loads only the row classes that it prints."""
     module, name = row.split(".")
     found: RowType = getattr(importlib.import_module(f"gsmap.types.rows.{module}"), name)
     return found

@@ -52,7 +52,7 @@ class OrientedBoxes:
         return np.array([self.bounds[:, 0].min(0), self.bounds[:, 1].max(0)])
 
     def share_within(self, which: Sequence[int], bounds: np.ndarray) -> np.ndarray:
-        """Return (K,) the fraction of the volume of each box's bounds that lies within a box (2, 3)."""
+        """Return for each of K boxes the fraction of its axis-aligned bounds that lies within the region (2, 3)."""
         low, high = self.bounds[which, 0], self.bounds[which, 1]
         shared = np.maximum(np.minimum(high, bounds[1]) - np.maximum(low, bounds[0]), 0)
         out: np.ndarray = (shared / (high - low)).prod(axis=1)

@@ -41,7 +41,8 @@ class Params:
 
     Args:
         views: Largest number of scene cameras, at least 0, from which a level is fitted and measured; larger is slower
-            and more reliable. With 0, levels are merged without a fit and their errors are distances.
+            and more reliable. With 0, Gaussians are merged without a fit, and the error of a level is the distance by
+            which they move.
         steps: Number of optimization steps of one level, at least 0; larger improves levels and takes more time.
     """
 

@@ -42,9 +42,8 @@ def about_origin(where: str | os.PathLike[str], source: GaussianSource) -> Gauss
     apart = neighbour_distance(source) if step else np.inf
     if apart <= 2 * step:
         raise InputError(
-            f"{where}: its positions near {format_origin(origin)} are in single precision, which rounds them to "
-            f"{step:g} there, but neighbours are {apart:.2g} apart: export it in double precision, or with "
-            f"{format_origin(origin)} taken off",
+            f"{where}: near {format_origin(origin)}, single precision stores positions in steps of {step:g}, too "
+            f"coarse for points {apart:.2g} apart: export it in double precision, or subtract {format_origin(origin)}",
             code="precision_loss",
         )
     return source

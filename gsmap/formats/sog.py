@@ -111,7 +111,8 @@ def write(
         )
     if len(gaussians) > _MAX_PIXELS:
         raise InputError(
-            f"{path}: one SOG can store {_MAX_PIXELS:,} Gaussians, not {len(gaussians):,}: write lod-meta.json",
+            f"{path}: a SOG file stores at most {_MAX_PIXELS:,} Gaussians, not {len(gaussians):,}: name the output "
+            "lod-meta.json, which consists of several files",
             code="unsupported_output",
         )
     g = gaussians if ordered else gaussians[morton_order(gaussians.means)]

@@ -91,7 +91,8 @@ def localize_files(
     check_named(files, video, masks)
     if depth is not None and masks is not None:
         raise ConfigError(
-            "--masks apply to photos: in a depth image, set pixels to ignore to 0", code="option_not_applicable"
+            "--masks applies to photos only: give the value 0 to pixels of a depth image that are to be ignored",
+            code="option_not_applicable",
         )
     lens = parse_lens(intrinsics, focal)
     if video is not None:
@@ -99,7 +100,8 @@ def localize_files(
     paths = [one if is_path(one) else f"photo_{number}" for number, one in enumerate(files)]
     if len(paths) != sum(map(is_path, files)) and (masks is not None or depth is not None):
         raise ConfigError(
-            "--masks and --depth apply to photos by file: write the photo to a file", code="option_not_applicable"
+            "--masks and --depth need photos in files, not in memory: write the photo to a file",
+            code="option_not_applicable",
         )
     in_memory = {paths[number]: one for number, one in enumerate(files) if not is_path(one)}
     photos = [path for path in paths if depth is None and (path in in_memory or not is_scan(path))]

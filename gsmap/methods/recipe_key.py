@@ -58,7 +58,7 @@ class RecipeKey:
         return {one.name: getattr(self, one.name) for one in fields(self)} | {"recipe": self.recipe}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the recipe without its inputs as plain values."""
+        """Return the recipe as plain values, leaving out its inputs."""
         return {
             "stage": self.stage,
             "method": self.method,

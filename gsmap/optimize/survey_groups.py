@@ -120,7 +120,7 @@ class _GroupSolver:
         return self._all(reference, agreeing)
 
     def _explain(self, reference: _PartialSolution) -> None:
-        """Compare the sources that contradict themselves with the reference, which may reveal the cause."""
+        """Compare each source that contradicts itself with the reference; their difference may reveal the cause."""
         own = str(self.places.kinds[reference.rows[0]])
         for k, (one, rows) in enumerate(zip(self.contradictions.found, self.contradictions.rows, strict=True)):
             if one.cause == "split" and one.kept == "none" and len(rows) >= 2:

@@ -41,7 +41,7 @@ class Params:
             larger value rejects more repainted places.
         min_probability: Smallest probability in [0, 1], given all evidence, that an accepted pose is correct; a larger
             value accepts fewer incorrect and fewer correct poses.
-        max_rotation_sigma_deg: Largest standard deviation of the rotation, in degrees, in its least certain direction
+        max_rotation_sigma_deg: Largest standard deviation of the rotation, in degrees, about its least certain axis
             at the overlap's centroid; a larger value accepts less certain poses.
         max_translation_sigma_m: Largest standard deviation of the translation, in metres, in its least certain
             direction at the overlap's centroid; a larger value accepts less certain poses.

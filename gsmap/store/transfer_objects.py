@@ -15,7 +15,7 @@ from gsmap.store.transfer import Transfer, merge_by_time
 
 
 def transfer_objects(transfer: Transfer) -> None:
-    """Copy the objects that the copied scenes show, with boxes and facts.
+    """Copy the objects seen in the copied scenes, with their boxes and their recorded names and notes.
 
     An object with overlapping boxes in this map takes its number here, so that the facts are merged; others get new
     numbers. Computed object sets are not copied.

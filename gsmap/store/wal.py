@@ -153,7 +153,7 @@ def _blocks(handle: int, size: int, page_size: int) -> Iterator[np.ndarray]:
 
 
 def _summed(words: np.ndarray) -> np.ndarray:
-    """Compute the checksums (N, 2) of N rows of words, each checksum starting at 0."""
+    """Compute the checksum of each of N rows of words by itself; return (N, 2)."""
     weights = _weights(words.shape[1] // 2)
     return np.stack([(words * weights[i]).sum(1, dtype=np.uint32) for i in range(2)], axis=1)
 

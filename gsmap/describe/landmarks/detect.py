@@ -52,7 +52,7 @@ class Blobs:
 
 
 class OctaveCache:
-    """Cache of one levelled cloud and of its extrema by grid cell size, for layers that use the same cloud.
+    """Cache of one cloud with its z axis up and of its extrema for each grid cell size, shared by layers.
 
     Layers whose units differ by a power of two use the same grids, bit by bit.
     """

@@ -41,7 +41,8 @@ class Params:
 
     Args:
         segmenter: Segmenter that finds masks in renders: ``builtin``, ``per_view``, ``sam`` or one from another
-            package; ``auto`` takes the first that needs models and has them all, or ``builtin``.
+            package; ``auto`` takes the first segmenter whose models are all in the map, and ``builtin`` if
+            there is none.
         segmenters: Settings of each segmenter.
         embedder: Embedder that describes masks: ``builtin``, ``clip`` or one from another package; ``auto`` takes the
             first that needs models and has them all, or ``builtin``.

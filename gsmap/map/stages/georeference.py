@@ -325,7 +325,8 @@ def _hold_out(before: Survey, names: set[str], noted: _NewObservations) -> None:
     known = fresh | {point.name for point in before.points}
     if unknown := sorted(names - known):
         raise NotFoundError(
-            f"there is no control point called {unknown[0]!r}: {', '.join(sorted(known)[:8]) or 'there is none'}",
+            f"no control point is called {unknown[0]!r}; the map has {', '.join(sorted(known)[:8]) or 'none'}"
+            f"{f' and {len(known) - 8} more' if len(known) > 8 else ''}",
             code="observation_not_found",
         )
     for point in before.points:
