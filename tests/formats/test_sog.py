@@ -122,8 +122,8 @@ def test_real_files_hold_what_their_meta_says(shared_data):
     [
         (lambda m, f: m.update(version=1), "unsupported_version", "version 1"),
         (lambda m, f: m.pop("version"), "unsupported_version", "version 1"),
-        (lambda m, f: m.update(count=10**12), "count_mismatch", "count of 1000000000000"),
-        (lambda m, f: m.update(count=-1), "count_mismatch", "count of -1"),
+        (lambda m, f: m.update(count=10**12), "count_mismatch", "1000000000000"),
+        (lambda m, f: m.update(count=-1), "count_mismatch", "promises -1"),
         (lambda m, f: m.update(count=9), "count_mismatch", "8 texels for 9"),
         (
             lambda m, f: m["means"].update(files=["../../etc/passwd", "means_u.webp"]),
@@ -135,8 +135,8 @@ def test_real_files_hold_what_their_meta_says(shared_data):
         (lambda m, f: m["scales"].update(codebook=[1, 2]), "invalid_codebook", r"codebook of shape \(2,\)"),
         (lambda m, f: m["scales"].update(codebook=["x"] * 256), "not_json", r"meta\.json .*ValueError"),
         (lambda m, f: m["shN"].update(bands=7), "unsupported_sh_degree", "7 bands"),
-        (lambda m, f: m["shN"].update(bands=2), "invalid_palette", "192 wide, expected 512"),
-        (lambda m, f: m["shN"].update(count=64), "invalid_palette", "label of 65 .*64"),
+        (lambda m, f: m["shN"].update(bands=2), "invalid_palette", "192 .*512"),
+        (lambda m, f: m["shN"].update(count=64), "invalid_palette", "65 .*64"),
         (lambda m, f: f.pop("quats.webp"), "content_missing", "'quats.webp'"),
         (lambda m, f: f.update({"quats.webp": b"not an image"}), "picture_unreadable", r"quats\.webp .*WebP"),
         (lambda m, f: f.update({"quats.webp": f["quats.webp"][:40]}), "picture_unreadable", r"quats\.webp .*WebP"),

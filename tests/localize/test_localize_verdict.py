@@ -127,9 +127,9 @@ def test_a_twin_is_told_as_ambiguous() -> None:
 def test_a_pose_that_is_hardly_known_is_not_said() -> None:
     assert "only to" in verdict.rejection_reason(GOOD, 0.99, (0.2, 0.01), 0.0, verdict.Params())
     assert "only to" in verdict.rejection_reason(GOOD, 0.99, (0.01, 2.0), 0.0, verdict.Params())
-    assert "0 patches" in verdict.rejection_reason(GOOD | {"inliers": 0.0}, 0.99, SURE, 0.0, verdict.Params())
+    assert "0 found" in verdict.rejection_reason(GOOD | {"inliers": 0.0}, 0.99, SURE, 0.0, verdict.Params())
     few = GOOD | {"inliers": np.log10(4)}
-    assert "3 patches" in verdict.rejection_reason(few, 0.99, SURE, 0.0, verdict.Params(), min_inliers=6)
+    assert "3 found" in verdict.rejection_reason(few, 0.99, SURE, 0.0, verdict.Params(), min_inliers=6)
 
 
 def test_thresholds_are_settings() -> None:

@@ -127,7 +127,7 @@ def test_wrong_arguments_are_input_errors():
         render(np.zeros((3, 3)), cameras)
     with raises(InputError, code="invalid_pose", match="T_camera_frame needs"):
         render(gaussians, cameras, T_camera_frame=torch.eye(4)[None])
-    with raises(InputError, code="shape_mismatch", match="index is of 10 Gaussians"):
+    with raises(InputError, code="shape_mismatch", match="10 Gaussians"):
         render(gaussians, cameras, index=ChunkIndex.build(gaussians[:10]))
     with raises(ConfigError, code="invalid_choice", match="backend .*'vulkan'"):
         render(gaussians, cameras, backend="vulkan")
