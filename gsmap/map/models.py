@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from gsmap.describe.onnx.check import check_model
 from gsmap.errors import CorruptError
 from gsmap.store import Store
 from gsmap.types.model import ModelLimits, ModelSpec, Tensor
@@ -15,6 +14,8 @@ def add(
     store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool, limits: ModelLimits
 ) -> ModelSpec:
     """Check a model and store it in place of the previous model of its kind; see `check_model` for the errors."""
+    from gsmap.describe.onnx.check import check_model  # loads the networks, which no other verb of a map needs
+
     spec = check_model(kind, path, preset, limits)
     store.models.add(kind, path, kind=kind, options=spec.to_json(), copy=copy)
     return spec
