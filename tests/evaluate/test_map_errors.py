@@ -167,7 +167,7 @@ def test_what_has_no_truth_is_not_judged_and_said() -> None:
     report = evaluate_map(scenes, edges, poses, overlaps(scenes, ab=0.6))
     assert (len(report.edges), report.edges_without_truth) == (1, 1)
     assert report.notes[0] == "scenes without a true pose are not evaluated: c"
-    assert report.notes[1] == "newer than the newest poses: c; run gsmap optimize"
+    assert report.notes[1] == "scenes newer than the newest poses: c; run gsmap optimize"
 
 
 # --- poses ----------------------------------------------------------------------------------------------------------
