@@ -215,7 +215,7 @@ def test_few_enough_are_left_as_they_are():
     same, into = decimate(g, 50)
     assert same is g
     np.testing.assert_array_equal(into, np.arange(50))
-    with raises(ConfigError, code="out_of_range", match="0 asked for"):
+    with raises(ConfigError, code="out_of_range", match="at least 1, got 0"):
         decimate(g, 0)
 
 
