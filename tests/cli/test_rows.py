@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import pkgutil
 import re
 import subprocess
 import sys
@@ -18,10 +20,18 @@ from gsmap.cli.console import json_object, print_facts, print_rows, print_table
 from gsmap.texts import shown
 from gsmap.types import Sim3, rows
 from gsmap.types.rows.base import Row
+from gsmap.types.rows.maps import ViewReport
+from gsmap.types.rows.scenes import SceneRef
 from tools.make import json_docs as TOOL
 
 ROOT = Path(__file__).resolve().parents[2]
-TYPES = [cls for cls in vars(rows).values() if isinstance(cls, type) and issubclass(cls, Row) and is_dataclass(cls)]
+MODULES = [importlib.import_module(f"{rows.__name__}.{m.name}") for m in pkgutil.iter_modules(rows.__path__)]
+TYPES = [
+    cls
+    for module in MODULES
+    for cls in vars(module).values()
+    if isinstance(cls, type) and issubclass(cls, Row) and is_dataclass(cls) and cls.__module__ == module.__name__
+]
 
 
 def test_the_generated_page_has_a_section_for_every_row_that_a_verb_prints(tmp_path: Path) -> None:
@@ -62,7 +72,7 @@ class Sample(Row):
     pose: Sim3
     matrix: np.ndarray
     number: float
-    inner: tuple[rows.SceneRef, ...]
+    inner: tuple[SceneRef, ...]
     more: dict[str, float]
 
 
@@ -71,7 +81,7 @@ def sample(number: float) -> Sample:
         pose=Sim3(np.eye(3), np.array([1.0, 2, 3]), 2.0),
         matrix=np.array([1.0, np.nan, np.inf]),
         number=number,
-        inner=(rows.SceneRef(scene="a", scene_name="monday"),),
+        inner=(SceneRef(scene="a", scene_name="monday"),),
         more={"x": float("nan"), "y": 1},
     )
 
@@ -94,12 +104,12 @@ def test_floats_keep_their_bits() -> None:
 
 def test_equal_rows_say_the_same() -> None:
     assert sample(1.0) == sample(1.0) != sample(2.0)
-    assert rows.SceneRef(scene="a", scene_name="b") != rows.ViewReport(url="a")
+    assert SceneRef(scene="a", scene_name="b") != ViewReport(url="a")
 
 
 def test_a_verb_cannot_print_another_row_than_it_declares() -> None:
     with pytest.raises(TypeError, match="InitReport, not ViewReport"):
-        json_object("init", rows.ViewReport(url="x"))
+        json_object("init", ViewReport(url="x"))
     with pytest.raises(TypeError, match="one InitReport"):
         json_object("init", [])
     assert json_object("prior", None) == {"schema": 2, "prior": None}
@@ -108,7 +118,7 @@ def test_a_verb_cannot_print_another_row_than_it_declares() -> None:
 
 def test_tables_shorten_digests_and_escape_markup(capsys: pytest.CaptureFixture[str]) -> None:
     digest = "0123456789abcdef" * 2
-    print_table("t", {"scene": "id", "scene_name": "name"}, [rows.SceneRef(scene=digest, scene_name="[bold]x")])
+    print_table("t", {"scene": "id", "scene_name": "name"}, [SceneRef(scene=digest, scene_name="[bold]x")])
     printed = capsys.readouterr().out
     assert digest[:12] in printed
     assert digest not in printed
@@ -117,7 +127,7 @@ def test_tables_shorten_digests_and_escape_markup(capsys: pytest.CaptureFixture[
 
 def test_names_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
     names = ["the:key:room", "a\\[/b]", "[red]", "50%"]
-    print_table("[red]", {"scene_name": "name"}, [rows.SceneRef(scene="", scene_name=name) for name in names])
+    print_table("[red]", {"scene_name": "name"}, [SceneRef(scene="", scene_name=name) for name in names])
     print_facts(":key:", {"[red]": "[/]"})
     printed = capsys.readouterr().out
     assert all(text in printed for text in [*names, ":key:", "[/]"])
@@ -163,7 +173,7 @@ def test_coordinates_name_their_frame_and_unit(row: type[Row]) -> None:
 
 def test_a_long_table_holds_what_a_short_one_does_and_is_printed_at_once(capsys: pytest.CaptureFixture[str]) -> None:
     columns = {"scene": "id", "scene_name": "name"}
-    many = [rows.SceneRef(scene=f"{i:032x}", scene_name=f"部屋 {i} [bold]") for i in range(5000)]
+    many = [SceneRef(scene=f"{i:032x}", scene_name=f"部屋 {i} [bold]") for i in range(5000)]
     print_table("t", columns, many[:100])
     short = [line.rstrip() for line in capsys.readouterr().out.splitlines() if line.strip()]
     start = time.process_time()
