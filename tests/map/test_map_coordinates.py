@@ -106,7 +106,7 @@ def test_an_export_is_about_the_map_and_says_what_was_taken_off(
 ) -> None:
     folder, truth = site
     with gsmap.open(folder / "site.gsmap") as m:
-        m.export(tmp_path / "out", format=form, tile_size_m=tile, merge="union")
+        m.export(tmp_path / "out", format=form, tile_size_m=tile, merge="union", up="z")
         poses = {row.scene: row for row in m.pose_rows()}
     told = json.loads((tmp_path / "out" / "tiles.json").read_text())
     assert {scene: row.offset.tolist() for scene, row in poses.items()} == told["offsets"]

@@ -160,7 +160,7 @@ def test_the_command_line_tells_it(made: Made, capsys: pytest.CaptureFixture[str
     assert "0.3 m per unit, told, to within 1 %" in said("status")[1]
     assert "0.3 m per unit, told, to within 1 %" in said("show", "capture_a")[1]
     assert said("edit", "capture_a", "--metres-per-unit", "none")[0] == 0
-    assert "not known" in said("status")[1]
+    assert "unknown" in said("status")[1]
     for wrong in ("0", "-1", "nan", "three"):
         assert said("edit", "capture_a", "--metres-per-unit", wrong)[0] in (1, 2)
 
