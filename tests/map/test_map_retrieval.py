@@ -183,7 +183,7 @@ def test_why_tells_what_is_not_looked_up_from_what_is_not_listed(made: Described
     with gsmap.map.open(site) as m:
         made.ingest(m, NAMES[3])
         pair = f"{NAMES[0]}:{NAMES[3]}"
-        assert "looks for" in m.why(pair).advice
+        assert "next gsmap update" in m.why(pair).advice
     with gsmap.map.open(site) as m:
         m.with_settings({"retrieve.top_k": 1, "retrieve.num_neighbours": 0})
         m.register("auto")
@@ -191,7 +191,7 @@ def test_why_tells_what_is_not_looked_up_from_what_is_not_listed(made: Described
         for k, a in enumerate(NAMES):
             for b in NAMES[k + 1 :]:
                 report = m.why(f"{a}:{b}")
-                told[report.status, "the first 1 are tried" in report.advice] = report
+                told[report.status, "the first 1 " in report.advice] = report
         assert ("never registered", True) in told
         assert ("never registered", False) not in told
 
