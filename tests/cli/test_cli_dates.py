@@ -92,7 +92,7 @@ def test_a_date_that_is_found_makes_tiles_again_where_dates_decide(
     voxels = ("export", site, tmp_path / "voxel", "--tile-size", 0, "--component", 0, "--merge", "voxel")
     first = cli(*optimised)
     assert first.code == 0, first.stderr
-    assert "2 of 2 captures have no date, so their order is unknown" in first.stderr
+    assert "2 of 2 overlapping captures have no date" in first.stderr
     assert "no date" not in cli(*voxels).stderr
     assert "0 files written, 1 unchanged" in cli(*optimised).stderr
     shutil.move(left / "left.ply", left / "left_2026-05-31.ply")
@@ -100,8 +100,8 @@ def test_a_date_that_is_found_makes_tiles_again_where_dates_decide(
     assert cli("ingest", site, left, "--json").json["ingested"][0]["dated"]
     again = cli(*optimised)
     assert "1 file written, 0 unchanged" in again.stderr
-    assert "1 of 2 captures have no date" in again.stderr
-    assert "1 of 2 captures have no date" in (tmp_path / "tto" / "tiles.json").read_text()
+    assert "1 of 2 overlapping captures have no date" in again.stderr
+    assert "1 of 2 overlapping captures have no date" in (tmp_path / "tto" / "tiles.json").read_text()
     assert "0 files written, 1 unchanged" in cli(*voxels).stderr
     cli("edit", site, "right", "--captured-at", "2026-05-30")
     assert "no date" not in cli(*optimised).stderr

@@ -49,7 +49,7 @@ def test_what_disagrees_is_named_with_what_would_settle_it(site, cli):
     assert steps["the other edges"] == {
         "name": "the other edges", "value": "tentative", "bar": "bear it out: used", "passed": False
     }  # fmt: skip
-    assert "looks alike" in found["advice"]
+    assert "look alike" in found["advice"]
     assert "--captured-at" in found["advice"]
     _doubtful(site, 0.05)
     assert _steps(cli("why", site, "left:right", "--json").json)["disagreement"]["passed"] is True

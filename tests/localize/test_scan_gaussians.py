@@ -51,7 +51,7 @@ def test_few_points_and_none() -> None:
     assert np.isfinite(as_gaussians(Scan(np.arange(9.0).reshape(3, 3)), 0.02).log_scales).all()
     with raises(InputError, code="empty_scan"):
         Scan(np.zeros((0, 3)))
-    with raises(InputError, code="shape_mismatch", match="has colours"):
+    with raises(InputError, code="shape_mismatch", match="colours"):
         Scan(np.zeros((2, 3)), np.zeros((1, 3)))
     with raises(ConfigError, code="out_of_range", match="cell_m"):
         Params(cell_m=0)
