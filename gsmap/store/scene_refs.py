@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,8 +10,6 @@ from sqlalchemy import Connection, Row, Text, select, type_coerce
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.store.schema import scenes
-
-_RESERVED = re.compile(r"[cop][1-9]\d*")  # ids of changes, objects and photos, which the same verbs take
 
 
 def living_ids(connection: Connection) -> set[str]:
@@ -32,9 +29,7 @@ def scene_name(connection: Connection, ref: str) -> str:
 
 
 def name_taken(connection: Connection, name: str) -> bool:
-    """Return True if a living scene has this name, or if objects, changes or photos are called so."""
-    if _RESERVED.fullmatch(name):
-        return True
+    """Return True if a living scene has this name."""
     same = select(scenes.c.id).where(scenes.c.name == name, scenes.c.removed_at.is_(None))
     return connection.execute(same).first() is not None
 

@@ -26,10 +26,10 @@ def made(tmp_path):
         m = m.with_settings(QUICK)
         for day, scene in enumerate(scenes, 1):
             gaussians, cameras = transform_gaussians(scene.gaussians, S), transform_cameras(scene.cameras, S)
-            m.ingest(gaussians, cameras=cameras, name=f"v{day}", scale="unknown", captured_at=f"2026-01-0{day}")
-        m.add_edge("v1:v2", Sim3.identity(), np.array([1e-3] * 3 + [1e-3 / unit] * 3 + [1e-6]))
+            m.ingest(gaussians, cameras=cameras, name=scene.scene_id, scale="unknown", captured_at=f"2026-01-0{day}")
+        m.add_edge("c1:c2", Sim3.identity(), np.array([1e-3] * 3 + [1e-3 / unit] * 3 + [1e-6]))
         m.optimize()
-        m.edit("v1", metres_per_unit=unit)
+        m.edit("c1", metres_per_unit=unit)
         return m
 
     yield make
@@ -54,7 +54,7 @@ def test_changes_are_found_in_metres_and_told_in_the_map(made, tmp_path, monkeyp
     assert (tmp_path / "pictures" / f"{found.id}.png").is_file()
     # The same metre is the same comparison, another one is another.
     assert other.changes().pairs[0].compared_at == two.pairs[0].compared_at
-    other.edit("v1", metres_per_unit=2 * UNIT)
+    other.edit("c1", metres_per_unit=2 * UNIT)
     assert other.changes().pairs[0].compared_at != two.pairs[0].compared_at
 
 
@@ -62,9 +62,9 @@ def test_a_capture_that_moved_by_less_than_a_length_in_metres_is_not_compared_ag
     monkeypatch.setenv("GSMAP_WORKERS", "1")
     other = made(UNIT)
     at = other.changes().pairs[0].compared_at
-    other.add_edge("v1:v2", Sim3(np.eye(3), [0.01 / UNIT, 0, 0]), np.array([1e-3] * 3 + [1e-3 / UNIT] * 3 + [1e-6]))
+    other.add_edge("c1:c2", Sim3(np.eye(3), [0.01 / UNIT, 0, 0]), np.array([1e-3] * 3 + [1e-3 / UNIT] * 3 + [1e-6]))
     other.optimize()
     assert other.changes().pairs[0].compared_at == at  # by 1 cm
-    other.add_edge("v1:v2", Sim3(np.eye(3), [0.05 / UNIT, 0, 0]), np.array([1e-3] * 3 + [1e-3 / UNIT] * 3 + [1e-6]))
+    other.add_edge("c1:c2", Sim3(np.eye(3), [0.05 / UNIT, 0, 0]), np.array([1e-3] * 3 + [1e-3 / UNIT] * 3 + [1e-6]))
     other.optimize()
     assert other.changes().pairs[0].compared_at != at  # by 5 cm, though by 0.005 units

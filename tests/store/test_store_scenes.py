@@ -275,12 +275,3 @@ def test_names_with_characters_that_nobody_sees_are_refused(store, name):
 @pytest.mark.parametrize("name", ["نمی\u200cخواهم", "👩\u200d🚀", "salle à manger", "部屋"])
 def test_names_in_any_script_are_kept(store, name):
     assert store.scenes.add(make_gaussians(), make_cameras(), name=name)[0].name == name
-
-
-@pytest.mark.parametrize("name", ["o1", "c12", "p3"])
-def test_no_scene_is_called_as_an_object_a_change_or_a_photo(store, name):
-    """A capture of such a file is still ingested, under the next free name."""
-    assert store.scenes.add(make_gaussians(), make_cameras(), name=name)[0].name == f"{name}-2"
-    with raises(InputError, code="name_taken"):
-        store.scenes.edit(f"{name}-2", name=name)
-    assert store.scenes.add(make_gaussians(seed=5), make_cameras(), name="o0")[0].name == "o0"
