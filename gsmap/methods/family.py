@@ -104,7 +104,7 @@ class Family:
             except (Exception, SystemExit) as error:  # another package's code may fail in any way
                 raise ConfigError(
                     f"{self.name} {name!r} of the package {_package(added[name])} cannot be loaded "
-                    f"({type(error).__name__}: {error}):  repair or uninstall that package",
+                    f"({type(error).__name__}: {error}): repair or uninstall that package",
                     code="method_not_loadable",
                 ) from error
         else:
