@@ -245,7 +245,7 @@ def test_photographs_alone_are_counted_and_leave_no_map(cli: Run, tmp_path: Path
     for arguments in ([folder], sorted(folder.iterdir())):
         done = cli("update", tmp_path / "site.gsmap", *arguments)
         assert done.code == 1
-        assert "40 photographs" in done.stderr
+        assert "40 photographs, but no splat" in done.stderr
         assert "gsmap localize" in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "site.gsmap").exists()
@@ -312,7 +312,7 @@ def test_a_forgotten_map_is_guessed(cli: Run, tmp_path: Path, monkeypatch: pytes
     gsmap.map.create("other.gsmap").close()
     assert "gsmap update MAP captures (MAP is one of other.gsmap, site.gsmap)\n" in said("update", "captures")
     photographs(Path("photos"), 2)
-    assert "2 photographs" in said("update", "photos")
+    assert "2 photographs, but no splat" in said("update", "photos")
     assert sorted(os.listdir()) == ["captures", "other.gsmap", "photos", "site.gsmap"]
     with gsmap.map.open("site.gsmap") as m:
         assert m.scenes() == []

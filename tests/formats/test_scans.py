@@ -64,7 +64,7 @@ def test_points_that_are_not_finite_are_left_out_and_told(tmp_path: Path) -> Non
     points[7, 1] = np.nan
     found = scans.read(write_ply(tmp_path / "a.ply", points, None))
     assert len(found) == len(points) - 1
-    assert "1 points" in found.notes[0]
+    assert "1 points with NaN or infinite" in found.notes[0]
     with raises(InputError, code="empty_scan"):
         scans.read(write_ply(tmp_path / "b.ply", np.full((5, 3), np.inf), None))
 

@@ -55,14 +55,14 @@ def test_bytes_come_back_and_others_are_told() -> None:
         with pytest.raises(ValueError, match="LZMA stream"):
             compression.decompress(wrong, (3, 500), np.uint8)
     for shape in ((3, 499), (3, 501)):
-        with pytest.raises(ValueError, match="size"):
+        with pytest.raises(ValueError, match="differ in size"):
             compression.decompress(stream, shape, np.uint8)
 
 
 def test_bytes_are_not_expanded_beyond_what_is_asked_for() -> None:
     bomb = compression.compress(np.zeros(1 << 24, np.uint8))
     assert len(bomb) < 1 << 15
-    with pytest.raises(ValueError, match="size"):
+    with pytest.raises(ValueError, match="differ in size"):
         compression.decompress(bomb, (10,), np.uint8)
 
 

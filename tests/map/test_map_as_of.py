@@ -104,7 +104,7 @@ def test_whom_to_believe_is_part_of_how_a_tile_is_made(site: Map, tmp_path: Path
 def test_remarks_on_how_a_tile_was_made_are_kept_and_told(site: Map, tmp_path: Path) -> None:
     report = site.export(tmp_path / "out", format="ply", tile_size_m=0)
     (tile,) = report.tiles
-    assert any("1 of 4 " in note and "no date" in note for note in tile.notes)
+    assert any("1 of 4 overlapping captures have no date" in note for note in tile.notes)
     (kept,) = json.loads((tmp_path / "out" / "tiles.json").read_text())["tiles"]
     assert tuple(kept["notes"]) == tile.notes == site.tile_rows()[0].notes
 

@@ -160,7 +160,7 @@ def test_captures_without_a_date_are_told_where_dates_decide():
 
     dates = ["2026-01-01T00:00:00+00:00", "2026-01-02T00:00:00+00:00", None]
     (note,) = notes(dates)
-    assert note.startswith("1 of 3 ")
+    assert note.startswith("1 of 3 overlapping captures have no date, so their order is unknown")
     assert notes(dates[:2]) == notes([None]) == []
     assert notes(dates, shift=5.0) == []  # they do not meet
     assert notes(dates, "voxel") == notes(dates, params=replace(default_params("tto"), prefer="both")) == []
