@@ -26,7 +26,7 @@ from gsmap.store import remote_map, sqlite, trust
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.catalog import Catalog, now, open_engine
 from gsmap.store.catalog_copy import copy_catalog, empty_catalog, make_independent
-from gsmap.store.error_translation import staged_for, translate_errors
+from gsmap.store.error_translation import displayed_as, translate_errors
 from gsmap.store.remote_map import RemoteMap
 from gsmap.store.schema import exports, files, groups, leases, models, revisions, scenes, set_aside, tiles
 
@@ -219,7 +219,7 @@ class Branches:
             )
         staged = folder.with_name(f".{name}.{uuid.uuid4().hex[:8]}")
         # The lock keeps arrays from being reclaimed between the copy and the rename.
-        with translate_errors(home), staged_for(staged, folder), self._arrays.lock():
+        with translate_errors(home), displayed_as(staged, folder), self._arrays.lock():
             try:
                 make_folder(staged.parent)
                 staged.mkdir()

@@ -81,7 +81,7 @@ def display_name(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def staged_for(staged: Path, target: Path) -> Iterator[None]:
+def displayed_as(staged: Path, target: Path) -> Iterator[None]:
     """Context in which messages name ``target`` for a folder in which its content is staged."""
     _STAGED[staged] = target
     try:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsmap.durable import is_folder, lock_folder, make_locked_folder, remove_tree
-from gsmap.store.error_translation import staged_for
+from gsmap.store.error_translation import displayed_as
 
 # Doubled for a map made in a folder that is staged itself.
 _STAGED = r"\.{{1,2}}{name}(\.[0-9a-f]{{8}}){{1,2}}"
@@ -31,7 +31,7 @@ def beside(folder: Path) -> Iterator[Path]:
     _remove_leftovers(folder)
     staged, handle = make_locked_folder(folder.with_name(f".{folder.name}"))
     try:
-        with staged_for(staged, folder):
+        with displayed_as(staged, folder):
             yield staged
     finally:
         with contextlib.suppress(OSError):

@@ -29,7 +29,7 @@ from gsmap.errors import (
     StoreError,
     of_system,
 )
-from gsmap.store.error_translation import staged_for
+from gsmap.store.error_translation import displayed_as
 
 CHUNK_BYTES = 1 << 20  # read, hashed and written at a time
 
@@ -161,7 +161,7 @@ class FolderStorage:
             make_folder(self.root / _STAGING)
             folder = Path(tempfile.mkdtemp(dir=self.root / _STAGING))
         try:
-            with staged_for(folder, self.root):
+            with displayed_as(folder, self.root):
                 yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
