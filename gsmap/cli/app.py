@@ -60,7 +60,7 @@ PANELS = {
     ),
     "Changes over time": ("changes", "history", "diff", "thin"),
     "View and query": ("view", "report", "graph", "find", "localize", "evaluate"),
-    "Export": ("export", "convert"),
+    "Export": ("export", "convert", "clean"),
     "Branches and backups": ("branch", "tag", "merge", "split", "clone", "backup", "restore"),
     "Maintenance": ("check", "prune", "migrate", "trust"),
 }

@@ -40,6 +40,9 @@ def command(
     name: Name = None,
     captured_at: CapturedAt = None,
     scale: Scale = "auto",
+    clean: Annotated[
+        bool, typer.Option("--clean", help="Remove invalid Gaussians, floaters and background; see gsmap clean.")
+    ] = False,
     supersedes: Annotated[
         str | None,
         typer.Option(
@@ -65,11 +68,19 @@ def command(
         )
     create = False
     if supersedes is None and not no_create:
-        create = makes_map(map, paths, captured_at, cameras=cameras, name=name, scale=scale)
+        create = makes_map(map, paths, captured_at, cameras=cameras, name=name, scale=scale, clean=clean)
     with opened(map, create=create, bars=True) as m:
         if create:
             say(f"created {map}")
-        rows = m.ingest(*paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, supersedes=supersedes)
+        rows = m.ingest(
+            *paths,
+            cameras=cameras,
+            name=name,
+            captured_at=captured_at,
+            scale=scale,
+            clean=clean,
+            supersedes=supersedes,
+        )
     for row in rows:
         for note in row.notes:
             say(f"{row.scene_name}: {note}")
@@ -84,6 +95,7 @@ def makes_map(
     cameras: str | None = None,
     name: str | None = None,
     scale: str = "auto",
+    clean: bool = False,
 ) -> bool:
     """Return true if MAP is missing and these captures can be ingested into a new map.
 
@@ -95,7 +107,7 @@ def makes_map(
 
     if Store.exists(map):
         return False
-    check_captures(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
+    check_captures(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean)
     return True
 
 

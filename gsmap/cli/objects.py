@@ -86,6 +86,7 @@ OBJECTS: dict[str, Object] = {
     "measure": OneRow("world.MeasureReport"),
     "settings": ManyRows("settings", "maps.SettingRow"),
     "convert": OneRow("maps.ConvertReport"),
+    "clean": OneRow("maps.CleanReport"),
     "models add": OneRow("maps.ModelRow"),
     "models list": ManyRows("models", "maps.ModelRow"),
     "evaluate": OneRow("evaluation.EvaluationReport"),

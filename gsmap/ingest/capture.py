@@ -17,6 +17,7 @@ from gsmap.formats.precision import about_origin, format_origin, rounded_to
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.ingest.capture_search import CaptureFiles, find_captures
+from gsmap.ingest.clean import clean as clean_gaussians
 from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.validate import validate_cameras, validate_gaussians
 from gsmap.stream import clamp_infinities
@@ -100,8 +101,9 @@ def read_capture(
     name: str | None = None,
     captured_at: str | datetime | None = None,
     scale_policy: str = "auto",
+    clean: bool = False,
 ) -> Capture:
-    """Read and check a capture from `find_captures`; see `read_captures`."""
+    """Read and check a capture from `find_captures`; see `read_captures` and `take_capture`."""
     given_date(captured_at)  # refuses what is none before a large file is read
     gaussians = formats.stream(found.path)
     about = formats.info(found.path)
@@ -119,6 +121,7 @@ def read_capture(
         name=name or found.name,
         captured_at=captured_at,
         scale_policy=scale_policy,
+        clean=clean,
         source=str(found.path),
         cameras_source="" if source is None else str(source),
     )
@@ -138,6 +141,7 @@ def take_capture(
     name: str,
     captured_at: str | datetime | None = None,
     scale_policy: str = "auto",
+    clean: bool = False,
     source: str = "",
     cameras_source: str = "",
 ) -> Capture:
@@ -145,6 +149,7 @@ def take_capture(
 
     Args:
         gaussians, cameras: in one frame; see `Capture` on its origin.
+        clean: remove what is no surface first (`gsmap.ingest.clean`).
 
     Raises:
         InputError: what makes no capture; see `gsmap.ingest.validate`.
@@ -155,7 +160,12 @@ def take_capture(
     where = source or f"capture {name!r}"
     if isinstance(gaussians, Gaussians):
         gaussians = about_origin(where, clamp_infinities(gaussians))
-    notes = list(validate_gaussians(gaussians, where))
+    notes = []
+    if clean:
+        cleaned = clean_gaussians(gaussians.load(), where=where)
+        gaussians = cleaned.gaussians
+        notes.append(cleaned.note)
+    notes += validate_gaussians(gaussians, where)
     notes += [] if cameras is None else cameras.notes
     origin = origin_of_source(gaussians)
     if origin.any():

@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.geometry.projection import in_image, project
 from gsmap.stream import clamp_infinities, count_clamped
-from gsmap.types import Cameras, GaussianSource
+from gsmap.types import Cameras, Gaussians, GaussianSource
 from gsmap.types.gaussians import FIELDS
 from gsmap.types.source import gathered
 
@@ -63,10 +63,8 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
         start += len(chunk)
     for what, found in bad.items():
         found.refuse(where, what)
-    low, high = np.percentile(np.concatenate(sampled), [5, 95], axis=0).astype(np.float64)
-    extent = max(float(np.linalg.norm(high - low)), float(np.exp(min(float(np.median(widest)), 80.0))))
     absurd = _BadRows()
-    absurd.note(0, widest.astype(np.float64) > np.log(MAX_SCALE_OVER_EXTENT * extent))
+    absurd.note(0, _is_oversized(widest, np.concatenate(sampled)))
     absurd.refuse(where, f"a scale of more than {MAX_SCALE_OVER_EXTENT:g} extents of the capture")
     if not opacities and not scales:
         return ()
@@ -74,6 +72,27 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
         f"{opacities} opacities are 0 or 1 and {scales} scales are 0, whose logits or logarithms are infinite: "
         "they were replaced by finite numbers that look the same",
     )
+
+
+def invalid_rows(gaussians: Gaussians) -> np.ndarray:
+    """Return an (N,) mask of Gaussians that `validate` refuses for NaN, an infinity, or a rotation of zero."""
+    bad: np.ndarray = (gaussians.quats == 0).all(1)
+    for name in FIELDS:
+        bad |= ~np.isfinite(getattr(gaussians, name).reshape(len(gaussians), -1)).all(1)
+    return bad
+
+
+def oversized_rows(gaussians: Gaussians) -> np.ndarray:
+    """Return an (N,) mask of Gaussians that `validate` refuses for their scale; all other values are valid."""
+    return _is_oversized(gaussians.log_scales.max(1), gaussians.means[:: _step(len(gaussians))])
+
+
+def _is_oversized(log_scales: np.ndarray, means: np.ndarray) -> np.ndarray:
+    """Return an (N,) mask of largest log-scales (N,) that are absurd for the extent of a sample of means (M, 3)."""
+    low, high = np.percentile(means, [5, 95], axis=0).astype(np.float64)
+    extent = max(float(np.linalg.norm(high - low)), float(np.exp(min(float(np.median(log_scales)), 80.0))))
+    result: np.ndarray = log_scales.astype(np.float64) > np.log(MAX_SCALE_OVER_EXTENT * extent)
+    return result
 
 
 def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) -> tuple[str, ...]:
@@ -134,5 +153,6 @@ class _BadRows:
         if self.count:
             more = f" ({self.count} such rows)" if self.count > 1 else ""
             raise InputError(
-                f"{where} holds {what} in row {self.first}{more}: clean or export it again", code="invalid_gaussians"
+                f"{where} holds {what} in row {self.first}{more}: clean it (gsmap clean) or export it again",
+                code="invalid_gaussians",
             )

@@ -227,6 +227,7 @@ class Map(AbstractContextManager["Map"]):
         name: str | None = None,
         captured_at: str | None = None,
         scale: str = "auto",
+        clean: bool = False,
         supersedes: str | None = None,
     ) -> Table[IngestRow]:
         """Add captures from files and folders, or one capture from memory; validate each capture before writing it.
@@ -241,6 +242,8 @@ class Map(AbstractContextManager["Map"]):
             captured_at: capture date of all captures, ISO 8601; UTC if it has no zone. Default: a sidecar, the EXIF of
                 the frames, or the name (`gsmap.ingest.find_date`).
             scale: ``known`` (metres), ``unknown`` (any unit) or ``auto`` (estimated by registration).
+            clean: remove invalid Gaussians, floaters and background (`gsmap.ingest.clean`); notes say how many of each.
+                Superseding the scene by the same file without it undoes this, and the other way round.
             supersedes: scene to replace by a retrained capture of the same frames in the same coordinates. The capture
                 takes over its pose, annotations and edges, which are verified but not searched again.
 
@@ -252,7 +255,13 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.stages.ingest import ingest, readers
         from gsmap.map.stages.supersede import supersede
 
-        options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale": scale}
+        options: dict[str, Any] = {
+            "cameras": cameras,
+            "name": name,
+            "captured_at": captured_at,
+            "scale": scale,
+            "clean": clean,
+        }
         if supersedes is not None:
             found, _ = readers(captures, **options)
             if len(found) != 1:

@@ -80,6 +80,7 @@ RUNS = {
     "measure": "measure MAP left:0,0,0 right:1,0,0",
     "settings": "settings MAP",
     "convert": "convert CAPTURES/left.ply TMP/left.spz",
+    "clean": "clean CAPTURES/left.ply TMP/left.ply",
     "models add": "models add MAP clip TMP/encoder.onnx --preset unit",
     "models list": "models list MAP",
     "evaluate": "evaluate MAP --truth CAPTURES/truth",

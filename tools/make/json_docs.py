@@ -117,7 +117,8 @@ def _shape(shape: Object) -> str:
 
 
 def _usage(verb: str) -> str:
-    known = {"show SCENE": "show MAP SCENE", "show A:B": "show MAP A:B", "convert": "convert IN OUT", "demo": "demo"}
+    known = {"show SCENE": "show MAP SCENE", "show A:B": "show MAP A:B", "demo": "demo"}
+    known |= {"convert": "convert IN OUT", "clean": "clean IN OUT"}
     known |= {"backup": "backup MAP DEST", "backup --list": "backup MAP DEST --list"}
     known |= {"restore": "restore DEST MAP", "clone": "clone MAP NEW"}
     words = verb.split()

@@ -74,11 +74,12 @@ def ingest(
     name: str | None,
     captured_at: str | None,
     scale: str,
+    clean: bool,
     progress: StageProgress,
 ) -> list[IngestResult]:
     """Ingest every capture that is found in ``sources``; see `gsmap.map.Map.ingest`."""
     dates = {scene.id: scene.captured_at for scene in store.scenes.list()}
-    found, search = readers(sources, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
+    found, search = readers(sources, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean)
     skipped, bad, good = list(search.skipped), list(search.unreadable), list[Path]()
     is_only_one = len(found) == 1 and not bad and _is_named(found[0], sources)
     results: list[IngestResult] = []
@@ -146,13 +147,14 @@ def check_captures(
     name: str | None = None,
     captured_at: str | None = None,
     scale: str = "auto",
+    clean: bool = False,
 ) -> None:
     """Raise an error for invalid captures before a map is created.
 
     Raises:
         NotFoundError, InputError, ConfigError: see `gsmap.map.Map.ingest`.
     """
-    found, search = readers(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
+    found, search = readers(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean)
     if len(found) == 1 and not search.unreadable and _is_named(found[0], paths):
         found[0].read()
 
@@ -164,6 +166,7 @@ def readers(
     name: str | None,
     captured_at: str | None,
     scale: str,
+    clean: bool,
 ) -> tuple[list[CaptureReader], SearchResult]:
     """Find captures; return a reader for each capture, and the search result; see `gsmap.map.Map.ingest`."""
     given_date(captured_at)  # refuses what is none before anything is searched
@@ -175,7 +178,8 @@ def readers(
         if cameras is not None and not isinstance(cameras, Cameras):
             raise ConfigError("pass gsmap.Cameras or None with in-memory Gaussians", code="in_memory_mismatch")
         called = name or "capture"
-        take = partial(take_capture, memory[0], cameras, name=called, captured_at=captured_at, scale_policy=scale)
+        options: dict[str, Any] = {"captured_at": captured_at, "scale_policy": scale, "clean": clean}
+        take = partial(take_capture, memory[0], cameras, name=called, **options)
         return [CaptureReader(called, take)], SearchResult()
     if isinstance(cameras, Cameras):
         raise ConfigError(
@@ -189,7 +193,13 @@ def readers(
             f"cameras and name apply to one capture, but {len(found)} captures were found: ingest them one by one",
             code="many_captures",
         )
-    options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale_policy": scale}
+    options = {
+        "cameras": cameras,
+        "name": name,
+        "captured_at": captured_at,
+        "scale_policy": scale,
+        "clean": clean,
+    }
     return [CaptureReader(files.name, partial(read_capture, files, **options), files.path) for files in found], search
 
 

@@ -299,6 +299,42 @@ class ConvertReport(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class CleanReport(Row):
+    """A cleaned file.
+
+    Args:
+        input: input file.
+        output: output file.
+        num_gaussians: number of Gaussians it holds.
+        num_invalid: number of removed Gaussians with NaN, an infinity that is no value, or a rotation of zero.
+        num_oversized: number of removed Gaussians with an impossible scale.
+        num_outside: number of removed Gaussians outside the box.
+        num_background: number of removed Gaussians in a shell far around all surfaces.
+        num_floaters: number of removed Gaussians that belong to no surface.
+        is_judged: false if the Gaussians do not overlap into surfaces, so that floaters and background cannot be told.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "num_gaussians": "Gaussians",
+        "num_invalid": "invalid",
+        "num_oversized": "oversized",
+        "num_outside": "outside",
+        "num_background": "background",
+        "num_floaters": "floaters",
+    }
+
+    input: str
+    output: str
+    num_gaussians: int
+    num_invalid: int
+    num_oversized: int
+    num_outside: int
+    num_background: int
+    num_floaters: int
+    is_judged: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ViewReport(Row):
     """An interactive page that is served or was written.
 

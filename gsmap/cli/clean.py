@@ -1,0 +1,46 @@
+"""gsmap clean: remove floaters and other Gaussians that are no surface from a file."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, print_rows, say
+
+
+def command(
+    source: Annotated[str, typer.Argument(metavar="IN", help="File of Gaussians to read.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="File to write; its suffix selects the format.")],
+    bbox: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            "--bbox",
+            metavar="X0 Y0 Z0 X1 Y1 Z1",
+            help="Remove everything outside this box, in the coordinates of the file.",
+        ),
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """Remove invalid values, impossible scales, background and floaters from a file; say how many of each.
+
+    Background is a shell far around all surfaces, as trainers put it there for the sky. Floaters are Gaussians that
+    overlap no surface, and small groups of them away from every surface.
+
+    Example: `gsmap clean scan.ply cleaned.ply`
+    """
+    from gsmap import formats
+    from gsmap.ingest import clean
+    from gsmap.types.rows.maps import CleanReport
+
+    cleaned = clean(formats.read(source), bbox, where=source)
+    formats.write(target, cleaned.gaussians)
+    say(f"{target}: {cleaned.note}")
+    report = CleanReport(
+        input=source,
+        output=target,
+        num_gaussians=len(cleaned.gaussians),
+        **{f"num_{kind}": count for kind, count in cleaned.removed.items()},
+        is_judged=cleaned.is_judged,
+    )
+    print_rows("clean", report, json)
