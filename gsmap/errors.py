@@ -27,6 +27,8 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from gsmap.version import DISTRIBUTION
+
 MALFORMED = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 """Exceptions that Python raises for JSON or TOML that is damaged, too deeply nested, or of another structure."""
 
@@ -173,9 +175,19 @@ class DiskError(StoreError):
 
 
 class MissingDependencyError(GsmapError, ImportError):
-    """An optional package is not installed."""
+    """An optional package is not installed.
+
+    Args:
+        args: the message.
+        extra: the extra of gsmap that installs the package; the command that does so ends the message.
+    """
 
     code = "missing_dependency"
+
+    def __init__(self, *args: object, extra: str | None = None, code: str | None = None) -> None:
+        if extra is not None:
+            args = (f"{args[0]}: pip install '{DISTRIBUTION}[{extra}]'", *args[1:])
+        super().__init__(*args, code=code)
 
 
 def failed_path(error: OSError) -> str | None:

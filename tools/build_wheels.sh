@@ -1,7 +1,7 @@
 #!/bin/sh
 # Wheels and what can be known of other machines.
 #
-#   tools/build_wheels.sh x86_64     a wheel for manylinux x86-64 in dist/ (auditwheel, patchelf), with synthetic's beside it
+#   tools/build_wheels.sh x86_64     a wheel for manylinux x86-64 in dist/ (auditwheel, patchelf)
 #   tools/build_wheels.sh try        those of dist/ installed in a fresh environment and a small map made with them, away
 #                                    from the sources
 #   tools/build_wheels.sh aarch64    the native module compiled for aarch64 by a cross compiler (g++-aarch64-linux-gnu),
@@ -24,13 +24,12 @@ need() { for tool in "$@"; do command -v "$tool" >/dev/null || { echo "this need
 
 wheel() {
     need auditwheel patchelf npm
-    rm -rf dist/raw dist/gsmap-*.whl dist/gsmap_synthetic-*.whl
+    rm -rf dist/raw dist/gsmapdb-*.whl
     # The page of gsmap view in it, or no wheel.
-    GSMAP_PAGE=REQUIRED "$PYTHON" -m pip wheel -q --no-deps --no-build-isolation -w dist/raw . ./synthetic
-    auditwheel repair -w dist dist/raw/gsmap-*.whl
-    mv dist/raw/gsmap_synthetic-*.whl dist/
+    GSMAP_PAGE=REQUIRED "$PYTHON" -m pip wheel -q --no-deps --no-build-isolation -w dist/raw .
+    auditwheel repair -w dist dist/raw/gsmapdb-*.whl
     rm -rf dist/raw
-    auditwheel show dist/gsmap-*.whl
+    auditwheel show dist/gsmapdb-*.whl
     ls -l dist
 }
 
@@ -41,7 +40,7 @@ try() {
     "$PYTHON" -m venv "$here/venv"
     # As tools/setup.sh does: torch by itself first, so that its pin is settled.
     "$here/venv/bin/pip" install -q -c constraints.txt torch
-    "$here/venv/bin/pip" install -q -c constraints.txt dist/gsmap-*.whl dist/gsmap_synthetic-*.whl
+    "$here/venv/bin/pip" install -q -c constraints.txt dist/gsmapdb-*.whl
     cd "$here"
     PATH=$here/venv/bin:$PATH
     unset PYTHONPATH

@@ -74,7 +74,7 @@ pip install -q -c constraints.txt torch
 if [ "${1:-}" = test ]; then
     # Without isolation: the module is built by the tools that stay in the environment, again and again.
     pip install -q -c constraints.txt scikit-build-core nanobind cmake ninja
-    pip install -q -c constraints.txt --no-build-isolation -e ".[test,lint,docs]" -e synthetic
+    pip install -q -c constraints.txt --no-build-isolation -e ".[test,lint,docs]"
     # Leave plain path files: the import hooks beside them would stand before PYTHONPATH, and a checkout that PYTHONPATH
     # names could not be tested with this environment.
     purelib=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
@@ -82,7 +82,7 @@ if [ "${1:-}" = test ]; then
     PYTHON="$venv/bin/python" tools/build_native.sh >&2
     if command -v npm >/dev/null; then tools/build_page.sh; fi
 else
-    pip install -q -c constraints.txt . ./synthetic
+    pip install -q -c constraints.txt .
     "$venv/bin/python" -P -c 'from gsmap.view.built import built_page; built_page()' 2>/dev/null ||
         say "the page of gsmap view was left out: GSMAP_PAGE=REQUIRED tools/setup.sh says why"
 fi

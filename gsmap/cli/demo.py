@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gsmap.cli.console import AsJson, print_rows, print_table, progress_bars, say
-from gsmap.errors import MissingDependencyError
 
 if TYPE_CHECKING:
     from gsmap.map import Map
@@ -27,17 +25,17 @@ def command(
     Example: `gsmap demo`
     """
     import gsmap.map
+    import gsmap_synthetic
     from gsmap.cli.update import print_map
     from gsmap.types.rows.demo import DemoReport
 
-    synthetic = _synthetic()
     root = Path(folder)
     map_path = root / "demo.gsmap"
     root.mkdir(parents=True, exist_ok=True)  # fail now, not after a minute of making captures
     with progress_bars() as progress:
         draw = progress or (lambda stage, fraction, text: None)
-        captures = synthetic.make_captures(seed, progress=lambda fraction, text: draw("capture", fraction, text))
-        synthetic.write_captures(root / "captures", captures)
+        captures = gsmap_synthetic.make_captures(seed, progress=lambda fraction, text: draw("capture", fraction, text))
+        gsmap_synthetic.write_captures(root / "captures", captures)
         with gsmap.map.open_or_create(map_path, progress=progress) as m:
             m.update(root / "captures")
             scenes, edges = m.scene_rows(), m.edge_rows()
@@ -62,21 +60,6 @@ def command(
         say(f"merged tile: {root / 'tiles' / tile.path} ({tile.num_gaussians} Gaussians; any 3DGS viewer opens it)")
     say(f"picture: {report.picture}")
     say(f"to explore the map: gsmap view {map_path}")
-
-
-def _synthetic() -> ModuleType:
-    """Import the generator of synthetic scenes, which is a separate distribution."""
-    try:
-        import gsmap_synthetic
-    except ModuleNotFoundError as error:
-        if error.name != "gsmap_synthetic":
-            raise
-        raise MissingDependencyError(
-            "gsmap demo needs gsmap-synthetic, which is not installed: "
-            "pip install the folder synthetic/ of gsmap's source, or run tools/setup.sh there"
-        ) from error
-    module: ModuleType = gsmap_synthetic
-    return module
 
 
 def _draw(m: Map, path: Path) -> None:

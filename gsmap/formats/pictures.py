@@ -72,9 +72,7 @@ def open_picture(
         raise
     except UnidentifiedImageError as error:
         if "HEIF" in formats and "HEIF" not in readable and _is_heif(path, data):
-            raise MissingDependencyError(
-                f"{name} is a HEIC picture, which pillow-heif reads: pip install 'gsmap[heic]'"
-            ) from error
+            raise MissingDependencyError(f"{name} is a HEIC picture, which pillow-heif reads", extra="heic") from error
         raise InputError(
             f"{name} cannot be read as a {_listed(readable)} picture: convert it to one of these formats",
             code="picture_unreadable",

@@ -174,5 +174,5 @@ def _similarity(path: Path, matrix: np.ndarray) -> Sim3:
 def _require_usd(path: Path) -> None:
     if importlib.util.find_spec("pxr") is None:
         raise MissingDependencyError(
-            f"{path}: reading and writing USD needs usd-core, which is not installed: pip install 'gsmap[usd]'"
+            f"{path}: reading and writing USD needs usd-core, which is not installed", extra="usd"
         )

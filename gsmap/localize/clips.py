@@ -46,7 +46,7 @@ def read_clip(
     try:
         import av
     except ImportError as error:
-        raise MissingDependencyError("reading clips needs PyAV: pip install 'gsmap[video]'") from error
+        raise MissingDependencyError("reading clips needs PyAV", extra="video") from error
 
     path, lens, params = Path(path), lens or Lens(), params or Params()
     if not path.is_file():

@@ -52,7 +52,7 @@ def load() -> Any:
         import gsplat
         import gsplat.cuda._backend as built
     except ImportError as error:
-        raise MissingDependencyError("rendering on CUDA needs gsplat: pip install 'gsmap[cuda]'") from error
+        raise MissingDependencyError("rendering on CUDA needs gsplat", extra="cuda") from error
     if built._C is None:
         raise MissingDependencyError(
             "gsplat is installed without its CUDA kernels, and could not build them: install the CUDA toolkit (nvcc) "

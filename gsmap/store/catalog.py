@@ -394,7 +394,7 @@ def url_engine(url: str) -> Engine:
     except (ArgumentError, NoSuchModuleError) as error:
         raise ConfigError(f"{url!r} is not a valid database URL: {error}", code="invalid_catalog_url") from error
     except ModuleNotFoundError as error:
-        raise MissingDependencyError(f"the catalog needs the package {error.name}: pip install {error.name}") from error
+        raise MissingDependencyError(f"the catalog needs the package {error.name}", extra="postgres") from error
 
 
 def url_without_password(url: str) -> str:

@@ -275,7 +275,7 @@ class BucketStorage:
             import obstore
             from obstore.store import S3Store
         except ImportError as error:
-            raise MissingDependencyError("backups on S3 need the package obstore: pip install gsmap[cloud]") from error
+            raise MissingDependencyError("object stores need the package obstore", extra="cloud") from error
         self.url = f"s3://{bucket}/{prefix}".rstrip("/")
         endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
         options: dict[str, Any] = {"endpoint": endpoint} if endpoint else {}

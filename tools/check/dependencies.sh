@@ -45,7 +45,7 @@ install -q $build "$cmake" ninja
 
 pin=$(sed -n 's/^torch==/torch==/p' constraints.txt)
 [ -n "$pin" ] || { echo "constraints.txt does not pin torch" >&2; exit 1; }
-all() { install -c "$VIRTUAL_ENV/torch.txt" --no-build-isolation -e ".[test]" -e synthetic "$@"; }
+all() { install -c "$VIRTUAL_ENV/torch.txt" --no-build-isolation -e ".[test]" "$@"; }
 # A CPU build goes by "+cpu" where there is one beside a CUDA build, and has no name of its own where there is not.
 for torch in "$pin+cpu" "$pin"; do
     echo "$torch" >"$VIRTUAL_ENV/torch.txt"

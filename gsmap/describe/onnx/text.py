@@ -123,7 +123,7 @@ def _tokenizer(path: Path) -> Any:
     try:
         from tokenizers import Tokenizer
     except ImportError as error:
-        raise MissingDependencyError("text queries need the package tokenizers: pip install 'gsmap[text]'") from error
+        raise MissingDependencyError("text queries need the package tokenizers", extra="text") from error
     try:
         return Tokenizer.from_file(str(path))
     except Exception as error:  # the package raises plain exceptions for all problems

@@ -112,7 +112,7 @@ class DaskWorkers:
                 from distributed import Client
             except ImportError as error:
                 raise MissingDependencyError(
-                    "the dask executor needs the package distributed: pip install 'gsmap[cluster]'"
+                    "the dask executor needs the package distributed", extra="cluster"
                 ) from error
             try:
                 self._client = Client(self._address, timeout=self._params.timeout_s, set_as_default=False, name="gsmap")

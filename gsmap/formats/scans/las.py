@@ -28,7 +28,7 @@ def read(path: Path, params: limits.Params) -> Scan:
     """
     if not all(importlib.util.find_spec(name) for name in ("laspy", "lazrs")):
         raise MissingDependencyError(
-            f"{path}: .las and .laz are read by laspy, which is not installed: pip install 'gsmap[las]'"
+            f"{path}: .las and .laz are read by laspy, which is not installed", extra="las"
         )
     _require_header(path)
     found = read_in_process(path, "las", params)

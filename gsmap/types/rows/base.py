@@ -94,7 +94,7 @@ class Table(list[R]):
         try:
             import pandas
         except ImportError as error:
-            raise MissingDependencyError("a data frame needs pandas: pip install 'gsmap[pandas]'") from error
+            raise MissingDependencyError("a data frame needs pandas", extra="pandas") from error
         names = dict.fromkeys((*self[0].columns, *(field.name for field in fields(self[0])))) if self else ()  # type: ignore[arg-type]
         return pandas.DataFrame([{name: getattr(row, name) for name in names} for row in self])
 
