@@ -64,8 +64,9 @@ def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: f
     return out
 
 
-def upright_size(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> tuple[float, float, float]:
-    """Return length, width and height of the upright box with the smallest floor area around points (N, 3), N > 0.
+def upright_box(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+    """Return the upright box with the smallest floor area around points (N, 3), N > 0: the rotation (3, 3) whose rows
+    are its length, its width and ``up``, and the bounds (2, 3) along these.
 
     Args:
         up: (3,) unit vector.
@@ -75,13 +76,14 @@ def upright_size(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> t
     first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
-    turns = np.radians(np.arange(90))
+    turns = np.radians(np.arange(180))
     along = np.cos(turns)[:, None] * first + np.sin(turns)[:, None] * second
-    across = np.cos(turns)[:, None] * second - np.sin(turns)[:, None] * first
-    low, high = np.quantile(points @ np.concatenate([along, across, [up]]).T, [outside, 1 - outside], axis=0)
-    sides = (high - low)[:-1].reshape(2, -1)
-    width, length = np.sort(sides[:, sides.prod(0).argmin()])
-    return float(length), float(width), float((high - low)[-1])
+    low, high = np.quantile(points @ along.T, [outside, 1 - outside], axis=0)
+    length, width = high - low, np.roll(high - low, 90)
+    best = int(np.where(length >= width, length * width, np.inf).argmin())
+    axes = np.stack([along[best], np.cross(up, along[best]), up])
+    bounds: np.ndarray = np.quantile(points @ axes.T, [outside, 1 - outside], axis=0)
+    return axes, bounds
 
 
 def cube_around(points: np.ndarray) -> tuple[np.ndarray, float]:

@@ -167,7 +167,10 @@ class PairViews:
 def pair_views(store: Store, edge: Registration) -> PairViews:
     """Return both scenes of an edge with a pose, and at most `VIEWS_PER_SCENE` cameras of each."""
     assert edge.S_target_source is not None
-    target, source = _placed(store, edge.target, Sim3.identity()), _placed(store, edge.source, edge.S_target_source)
+    target, source = (
+        posed_scene(store, edge.target, Sim3.identity()),
+        posed_scene(store, edge.source, edge.S_target_source),
+    )
     graph = store.graphs.load(edge.target)
     chosen = []
     for one, other in ((target, source), (source, target)):
@@ -231,7 +234,7 @@ def draw_places(
     known.save(folder)  # first: what an interrupted run leaves is known to a purge
     for done, scene in enumerate(dict.fromkeys(scenes)):
         progress("pictures", done / len(scenes), scene[:12])
-        placed = _placed(store, scene, in_metres(poses.poses[scene].S_map_scene, metres[scene]))
+        placed = posed_scene(store, scene, in_metres(poses.poses[scene].S_map_scene, metres[scene]))
         for name, one, box in zip(names, scenes, boxes, strict=True):
             if one == scene:
                 write_owned(folder / name, store.id, partial(_save, draw_place(placed, box * metres[scene])))
@@ -253,8 +256,8 @@ class PairRenderer:
         assert graph is not None
         self._store = store
         self._metres = metres = metres_of_scenes(store, graph)[newer]
-        self._older = _placed(store, older, in_metres(graph.poses[older].S_map_scene, metres))
-        self._newer = _placed(store, newer, in_metres(graph.poses[newer].S_map_scene, metres))
+        self._older = posed_scene(store, older, in_metres(graph.poses[older].S_map_scene, metres))
+        self._newer = posed_scene(store, newer, in_metres(graph.poses[newer].S_map_scene, metres))
 
     def draw(self, row: ChangeRow, path: Path) -> None:
         """Draw a change to a PNG file."""
@@ -269,7 +272,8 @@ class PairRenderer:
         return draw_change(self._older, self._newer, box, voxels, side_px)
 
 
-def _placed(store: Store, scene: str, S: Sim3) -> PosedScene:
+def posed_scene(store: Store, scene: str, S: Sim3) -> PosedScene:
+    """Read a scene and transform it by ``S``."""
     gaussians, cameras = store.scenes.gaussians(scene), store.scenes.cameras(scene)
     return PosedScene(transform_gaussians(gaussians, S), transform_cameras(cameras, S), scene)
 

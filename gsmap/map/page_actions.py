@@ -28,6 +28,7 @@ class EditableMap(Protocol):
     def set_prior(self, prior: Prior) -> object: ...
     def remove_prior(self, scene: str) -> None: ...
     def optimize(self) -> object: ...
+    def edit_object(self, ref: str, *, name: str | None = None) -> object: ...
     def metres(self) -> Mapping[int, MetricScale]: ...
     def pose_graph(self) -> PoseGraph | None: ...
 
@@ -41,6 +42,7 @@ def actions_of(opened: EditableMap) -> dict[str, Action]:
         "prior": partial(_prior, opened),
         "earlier_prior": partial(_earlier_prior, opened),
         "remove_prior": lambda said: opened.remove_prior(_text(said, "scene")),
+        "name_object": partial(_name_object, opened),
         "optimize": lambda said: (opened.optimize(), None)[1],
     }
 
@@ -79,6 +81,11 @@ def _earlier_prior(opened: EditableMap, said: Mapping[str, Any]) -> None:
     if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 1 << 63:
         raise InputError("the number of a revision must be an integer", code="invalid_request")
     opened.set_prior(opened.store.priors.earlier(scene, number))
+
+
+def _name_object(opened: EditableMap, said: Mapping[str, Any]) -> None:
+    """Name an object; an empty name takes the last one back."""
+    opened.edit_object(_text(said, "object"), name=_text(said, "name", may_be_empty=True).strip() or "none")
 
 
 def _text(said: Mapping[str, Any], name: str, *, may_be_empty: bool = False) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import threading
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,24 +12,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_poses
 from gsmap.map import reports
 from gsmap.map.changes import change_row, changes_report, parse_change_id
-from gsmap.map.comparison_pictures import VIEWS_PER_SCENE, pair_views, picture_of_change
+from gsmap.map.comparison_pictures import VIEWS_PER_SCENE, pair_views, picture_of_change, posed_scene
+from gsmap.map.floor_plans import MAX_GAUSSIANS, MAX_SCENES, box_of, plan_of_component, read_scene
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.objects import MapObjects, compute_objects, history_report, objects_report
 from gsmap.map.page_pairs import pair_detail
 from gsmap.map.photos import photo_rows
+from gsmap.map.reports.one_pair import is_one_pair, scenes_by_one_pair
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.change import plan_comparisons
 from gsmap.map.stages.optimize import pose_basis
 from gsmap.methods import text_digest
 from gsmap.report.content import EdgeEntry
 from gsmap.store import Store, cache
-from gsmap.types import GaussianSource, PoseGraph, Prior, Scene
+from gsmap.types import GaussianSource, PosedScene, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
 from gsmap.types.world import ImagePoint
 from gsmap.view import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
+from gsmap.view.change_picture import draw_place
+from gsmap.view.content import up_of
 from gsmap.view.page_source import Action, PairPictures
 from gsmap.view.pair_picture import looks_at
 from gsmap.view.trees import VERSION, TreeParams
@@ -39,6 +45,8 @@ if TYPE_CHECKING:
 _NODES = 2_000  # of a layer of a scene graph that are sent, by weight
 _CAMERAS = 300  # of a scene that are sent, evenly along its capture
 _PICTURE_PX = 640  # longer side of the pictures of a pair or a change
+_THUMBNAIL_PX = 400  # longer side of the picture of an object
+_PLAN_PX = 640  # longer side of the picture under a floor plan
 _CAMERA_M = 0.1  # how long a camera is drawn
 
 
@@ -68,6 +76,7 @@ class MapPageSource:
         self._read: tuple[str | None, ViewMap] | None = None
         self._objects: tuple[str | None, MapObjects] | None = None
         self._objects_lock = threading.Lock()
+        self._posed: tuple[tuple[str, str], PosedScene] | None = None  # the scene that was last drawn
         self._tiles = tiles
         self._merged = {} if tiles is None else merged_tilesets(store, tiles)
 
@@ -127,6 +136,50 @@ class MapPageSource:
             ],
         }
 
+    def plan(self, component: int) -> dict[str, Any]:
+        """Return the floor plan of a component, drawn as in the report."""
+        view = self.content()
+        inside = {
+            place: entry
+            for place, entry in enumerate(view.scenes)
+            if entry.pose is not None and entry.pose.component == component
+        }
+        if not inside:
+            raise NotFoundError(f"the map has no component {component}", code="component_not_found")
+        whole = sum(entry.scene.num_gaussians for entry in inside.values()) <= MAX_GAUSSIANS
+        entries = list(inside.values())
+        arrays = [
+            read_scene(self._store, entry.scene, whole=whole) if k < MAX_SCENES else box_of(entry.scene)
+            for k, entry in enumerate(entries)
+        ]
+        plan, _ = plan_of_component(
+            [entry.scene.name for entry in entries],
+            [entry.pose for entry in entries if entry.pose is not None],
+            arrays,
+            (),
+            np.array(up_of(entries)),
+            view.metres_per_unit.get(component, 1.0),
+            _PLAN_PX,
+        )
+        if plan is None:
+            raise NotFoundError(f"the content of component {component} cannot be located", code="no_plan")
+        low, span = plan.bounds[0], plan.bounds[1] - plan.bounds[0]
+
+        def place_on_page(points: np.ndarray) -> list[list[float]]:
+            share = (points - low) / span
+            found: list[list[float]] = np.column_stack([share[:, 0], 1 - share[:, 1]]).round(4).tolist()
+            return found
+
+        picture = None if plan.picture is None else base64.b64encode(plan.picture).decode()
+        return {
+            "picture": picture and f"data:image/webp;base64,{picture}",
+            "size_m": span.tolist(),
+            "scenes": [
+                {"scene": place, "at": at, "outlines": [place_on_page(ring) for ring in rings]}
+                for place, at, rings in zip(inside, place_on_page(plan.middles), plan.footprints, strict=True)
+            ],
+        }
+
     # --- pairs and changes -------------------------------------------------------------------------------------------
 
     def edge(self, target: str, source: str) -> dict[str, Any]:
@@ -177,7 +230,8 @@ class MapPageSource:
             "objects": [
                 {
                     "id": row.id,
-                    "name": row.name or row.label or _called(row.size * known.metres[row.component]),
+                    "name": row.name or "",
+                    "label": row.label or "",
                     "component": row.component,
                     "position": row.position.tolist(),
                     "box": boxes[row.id].tolist(),
@@ -186,6 +240,7 @@ class MapPageSource:
                     "present": row.there,
                     "num_sightings": row.seen,
                     "room": row.room,
+                    "picture": f"objects/{row.id}.jpg",
                 }
                 for row in report.objects
             ],
@@ -201,6 +256,22 @@ class MapPageSource:
                 for row in report.rooms
             ],
         }
+
+    def object_picture(self, id: str) -> np.ndarray:
+        known = self._known()
+        thing = known.named(id)
+        shown = [one for one in thing.sightings if one.box is not None and one.scene in known.scenes]
+        if not shown:
+            raise NotFoundError(f"no scene shows {id}", code="object_not_shown")
+        best = max(shown, key=lambda one: one.thing >= 0)  # the first that has a segment of its own
+        assert best.box is not None
+        metres = known.metres[thing.component]
+        with self._objects_lock:
+            S = in_metres(self._entry(best.scene).S_map_scene, metres)
+            key = best.scene, self.content().state
+            if self._posed is None or self._posed[0] != key:
+                self._posed = key, posed_scene(self._store, best.scene, S)
+            return draw_place(self._posed[1], best.box * metres, _THUMBNAIL_PX)
 
     def history(self, at: str, component: int) -> dict[str, Any]:
         known, places = self._known(), self._places()
@@ -253,7 +324,11 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         pose = poses.get(prior.scene)
         metre = None if pose is None else metres.get(pose.component)
         told[prior.scene] = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit), number
-    scenes = [_scene(scene, content_key(scene, TreeParams()), poses, ups, told) for scene in store.scenes.list()]
+    alone = scenes_by_one_pair(store) if placed else set()
+    scenes = [
+        _scene(scene, content_key(scene, TreeParams()), poses, ups, told, scene.id in alone)
+        for scene in store.scenes.list()
+    ]
     living = {entry.scene.id for entry in scenes}
     newest, given = store.revisions.newest(), pose_basis(store, settings)
     found = ViewMap(
@@ -293,11 +368,13 @@ def _scene(
     poses: Mapping[str, Any],
     ups: Mapping[str, np.ndarray],
     told: Mapping[str, tuple[str, int]],
+    one_pair: bool,
 ) -> ViewScene:
     up = ups.get(scene.id)
     if up is None and scene.thinning is not None and scene.thinning.up is not None:
         up = np.array(scene.thinning.up, np.float64)
-    return ViewScene(scene, key, poses.get(scene.id), up, *told.get(scene.id, (None, None)))
+    prior, number = told.get(scene.id, (None, None))
+    return ViewScene(scene, key, poses.get(scene.id), up, prior, number, one_pair)
 
 
 def content_key(scene: Scene, tree: TreeParams) -> str:
@@ -328,6 +405,7 @@ def _edges(store: Store, placed: PoseGraph | None) -> list[ViewEdge]:
                 status=row.status,
                 reason=row.reason,
                 used=row.used if placed else None,
+                one_pair=outcome is not None and is_one_pair(outcome),
                 undecided=row.undecided,
                 review=row.review,
                 note=note,
@@ -413,8 +491,3 @@ def merged_tilesets(store: Store, out: Path) -> dict[int, Path]:
     if not found:
         raise ConfigError(f"{out} has no 3D Tiles: run gsmap export MAP {out} --format 3dtiles", code="no_tiles")
     return found
-
-
-def _called(size_m: np.ndarray) -> str:
-    """Describe an unnamed object by its size."""
-    return " × ".join(f"{value:.2g}" for value in sorted(size_m.tolist(), reverse=True)) + " m"

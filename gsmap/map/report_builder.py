@@ -16,13 +16,13 @@ import numpy as np
 
 from gsmap.durable import is_stream, write_text_output
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
-from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.rotations import angle_between
 from gsmap.geometry.uncertainty import middle_covariance_m2
 from gsmap.map import reports
 from gsmap.map.changes import changes_report, filter_by_date
 from gsmap.map.comparison_pictures import PairRenderer, note_target, picture_of_pair
 from gsmap.map.date_filter import is_after, parse_moment
+from gsmap.map.floor_plans import MAX_GAUSSIANS, MAX_SCENES, SceneArrays, box_of, plan_of_component, read_scene
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.objects import load_objects, objects_report
 from gsmap.map.settings import Settings
@@ -37,18 +37,13 @@ from gsmap.report import (
     Island,
     PairPicture,
     Params,
-    Plan,
     PlanEdge,
-    PlanScene,
     PoseDifferences,
     Report,
     SceneEntry,
     StorageEntry,
-    density_picture,
-    make_plan,
     owner_of,
     page,
-    top_picture,
 )
 from gsmap.report.content import CHI2_999
 from gsmap.report.words import verdict
@@ -56,7 +51,7 @@ from gsmap.store import Store
 from gsmap.store.quarantine import CAPTURE
 from gsmap.store.registrations import StoredRegistration
 from gsmap.store.sizes import scene_sizes, sizes
-from gsmap.types import Gaussians, PoseGraph, Scene, ScenePose
+from gsmap.types import PoseGraph, Scene, ScenePose
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.changes import ChangesReport
@@ -68,16 +63,11 @@ from gsmap.types.rows.revisions import RevisionRow
 from gsmap.version import __version__
 
 _SUFFIXES = (".html", ".htm")
-_PLAN_GAUSSIANS = 2_000_000  # read for the pictures under floor plans; larger components are drawn by landmarks
-_PLAN_SCENES = 400  # with arrays read for plans; boxes of the others are drawn
 _PLAN_PX = 1200  # longer side of the picture under a floor plan
-_TRACK_CAMERAS = 120  # drawn of one scene, evenly along its capture
 _PICTURE_GAUSSIANS = 3_000_000  # of a pair of scenes that is drawn
 _PICTURE_PX = 320  # longer side of one view in a picture of a pair or a change
 _REVISIONS = 30  # in the history, the newest
 _COMPARED_REVISIONS = 8  # of these, each compared with the one before it
-_SAMPLE = 4000  # points of a scene that its outline is drawn around
-_SOLID = 0.3  # opacity from which a Gaussian is something
 _KINDS = {
     "scenes": "captures",
     "graphs": "scene graphs",
@@ -165,18 +155,6 @@ class _CatalogState:
 
 
 @dataclass
-class _SceneArrays:
-    """Points, cameras and centre of one scene in its frame, for plans and uncertainties."""
-
-    points: np.ndarray
-    track: np.ndarray
-    eyes: np.ndarray
-    middle: np.ndarray
-    kind: str = "boxes"
-    gaussians: Gaussians | None = None
-
-
-@dataclass
 class _ReportBuilder:
     """Builds one report."""
 
@@ -209,12 +187,12 @@ class _ReportBuilder:
 
     # --- arrays ------------------------------------------------------------------------------------------------------
 
-    def _arrays(self, state: _CatalogState) -> dict[str, _SceneArrays]:
+    def _arrays(self, state: _CatalogState) -> dict[str, SceneArrays]:
         """Read the points and centre of every placed scene, within the limits of a report."""
         poses = state.graph.poses if state.graph else {}
         placed = [scene for scene in state.scenes if scene.id in poses]
         placed.sort(key=lambda scene: poses[scene.id].component)
-        budget = _PLAN_GAUSSIANS
+        budget = MAX_GAUSSIANS
         whole: set[int] = set()
         drawn = sorted({poses[scene.id].component for scene in placed})[: self.params.islands]
         for component in drawn:
@@ -226,34 +204,15 @@ class _ReportBuilder:
         for i, scene in enumerate(placed):
             self.progress("report", 0.6 * i / len(placed), scene.name)
             component = poses[scene.id].component
-            is_read = i < _PLAN_SCENES and component in drawn
+            is_read = i < MAX_SCENES and component in drawn
             try:
-                found[scene.id] = self._read(scene, whole=component in whole) if is_read else _box_of(scene)
+                found[scene.id] = read_scene(self.store, scene, whole=component in whole) if is_read else box_of(scene)
             except (CorruptError, NotFoundError) as error:
                 self.notes.append(f"scene {scene.name} is drawn as a box: {self._hidden(str(error))}")
-                found[scene.id] = _box_of(scene)
+                found[scene.id] = box_of(scene)
         return found
 
-    def _read(self, scene: Scene, *, whole: bool) -> _SceneArrays:
-        cameras = self.store.scenes.cameras(scene.id)
-        eyes = np.zeros((0, 3)) if cameras.synthesised else cameras.centers
-        track = eyes if not len(eyes) else cameras.evenly(_TRACK_CAMERAS).centers
-        gaussians, kind = None, "boxes"
-        points = box_corners(scene.bounds)
-        if whole:
-            every = self.store.scenes.gaussians(scene.id)
-            gaussians, kind = replace(every, sh=every.sh[:, :1]), "rendered"
-            solid = np.flatnonzero((every.opacities > _SOLID) & np.isfinite(every.means).all(1))
-            if len(solid):
-                points = every.means[solid[:: -(-len(solid) // _SAMPLE)]].astype(np.float64)
-        elif (graph := self.store.graphs.load(scene.id)) is not None:
-            layer = graph.layers.get("landmarks") or graph.layers.get("landmarks:1") or graph.layers.get("objects")
-            if layer is not None and len(layer):
-                points, kind = layer.positions[:: -(-len(layer) // _SAMPLE)], "landmarks"
-        middle = np.median(eyes if len(eyes) else points, axis=0)
-        return _SceneArrays(points, track, eyes, middle, kind, gaussians)
-
-    def _scene_entries(self, state: _CatalogState, reads: Mapping[str, _SceneArrays]) -> Iterable[SceneEntry]:
+    def _scene_entries(self, state: _CatalogState, reads: Mapping[str, SceneArrays]) -> Iterable[SceneEntry]:
         poses = state.graph.poses if state.graph else {}
         for entry in state.report.scenes:
             pose, read = poses.get(entry.row.id), reads.get(entry.row.id)
@@ -271,7 +230,7 @@ class _ReportBuilder:
     # --- plans -------------------------------------------------------------------------------------------------------
 
     def _islands(
-        self, state: _CatalogState, reads: Mapping[str, _SceneArrays], edges: Sequence[EdgeEntry]
+        self, state: _CatalogState, reads: Mapping[str, SceneArrays], edges: Sequence[EdgeEntry]
     ) -> list[Island]:
         members: dict[int, list[Scene]] = {}
         poses = state.graph.poses if state.graph else {}
@@ -289,57 +248,21 @@ class _ReportBuilder:
         return islands
 
     def _plan(
-        self, state: _CatalogState, island: Island, scenes: Sequence[Scene], reads: Mapping[str, _SceneArrays],
+        self, state: _CatalogState, island: Island, scenes: Sequence[Scene], reads: Mapping[str, SceneArrays],
         edges: Sequence[EdgeEntry],
     ) -> Island:  # fmt: skip
         assert state.graph is not None
         poses = [state.graph.poses[scene.id] for scene in scenes]
         found = [reads[scene.id] for scene in scenes]
-        metre = island.metre.metres_per_unit
-        shown = [
-            PlanScene(
-                scene.name,
-                pose.status,
-                pose.S_map_scene.apply(read.points),
-                pose.S_map_scene.apply(read.track),
-                pose.S_map_scene.apply(read.middle[None])[0],
-                middle_covariance_m2(pose, read.middle, metre),
-            )
-            for scene, pose, read in zip(scenes, poses, found, strict=True)
-        ]
         place = {scene.id: i for i, scene in enumerate(scenes)}
         lines = [
             PlanEdge(place[edge.row.target], place[edge.row.source], _on_plan(edge), _tip(edge))
             for edge in edges
             if edge.row.target in place and edge.row.source in place and edge.use not in ("rejected", "no_match")
         ]
-        plan = make_plan(shown, lines, _up(state, scenes, poses), metre)
-        if plan is None:
-            return replace(island, note="the content of its scenes cannot be located")
-        plan, note = self._picture(plan, poses, found)
+        metre, up = island.metre.metres_per_unit, _up(state, scenes, poses)
+        plan, note = plan_of_component(island.scenes, poses, found, lines, up, metre, _PLAN_PX)
         return replace(island, plan=plan, note=note)
-
-    def _picture(self, plan: Plan, poses: Sequence[ScenePose], found: Sequence[_SceneArrays]) -> tuple[Plan, str]:
-        from gsmap.geometry.transforms import transform_gaussians
-
-        px = _PLAN_PX
-        whole = [(read.gaussians, pose) for read, pose in zip(found, poses, strict=True) if read.gaussians is not None]
-        if whole:
-            parts = [transform_gaussians(gaussians, pose.S_map_scene) for gaussians, pose in whole]
-            eyes = np.concatenate([pose.S_map_scene.apply(r.eyes) for r, pose in zip(found, poses, strict=True)])
-            picture, kind = top_picture(parts, plan, eyes, px), "rendered"
-            note = "The picture shows the Gaussians from straight above, without ceilings."
-        else:
-            marks = [
-                pose.S_map_scene.apply(read.points)
-                for read, pose in zip(found, poses, strict=True)
-                if read.kind == "landmarks"
-            ]
-            if not marks:
-                return plan, "Outlines are boxes around the Gaussians of the scenes."
-            picture, kind = density_picture(np.concatenate(marks), plan, px), "landmarks"
-            note = "The picture shows the landmarks of the scene graphs."
-        return (replace(plan, picture=picture, picture_kind=kind), note) if picture else (plan, "")
 
     # --- pictures ----------------------------------------------------------------------------------------------------
 
@@ -484,7 +407,7 @@ def _seconds(stored: Iterable[StoredRegistration]) -> dict[str, float]:
     return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
-def _edges(state: _CatalogState, reads: Mapping[str, _SceneArrays]) -> list[EdgeEntry]:
+def _edges(state: _CatalogState, reads: Mapping[str, SceneArrays]) -> list[EdgeEntry]:
     """Return every edge with its residual under the newest poses."""
     poses = state.graph.poses if state.graph else {}
     outcomes = state.graph.outcomes if state.graph else {}
@@ -520,11 +443,6 @@ def _tip(edge: EdgeEntry) -> str:
     chi2 = "" if edge.chi2 is None else f", chi2 {edge.chi2:.3g}"
     off = "" if edge.translation_m is None else f", off by {edge.translation_m:.3g} m"
     return f"{edge.row.pair}: {_on_plan(edge)}{chi2}{off}"
-
-
-def _box_of(scene: Scene) -> _SceneArrays:
-    none = np.zeros((0, 3))
-    return _SceneArrays(box_corners(scene.bounds), none, none, scene.bounds.mean(0))
 
 
 def _rotation_sigma_deg(pose: ScenePose) -> float | None:

@@ -86,6 +86,8 @@ class Answers:
                 (rf"/edges/({_ID})-({_ID})/(\d{{1,2}})-(target|source|difference)\.jpg", self._pair_picture),
                 (r"/changes/(c\d{1,9})\.jpg", self._change_picture),
                 (r"/revisions/(\d{1,9})\.json", self._revision),
+                (r"/objects/([0-9a-z]{1,12})\.jpg", self._object_picture),
+                (r"/plans/(\d{1,8})\.json", self._plan),
                 (r"/graph\.json", self._graph),
                 (r"/history\.json", self._history),
             )
@@ -173,6 +175,9 @@ class Answers:
     def _revision(self, number: str) -> Answer:
         return Answer.json(self._page_source.revision(int(number)))
 
+    def _plan(self, component: str) -> Answer:
+        return Answer.json(self._page_source.plan(int(component)))
+
     def _graph(self) -> Answer:
         return Answer.json(self._page_source.graph())
 
@@ -213,6 +218,9 @@ class Answers:
 
     def _change_picture(self, change: str) -> Answer:
         return self._drawn(change, lambda: {change: self._page_source.change_picture(change)})
+
+    def _object_picture(self, id: str) -> Answer:
+        return self._drawn(f"object {id}", lambda: {f"object {id}": self._page_source.object_picture(id)})
 
     def _drawn(self, name: str, draw: Callable[[], Mapping[str, np.ndarray]]) -> Answer:
         """Return a picture from memory, or draw it together with all pictures of the same call, one call at a time."""

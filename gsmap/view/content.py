@@ -32,6 +32,7 @@ class ViewScene:
         up: (3,) direction opposite to gravity in the scene frame; None if unknown.
         prior: Description of its pose prior; None if there is none.
         prior_number: Number of that prior in the history of priors.
+        one_pair: The scene is tentative only because single pairs place it, which nothing contradicts.
     """
 
     scene: Scene
@@ -40,6 +41,7 @@ class ViewScene:
     up: np.ndarray | None = None
     prior: str | None = None
     prior_number: int | None = None
+    one_pair: bool = False
 
     @property
     def S_map_scene(self) -> Sim3:
@@ -55,6 +57,7 @@ class ViewEdge:
         status: ``accepted``, ``rejected`` or ``no_match``, after any review.
         reason: Reason for the status.
         used: Use in the newest revision: True, False or ``"tentative"``; None if it has not been optimized.
+        one_pair: It is tentative only because no cycle confirms it; nothing contradicts it.
         undecided: The edge contradicts others, without evidence for either.
         review: Current review, ``confirm`` or ``reject``; None if unreviewed.
         note: Note of the review.
@@ -69,6 +72,7 @@ class ViewEdge:
     status: str
     reason: str = ""
     used: bool | str | None = None
+    one_pair: bool = False
     undecided: bool = False
     review: str | None = None
     note: str = ""
@@ -172,6 +176,25 @@ class ViewMap:
         return [s.pose.component if s.pose else last + i for i, s in enumerate(self.scenes)]
 
 
+@dataclass(frozen=True, eq=False)
+class ViewExtent:
+    """Extent of the scenes of an overview in the map frame, without outliers.
+
+    Args:
+        corners: (8, 3) corners of an upright box around each scene, the lower four first.
+        frame: (8, 3) corners of an upright box around all scenes, in the same order.
+        box: (2, 3) box along the axes of the map around all scenes.
+        size: Length, width and height of ``frame``.
+        has_ceiling: Most of the floor has something above it.
+    """
+
+    corners: tuple[np.ndarray, ...]
+    frame: np.ndarray
+    box: np.ndarray
+    size: tuple[float, float, float]
+    has_ceiling: bool
+
+
 @dataclass(frozen=True)
 class ViewOverview:
     """An overview of a component: the coarsest levels of its scenes in one file.
@@ -181,16 +204,14 @@ class ViewOverview:
         scenes: Indices of its scenes in the map's list.
         counts: Number of Gaussians of each scene.
         pending: Number of scenes that the overview still lacks.
-        heights: Heights of floor and ceiling of each scene along the up direction of the component.
-        size: Length, width and height of all scenes in map units; None if the overview is empty.
+        extent: Extent of its scenes; None if the overview is empty.
     """
 
     uri: str
     scenes: tuple[int, ...] = ()
     counts: tuple[int, ...] = ()
     pending: int = 0
-    heights: tuple[tuple[float, float], ...] = ()
-    size: tuple[float, float, float] | None = None
+    extent: ViewExtent | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +239,10 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
     at = {entry.scene.id: index for index, entry in enumerate(view.scenes)}
     boxes = [served.boxes.get(entry.key, entry.scene.bounds) for entry in view.scenes]
     corners = [entry.S_map_scene.apply(box_corners(box)) for entry, box in zip(view.scenes, boxes, strict=True)]
+    for overview in served.overviews.values():
+        if overview.extent is not None:
+            for index, upright in zip(overview.scenes, overview.extent.corners, strict=True):
+                corners[index] = upright
     members: dict[int, list[int]] = {}
     for index, component in enumerate(components):
         members.setdefault(component, []).append(index)
@@ -236,7 +261,8 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
                 "num_scenes": len(members[component]),
                 "up": up_of([view.scenes[i] for i in members[component]]),
                 "metres_per_unit": view.metres_per_unit.get(component, 1.0),
-                "box": box_around(np.concatenate([corners[i] for i in members[component]])).tolist(),
+                "box": _box(served.overviews.get(component), [corners[i] for i in members[component]]).tolist(),
+                "plan": f"plans/{component}.json" if served.live and view.revision is not None else None,
                 "overview": _overview(served.overviews.get(component)),
                 "merged": f"merged/{component}/tileset.json" if component in view.merged else None,
             }
@@ -321,7 +347,7 @@ def _scene(
         "num_cameras": scene.num_cameras,
         "captured_at": scene.captured_at,
         "component": component,
-        "status": pose.status if pose is not None else "not placed",
+        "status": "one pair" if entry.one_pair else pose.status if pose is not None else "not placed",
         "S_map_scene": entry.S_map_scene.matrix().tolist(),
         "box": box.tolist(),
         "corners": corners.tolist(),
@@ -342,6 +368,7 @@ def _edge(edge: ViewEdge, at: Mapping[str, int]) -> dict[str, Any]:
         "source": at[edge.source],
         "status": edge.status,
         "used": edge.used,
+        "one_pair": edge.one_pair,
         "undecided": edge.undecided,
         "review": edge.review,
         "note": edge.note,
@@ -358,8 +385,19 @@ def _overview(one: ViewOverview | None) -> dict[str, Any] | None:
     if one is None:
         return None
     data = {"uri": one.uri, "pending": one.pending, "scenes": list(one.scenes), "counts": list(one.counts)}
-    size = None if one.size is None else list(one.size)
-    return data | {"heights": [list(pair) for pair in one.heights], "size": size}
+    extent = one.extent
+    return data | {
+        "frame": None if extent is None else extent.frame.tolist(),
+        "size": None if extent is None else list(extent.size),
+        "has_ceiling": extent is not None and extent.has_ceiling,
+    }
+
+
+def _box(overview: ViewOverview | None, corners: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the box of a component: of its Gaussians in the map frame, or of the boxes of its scenes."""
+    if overview is not None and overview.extent is not None and not overview.pending:
+        return overview.extent.box
+    return box_around(np.concatenate(corners))
 
 
 def _number(value: float | None) -> float | None:

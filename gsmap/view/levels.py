@@ -16,11 +16,11 @@ import numpy as np
 
 from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import spz
-from gsmap.geometry.boxes import upright_size
+from gsmap.geometry.boxes import box_corners, robust_box, upright_box
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.progress import Progress
-from gsmap.view.content import ViewMap, ViewOverview, ViewScene, up_of
+from gsmap.view.content import ViewExtent, ViewMap, ViewOverview, ViewScene, up_of
 from gsmap.view.making import Maker, PendingResult
 from gsmap.view.page_source import PageSource
 from gsmap.view.tree_cache import TreeCache
@@ -35,6 +35,9 @@ _FIRST = -1.0  # rank of overviews, before all trees
 _COMPONENTS_KEPT = 8  # maximum number of components with sketches in memory
 _TRIES = 3
 _STRAYS = 0.02  # fraction of Gaussians left out below the floor, above the ceiling and at each side
+_CEILING_AT = 0.72  # height from which on there are ceilings, as a fraction of the height from floor to ceiling
+_FLAT = 0.01  # height as a fraction of the width below which a place is flat, without ceilings
+_PER_CELL = 12  # average number of Gaussians in a cell of the plan by which ceilings are found
 _FILES_KEPT = 4  # maximum number of overview files in memory
 
 _T = TypeVar("_T")
@@ -55,13 +58,47 @@ def overview_file(parts: Sequence[tuple[ViewScene, Sketch]]) -> bytes:
     return spz.pack("overview.spz", Gaussians.concatenate(placed))
 
 
-def extent_of(
-    parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]
-) -> tuple[tuple[tuple[float, float], ...], tuple[float, float, float]]:
-    """Return the floor and ceiling of each scene, and the length, width and height of all scenes, without outliers."""
-    points = [entry.S_map_scene.apply(one.gaussians.means) for entry, one in parts]
-    ends = [np.quantile(one @ np.asarray(up), (_STRAYS, 1 - _STRAYS)).tolist() for one in points]
-    return tuple((low, high) for low, high in ends), upright_size(np.concatenate(points), np.asarray(up), _STRAYS)
+def extent_of(parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]) -> ViewExtent:
+    """Return the extent of scenes in the map frame, without outliers.
+
+    Args:
+        up: (3,) direction opposite to gravity in the map frame.
+    """
+    points, axis = [entry.S_map_scene.apply(one.gaussians.means) for entry, one in parts], np.asarray(up, np.float64)
+    every = np.concatenate(points)
+    axes, bounds = upright_box(every, axis, _STRAYS)
+    length, width, height = (bounds[1] - bounds[0]).tolist()
+    return ViewExtent(
+        corners=tuple(_corners(*upright_box(one, axis, _STRAYS)) for one in points),
+        frame=_corners(axes, bounds),
+        box=robust_box(every, None, _STRAYS),
+        size=(length, width, height),
+        has_ceiling=_has_ceiling(every @ axes.T, bounds),
+    )
+
+
+def _corners(axes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Return the (8, 3) corners of an upright box, the lower four first."""
+    corners: np.ndarray = box_corners(bounds) @ axes
+    return corners
+
+
+def _has_ceiling(points: np.ndarray, bounds: np.ndarray) -> bool:
+    """Return whether most of the floor has something above it: a place seen from above then shows roofs, no rooms.
+
+    Args:
+        points: (N, 3), the third axis up.
+        bounds: (2, 3) box around them.
+    """
+    low, size = bounds[0], np.maximum(bounds[1] - bounds[0], 1e-9)
+    if size[2] < _FLAT * size[1]:
+        return False
+    share = (points - low) / size
+    share = share[((share >= 0) & (share < 1)).all(1)]
+    sides = max(1, int(np.sqrt(len(share) / _PER_CELL)))
+    cells = (share[:, :2] * sides).astype(int) @ [sides, 1]
+    covered = len(np.unique(cells[share[:, 2] > _CEILING_AT]))
+    return bool(2 * covered > len(np.unique(cells)) > 1)
 
 
 @dataclass(eq=False)
@@ -243,8 +280,8 @@ class Levels:
         if not parts:
             raise InputError("the component has no opaque Gaussians", code="no_opaque_gaussians")
         counts = tuple(len(one.gaussians) for _, one in parts)
-        heights, sides = extent_of(parts, up_of(list(inside.values())))
-        return overview_file(parts), ViewOverview("", tuple(places), counts, 0, heights, sides), boxes
+        extent = extent_of(parts, up_of(list(inside.values())))
+        return overview_file(parts), ViewOverview("", tuple(places), counts, 0, extent), boxes
 
     def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
         """Return the overview of a component with the sketches that exist, and request the missing sketches."""
@@ -284,8 +321,8 @@ class Levels:
         counts = tuple(len(one.gaussians) for _, one in parts)
         uri = f"overviews/{component}/{name}.spz"
         if group.overview is None or group.overview.uri != uri:
-            heights, sides = extent_of(parts, up_of(list(inside.values())))
-            group.overview = ViewOverview(uri, places, counts, pending, heights, sides)
+            extent = extent_of(parts, up_of(list(inside.values())))
+            group.overview = ViewOverview(uri, places, counts, pending, extent)
         group.overview = replace(group.overview, scenes=places, pending=pending)
         return group.overview
 

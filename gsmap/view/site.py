@@ -130,7 +130,7 @@ class _Maker:
             graph = self.tried("the graph of objects", self.page_source.graph)
             if graph is not None:
                 has_objects = True
-                yield "graph.json", _json(graph)
+                yield "graph.json", _json({**graph, "objects": [{**one, "picture": None} for one in graph["objects"]]})
         served = ServerState(False, boxes, overviews, live=False, drawn=frozenset(drawn))
         said = summary(view, served)
         yield "map.json", _json(said | {"graph": "graph.json" if has_objects else None})

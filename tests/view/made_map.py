@@ -95,9 +95,11 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
                     "pending": 0,
                     "scenes": [],
                     "counts": [],
-                    "heights": [],
+                    "frame": None,
+                    "has_ceiling": k == 0,
                     "size": [3.0 * (scenes, second_island)[k] - 1, 2, 2],
                 },
+                "plan": f"plans/{k}.json",
                 "merged": "merged/tileset.json" if k == 0 else None,
             }
             for k in range(2 if second_island else 1)
@@ -144,6 +146,7 @@ def _edge(target: int, source: int, how: str, hostile: bool) -> dict[str, Any]:
         "source": source,
         "status": how if how in ("rejected", "no_match") else "accepted",
         "used": {"used": True, "tentative": "tentative", "undecided": False}.get(how, False),
+        "one_pair": False,
         "undecided": how == "undecided",
         "review": None,
         "note": "",
@@ -166,6 +169,7 @@ class MadeServer:
         self.built, self.map, self.log = built, summary, []
         self.events: dict[str, list[dict[str, str]]] = {}
         self.priors = ["position, 0.30 m"]  # that were ever told; numbered from one
+        self.names: dict[str, str] = {}  # that were given to objects
         self.refuse: str | None = None  # what the next action is answered with
         self.delay_s = 0.0
         self._http: http.server.ThreadingHTTPServer | None = None
@@ -203,6 +207,8 @@ class MadeServer:
                 self.priors.append(f"pose, {body['sigma_m']} m, {body['sigma_deg']}°")
             number = {"prior": len(self.priors), "remove_prior": None}.get(name, body.get("number"))
             scene |= {"prior": None if number is None else self.priors[number - 1], "prior_number": number}
+        elif name == "name_object":
+            self.names[body["object"]] = body["name"]
         elif name == "optimize":
             self.map["revision"] += 1
             last = self.map["revisions"][-1]
@@ -252,6 +258,10 @@ class MadeServer:
             return _json({"id": number, "scenes": rows})
         if folder == "edges" and rest.endswith(".json"):
             return _json(self._detail(rest.removesuffix(".json")))
+        if folder == "plans":
+            return _json(
+                {"picture": None, "size_m": [12, 6], "scenes": [{"scene": 0, "at": [0.5, 0.5], "outlines": []}]}
+            )
         if folder == "changes" or rest.endswith(".jpg"):
             return _picture(name), "image/jpeg"
         file = self.built / name
@@ -297,11 +307,13 @@ class MadeServer:
         }  # fmt: skip
 
     def _graph(self) -> dict[str, Any]:
-        names = ("chair", "red cabinet", "forklift", "plant")
+        names = [self.names.get(f"o{k + 1}", n) for k, n in enumerate(("chair", "red cabinet", "forklift", "plant"))]
         objects = [
             {
                 "id": f"o{k + 1}",
                 "name": name,
+                "label": "",
+                "picture": f"objects/o{k + 1}.jpg",
                 "component": 0,
                 "position": [2.0 * k, 0, 0.4],
                 "box": [[2.0 * k - 0.3, -0.3, 0], [2.0 * k + 0.3, 0.3, 0.9]],

@@ -97,9 +97,12 @@ def site(
     every = np.concatenate(corners)
     component = {"component": 0, "num_scenes": len(rows), "up": [0, -1, 0], "metres_per_unit": 1.0,
                  "box": [every.min(0).tolist(), every.max(0).tolist()], "merged": None,
-                 "overview": {"uri": "overview.spz", "pending": 0, "scenes": list(range(len(rows))), "counts": counts}
+                 "plan": None,
+                 "overview": {"uri": "overview.spz", "pending": 0, "scenes": list(range(len(rows))), "counts": counts,
+                              "frame": None, "size": None, "has_ceiling": False}
                  if overview else None}  # fmt: skip
-    edges = [{"target": i, "source": i + 1, "status": "accepted", "used": True, "undecided": False, "review": None,
+    edges = [{"target": i, "source": i + 1, "status": "accepted", "used": True, "one_pair": False, "undecided": False,
+              "review": None,
               "note": "", "reason": "", "probability": 0.9, "overlap": 0.5, "num_inliers": 9, "doubt": 0.0,
               "detail": ""} for i in range(len(rows) - 1)]  # fmt: skip
     out = {"schema": 1, "state": "1", "title": "made", "actions": False, "revision": 1, "components": [component],

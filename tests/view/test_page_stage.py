@@ -458,13 +458,36 @@ def test_the_overview_is_drawn_before_any_tree(made):
         assert page.picture().std() > 0.05
 
 
-def test_rooms_are_first_seen_from_within(made):
-    """Not their ceilings: from where one of the captures was made, level, towards most of the others."""
+_FRAMED = (
+    "const c = map.components[0]; c.overview.has_ceiling = true; const [l, h] = c.box;"
+    "c.overview.frame = [...Array(8).keys()].map((k) =>"
+    " [(k & 1 ? h : l)[0], k & 4 ? l[1] : h[1], (k & 2 ? h : l)[2]])"
+)
+
+
+def test_rooms_are_first_seen_from_above_without_ceilings_and_walked_into(made):
+    """The whole of it as large as it fits; in, where one of the captures was made, level, towards the others."""
     folder, served = made
     with opened(folder, served) as page:
         seen = Seen(page, served)
-        seen.show()
-        page.wait("Math.abs(gsmap.stage.standpoint().position[1] + 1.2) < 1e-3", 10)
+        seen.show(_FRAMED)
+        assert seen.state()["isAbove"]
+        cut = page.picture()
+        inside = [g[g.means[:, 1] > -1.5] for g, _ in FOUR]
+        assert max(len(one) / len(g) for one, (g, _) in zip(inside, FOUR, strict=True)) < 1
+        shown = page.value(
+            "gsmap.map.components[0].overview.frame.map((p) => gsmap.stage.project([p[0], Math.max(p[1], -1.8), p[2]]))"
+        )
+        low, high = np.min(shown, axis=0), np.max(shown, axis=0)
+        assert low.min() > -1
+        assert (high <= [WIDTH + 1, HEIGHT + 1]).all()
+        assert max(((high - low) / [WIDTH, HEIGHT]).tolist()) > 0.93
+        seen.do("setCeiling(false)")
+        assert psnr(page.picture(), cut) > 50, "from above ceilings are never drawn"
+        seen.do("setCeiling(true)")
+        assert page.value("gsmap.stage.walkIn()") is True
+        seen.settle()
+        assert not seen.state()["isAbove"]
         at = seen.page.value("gsmap.stage.standpoint()")
         assert np.allclose(at["position"], [-1, -1.2, 0], atol=1e-3) or np.allclose(
             at["position"], [1, -1.2, 0], atol=1e-3

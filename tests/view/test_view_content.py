@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 from view_room import POSE_B, A, B, C, MadeDoors
 
+from gsmap.geometry.boxes import box_corners
 from gsmap.view import ViewMap
-from gsmap.view.content import ServerState, ViewOverview, summary
+from gsmap.view.content import ServerState, ViewExtent, ViewOverview, summary
 
 
 def test_summary_tells_where_everything_is():
@@ -54,13 +55,20 @@ def test_what_is_up_is_what_most_scenes_say():
 
 def test_a_static_page_promises_nothing_that_is_computed_when_asked():
     view = replace(MadeDoors().view, has_objects=True, merged=frozenset([0]))
-    overviews = {0: ViewOverview("o.spz", (0,), (9,), 1, ((0.0, 2.5),), (6.0, 5.0, 2.5))}
+    corners, box = box_corners(np.array([[0, 0, 0], [6, 5, 2.5]])), np.array([[0.5, 0, 0], [5, 5, 2]])
+    extent = ViewExtent((corners,), corners, box, (6.0, 5.0, 2.5), True)
+    overviews = {0: ViewOverview("o.spz", (0,), (9,), 1, extent)}
     live, still = (summary(view, ServerState(live=live, overviews=overviews)) for live in (True, False))
     assert (live["graph"], live["history"]) == ("graph.json", "history.json")
     assert (still["graph"], still["history"], still["actions"]) == ("graph.json", None, False)
     assert still["components"][0]["merged"] == "merged/0/tileset.json"
-    told = {"uri": "o.spz", "pending": 1, "scenes": [0], "counts": [9], "heights": [[0.0, 2.5]]}
+    assert live["components"][0]["plan"] == "plans/0.json"
+    assert still["components"][0]["plan"] is None
+    told = {"uri": "o.spz", "pending": 1, "scenes": [0], "counts": [9], "frame": corners.tolist(), "has_ceiling": True}
     told["size"] = [6.0, 5.0, 2.5]
+    assert still["scenes"][0]["corners"] == corners.tolist()
+    whole = {0: replace(overviews[0], pending=0)}
+    assert summary(view, ServerState(overviews=whole))["components"][0]["box"] == box.tolist()
     assert still["components"][0]["overview"] == told
     assert still["components"][1]["overview"] is None
 

@@ -108,10 +108,20 @@ def test_a_room_is_measured_whatever_its_frame_is_turned(tmp_path):
     up = turn @ [0, 0, 1.0]
     g = replace(blob(0, len(room)), means=(room @ turn.T).astype(np.float32))
     scene = Scene("0" * 32, "room", len(g), 0, 0, np.stack([g.means.min(0), g.means.max(0)]))
-    ((floor, ceiling),), size = extent_of([(ViewScene(scene, "k", None, up), Sketch(g, scene.bounds))], up)
-    assert abs(floor) < 0.01
-    assert abs(ceiling - 2.5) < 0.01
-    np.testing.assert_allclose(size, (6, 3, 2.5), rtol=0.05)  # 2 % are left out on every side
+    extent = extent_of([(ViewScene(scene, "k", None, up), Sketch(g, scene.bounds))], up)
+    np.testing.assert_allclose(extent.size, (6, 3, 2.5), rtol=0.05)  # 2 % are left out on every side
+    for corners in (extent.frame, *extent.corners):
+        own = corners @ turn  # back where the room is upright, along its walls
+        np.testing.assert_allclose(own[:4, 2], 0, atol=0.01)
+        np.testing.assert_allclose(own[4:, 2], 2.5, atol=0.01)
+        np.testing.assert_allclose(np.ptp(own, axis=0), (6, 3, 2.5), rtol=0.05)
+    assert extent.has_ceiling
+    floor = ViewScene(replace(scene, bounds=scene.bounds), "k", None, up), Sketch(g[:1000], scene.bounds)
+    wall = blob(1, 300)
+    wall = replace(wall, means=(np.c_[np.zeros(300), rng.uniform(0, (3, 2.5), (300, 2))] @ turn.T).astype(np.float32))
+    yard = ViewScene(scene, "k", None, up), Sketch(Gaussians.concatenate([g[:1000], wall]), scene.bounds)
+    assert not extent_of([yard], up).has_ceiling, "walls about a yard are no ceiling"
+    assert not extent_of([floor], up).has_ceiling
 
 
 def test_what_cannot_be_seen_is_left_out_and_nothing_at_all_is_said(tmp_path):

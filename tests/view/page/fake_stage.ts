@@ -47,6 +47,8 @@ export async function createStage(options: StageOptions): Promise<Stage> {
       pending: 0,
       settled: true,
       error: null,
+      isShown: true,
+      isAbove: true,
     },
     show: (map, component) => calls.push(["show", map.scenes.length, component]),
     setVisible: note("setVisible"),
@@ -59,6 +61,8 @@ export async function createStage(options: StageOptions): Promise<Stage> {
     setCeiling: note("setCeiling"),
     setOverlay: note("setOverlay"),
     setGraph: note("setGraph"),
+    setHighlighted: note("setHighlighted"),
+    setMeasure: note("setMeasure"),
     setChanges: (changes) => calls.push(["setChanges", changes.map((one) => one.id)]),
     setCorrespondences: (detail) => calls.push(["setCorrespondences", detail?.correspondences.length ?? null]),
     setPoses: (revision) => calls.push(["setPoses", revision?.id ?? null]),
@@ -71,6 +75,11 @@ export async function createStage(options: StageOptions): Promise<Stage> {
       fake.move(at);
     },
     fit: note("fit"),
+    walkIn: (scene) => {
+      calls.push(["walkIn", scene ?? null]);
+      return Promise.resolve(true);
+    },
+    project: ([x, y]) => [100 + 40 * x, 100 + 40 * y],
     standpoint: () => standpoint,
     setTheme: note("setTheme"),
     standAtCamera: note("standAtCamera"),

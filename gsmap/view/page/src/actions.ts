@@ -1,5 +1,5 @@
 // Everything that a person can do on the page, one function each. What changes the map goes through `send`.
-import { act, getEdge, getGraph, getHistory, getMap, getRevision, getState, Gone } from "./api";
+import { act, getEdge, getGraph, getHistory, getMap, getPlan, getRevision, getState, Gone } from "./api";
 import { fits } from "./address";
 import type { Actions, Box, GraphEntry, MapSummary, Matrix, RevisionPoses, SceneEntry, Vector } from "./contract";
 import * as derive from "./derive";
@@ -16,6 +16,7 @@ import { middleOf, standpointOf } from "./words";
 export const revisions = new Resources(getRevision);
 export const edges = new Resources(getEdge);
 export const graphs = new Resources(getGraph);
+export const plans = new Resources(getPlan);
 /** By "component at X,Y,Z", in the map as it is. */
 export const histories = new Resources((key) => {
   const [component, at] = key.split(" ");
@@ -110,6 +111,7 @@ export function showComponent(component: number): void {
     clip: null,
     until: null,
     pick: null,
+    measureFrom: null,
     drag: null,
     standpoint: null,
   });
@@ -210,7 +212,7 @@ export function splitPair(a: string, b: string): void {
 export function clip(on = !page.state.clip): void {
   const { map, component } = page.state;
   const whole = map ? derive.componentOf(map, component)?.box : null;
-  page.set({ clip: on && whole ? shrunk(whole, 0.7) : null });
+  page.set({ clip: on && whole ? structuredClone(whole) : null });
 }
 
 function shrunk(box: Box, share: number): Box {
@@ -240,6 +242,13 @@ export function overlay(name: Overlay, shown = !page.state.overlays.has(name)): 
 
 export function fit(): void {
   aim(() => page.stage?.fit(undefined, true));
+}
+
+/** Stands in the chosen scene, or in the largest one. */
+export async function walkIn(): Promise<void> {
+  const { map, selection } = page.state;
+  const index = selection?.kind === "scene" ? map?.scenes.findIndex((scene) => scene.id === selection.key) : undefined;
+  if (!(await page.stage?.walkIn(index))) say("No camera of these scenes is known: W A S D and the mouse walk in");
 }
 
 export function flyTo(box: Box): void {
@@ -323,7 +332,12 @@ export function picked(pick: Pick): void {
   const { map } = page.state;
   const { thing } = pick;
   page.set({ pick });
-  if (!map || !thing) return;
+  if (!map) return;
+  if (!thing) {
+    const object = page.state.tab === "things" && page.state.measureFrom === null ? objectAt(pick.point) : undefined;
+    if (object) select({ kind: "object", key: object.id }, false);
+    return;
+  }
   const edge = thing.kind === "edge" ? map.edges[thing.index] : undefined;
   const key = {
     edge: () => edge && derive.edgeKey(map, edge),
@@ -334,6 +348,28 @@ export function picked(pick: Pick): void {
   }[thing.kind]();
   if (key && thing.kind !== "camera") select({ kind: thing.kind, key }, thing.kind === "photo");
 }
+
+/** The smallest object whose box holds a point. */
+function objectAt(point: Vector) {
+  const { state } = page;
+  const holds = ([low, high]: Box) => point.every((v, i) => v >= (low[i] ?? v) && v <= (high[i] ?? v));
+  const size = ([low, high]: Box) => low.reduce((sum, v, i) => sum * ((high[i] ?? v) - v), 1);
+  return objectsOf(state)
+    .filter((one) => one.component === state.component && one.present && holds(one.box))
+    .sort((a, b) => size(a.box) - size(b.box))[0];
+}
+
+/** Measures from the place that was picked to the next one; again: ends it. */
+export function measure(): void {
+  const { pick, measureFrom } = page.state;
+  if (measureFrom) page.set({ measureFrom: null, pick: null });
+  else if (pick) page.set({ measureFrom: pick.point, pick: null });
+  else say("Click the first end of the length in the 3D view, then press m");
+}
+
+export const hover = (object: string | null) => {
+  if (object !== page.state.hovered) page.set({ hovered: object });
+};
 
 /** The next or previous of the list that is open. */
 export function step(by: 1 | -1): void {
@@ -347,7 +383,9 @@ export function step(by: 1 | -1): void {
         ? derive.listedScenes(state).map((one) => ({ kind: "scene", key: one.id }))
         : state.tab === "review"
           ? derive.listedEdges(state).map((one) => ({ kind: "edge", key: derive.edgeKey(map, one) }))
-          : [];
+          : objectsOf(state)
+              .filter((one) => one.component === state.component)
+              .map((one) => ({ kind: "object", key: one.id }));
   if (!keys.length) return;
   const now = keys.findIndex(({ kind, key }) => derive.isSelected(state, kind, key));
   const next = now < 0 ? (by > 0 ? 0 : keys.length - 1) : now + by;
@@ -393,6 +431,7 @@ async function send<Name extends keyof Actions>(
     const map = await act(name, body);
     page.set({ busy: null, gone: false, undo: said.undo ? [...page.state.undo, said.undo] : page.state.undo });
     edges.refresh(); // a review is one of its events
+    graphs.refresh(); // and a name one of an object's
     setMap(map);
     say(said.done);
     return true;
@@ -527,6 +566,18 @@ export const optimize = () =>
     {},
     { doing: "optimizing: all poses are solved for anew", done: "Optimized: a new revision is shown" },
   );
+
+export async function nameObject(id: string, name: string, before: string): Promise<boolean> {
+  const told = (text: string, said: string): Promise<boolean> =>
+    send("name_object", { object: id, name: text }, { doing: `naming ${id}`, done: said });
+  const undo: Undo = { label: `name of ${id}`, run: () => told(before, `Undone: name of ${id}`) };
+  const isDone = await send(
+    "name_object",
+    { object: id, name },
+    { doing: `naming ${id}`, done: name ? `${id} is called ${name}` : `Name of ${id} taken back`, undo },
+  );
+  return isDone;
+}
 
 // ---- priors -----------------------------------------------------------------------------------------------------
 

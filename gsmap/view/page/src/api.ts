@@ -1,6 +1,15 @@
 // Every request that the panels make. What comes back is data of a map that may be anybody's: shapes are checked where
 // the page would break, addresses wherever one is loaded, and nothing is ever taken for HTML.
-import type { Actions, EdgeDetail, GraphEntry, MapState, MapSummary, PlaceHistory, RevisionPoses } from "./contract";
+import type {
+  Actions,
+  EdgeDetail,
+  FloorPlan,
+  GraphEntry,
+  MapState,
+  MapSummary,
+  PlaceHistory,
+  RevisionPoses,
+} from "./contract";
 
 /** Nobody answered: the server was ended, or the way to it is cut. */
 export class Gone extends Error {}
@@ -34,6 +43,7 @@ export async function getMap(): Promise<MapSummary> {
 export const getState = () => get<MapState>("state.json");
 export const getRevision = (uri: string) => get<RevisionPoses>(below(uri));
 export const getEdge = (uri: string) => get<EdgeDetail>(below(uri));
+export const getPlan = (uri: string) => get<FloorPlan>(below(uri));
 export const getGraph = (uri: string) => get<GraphEntry>(below(uri));
 export const getHistory = (uri: string, at: string, component: number) =>
   get<PlaceHistory>(`${below(uri)}?at=${at}&component=${component}`);

@@ -39,6 +39,7 @@ export interface Component {
   up: Vector; // against gravity
   metres_per_unit: number;
   box: Box; // of what its scenes show, without floaters; map frame
+  plan: string | null; // GET: FloorPlan; null in a static page and before the first optimize
   overview: Overview | null; // every scene of it, coarsely, in one file
   merged: string | null; // a tileset of merged tiles, in this component's frame, where one was given
 }
@@ -52,8 +53,9 @@ export interface Overview {
   pending: number; // scenes that are not in it yet
   scenes: number[]; // indices into MapSummary.scenes
   counts: number[]; // Gaussians of each
-  heights: [number, number][]; // of floor and ceiling of each along `up`: nearly all of it lies between
-  size: Vector | null; // length, width and height of it all, map units
+  frame: Vector[] | null; // (8) corners of an upright box around nearly all of it, the lower four first; map frame
+  size: Vector | null; // length, width and height of that box, map units
+  has_ceiling: boolean; // from above one would see roofs: most of the floor has something over it
 }
 
 export interface SceneEntry {
@@ -63,10 +65,10 @@ export interface SceneEntry {
   num_cameras: number;
   captured_at: string | null;
   component: number;
-  status: string; // "placed", "tentative", "not placed"
+  status: string; // "placed", "one pair", "tentative", "not placed"
   S_map_scene: Matrix;
   box: Box; // without floaters; scene frame
-  corners: Vector[]; // (8) of that box in the map frame
+  corners: Vector[]; // (8) of an upright box around it, or of `box` before there is an overview; map frame
   sigma_m: number | null; // of its middle, along the worst axis
   ellipsoid: Matrix3 | null; // covariance of its middle, map frame, square units
   middle: Vector; // map frame
@@ -94,6 +96,7 @@ export interface EdgeEntry {
   source: number;
   status: "accepted" | "rejected" | "no_match";
   used: boolean | "tentative" | null;
+  one_pair: boolean; // tentative only because no loop confirms it; nothing contradicts it
   undecided: boolean;
   review: "confirm" | "reject" | null;
   note: string; // of the review
@@ -142,6 +145,13 @@ export interface PhotoEntry {
   captured_at: string | null;
 }
 
+/** GET of Component.plan: its floor plan from above. Positions are shares of width and height, from the top left. */
+export interface FloorPlan {
+  picture: string | null; // a data address
+  size_m: [number, number];
+  scenes: { scene: number; at: [number, number]; outlines: [number, number][][] }[]; // index into MapSummary.scenes
+}
+
 /** GET of SceneEntry.extras */
 export interface SceneExtras {
   layers: Record<string, Vector[]>; // nodes of its graph, map frame
@@ -169,7 +179,8 @@ export interface EdgeView {
 
 export interface ObjectEntry {
   id: string; // "o12"; 8 hex digits in a map that nobody may write
-  name: string; // what people call it, or its size
+  name: string; // given by people; empty where there is none
+  label: string; // the class that people gave it; empty where there is none
   component: number;
   position: Vector; // map frame
   box: Box;
@@ -178,6 +189,7 @@ export interface ObjectEntry {
   present: boolean;
   num_sightings: number;
   room: string | null; // id of the one it stands in
+  picture: string | null; // GET: a small picture of it; null in a static page
 }
 export interface RoomEntry {
   id: string; // "r1"
@@ -210,4 +222,5 @@ export interface Actions {
   earlier_prior: { scene: string; number: number }; // what was told of it before, by its number, holds again
   remove_prior: { scene: string };
   optimize: Record<string, never>;
+  name_object: { object: string; name: string }; // an empty name takes the last one back
 }

@@ -71,7 +71,8 @@ export function captureDays(state: State): string[] {
 
 const IS_IN: Record<EdgeFilter, (edge: EdgeEntry) => boolean> = {
   doubtful: (edge) => edge.doubt > 0 && edge.review === null,
-  tentative: (edge) => edge.used === "tentative",
+  "one pair": (edge) => edge.one_pair,
+  tentative: (edge) => edge.used === "tentative" && !edge.one_pair,
   undecided: (edge) => edge.undecided,
   rejected: (edge) => edge.status !== "accepted",
   reviewed: (edge) => edge.review !== null,
@@ -109,10 +110,12 @@ export function listedChanges(state: State): ChangeEntry[] {
 }
 
 /** How an edge stands, in one word of the map's. */
-export function standing(edge: EdgeEntry): "used" | "tentative" | "undecided" | "unused" | "rejected" | "no match" {
+export function standing(
+  edge: EdgeEntry,
+): "used" | "one pair" | "tentative" | "undecided" | "unused" | "rejected" | "no match" {
   if (edge.undecided) return "undecided";
   if (edge.status === "no_match") return "no match";
   if (edge.status === "rejected") return "rejected";
-  if (edge.used === "tentative") return "tentative";
+  if (edge.used === "tentative") return edge.one_pair ? "one pair" : "tentative";
   return edge.used === false ? "unused" : "used";
 }

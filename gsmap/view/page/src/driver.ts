@@ -1,6 +1,6 @@
 // Tells the 3D view what the state says, and only what is new in it.
 import * as actions from "./actions";
-import type { EdgeDetail, MapSummary, RevisionPoses } from "./contract";
+import type { EdgeDetail, MapSummary, RevisionPoses, Vector } from "./contract";
 import * as derive from "./derive";
 import { OVERLAYS, page } from "./state";
 import type { Overlay, State, Tab } from "./state";
@@ -45,8 +45,8 @@ const is = <T>(a: T, b: T) => a === b;
 const alike = <T>(a: T, b: T) => JSON.stringify(a) === JSON.stringify(b);
 const sameSet = <T>(a: ReadonlySet<T>, b: ReadonlySet<T>) => a.size === b.size && [...a].every((v) => b.has(v));
 
-/** Who reviews edges sees them, and who looks for things, whatever else is drawn. */
-const OF_TAB: Partial<Record<Overlay, Tab>> = { edges: "review", objects: "things", photos: "things" };
+/** Who reviews edges sees them, and who looks for photos, whatever else is drawn. */
+const OF_TAB: Partial<Record<Overlay, Tab>> = { edges: "review", photos: "things" };
 
 /** Keeps the stage at what the state says from now on. */
 export function drive(stage: Stage): () => void {
@@ -81,6 +81,8 @@ export function drive(stage: Stage): () => void {
     if (id === null || index < 0) stage.drag(null);
     else stage.drag(index, (S_map_scene) => actions.dragged(S_map_scene));
   });
+  const highlighted = new StageCall<ReadonlySet<string>>(sameSet, (ids) => stage.setHighlighted(ids));
+  const measured = new StageCall<readonly Vector[]>(alike, (points) => stage.setMeasure(points));
   const theme = new StageCall<boolean>(is, (dark) => stage.setTheme(dark));
   let things: unknown = null;
 
@@ -103,7 +105,12 @@ export function drive(stage: Stage): () => void {
     clip.now(state.clip);
     ceiling.now(state.ceiling);
     for (const [name, told] of overlays) told.now(state.overlays.has(name) || OF_TAB[name] === state.tab);
-    if (state.overlays.has("objects") || state.overlays.has("rooms") || state.tab === "things") {
+    if (
+      state.overlays.has("objects") ||
+      state.overlays.has("rooms") ||
+      state.tab === "things" ||
+      state.selection?.kind === "object"
+    ) {
       const known = actions.graphOf(state);
       if (known?.status === "ready" && known.value !== things) {
         things = known.value;
@@ -112,6 +119,9 @@ export function drive(stage: Stage): () => void {
     }
     changes.now(state.tab === "time" || state.selection?.kind === "change" ? derive.listedChanges(state) : []);
     detail.now(detailOf(state));
+    const chosen = state.selection?.kind === "object" ? state.selection.key : null;
+    highlighted.now(new Set([chosen, state.hovered].flatMap((id) => id ?? [])));
+    measured.now([state.measureFrom, state.pick?.point].flatMap((at) => (at ? [at] : [])));
     dragging.now(state.drag?.scene ?? null);
     for (const aim of actions.takeAims()) aim();
   };

@@ -32,6 +32,12 @@ function verdict(name: actions.Verdict): void {
   else void form()?.send(name);
 }
 
+function writeNote(): void {
+  const thing = document.querySelector("gs-app")?.shadowRoot?.querySelector("gs-thing")?.shadowRoot;
+  if (page.state.selection?.kind === "object") thing?.querySelector<HTMLElement>("#name")?.focus();
+  else form()?.focusNote();
+}
+
 function views(): number {
   const edge = derive.selectedEdge(page.state);
   const known = edge && actions.edges.get(edge.detail);
@@ -51,6 +57,7 @@ function findBox(): void {
 function escape(): void {
   const { state } = page;
   if (state.drag) actions.endDrag();
+  else if (state.measureFrom) actions.measure();
   else if (state.pick) page.set({ pick: null });
   else if (state.selection) actions.select(null);
 }
@@ -75,13 +82,15 @@ export const KEYS: readonly Key[] = [
   { key: "c", what: "Confirm", group: "Review", press: () => verdict("confirm") },
   { key: "r", what: "Reject", group: "Review", press: () => verdict("reject") },
   { key: "t", what: "Take the review back", group: "Review", press: () => verdict("withdraw") },
-  { key: "n", what: "Write a note", group: "Review", press: () => form()?.focusNote() },
+  { key: "n", what: "Write a note, or the name of an object", group: "Review", press: writeNote },
   { key: "u", what: "Undo the last action", group: "Review", press: mayAct(() => void actions.undo()) },
   { key: "o", what: "Optimize now", group: "Review", press: mayAct(() => void actions.optimize()) },
   { key: "b", what: "Blink, swipe, beside, difference", group: "Review", press: actions.nextComparison },
   { key: ",", what: "Previous camera", group: "Review", press: () => actions.view(-1, views()) },
   { key: ".", what: "Next camera", group: "Review", press: () => actions.view(1, views()) },
   { key: "f", what: "Fit all in view", group: "View", press: actions.fit },
+  { key: "i", what: "Walk in", group: "View", press: () => void actions.walkIn() },
+  { key: "m", what: "Measure from the place that was clicked", group: "View", press: actions.measure },
   { key: "g", what: "Fly to what is chosen", group: "View", press: () => actions.flyToSelected() },
   { key: "h", what: "Doll’s house: no ceiling", group: "View", press: () => actions.ceiling() },
   { key: "x", what: "Clip box", group: "View", press: () => actions.clip() },
@@ -103,7 +112,14 @@ export function listen(): void {
       if (event.key === "Escape") (event.composedPath()[0] as HTMLElement).blur();
       return;
     }
-    if (page.state.help) return; // the dialog has the keys to itself
+    if (page.state.help) {
+      // The dialog has the keys to itself; its own closing comes only with the next picture.
+      if (event.key === "Escape") {
+        event.preventDefault();
+        actions.help(false);
+      }
+      return;
+    }
     const isInDialog = event.composedPath().some((one) => one instanceof HTMLDialogElement);
     if (event.key === "Escape" && isInDialog) return; // which it closes
     const found = KEYS.find((one) => one.key === event.key);

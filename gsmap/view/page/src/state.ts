@@ -1,6 +1,6 @@
 // What the page shows, in one value. Elements read it, actions change it, and whoever shows a part of it is told.
 // Scenes, pairs and changes are named by their ids, so a map that others changed meanwhile keeps what was chosen.
-import type { Box, MapSummary, Matrix } from "./contract";
+import type { Box, MapSummary, Matrix, Vector } from "./contract";
 import type { Pick, Source, Stage, Standpoint } from "./stage/stage";
 
 export const TABS = ["look", "review", "time", "things"] as const;
@@ -9,7 +9,7 @@ export type Tab = (typeof TABS)[number];
 export const OVERLAYS = ["cameras", "nodes", "boxes", "edges", "ellipsoids", "objects", "rooms", "photos"] as const;
 export type Overlay = (typeof OVERLAYS)[number];
 
-export const EDGE_FILTERS = ["doubtful", "tentative", "undecided", "rejected", "reviewed", "all"] as const;
+export const EDGE_FILTERS = ["doubtful", "one pair", "tentative", "undecided", "rejected", "reviewed", "all"] as const;
 export type EdgeFilter = (typeof EDGE_FILTERS)[number];
 
 export const CHANGE_FILTERS = ["open", "confirmed", "rejected", "all"] as const;
@@ -84,6 +84,8 @@ export interface State {
   until: string | null; // only scenes captured until then
   revision: number | null; // null: the newest
   pick: Pick | null;
+  measureFrom: Vector | null; // the first end of a measured length, map frame; the second is picked
+  hovered: string | null; // id of the object in the list that the pointer is on
   drag: Drag | null;
   standpoint: Standpoint | null;
   busy: string | null; // what the server is doing
@@ -121,6 +123,8 @@ export function initial(): State {
     until: null,
     revision: null,
     pick: null,
+    measureFrom: null,
+    hovered: null,
     drag: null,
     standpoint: null,
     busy: null,

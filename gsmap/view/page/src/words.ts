@@ -1,5 +1,5 @@
 // Numbers, dates and lengths as the page writes them.
-import type { Box, Matrix, PhotoEntry, Vector } from "./contract";
+import type { Box, Matrix, ObjectEntry, PhotoEntry, Vector } from "./contract";
 import type { Standpoint } from "./stage/stage";
 
 const count = new Intl.NumberFormat("en");
@@ -56,6 +56,15 @@ export function moved(from: Matrix, now: Matrix, middle: Vector, metresPerUnit: 
     metres: Math.hypot(...a.map((v, i) => v - (b[i] ?? 0))) * metresPerUnit,
     degrees: (Math.acos(cosine) * 180) / Math.PI,
   };
+}
+
+/** What an object is called: by people, else by its number. */
+export const titleOf = (one: ObjectEntry) => one.name || (one.label ? `${one.label} (${one.id})` : one.id);
+
+/** Two sides and the height of an object, in metres. */
+export function sizeOf(one: ObjectEntry, metresPerUnit: number): string {
+  const sides = one.box[1].map((v, i) => Math.max(0, v - (one.box[0][i] ?? v)) * metresPerUnit);
+  return `${sides.map((side) => side.toFixed(side < 0.995 ? 2 : 1)).join(" × ")} m`;
 }
 
 export const middleOf = (box: Box) => box[0].map((v, i) => (v + (box[1][i] ?? v)) / 2) as Vector;

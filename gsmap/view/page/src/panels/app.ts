@@ -12,7 +12,9 @@ import { icon } from "./icons";
 import "./change";
 import "./divider";
 import "./edge";
+import "./entry";
 import "./help";
+import "./labels";
 import "./look";
 import "./notices";
 import "./place";
@@ -275,6 +277,8 @@ export class App extends Panel {
       </aside>
       <main>
         <slot></slot>
+        <gs-labels></gs-labels>
+        <gs-entry></gs-entry>
         ${state.split ? html`<gs-divider></gs-divider>` : nothing}
         <gs-tools></gs-tools>
         <gs-progress></gs-progress>

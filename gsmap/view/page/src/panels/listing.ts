@@ -70,6 +70,25 @@ export class Listing extends LitElement {
         border-radius: 6px;
         gap: 1px;
       }
+      .choose.pictured {
+        grid-template-columns: 84px minmax(0, 1fr);
+        column-gap: 10px;
+      }
+      .pictured img {
+        grid-row: 1 / 4;
+        width: 84px;
+        height: 63px;
+        object-fit: cover;
+        border-radius: 4px;
+        background: var(--line);
+      }
+      .pictured .name {
+        align-self: end;
+        -webkit-line-clamp: 1;
+      }
+      .pictured .detail {
+        align-self: start;
+      }
       .choose:focus-visible {
         outline: 2px solid var(--focus);
         outline-offset: -2px;

@@ -4,8 +4,8 @@ import { customElement, state } from "lit/decorators.js";
 import * as actions from "../actions";
 import * as derive from "../derive";
 import { page } from "../state";
-import type { PlaceHistory } from "../contract";
-import { day, point } from "../words";
+import type { Component, PlaceHistory, Vector } from "../contract";
+import { day, metres, point } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
@@ -53,9 +53,12 @@ export class Place extends Panel {
   @state() private asked: string | null = null; // the place whose history was asked for
 
   protected override render() {
-    const { map, pick, component } = this.state;
-    if (!map || !pick) return nothing;
-    const unit = derive.componentOf(map, component)?.metres_per_unit ?? 1;
+    const { map, pick, component, measureFrom } = this.state;
+    const shown = map && derive.componentOf(map, component);
+    if (!map || !shown || (!pick && !measureFrom)) return nothing;
+    const unit = shown.metres_per_unit;
+    if (measureFrom) return this.measure(measureFrom, pick?.point ?? null, shown);
+    if (!pick) return nothing;
     const scene = pick.scene === null ? undefined : map.scenes[pick.scene];
     const key = `${component} ${pick.point.map((v) => v.toFixed(4)).join(",")}`;
     const isAsked = this.asked === key;
@@ -76,6 +79,9 @@ export class Place extends Panel {
                 ${icon("clock")} What happened here
               </button>`
         }
+        <button class="plain" title="Measure from here (m)" @click=${actions.measure}>
+          ${icon("ruler")} Measure from here
+        </button>
         <button class="plain square" aria-label="Close" @click=${() => page.set({ pick: null })}>
           ${icon("close")}
         </button>
@@ -90,6 +96,29 @@ export class Place extends Panel {
             )
           : nothing
       }
+    </div>`;
+  }
+
+  private measure(from: Vector, to: Vector | null, { up, metres_per_unit: unit }: Component) {
+    const off = to ? from.map((v, i) => (to[i] ?? v) - v) : [];
+    const high = Math.abs(off.reduce((sum, v, i) => sum + v * (up[i] ?? 0), 0));
+    const whole = Math.hypot(...off);
+    return html`<div class="card" role="group" aria-label="A length">
+      <div class="row">
+        ${
+          to
+            ? html`<strong class="figures" role="status">${metres(whole * unit)}</strong>
+                <span class="figures muted">height ${metres(high * unit)}</span>
+                <span class="figures muted"
+                  >level ${metres(Math.sqrt(Math.max(0, whole ** 2 - high ** 2)) * unit)}</span
+                >
+                <span class="figures muted">${point(from, unit)} to ${point(to, unit)}</span>`
+            : html`<span role="status">Click the other end of the length</span>`
+        }
+        <button class="plain square" aria-label="End measuring" title="End measuring (Esc)" @click=${actions.measure}>
+          ${icon("close")}
+        </button>
+      </div>
     </div>`;
   }
 

@@ -14,6 +14,7 @@ import "./listing";
 
 const NAMES: Record<EdgeFilter, string> = {
   doubtful: "To review",
+  "one pair": "One pair",
   tentative: "Tentative",
   undecided: "Undecided",
   rejected: "Rejected",
@@ -23,6 +24,7 @@ const NAMES: Record<EdgeFilter, string> = {
 
 const MARKS: Record<ReturnType<typeof derive.standing>, string> = {
   used: "good",
+  "one pair": "warn hollow",
   tentative: "warn",
   undecided: "warn hollow",
   unused: "bad hollow",
@@ -34,7 +36,8 @@ const SAID = { confirm: "confirmed", reject: "rejected" };
 
 const NONE: Record<EdgeFilter, string> = {
   doubtful: "Nothing is in doubt on this component. “All” lists every pair that was tried.",
-  tentative: "No tentative edge: every scene is held by a loop, or by a review.",
+  "one pair": "No scene is placed by one pair alone.",
+  tentative: "No tentative edge.",
   undecided: "No undecided edge: no two groups of edges contradict each other.",
   rejected: "No pair was rejected.",
   reviewed: "No pair has been reviewed yet.",

@@ -12,7 +12,7 @@ import { heading } from "./heading";
 import { icon } from "./icons";
 import { markOf } from "./review";
 
-const MARKS: Record<string, string> = { placed: "good", tentative: "warn" };
+const MARKS: Record<string, string> = { placed: "good", "one pair": "warn hollow", tentative: "warn" };
 const MOST_EDGES = 12;
 
 @customElement("gs-scene")

@@ -11,7 +11,7 @@ import { shared } from "./css";
 import { icon } from "./icons";
 import "./listing";
 
-const MARKS: Record<string, string> = { placed: "good", tentative: "warn" };
+const MARKS: Record<string, string> = { placed: "good", "one pair": "warn hollow", tentative: "warn" };
 
 @customElement("gs-scene-list")
 export class SceneList extends Panel {

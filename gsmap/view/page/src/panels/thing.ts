@@ -1,10 +1,11 @@
 // One object or one localised photograph.
-import { html, nothing } from "lit";
+import { css, html, nothing } from "lit";
 import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
+import { relative } from "../api";
 import type { GraphEntry, ObjectEntry, PhotoEntry } from "../contract";
 import * as derive from "../derive";
-import { day, metres, moment, plural, point } from "../words";
+import { day, metres, moment, plural, point, titleOf } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { heading } from "./heading";
@@ -14,7 +15,21 @@ import type { Vector } from "../contract";
 
 @customElement("gs-thing")
 export class Thing extends Panel {
-  static override styles = [shared, heading.styles];
+  static override styles = [
+    shared,
+    heading.styles,
+    css`
+      .picture {
+        display: block;
+        width: 100%;
+        border-radius: 6px;
+        background: #000;
+      }
+      form input {
+        min-width: 0;
+      }
+    `,
+  ];
 
   protected override render() {
     const { state } = this;
@@ -43,14 +58,20 @@ export class Thing extends Panel {
 
   private object(one: ObjectEntry, graph: GraphEntry) {
     const unit = this.unit(one.component);
-    const nameOf = (id: string) => graph.objects.find((other) => other.id === id)?.name ?? id;
+    const named = (id: string) => {
+      const found = graph.objects.find((other) => other.id === id);
+      return found ? titleOf(found) : id;
+    };
+    const picture = relative(one.picture);
     const room = graph.rooms.find(({ id }) => id === one.room);
     const relations = graph.relations.filter(({ a, b }) => a === one.id || b === one.id);
     const sides = one.box[1].map((v, i) => metres((v - (one.box[0][i] ?? v)) * unit));
     return html`
-      ${heading(one.name, html`<span class="mark ${one.present ? "good" : "hollow"}">${one.present ? "there" : "gone"}</span> <span>${one.id}</span>`)}
+      ${heading(titleOf(one), html`<span class="mark ${one.present ? "good" : "hollow"}">${one.present ? "there" : "gone"}</span> <span>${one.id}</span>`)}
       <div class="body">
+        ${picture ? html`<img class="picture" src=${picture} alt="Picture of ${titleOf(one)}" />` : nothing}
         <section class="row">
+          ${actions.mayAct(this.state) ? this.naming(one) : nothing}
           <button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>
         </section>
         <section>
@@ -80,13 +101,34 @@ export class Thing extends Panel {
             ? html`<section>
                 <h3>How it stands to others</h3>
                 <ul>
-                  ${relations.map(({ a, b, kind }) => html`<li class="anywhere">${nameOf(a)} ${kind} ${nameOf(b)}</li>`)}
+                  ${relations.map(({ a, b, kind }) => html`<li class="anywhere">${named(a)} ${kind} ${named(b)}</li>`)}
                 </ul>
               </section>`
             : nothing
         }
       </div>
     `;
+  }
+
+  private naming(one: ObjectEntry) {
+    const send = (event: Event) => {
+      event.preventDefault();
+      const input = (event.target as HTMLFormElement).querySelector("input");
+      const name = input?.value.trim() ?? "";
+      if (name !== one.name) void actions.nameObject(one.id, name, one.name);
+      input?.blur();
+    };
+    return html`<form class="row grow" @submit=${send}>
+      <input
+        id="name"
+        class="grow"
+        maxlength="100"
+        aria-label="Name of ${one.id}"
+        placeholder="Give it a name"
+        .value=${one.name}
+      />
+      <button type="submit" ?disabled=${this.state.busy !== null}>Name it</button>
+    </form>`;
   }
 
   private photo(one: PhotoEntry) {

@@ -2,9 +2,11 @@
 import { css, html, nothing } from "lit";
 import { customElement, state } from "lit/decorators.js";
 import * as actions from "../actions";
+import { relative } from "../api";
 import type { ObjectEntry, PhotoEntry } from "../contract";
+import * as derive from "../derive";
 import { page } from "../state";
-import { day, plural } from "../words";
+import { day, plural, sizeOf, titleOf } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import "./listing";
@@ -82,7 +84,8 @@ export class Things extends Panel {
       () => actions.graphs.forget(),
       ({ objects }) => {
         const listed = objects.filter(
-          (one) => one.component === this.state.component && this.fits(one.name, one.id, one.room, one.last_seen),
+          (one) =>
+            one.component === this.state.component && this.fits(one.name, one.label, one.id, one.room, one.last_seen),
         );
         return listed.length
           ? this.list("Objects", listed, (one) => one.id, this.object, "object")
@@ -112,6 +115,7 @@ export class Things extends Panel {
       <p class="muted small" role="status">${plural(items.length, kind)}</p>
       <gs-listing
         label=${label}
+        rem=${kind === "object" ? "4.4" : "3.4"}
         .items=${items}
         .keyOf=${keyOf}
         .row=${row}
@@ -121,16 +125,34 @@ export class Things extends Panel {
     </div>`;
   }
 
-  private readonly object = (one: ObjectEntry) =>
-    html`<span role="gridcell" class="wide ${one.present ? "" : "off"}"
-      ><button class="choose" title=${one.name} @click=${() => actions.select({ kind: "object", key: one.id })}>
-        <span class="name">${one.name}</span>
+  private readonly object = (one: ObjectEntry) => {
+    const { map } = this.state;
+    const unit = (map && derive.componentOf(map, one.component)?.metres_per_unit) ?? 1;
+    const picture = relative(one.picture);
+    const hover = () => actions.hover(one.id);
+    const leave = () => actions.hover(null);
+    return html`<span
+      role="gridcell"
+      class="wide ${one.present ? "" : "off"}"
+      @pointerenter=${hover}
+      @pointerleave=${leave}
+      @focusin=${hover}
+      @focusout=${leave}
+      ><button
+        class="choose pictured"
+        title=${titleOf(one)}
+        @click=${() => actions.select({ kind: "object", key: one.id })}
+      >
+        ${picture ? html`<img src=${picture} alt="Picture of ${one.id}" loading="lazy" decoding="async" width="84" height="63" />` : nothing}
+        <span class="name">${titleOf(one)}</span>
+        <span class="detail">${sizeOf(one, unit)}</span>
         <span class="detail"
-          ><span>${one.present ? `seen ${plural(one.num_sightings, "time")}` : "gone"}</span
-          >${one.room ? html`<span>${one.room}</span>` : nothing}<span>${day(one.last_seen)}</span></span
+          ><span>${one.room ?? ""}</span
+          ><span>${one.present ? (one.last_seen ? day(one.last_seen) : nothing) : "gone"}</span></span
         >
       </button></span
     >`;
+  };
 
   private readonly photo = (one: PhotoEntry) =>
     html`<span role="gridcell" class="wide"

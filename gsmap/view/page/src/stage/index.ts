@@ -4,6 +4,7 @@ import { TransformControls } from "three/addons/controls/TransformControls.js";
 import { Object3D } from "three";
 import type {
   Box,
+  Component,
   EdgeDetail,
   GraphEntry,
   MapSummary,
@@ -34,8 +35,6 @@ const SHORTEST_MS = 50;
 const LONGEST_MS = 2000;
 /** How far up a room reaches that is drawn without its ceiling: of what its scene shows, from the floor. */
 const CEILING_AT = 0.72;
-/** Components of at most so many scenes are first seen from where their captures were made. */
-const STAND_INSIDE = 8;
 
 interface Split {
   at: number;
@@ -58,6 +57,8 @@ class View3D implements Stage {
     pending: 0,
     settled: false,
     error: null,
+    isShown: false,
+    isAbove: false,
   };
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
@@ -83,10 +84,14 @@ class View3D implements Stage {
   private gizmos: { handle: Object3D; controls: TransformControls[] } | null = null;
   private readonly shownOverlays = new Set<Overlay>();
   private graph: GraphEntry = { objects: [], relations: [], rooms: [] };
+  private highlighted: ReadonlySet<string> = new Set();
+  private measured: readonly Vector[] = [];
   private changes: ChangeEntry[] = [];
   private detail: EdgeDetail | null = null;
-  private readonly extras = new Map<string, SceneExtras | null>(); // by address; null while it is on its way
-  private hasStood = false;
+  private readonly extras = new Map<string, Promise<SceneExtras | null>>(); // by address, asked for once
+  private readonly extrasOf = new Map<string, SceneExtras>(); // those that are there
+  private hasStood = false; // the viewer was put, or went, where they are
+  private top = Infinity; // height above which the viewer sees ceilings
   private scheduled = 0;
   private isStale = true; // the order and the colours are another view's
   private isPreparing = false;
@@ -112,6 +117,7 @@ class View3D implements Stage {
     canvas.addEventListener("pointerdown", this.onDown);
     canvas.addEventListener("pointerup", this.onUp);
     canvas.addEventListener("dblclick", this.onDouble);
+    for (const name of ["wheel", "keydown"] as const) canvas.addEventListener(name, this.onOwnWay, { passive: true });
     this.observer = new ResizeObserver(this.resize);
     this.observer.observe(canvas);
     this.resize();
@@ -140,7 +146,7 @@ class View3D implements Stage {
     this.place();
     this.drawOverlays();
     this.cut();
-    if (isOther) this.fit(undefined, false);
+    if (!this.hasStood) this.fit(undefined, false);
     this.refresh();
   }
 
@@ -182,6 +188,16 @@ class View3D implements Stage {
 
   setGraph(graph: GraphEntry): void {
     this.graph = graph;
+    this.drawOverlays();
+  }
+
+  setHighlighted(objects: ReadonlySet<string>): void {
+    this.highlighted = objects;
+    this.drawOverlays();
+  }
+
+  setMeasure(points: readonly Vector[]): void {
+    this.measured = points;
     this.drawOverlays();
   }
 
@@ -252,47 +268,46 @@ class View3D implements Stage {
     this.refresh();
   }
 
-  /** Lowest and highest along the component's up of what is drawn, and the box of it. */
-  private seenBox(): Box3 {
-    const out = new Box3();
-    this.map?.scenes.forEach((scene, i) => {
-      if (!this.isInComponent(i)) return;
-      if (!this.visible.has(i) && !this.split?.scenes.has(i)) return;
-      out.union(new Box3(new Vector3(...scene.box[0]), new Vector3(...scene.box[1])).applyMatrix4(this.poseOf(i)));
-    });
-    const shown = this.map?.components.find((one) => one.component === this.component);
-    if (out.isEmpty() && shown) out.set(new Vector3(...shown.box[0]), new Vector3(...shown.box[1]));
-    return out;
+  private get shown(): Component | undefined {
+    return this.map?.components.find((one) => one.component === this.component);
+  }
+
+  /** Corners of boxes around all that is drawn. */
+  private seenCorners(): Vector3[] {
+    const { map, shown } = this;
+    const at = (corner: Vector) => new Vector3(...corner);
+    const inside = map?.scenes.map((_, i) => i).filter((i) => this.isInComponent(i)) ?? [];
+    const isWhole = inside.every((i) => this.isSeen(i)) && !this.revision && !this.dragged;
+    if (isWhole && shown?.overview?.frame) return shown.overview.frame.map(at);
+    const corners = inside
+      .filter((i) => this.isSeen(i))
+      .flatMap((i) => map?.scenes[i]?.corners.map((one) => at(one).applyMatrix4(this.movedBy(i))) ?? []);
+    return corners.length || !shown ? corners : new Array(8).fill(0).map((_, k) => at(cornerOf(shown.box, k)));
   }
 
   private cut(): void {
     const box = this.clip.box;
     const clip = box && { low: new Vector3(...box[0]), high: new Vector3(...box[1]) };
-    let ceiling: Vector4 | null = null;
-    if (!this.isCeilingShown && this.map) {
-      const up = this.view.camera.up;
-      let [low, high] = [Infinity, -Infinity];
-      this.map.scenes.forEach((scene, i) => {
-        if (!this.isInComponent(i) || !this.visible.has(i)) return;
-        const [floor, top] = this.heights(scene, i, up);
-        [low, high] = [Math.min(low, floor), Math.max(high, top)];
-      });
-      if (high > low) ceiling = new Vector4(up.x, up.y, up.z, low + CEILING_AT * (high - low));
-    }
-    this.splatRenderer.setCuts(clip, ceiling);
+    const { up } = this.view.camera;
+    const { at, top } = this.ceilingOf(this.seenCorners());
+    this.top = this.shown?.overview?.has_ceiling ? top : Infinity;
+    const isCut = top > -Infinity && (!this.isCeilingShown || this.state.isAbove);
+    this.splatRenderer.setCuts(clip, isCut ? new Vector4(up.x, up.y, up.z, at) : null);
   }
 
-  /** Where floor and ceiling of a scene are along a direction; by its box, which a turned frame makes too high, where
-   * nobody has looked for them. */
-  private heights(scene: SceneEntry, index: number, up: Vector3): [number, number] {
-    const overview = this.map?.components.find((one) => one.component === scene.component)?.overview;
-    const known = this.revision ? undefined : overview?.heights?.[overview.scenes.indexOf(index)];
-    if (known) return known;
-    const pose = this.poseOf(index);
-    const heights = Array.from({ length: 8 }, (_, k) =>
-      new Vector3(...([0, 1, 2].map((a) => scene.box[(k >> a) & 1]?.[a] ?? 0) as Vector)).applyMatrix4(pose).dot(up),
-    );
-    return [Math.min(...heights), Math.max(...heights)];
+  /** From which height on ceilings are left out of what has these corners, and how high it is. */
+  private ceilingOf(corners: readonly Vector3[]): { at: number; top: number } {
+    const heights = corners.map((corner) => corner.dot(this.view.camera.up));
+    const [low, top] = [Math.min(...heights), Math.max(...heights)];
+    return { at: low + CEILING_AT * (top - low), top };
+  }
+
+  /** Ceilings go as the viewer rises above them, and come back as they walk in. */
+  private lookWhetherAbove(eye: Vector3): void {
+    const isAbove = eye.dot(this.view.camera.up) > this.top;
+    if (isAbove === this.state.isAbove) return;
+    this.state.isAbove = isAbove;
+    this.cut();
   }
 
   // ---- the view ---------------------------------------------------------------------------------------------------
@@ -309,11 +324,29 @@ class View3D implements Stage {
   fit(box?: Box, fly = true): void {
     if (box) {
       this.hasStood = true;
-      this.view.fit(new Box3(new Vector3(...box[0]), new Vector3(...box[1])), fly);
+      this.view.fit(
+        new Array(8).fill(0).map((_, k) => new Vector3(...cornerOf(box, k))),
+        fly,
+      );
       return;
     }
-    this.view.fit(this.seenBox(), fly);
-    if (!this.hasStood) void this.standInside();
+    let corners = this.seenCorners();
+    if (!corners.length) return;
+    const { up } = this.view.camera;
+    if (this.shown?.overview?.has_ceiling) {
+      const { at } = this.ceilingOf(corners);
+      corners = corners.map((corner) => corner.clone().addScaledVector(up, Math.min(0, at - corner.dot(up))));
+    }
+    this.view.fit(corners, fly, this.acrossFrame());
+  }
+
+  /** The level direction from which the component is widest. */
+  private acrossFrame(): Vector3 | undefined {
+    const frame = this.shown?.overview?.frame?.map((corner) => new Vector3(...corner));
+    const [origin, along, across] = frame ?? [];
+    if (!origin || !along || !across) return undefined;
+    const isWide = this.view.camera.aspect >= 1;
+    return (isWide ? origin.sub(across) : origin.sub(along)).normalize();
   }
 
   standAtCamera(T_map_camera: Matrix, intrinsics: [number, number, number, number], size: [number, number]): void {
@@ -321,15 +354,18 @@ class View3D implements Stage {
     this.view.standAtCamera(T_map_camera, intrinsics, size);
   }
 
-  /** A small component is first seen as its captures saw it: from above, a room is its ceiling. */
-  private async standInside(): Promise<void> {
+  async walkIn(scene?: number): Promise<boolean> {
     const { map, component } = this;
-    const scenes = map?.scenes.filter((scene) => scene.component === component) ?? [];
-    const [first] = [...scenes].sort((a, b) => b.num_gaussians - a.num_gaussians);
-    if (!first || scenes.length > STAND_INSIDE) return;
-    const extras = await this.fetchExtras(first.extras);
-    const cameras = extras?.cameras ?? [];
-    if (!cameras.length || this.hasStood || this.map !== map || this.component !== component) return;
+    const scenes =
+      map?.scenes.filter((one, i) => one.component === component && one.num_cameras && this.isSeen(i)) ?? [];
+    const [largest] = [...scenes].sort((a, b) => b.num_gaussians - a.num_gaussians);
+    const first = scene === undefined ? largest : map?.scenes[scene];
+    const extras = first && (await this.fetchExtras(first.extras));
+    const moved = this.movedBy(map?.scenes.indexOf(first as SceneEntry) ?? -1);
+    const cameras = extras?.cameras.map((frustum) =>
+      frustum.map((at) => new Vector3(...at).applyMatrix4(moved).toArray()),
+    );
+    if (!cameras?.length || this.map !== map || this.component !== component) return false;
     // From the camera that has most of the capture before it: the others' places lie ahead.
     const apexes = cameras.map((frustum) => new Vector3(...(frustum[0] as Vector)));
     const middle = apexes.reduce((sum, at) => sum.add(at), new Vector3()).divideScalar(apexes.length);
@@ -350,8 +386,23 @@ class View3D implements Stage {
     const distance = Math.max(eye.distanceTo(middle), this.view.controls.minDistance * 5);
     const target = eye.clone().addScaledVector(looks[best] as Vector3, distance);
     this.hasStood = true;
-    this.view.stand({ position: eye.toArray(), target: target.toArray() }, false);
+    this.view.stand({ position: eye.toArray(), target: target.toArray() }, true);
+    return true;
   }
+
+  project(point: Vector): [number, number] | null {
+    const { camera } = this.view;
+    const at = new Vector3(...point).applyMatrix4(camera.matrixWorldInverse);
+    if (at.z > -camera.near) return null;
+    at.applyMatrix4(camera.projectionMatrix);
+    const { clientWidth: width, clientHeight: height } = this.options.canvas;
+    return [((at.x + 1) / 2) * width, ((1 - at.y) / 2) * height];
+  }
+
+  /** The viewer has moved of their own: what comes later does not move them. */
+  private readonly onOwnWay = (): void => {
+    this.hasStood = true;
+  };
 
   private readonly resize = (): void => {
     const { canvas } = this.options;
@@ -404,6 +455,7 @@ class View3D implements Stage {
       this.last.copy(viewProjection);
       this.isStale = true;
     }
+    this.lookWhetherAbove(new Vector3().setFromMatrixPosition(camera.matrixWorld));
     if (this.isStale && this.loader) {
       const nearest = camera.near;
       const focalPx = ((camera.projectionMatrix.elements[5] ?? 1) * this.renderer.domElement.height) / 2;
@@ -415,6 +467,7 @@ class View3D implements Stage {
     this.splatRenderer.draw(this.scene, camera, camera.near);
     this.state.frames++;
     this.count();
+    this.options.canvas.dispatchEvent(new Event("drawn"));
     if (this.isMoving) this.draw();
     else {
       if (wasMoving) this.options.onMove(this.standpoint());
@@ -432,6 +485,7 @@ class View3D implements Stage {
       this.fail(error instanceof Error ? error.message : String(error));
     }
     this.isPreparing = false;
+    this.state.isShown ||= (this.loader?.splats ?? 0) > 0;
     this.costMs = performance.now() - start;
     this.draw();
   }
@@ -471,13 +525,12 @@ class View3D implements Stage {
 
   private fetchExtras(uri: string): Promise<SceneExtras | null> {
     const known = this.extras.get(uri);
-    if (known !== undefined) return Promise.resolve(known);
-    this.extras.set(uri, null);
-    return fetch(new URL(uri, document.baseURI))
+    if (known) return known;
+    const asked = fetch(new URL(uri, document.baseURI))
       .then(async (response) => {
         if (!response.ok) throw new Error(`${uri}: ${response.status} ${response.statusText}`);
         const extras = (await response.json()) as SceneExtras;
-        this.extras.set(uri, extras);
+        this.extrasOf.set(uri, extras);
         this.drawOverlays();
         return extras;
       })
@@ -485,6 +538,8 @@ class View3D implements Stage {
         this.fail(error instanceof Error ? error.message : String(error));
         return null;
       });
+    this.extras.set(uri, asked);
+    return asked;
   }
 
   private drawOverlays(): void {
@@ -501,8 +556,8 @@ class View3D implements Stage {
     if (on.has("cameras") || on.has("nodes"))
       for (const i of here) {
         const scene = map.scenes[i];
-        const extras = scene && this.extras.get(scene.extras);
-        if (scene && extras === undefined) void this.fetchExtras(scene.extras);
+        const extras = scene && this.extrasOf.get(scene.extras);
+        if (scene && !extras) void this.fetchExtras(scene.extras);
         if (!extras) continue;
         const moved = this.movedBy(i);
         if (on.has("cameras"))
@@ -565,19 +620,17 @@ class View3D implements Stage {
         : [],
     );
     const things: Lines[] = [];
-    if (on.has("objects")) {
-      const places = new Map(this.graph.objects.map((one) => [one.id, one]));
-      this.graph.objects.forEach((object, index) => {
-        if (isHere(object.component))
-          things.push({ points: boxLines(object.box), colour: COLOURS.object, thing: { kind: "object", index } });
-      });
-      for (const { a, b } of this.graph.relations) {
-        const [from, to] = [places.get(a), places.get(b)];
-        if (from && to && isHere(from.component) && isHere(to.component))
-          things.push({ points: [...from.position, ...to.position], colour: COLOURS.relation });
-      }
-    }
-    overlays.set("objects", things);
+    const isDrawn = ({ id, component }: { id: string; component: number }) =>
+      isHere(component) && (on.has("objects") || this.highlighted.has(id));
+    this.graph.objects.forEach((object, index) => {
+      if (isDrawn(object))
+        things.push({ points: boxLines(object.box), colour: COLOURS.object, thing: { kind: "object", index } });
+    });
+    overlays.set("objects", things, 2);
+    const [from, to] = this.measured;
+    const marks = this.measured.flatMap((at) => crossLines(at, 0.06 * unit));
+    if (from && to) marks.push(...from, ...to);
+    overlays.set("measure", [{ points: marks, colour: COLOURS.measure }], 2.5);
     const rooms = on.has("rooms") ? this.graph.rooms.filter((room) => isHere(room.component)) : [];
     overlays.set("rooms", [{ points: rooms.flatMap((room) => room.outline.flat(2)), colour: COLOURS.room }], 2);
     overlays.set(
@@ -736,6 +789,7 @@ class View3D implements Stage {
     canvas.removeEventListener("pointerdown", this.onDown);
     canvas.removeEventListener("pointerup", this.onUp);
     canvas.removeEventListener("dblclick", this.onDouble);
+    for (const name of ["wheel", "keydown"] as const) canvas.removeEventListener(name, this.onOwnWay);
     this.observer.disconnect();
     this.drag(null);
     this.clip.dispose();
@@ -746,6 +800,9 @@ class View3D implements Stage {
     this.renderer.dispose();
   }
 }
+
+const cornerOf = ([low, high]: Box, k: number) =>
+  [0, 1, 2].map((axis) => ((k >> axis) & 1 ? high : low)[axis]) as Vector;
 
 function photoLines(photo: PhotoEntry, depth: number): number[] {
   const pose = new Matrix4().set(...(photo.T_map_camera.flat() as Sixteen));

@@ -30,10 +30,10 @@ export const COLOURS = {
   box: 0x97a3b6,
   ellipsoid: 0xc792ea,
   object: 0x5ad1e6,
-  relation: 0x3c8ea0,
   room: 0xe7e3d4,
   correspondence: 0x9be564,
   clip: 0x4f9dff,
+  measure: 0xff4fa3,
 };
 export const CHANGE_COLOURS: Record<ChangeEntry["kind"], number> = {
   appeared: 0x2fbf83,

@@ -36,8 +36,11 @@ export interface StageState {
   pending: number; // tiles on their way
   settled: boolean; // nothing more to load, sort or draw for this standpoint
   error: string | null;
+  isShown: boolean; // some splats have been drawn
+  isAbove: boolean; // the viewer is higher than all that is drawn: ceilings are left out
 }
 
+/** The canvas gets an event "drawn" after every picture. */
 export interface Stage {
   readonly state: StageState;
   /** Shows a map; again after an action, keeping what is loaded. */
@@ -48,9 +51,14 @@ export interface Stage {
   setSplit(split: { at: number; scenes: ReadonlySet<number>; source: Source } | null): void;
   /** What lies outside is not drawn; drawn with handles, and `onChange` is told as they are dragged. */
   setClip(box: Box | null, onChange?: (box: Box) => void): void;
-  setCeiling(shown: boolean): void; // doll's house
+  /** Whether ceilings are drawn; from above they never are (doll's house). */
+  setCeiling(shown: boolean): void;
   setOverlay(name: Overlay, shown: boolean): void;
   setGraph(graph: GraphEntry): void; // of the objects
+  /** Objects whose boxes and relations are drawn, whatever else is; by their ids. */
+  setHighlighted(objects: ReadonlySet<string>): void;
+  /** A length that is measured, or a place that was picked. */
+  setMeasure(points: readonly Vector[]): void;
   setChanges(changes: ChangeEntry[]): void; // boxes coloured by kind
   setCorrespondences(detail: EdgeDetail | null): void;
   /** Poses of an old revision in place of the newest ones; null goes back. */
@@ -59,6 +67,10 @@ export interface Stage {
   drag(scene: number | null, onDrag?: (S_map_scene: Matrix) => void): void;
   stand(at: Standpoint, fly?: boolean): void;
   fit(box?: Box, fly?: boolean): void; // all that is visible, or one box
+  /** Stands where a capture was made: of this scene, or of the largest one. Gives whether any has cameras. */
+  walkIn(scene?: number): Promise<boolean>;
+  /** Where a point of the map is on the canvas, in its pixels; null behind the viewer. */
+  project(point: Vector): [number, number] | null;
   standpoint(): Standpoint;
   setTheme(dark: boolean): void;
   /** Renders once with the camera of a capture: for tests of fidelity. */

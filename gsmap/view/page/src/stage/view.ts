@@ -22,6 +22,8 @@ CameraControls.install({
 const FIELD_DEG = 60;
 const STEP = 0.08; // of the distance to what is looked at, for one key
 const TURN = Math.PI / 36;
+const ELEVATION = (68 * Math.PI) / 180; // of the viewer over what is seen whole
+const FILL = 0.97; // of the view, by what is seen whole
 
 export class View {
   readonly camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01, 1000);
@@ -119,16 +121,33 @@ export class View {
     this.stand({ position: near.toArray(), target: point.toArray() }, true);
   }
 
-  /** Sees a box whole, obliquely from above. */
-  fit(box: Box3, fly: boolean): void {
-    const sphere = box.getBoundingSphere(new Sphere());
-    const half = Math.atan(Math.tan((this.camera.fov * Math.PI) / 360) * Math.min(1, this.camera.aspect));
-    const distance = Math.max(sphere.radius, 1e-3) / Math.sin(half) / 1.15;
-    const up = this.camera.up.clone();
-    const aside = new Vector3(Math.abs(up.x) < 0.9 ? 1 : 0, Math.abs(up.x) < 0.9 ? 0 : 1, 0).cross(up).normalize();
-    const way = aside.multiplyScalar(Math.cos(Math.PI / 3.6)).addScaledVector(up, Math.sin(Math.PI / 3.6));
-    const eye = sphere.center.clone().addScaledVector(way, distance);
-    this.stand({ position: eye.toArray(), target: sphere.center.toArray() }, fly);
+  /**
+   * Sees points whole, obliquely from above, as large as they fit.
+   * @param aside level direction in which the viewer stands; else any
+   */
+  fit(points: readonly Vector3[], fly: boolean, aside?: Vector3): void {
+    const up = this.camera.up;
+    const side = aside ?? new Vector3(Math.abs(up.x) < 0.9 ? 1 : 0, Math.abs(up.x) < 0.9 ? 0 : 1, 0).cross(up);
+    const forward = side.normalize().multiplyScalar(-Math.cos(ELEVATION)).addScaledVector(up, -Math.sin(ELEVATION));
+    const right = forward.clone().cross(up).normalize();
+    const above = right.clone().cross(forward);
+    const middle = new Box3().setFromPoints([...points]).getCenter(new Vector3());
+    const half = Math.tan((this.camera.fov * Math.PI) / 360) * FILL;
+    // At a distance d a point at x across and z ahead of the middle is in view where |x - shift| <= tan (d + z).
+    const along = (axis: Vector3, tan: number) => {
+      let [a, b] = [-Infinity, -Infinity];
+      for (const point of points) {
+        const off = point.clone().sub(middle);
+        const [x, z] = [off.dot(axis) / tan, off.dot(forward)];
+        [a, b] = [Math.max(a, x - z), Math.max(b, -x - z)];
+      }
+      return { distance: (a + b) / 2, shift: (tan * (a - b)) / 2 };
+    };
+    const [x, y] = [along(right, half * this.camera.aspect), along(above, half)];
+    const distance = Math.max(x.distance, y.distance, this.controls.minDistance);
+    const target = middle.addScaledVector(right, x.shift).addScaledVector(above, y.shift);
+    const eye = target.clone().addScaledVector(forward, -distance);
+    this.stand({ position: eye.toArray(), target: target.toArray() }, fly);
   }
 
   private ahead(pose: Matrix4): Vector3 {

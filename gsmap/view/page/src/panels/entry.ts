@@ -1,0 +1,131 @@
+// The way into the map and out of it; until the 3D view has something to show, the floor plan.
+import { css, html, nothing, svg } from "lit";
+import { customElement, state } from "lit/decorators.js";
+import * as actions from "../actions";
+import type { FloorPlan } from "../contract";
+import * as derive from "../derive";
+import { page } from "../state";
+import { Panel } from "./base";
+import { shared } from "./css";
+import { icon } from "./icons";
+
+const WIDTH = 1000; // of the drawing's own units
+
+@customElement("gs-entry")
+export class Entry extends Panel {
+  static override styles = [
+    shared,
+    css`
+      :host {
+        position: absolute;
+        inset: 0;
+        display: grid;
+        pointer-events: none;
+      }
+      .way {
+        align-self: end;
+        justify-self: start;
+        margin: 12px;
+        pointer-events: auto;
+        box-shadow: 0 2px 10px var(--shade);
+      }
+      figure {
+        margin: 0;
+        padding: 48px 64px 24px;
+        min-height: 0;
+        display: grid;
+        grid-template-rows: minmax(0, 1fr) auto;
+        gap: 10px;
+        background: var(--ground);
+      }
+      figure svg {
+        width: 100%;
+        height: 100%;
+      }
+      figcaption {
+        text-align: center;
+        color: var(--muted);
+      }
+      .outline {
+        fill: none;
+        stroke: var(--accent);
+        stroke-width: 2.5;
+        opacity: 0.7;
+      }
+      text {
+        font:
+          600 26px system-ui,
+          sans-serif;
+        fill: var(--text);
+        stroke: var(--ground);
+        stroke-width: 6px;
+        paint-order: stroke;
+        text-anchor: middle;
+      }
+      @media (max-width: 759px) {
+        figure {
+          padding: 12px;
+        }
+      }
+    `,
+  ];
+
+  @state() private isAbove = false;
+  @state() private isDrawn = false;
+  private canvas: HTMLElement | null = null;
+
+  override connectedCallback(): void {
+    super.connectedCallback();
+    this.canvas = document.getElementById("canvas");
+    this.canvas?.addEventListener("drawn", this.look);
+  }
+
+  override disconnectedCallback(): void {
+    super.disconnectedCallback();
+    this.canvas?.removeEventListener("drawn", this.look);
+  }
+
+  private readonly look = (): void => {
+    const known = page.stage?.state;
+    this.isAbove = known?.isAbove ?? false;
+    this.isDrawn = known?.isShown ?? false;
+  };
+
+  protected override render() {
+    const { map, component, stageError } = this.state;
+    const shown = map && derive.componentOf(map, component);
+    if (!shown || stageError) return nothing;
+    if (!this.isDrawn) {
+      const known = shown.plan ? actions.plans.get(shown.plan) : null;
+      return known?.status === "ready" ? this.plan(known.value) : nothing;
+    }
+    if (!shown.overview?.has_ceiling) return nothing;
+    return this.isAbove
+      ? html`<button class="main way" title="Walk in (i)" @click=${() => void actions.walkIn()}>
+          ${icon("walk")} Walk in
+        </button>`
+      : html`<button class="way" title="See it from above (f)" @click=${actions.fit}>
+          ${icon("house")} From above
+        </button>`;
+  }
+
+  private plan({ picture, size_m: [width, height], scenes }: FloorPlan) {
+    const high = (WIDTH * height) / width;
+    const at = ([x, y]: [number, number]) => `${(WIDTH * x).toFixed(1)} ${(high * y).toFixed(1)}`;
+    const outline = (rings: [number, number][][]) => rings.map((ring) => `M${ring.map(at).join("L")}Z`).join("");
+    const uri = picture?.startsWith("data:image/webp;base64,") ? picture : null;
+    return html`<figure>
+      <svg viewBox="0 0 ${WIDTH} ${high}" role="img" aria-label="Floor plan of the map">
+        ${uri ? svg`<image href=${uri} width=${WIDTH} height=${high} preserveAspectRatio="none" />` : nothing}
+        ${scenes.map(({ outlines }) => svg`<path class="outline" d=${outline(outlines)} />`)}
+        ${scenes.map(
+          ({ scene, at: [x, y] }) =>
+            svg`<text x=${WIDTH * x} y=${high * y}>${this.state.map?.scenes[scene]?.name ?? ""}</text>`,
+        )}
+      </svg>
+      <figcaption role="status">
+        Floor plan, ${width.toFixed(0)} × ${height.toFixed(0)} m. The 3D view is being prepared.
+      </figcaption>
+    </figure>`;
+  }
+}
