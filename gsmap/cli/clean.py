@@ -30,7 +30,7 @@ def command(
     Example: `gsmap clean scan.ply cleaned.ply`
     """
     from gsmap import formats
-    from gsmap.ingest import clean
+    from gsmap.ingest.clean import clean
     from gsmap.types.rows.maps import CleanReport
 
     cleaned = clean(formats.read(source), bbox, where=source)

@@ -33,7 +33,10 @@ def command(
     intrinsics: Annotated[
         str | None,
         typer.Option(
-            "--intrinsics", metavar="FX,FY,CX,CY", help="Intrinsics of all photos, in pixels of the upright image."
+            "--intrinsics",
+            metavar="[MODEL,]FX,FY,CX,CY...",
+            help="Intrinsics of all photos, in pixels of the upright image: of a pinhole, or the name and parameters "
+            "of a COLMAP camera model.",
         ),
     ] = None,
     focal: Annotated[

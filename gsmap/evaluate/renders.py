@@ -12,6 +12,7 @@ import numpy as np
 from gsmap.errors import InputError, NotFoundError
 from gsmap.evaluate.images import psnr, ssim
 from gsmap.formats.pictures import open_picture
+from gsmap.geometry.camera_models import undistort
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.progress import Progress
 
@@ -40,7 +41,7 @@ class ImageScores:
 
 def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, Path]:
     """Find the images of cameras by name in a folder and its subfolders; return paths by camera index. Suffixes may
-    differ.
+    differ. The faces of a panorama have the same image.
 
     Raises:
         NotFoundError: the folder does not exist, or no image in it has the name of a camera.
@@ -49,17 +50,15 @@ def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, P
     folder = Path(folder)
     if not folder.is_dir():
         raise NotFoundError(f"there is no folder of images {folder}", code="folder_not_found")
-    index = {_stem(name): i for i, name in enumerate(cameras.names)}
+    index = {_stem(name): rows for name, rows in cameras.photo_rows.items()}
     found: dict[int, Path] = {}
     for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file()):
-        at = index.get(_stem(path.relative_to(folder)), index.get(path.stem))
-        if at is None:
-            continue
-        if at in found:
+        rows = index.get(_stem(path.relative_to(folder)), index.get(path.stem, []))
+        if rows and rows[0] in found:
             raise InputError(
-                f"camera {cameras.names[at]} has two images: {found[at]} and {path}", code="ambiguous_image"
+                f"camera {cameras.names[rows[0]]} has two images: {found[rows[0]]} and {path}", code="ambiguous_image"
             )
-        found[at] = path
+        found |= dict.fromkeys(rows, path)
     if not found:
         raise NotFoundError(
             f"no image in {folder} has the name of a camera (such as {', '.join(cameras.names[:3])})",
@@ -87,7 +86,8 @@ def compare_renders(
     Args:
         gaussians, cameras: Gaussians and cameras in one frame.
         images: images by camera index, as arrays (H, W, 3) in [0, 1] or as paths. An image of another size than its
-            camera is compared at its own size if the aspect ratios agree.
+            camera is compared at its own size if the aspect ratios agree. The image of a camera with a lens is the
+            photo, which is undistorted.
         lpips: function that measures LPIPS, such as `gsmap.evaluate.images.Lpips`.
 
     Raises:
@@ -100,8 +100,13 @@ def compare_renders(
     for done, (at, image) in enumerate(sorted(images.items())):
         if isinstance(image, str | os.PathLike):
             image = read_image(image)
-        camera = _at_size(cameras[at], image.shape[1], image.shape[0])
+        camera, known = cameras[at], None
+        if camera.lenses and camera.lenses[0] is not None:
+            image, known = undistort(image, camera)
+        camera = _at_size(camera, image.shape[1], image.shape[0])
         rendered = render(gaussians, camera, depth=False, dominant_id=False, index=index).colour[0]
+        if known is not None:
+            image = np.where(known[..., None], image, rendered)
         figures.append((psnr(rendered, image), ssim(rendered, image), lpips(rendered, image) if lpips else 0.0))
         if progress is not None:
             progress((done + 1) / len(images), f"image {done + 1} of {len(images)}")

@@ -19,7 +19,7 @@ def read(path: str | os.PathLike[str]) -> Cameras:
 
     Raises:
         NotFoundError: The file or folder is missing.
-        NotPinholesError: No camera can be approximated by a pinhole (panoramas, wide fisheyes).
+        NotPinholesError: Lenses that gsmap does not know.
         InputError: Another format, or damaged.
     """
     path = Path(path)

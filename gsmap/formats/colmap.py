@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
-from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,11 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import unique
-from gsmap.formats.lenses import Lens, keep_pinholes, lens_of
+from gsmap.formats.lenses import pinhole_cameras
+from gsmap.geometry.camera_models import camera_model
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.types import Cameras
+from gsmap.types.cameras import CameraModel
 
 _PLACES = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
 
@@ -36,11 +37,9 @@ def find_model(folder: Path) -> Path | None:
 def read(folder: str | os.PathLike[str]) -> Cameras:
     """Read the cameras of a model, sorted by image name, with poses in COLMAP's world frame.
 
-    Cameras with distortion are read as pinholes, and those that no pinhole stands for are left out: ``notes`` say so
-    (`gsmap.formats.lenses`).
+    Photos of other lenses than pinholes are seen through pinholes: ``notes`` say so (`gsmap.formats.lenses`).
 
     Raises:
-        NotPinholesError: No camera can be approximated by a pinhole.
         InputError: Damaged, or without images.
     """
     from scipy.spatial.transform import Rotation
@@ -49,7 +48,7 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
     binary = (folder / "images.bin").is_file() and (folder / "cameras.bin").is_file()
     try:
         if binary:
-            calibrations: dict[int, Lens] = dict(_binary_cameras((folder / "cameras.bin").read_bytes()))
+            calibrations: dict[int, CameraModel] = dict(_binary_cameras((folder / "cameras.bin").read_bytes()))
             images = sorted(_binary_images((folder / "images.bin").read_bytes()))
         else:
             calibrations = dict(_text_cameras((folder / "cameras.txt").read_text(errors="replace")))
@@ -70,12 +69,10 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
         raise InputError(
             f"{folder} is not a readable COLMAP model (truncated?): {error}", code="file_truncated"
         ) from error
-    kept, notes = keep_pinholes(chosen, folder)
     pose = np.tile(np.eye(4), (len(images), 1, 1))
     pose[:, :3, :3] = R_frame_camera
     pose[:, :3, 3] = -np.einsum("cij,cj->ci", R_frame_camera, translations)
-    intrinsics, sizes = np.array([lens.intrinsics_px for lens in chosen]), np.array([lens.size_px for lens in chosen])
-    return Cameras(pose[kept], intrinsics[kept], sizes[kept], tuple(compress(names, kept)), notes=notes)
+    return pinhole_cameras(pose, chosen, names, folder)
 
 
 def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
@@ -121,7 +118,7 @@ def _write_lines(path: Path, lines: list[str]) -> None:
     write_text_output(path, text)
 
 
-def _binary_cameras(data: bytes) -> Iterator[tuple[int, Lens]]:
+def _binary_cameras(data: bytes) -> Iterator[tuple[int, CameraModel]]:
     import pycolmap
 
     (count,) = struct.unpack_from("<Q", data)
@@ -132,7 +129,7 @@ def _binary_cameras(data: bytes) -> Iterator[tuple[int, Lens]]:
         num_params = len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
         params = struct.unpack_from(f"<{num_params}d", data, offset + 24)
         offset += 24 + 8 * num_params
-        yield camera_id, lens_of(model, width, height, params)
+        yield camera_id, camera_model(model, width, height, params)
 
 
 def _binary_images(data: bytes) -> Iterator[tuple[str, tuple[float, ...], int]]:
@@ -148,11 +145,11 @@ def _binary_images(data: bytes) -> Iterator[tuple[str, tuple[float, ...], int]]:
             raise ValueError(f"images.bin ends before the last of its {count} images")
 
 
-def _text_cameras(text: str) -> Iterator[tuple[int, Lens]]:
+def _text_cameras(text: str) -> Iterator[tuple[int, CameraModel]]:
     for line in text.splitlines():
         if line.strip() and not line.startswith("#"):
             camera_id, model, width, height, *params = line.split()
-            yield int(camera_id), lens_of(model, int(width), int(height), tuple(float(p) for p in params))
+            yield int(camera_id), camera_model(model, int(width), int(height), tuple(float(p) for p in params))
 
 
 def _text_images(text: str) -> Iterator[tuple[str, tuple[float, ...], int]]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import replace
-from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +13,13 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import load_json, unique
-from gsmap.formats.lenses import Lens, keep_pinholes, lens_of
+from gsmap.formats.lenses import pinhole_cameras
 from gsmap.formats.pictures import open_picture
+from gsmap.geometry.camera_models import EQUIRECTANGULAR, camera_model
 from gsmap.types import Cameras, Sim3
+from gsmap.types.cameras import CameraModel
 
+_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 DATAPARSER = "dataparser_transforms.json"
 
@@ -33,11 +34,11 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
     Nerfstudio trains in ``scale * (transform @ x)`` of the *original* coordinates, while the poses of
     ``transforms.json`` already had ``applied_transform`` and ``applied_scale`` done to them: both are taken back first.
 
-    Cameras with distortion are read as pinholes, and those that no pinhole stands for are left out: ``notes`` say so
-    (`gsmap.formats.lenses`).
+    Photos of other lenses than pinholes are seen through pinholes, and those of lenses that COLMAP does not have are
+    left out: ``notes`` say so (`gsmap.formats.lenses`).
 
     Raises:
-        NotPinholesError: No camera can be approximated by a pinhole.
+        NotPinholesError: COLMAP has no model of any lens.
         InputError: Cameras, sizes or focal lengths are missing.
     """
     frames = content["frames"]
@@ -60,11 +61,9 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
         pose[:, :3, 3] = scale * S.apply(pose[:, :3, 3])
         pose[:, :3, :3] = S.rotation @ pose[:, :3, :3]
 
-    lenses = [_lens(content | f, path) for f in frames]
-    kept, notes = keep_pinholes(lenses, path)
-    intrinsics, sizes = np.array([lens.intrinsics_px for lens in lenses]), np.array([lens.size_px for lens in lenses])
+    models = [_model(content | f, path) for f in frames]
     names = unique([str(f.get("file_path", i)) for i, f in enumerate(frames)])
-    return Cameras(pose[kept], intrinsics[kept], sizes[kept], tuple(compress(names, kept)), notes=notes)
+    return pinhole_cameras(pose, models, names, path)
 
 
 def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
@@ -97,28 +96,32 @@ def _rows_to_matrix(rows: list[list[float]]) -> np.ndarray:
     return out
 
 
-def _lens(both: dict[str, Any], path: Path) -> Lens:
-    """Return the lens of one image; each parameter may be specified for the image or for the whole file."""
-    fisheye = "OPENCV_FISHEYE"
-    model = fisheye if both.get("is_fisheye") else str(both.get("camera_model") or "OPENCV").upper()
-    if model not in (*_PERSPECTIVE, fisheye):
-        return Lens(model, (1, 1))
+def _model(both: dict[str, Any], path: Path) -> CameraModel | str:
+    """Return the lens of one image, or the name of a model that COLMAP does not have; each parameter may be specified
+    for the image or for the whole file."""
+    name = "OPENCV_FISHEYE" if both.get("is_fisheye") else str(both.get("camera_model") or "OPENCV").upper()
+    if name == EQUIRECTANGULAR:
+        width, height = _size(both, path)
+        return camera_model(name, width, height, (width, height))
+    if name not in (*_PERSPECTIVE, *_FISHEYE, "FISHEYE624"):
+        return name
     (fx, fy, cx, cy), (width, height) = _intrinsics(both, path)
-    k1, k2, k3, k4, p1, p2 = (float(both.get(name) or 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    if model == fisheye:
-        return lens_of(fisheye, width, height, (fx, fy, cx, cy, k1, k2, k3, k4))
-    if not any((k1, k2, k3, k4, p1, p2)):
-        return Lens(model, (width, height), (fx, fy, cx, cy), 0.0)
+    middle = (fx, fy, cx, cy)
+    k1, k2, k3, k4, p1, p2 = (float(both.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if name == "FISHEYE624":
+        params = tuple(float(value) for value in both.get("distortion_params") or ())
+        return camera_model("RAD_TAN_THIN_PRISM_FISHEYE", width, height, middle + params) if len(params) == 12 else name
+    if name in _FISHEYE:
+        return camera_model("OPENCV_FISHEYE", width, height, (*middle, k1, k2, k3, k4))
     if k4:  # the fourth term of a polynomial here, and of a quotient in COLMAP's models
-        return Lens(f"{model} with k4", (width, height))
-    lens = lens_of("FULL_OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
-    return replace(lens, model=model)
+        return f"{name} with k4"
+    if not any((k1, k2, k3, p1, p2)):
+        return camera_model("PINHOLE", width, height, middle)
+    return camera_model("FULL_OPENCV", width, height, (*middle, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
 
 
 def _intrinsics(both: dict[str, Any], path: Path) -> tuple[tuple[float, float, float, float], tuple[int, int]]:
-    width, height = (both.get("w"), both.get("h"))
-    if width is None or height is None:
-        width, height = _image_size(path.parent / both["file_path"], path)
+    width, height = _size(both, path)
     fx, fy = both.get("fl_x"), both.get("fl_y")
     if fx is None and "camera_angle_x" in both:
         fx = 0.5 * width / math.tan(0.5 * both["camera_angle_x"])
@@ -132,7 +135,13 @@ def _intrinsics(both: dict[str, Any], path: Path) -> tuple[tuple[float, float, f
         )
     fy = fx if fy is None else fy
     cx, cy = both.get("cx", width / 2), both.get("cy", height / 2)
-    return (float(fx), float(fy), float(cx), float(cy)), (int(width), int(height))
+    return (float(fx), float(fy), float(cx), float(cy)), (width, height)
+
+
+def _size(both: dict[str, Any], path: Path) -> tuple[int, int]:
+    if both.get("w") is None or both.get("h") is None:
+        return _image_size(path.parent / both["file_path"], path)
+    return int(both["w"]), int(both["h"])
 
 
 def _image_size(image: Path, path: Path) -> tuple[int, int]:

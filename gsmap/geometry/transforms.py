@@ -48,7 +48,7 @@ def transform_cameras(cameras: Cameras, S_a_b: Sim3) -> Cameras:
     """Transform cameras from frame b to frame a; images and intrinsics do not change, depths are multiplied by the
     scale."""
     T_a_camera = transform_poses(cameras.T_frame_camera, S_a_b)
-    return Cameras(T_a_camera, cameras.intrinsics_px, cameras.sizes_px, cameras.names, cameras.synthesised)
+    return replace(cameras, T_frame_camera=T_a_camera, notes=())
 
 
 def transform_poses(T_b_c: np.ndarray, S_a_b: Sim3) -> np.ndarray:

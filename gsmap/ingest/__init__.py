@@ -3,7 +3,6 @@
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.ingest.capture import Capture, check_scale, read_capture, read_captures, take_capture
 from gsmap.ingest.capture_search import CaptureFiles, SearchResult, SkippedPath, find_captures, search_captures
-from gsmap.ingest.clean import CleanResult, clean
 from gsmap.ingest.dates import CaptureDate, find_date, given_date, parse_date
 from gsmap.ingest.validate import validate
 
@@ -11,11 +10,9 @@ __all__ = [
     "Capture",
     "CaptureDate",
     "CaptureFiles",
-    "CleanResult",
     "SkippedPath",
     "SearchResult",
     "check_scale",
-    "clean",
     "find_captures",
     "find_date",
     "given_date",

@@ -17,7 +17,6 @@ from gsmap.formats.precision import about_origin, format_origin, rounded_to
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.ingest.capture_search import CaptureFiles, find_captures
-from gsmap.ingest.clean import clean as clean_gaussians
 from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.validate import validate_cameras, validate_gaussians
 from gsmap.stream import clamp_infinities
@@ -162,7 +161,9 @@ def take_capture(
         gaussians = about_origin(where, clamp_infinities(gaussians))
     notes = []
     if clean:
-        cleaned = clean_gaussians(gaussians.load(), where=where)
+        from gsmap.ingest import clean as cleaning
+
+        cleaned = cleaning.clean(gaussians.load(), where=where)
         gaussians = cleaned.gaussians
         notes.append(cleaned.note)
     notes += validate_gaussians(gaussians, where)

@@ -7,8 +7,9 @@ from gsmap.localize.features import scene_features
 from gsmap.localize.joint_localization import localize_together
 from gsmap.localize.localization import localize_photo
 from gsmap.localize.map_scene import MapScene
+from gsmap.localize.panoramas import combine_faces
 from gsmap.localize.params import Params
-from gsmap.localize.photos import Lens, photo_in_memory, read_photo
+from gsmap.localize.photos import Lens, checked_model, photo_in_memory, read_photo
 from gsmap.localize.recipe import recipe_key
 from gsmap.localize.retrieval import ViewIndex, index_recipe, new_segment, view_index
 
@@ -20,6 +21,8 @@ __all__ = [
     "Params",
     "PhotoComparison",
     "ViewIndex",
+    "checked_model",
+    "combine_faces",
     "compare_photo",
     "index_recipe",
     "localize_photo",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ import numpy as np
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats.pictures import open_picture
+from gsmap.geometry.camera_models import EQUIRECTANGULAR, camera_model, pinhole_views, undistort
 from gsmap.types.localization import Photo
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 _MIN_INTRINSIC_PX, _MAX_INTRINSIC_PX = 0.01, 1_000_000
 
+_PANORAMA = re.compile(rb"ProjectionType\W{1,4}equirectangular", re.IGNORECASE)  # of GPano
 _EXIF_IFD, _FOCAL_35MM = 0x8769, 0xA405
 _FILM_DIAGONAL_MM = 43.267  # of a frame of 36 x 24 mm, to which equivalent focal lengths refer
 _EXIF_SIGMA = 0.05  # relative: focal lengths are rounded to millimetres, and phones do not record crops
@@ -32,12 +35,14 @@ class Lens:
     Args:
         intrinsics_px: ``fx fy cx cy``, in pixels of the upright photo; None if unknown.
         focal_px: focal length in pixels, with the principal point in the middle; None if unknown.
+        model: name of a COLMAP camera model and its parameters, in pixels of the upright photo; None for a pinhole.
         use_exif: use the focal length in EXIF, if none is specified.
     """
 
     intrinsics_px: tuple[float, float, float, float] | None = None
     focal_px: float | None = None
     use_exif: bool = True
+    model: tuple[str, tuple[float, ...]] | None = None
 
     def __post_init__(self) -> None:
         given = (*(self.intrinsics_px or ()), *((self.focal_px,) if self.focal_px is not None else ()))
@@ -47,6 +52,17 @@ class Lens:
                 f"{_MIN_INTRINSIC_PX} and {_MAX_INTRINSIC_PX:,}",
                 code="invalid_intrinsics",
             )
+
+
+def checked_model(name: str, params: tuple[float, ...]) -> str:
+    """Return the name of a camera model, after a check of its parameters.
+
+    Raises:
+        ValueError, RuntimeError: an unknown model, or a wrong number of parameters.
+    """
+    if params or name != EQUIRECTANGULAR:
+        camera_model(name, 1, 1, params)
+    return name
 
 
 def read_photo(
@@ -66,8 +82,9 @@ def read_photo(
         raise NotFoundError(f"there is no photo {path}", code="file_not_found")
 
     with open_picture(path) as picture:
-        photo = make_photo(*_upright(picture, in_place=True), lens, path.name)
-    return photo if masks is None else replace(photo, known=read_mask(path, masks, photo.size_px))
+        rgb, focal_35mm, is_panorama = _upright(picture, in_place=True)
+    known = None if masks is None else read_mask(path, masks, (rgb.shape[1], rgb.shape[0]))
+    return make_photo(rgb, focal_35mm, _panoramic(lens) if is_panorama else lens, path.name, known)
 
 
 def photo_in_memory(picture: Image | ArrayLike, lens: Lens | None = None, name: str = "photo") -> Photo:
@@ -85,7 +102,8 @@ def photo_in_memory(picture: Image | ArrayLike, lens: Lens | None = None, name: 
 
     lens = lens or Lens()
     if isinstance(picture, Image):
-        return make_photo(*_upright(picture, in_place=False), lens, name)
+        rgb, focal_35mm, is_panorama = _upright(picture, in_place=False)
+        return make_photo(rgb, focal_35mm, _panoramic(lens) if is_panorama else lens, name)
     pixels = np.asarray(picture)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
@@ -105,8 +123,14 @@ def photo_in_memory(picture: Image | ArrayLike, lens: Lens | None = None, name: 
     return make_photo(np.ascontiguousarray(pixels), None, lens, name)
 
 
-def _upright(picture: Image, *, in_place: bool) -> tuple[np.ndarray, object]:
-    """Return the pixels (H, W, 3) of a picture, turned by its EXIF orientation, and the focal length that EXIF states.
+def _panoramic(lens: Lens) -> Lens:
+    """Return the lens of a photo whose metadata say that it is a panorama, unless another one was specified."""
+    return replace(lens, model=(EQUIRECTANGULAR, ())) if lens == Lens() else lens
+
+
+def _upright(picture: Image, *, in_place: bool) -> tuple[np.ndarray, object, bool]:
+    """Return the pixels (H, W, 3) of a picture, turned by its EXIF orientation, the focal length that EXIF states, and
+    whether its XMP says that it is an equirectangular panorama.
 
     Args:
         in_place: turn the picture itself, which takes less memory.
@@ -114,11 +138,13 @@ def _upright(picture: Image, *, in_place: bool) -> tuple[np.ndarray, object]:
     from PIL import ImageOps
 
     focal_35mm = picture.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
+    xmp = picture.info.get("xmp") or picture.info.get("XML:com.adobe.xmp") or b""
+    is_panorama = _PANORAMA.search(xmp if isinstance(xmp, bytes) else str(xmp).encode()) is not None
     if in_place:
         ImageOps.exif_transpose(picture, in_place=True)
     else:
         picture = ImageOps.exif_transpose(picture)
-    return np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB")), focal_35mm
+    return np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB")), focal_35mm, is_panorama
 
 
 def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_px: tuple[int, int]) -> np.ndarray:
@@ -154,13 +180,18 @@ def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_
     return known
 
 
-def make_photo(rgb: np.ndarray, focal_35mm: object, lens: Lens, name: str = "photo") -> Photo:
+def make_photo(
+    rgb: np.ndarray, focal_35mm: object, lens: Lens, name: str = "photo", known: np.ndarray | None = None
+) -> Photo:
     """Return a photo of pixels (H, W, 3), uint8, with intrinsics as specified, from EXIF, or by default.
 
     Args:
         focal_35mm: equivalent focal length in millimetres from EXIF; invalid values are ignored.
+        known: (H, W) mask of valid pixels; None for all.
     """
     height, width = rgb.shape[:2]
+    if lens.model is not None:
+        return _undistorted(rgb, *lens.model, name, known)
     focal, sigma = _DEFAULT_FOCAL * max(width, height), _UNKNOWN
     if lens.intrinsics_px is not None:
         cx, cy = lens.intrinsics_px[2:]
@@ -169,12 +200,43 @@ def make_photo(rgb: np.ndarray, focal_35mm: object, lens: Lens, name: str = "pho
                 f"{name} has {width} x {height} pixels: its principal point cannot lie at {cx:g}, {cy:g}",
                 code="invalid_intrinsics",
             )
-        return Photo(rgb, np.array(lens.intrinsics_px), 0.0, name)
+        return Photo(rgb, np.array(lens.intrinsics_px), 0.0, name, known)
     if lens.focal_px is not None:
         focal, sigma = lens.focal_px, 0.0
     elif lens.use_exif and (equivalent := _number(focal_35mm)) is not None:
         focal, sigma = equivalent / _FILM_DIAGONAL_MM * float(np.hypot(width, height)), _EXIF_SIGMA
-    return Photo(rgb, np.array([focal, focal, width / 2, height / 2]), sigma, name)
+    return Photo(rgb, np.array([focal, focal, width / 2, height / 2]), sigma, name, known)
+
+
+def _undistorted(
+    rgb: np.ndarray, model_name: str, params: tuple[float, ...], name: str, known: np.ndarray | None
+) -> Photo:
+    """Return a photo without distortion, or with the faces of a panorama; pixels that it does not have are unknown.
+
+    Raises:
+        InputError: an equirectangular photo that is not twice as wide as high.
+    """
+    height, width = rgb.shape[:2]
+    if model_name == EQUIRECTANGULAR and width != 2 * height:
+        raise InputError(
+            f"{name} has {width} x {height} pixels, but a full equirectangular panorama is twice as wide as high",
+            code="size_mismatch",
+        )
+    model = camera_model(model_name, width, height, params or (width, height))
+    views, photos = pinhole_views(model, np.eye(4), name), []
+    if not views.lenses:
+        return Photo(rgb, views.intrinsics_px[0], 0.0, name, known)
+    for row in range(len(views)):
+        shown, has = undistort(rgb, views[row])
+        if known is not None:
+            has &= undistort(np.repeat(known[..., None], 3, axis=2).astype(np.float32), views[row])[0][..., 0] > 0.5
+        photos.append(
+            Photo(shown, views.intrinsics_px[row], 0.0, views.names[row], None if has.all() else has, model_name)
+        )
+    if views.names == (name,):
+        return photos[0]
+    faces = tuple((photo, lens.R_photo_camera) for photo, lens in zip(photos, views.lenses, strict=True) if lens)
+    return Photo(rgb, views.intrinsics_px[0], 0.0, name, known, model_name, faces)
 
 
 def _number(value: object) -> float | None:

@@ -561,7 +561,8 @@ class Map(AbstractContextManager["Map"]):
         Args:
             files: photos and scans; or photos in memory: PIL images, or RGB arrays (H, W, 3) in uint8 or as floats in
                 [0, 1]. The latter are called ``photo_0`` and so on, by their position.
-            intrinsics: ``fx fy cx cy`` of all photos, in pixels of the upright image.
+            intrinsics: ``fx fy cx cy`` of all photos, in pixels of the upright image; or a text, the name of a COLMAP
+                camera model and its parameters, such as ``SIMPLE_RADIAL,700,400,300,-0.1`` or ``EQUIRECTANGULAR``.
             focal: focal length in pixels, or ``auto`` to estimate it; default: EXIF.
             near: restrict to places that this scene shows, or to ``X,Y,Z,R`` around a point of the map.
             together: the photos show one place and overlap; localized photos help to localize the others.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gsmap.errors import ConfigError, ReadOnlyError
 from gsmap.formats.scans import is_scan
 from gsmap.ingest.dates import CaptureDate, given_date, photo_date
-from gsmap.localize import Lens, photo_in_memory, read_clip, read_photo
+from gsmap.localize import Lens, checked_model, combine_faces, photo_in_memory, read_clip, read_photo
 from gsmap.map.metric_scales import metre_notes, metres_at
 from gsmap.map.photo_changes import PhotoReporter, write_picture
 from gsmap.map.photos import PhotoObservation, localized_photo_of, small_jpeg
@@ -163,10 +163,27 @@ def find_all(
     progress: StageProgress,
 ) -> list[tuple[LocalizationResult, float]]:
     """Localize photos; return each result with its wall time in seconds."""
-    photos = [photo for _, photo in named]
-    if together:
-        return list(localize_all(localizer, photos, where))
-    return list(localize(localizer, photos, where, progress))
+    photos = [part for _, photo in named for part in ([face for face, _ in photo.faces] or [photo])]
+    parts = iter(localize_all(localizer, photos, where) if together else localize(localizer, photos, where, progress))
+    out = []
+    for _, photo in named:
+        found = [next(parts) for _ in photo.faces or (photo,)]
+        result = combine_faces(photo, [one for one, _ in found]) if photo.faces else found[0][0]
+        out.append((result, sum(seconds for _, seconds in found)))
+    return out
+
+
+def lens_notes(named: Sequence[tuple[str, Photo]]) -> list[str]:
+    """Return notes on photos that were undistorted, and on panoramas."""
+    notes = []
+    for model in sorted({photo.lens for _, photo in named if photo.lens}):
+        bent = sum(photo.lens == model and not photo.faces for _, photo in named)
+        wide = sum(photo.lens == model and bool(photo.faces) for _, photo in named)
+        if bent:
+            notes.append(f"{bent} photos were undistorted ({model}); intrinsics are those of the undistorted photos")
+        if wide:
+            notes.append(f"{wide} photos were localized by pinhole faces of 90 degrees ({model})")
+    return notes
 
 
 def _of_pictures(
@@ -191,7 +208,11 @@ def _of_pictures(
     components = {row.component for row in rows if row.component is not None and row.status == "placed"}
     return LocalizeReport(
         results=tuple(rows),
-        notes=(*metre_notes({c: metres[c] for c in sorted(components) if c in metres}), *notes),
+        notes=(
+            *lens_notes(named),
+            *metre_notes({c: metres[c] for c in sorted(components) if c in metres}),
+            *notes,
+        ),
     )
 
 
@@ -209,7 +230,9 @@ def _with_what_they_tell(
     out: list[LocalizeRow] = []
     notes: list[str] = []
     for (name, photo), where, row in zip(named, found, rows, strict=True):
-        if not where.is_placed:
+        if not where.is_placed or photo.faces:
+            if where.is_placed:
+                notes.append(f"{name} is a panorama, which is neither compared with the map nor kept")
             out.append(row)
             continue
         observation = reporter.compare(photo, where)
@@ -262,12 +285,18 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
             "pass --intrinsics or --focal, not both, as intrinsics include the focal length", code="conflicting_options"
         )
     if intrinsics is not None:
-        parts = intrinsics.split(",") if isinstance(intrinsics, str) else intrinsics
+        model, *parts = intrinsics.split(",") if isinstance(intrinsics, str) else intrinsics
+        is_model = isinstance(model, str) and model.strip().replace("_", "").isalpha()
         try:
-            fx, fy, cx, cy = (float(part) for part in parts)
-        except ValueError:
+            values = tuple(float(part) for part in (parts if is_model else (model, *parts)))
+            if is_model:
+                return Lens(model=(checked_model(str(model).strip().upper(), values), values))
+            fx, fy, cx, cy = values
+        except (ValueError, RuntimeError):
             raise ConfigError(
-                f"--intrinsics needs four numbers fx,fy,cx,cy, got {intrinsics!r}", code="invalid_intrinsics"
+                "--intrinsics needs four numbers fx,fy,cx,cy, or the name of a COLMAP camera model and its parameters "
+                f"(only the name for EQUIRECTANGULAR), got {intrinsics!r}",
+                code="invalid_intrinsics",
             ) from None
         return Lens((fx, fy, cx, cy))
     if focal is None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsmap.errors import InputError, NotFoundError
+from gsmap.geometry.camera_models import view_of_pixel
 from gsmap.geometry.rays import surface_along
 from gsmap.map.photo_names import rows_of_photo
 from gsmap.store import Store
@@ -12,20 +15,58 @@ from gsmap.types import Cameras, Gaussians
 
 
 def camera_of(cameras: Cameras, name: str, scene_name: str) -> Cameras:
-    """Return a camera of a scene by the camera's name or its photo's name, with or without folders and suffix.
+    """Return the camera of a scene with a photo's name, with or without folders and suffix: several faces if the photo
+    is a panorama. A face is named ``PHOTO#front`` and so on; its pixels are those of the face.
 
     Raises:
         NotFoundError: none, or several.
     """
-    found = rows_of_photo(cameras.names, name)
+    photos = cameras.photo_rows
+    if name in cameras.names and name not in photos:
+        return replace(cameras[cameras.names.index(name)], lenses=())
+    names = list(photos)
+    found = rows_of_photo(names, name)
     if len(found) != 1:
         what = f"{len(found)} cameras" if found else "no camera"
-        some = ", ".join([cameras.names[row] for row in found[:3]] or cameras.names[:3])
+        some = ", ".join([names[row] for row in found[:3]] or names[:3])
         raise NotFoundError(
             f"scene {scene_name} has {what} called {name!r}: {'such as' if found else 'its first ones are'} {some}",
             code="camera_not_found",
         )
-    return cameras[found]
+    return cameras[photos[names[found[0]]]]
+
+
+def view_of(cameras: Cameras, pixel: np.ndarray) -> tuple[Cameras, np.ndarray]:
+    """Return the pinhole camera that shows a pixel of a photo, and the pixel in that camera, without distortion.
+
+    Args:
+        cameras: the cameras of one photo.
+
+    Raises:
+        InputError: the pixel lies outside of the photo, or its lens has no ray there.
+    """
+    name = next(iter(cameras.photo_rows))
+    width, height = photo_size(cameras)
+    if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
+        raise InputError(
+            f"pixel {pixel[0]:g},{pixel[1]:g} lies outside of the image of camera {name} ({width}x{height})",
+            code="pixel_outside",
+        )
+    found = view_of_pixel(cameras, pixel)
+    if found is None:
+        raise InputError(
+            f"the lens of {name} shows nothing at pixel {pixel[0]:g},{pixel[1]:g}: pick one nearer to the middle",
+            code="pixel_outside",
+        )
+    row, at = found
+    return cameras[row], at
+
+
+def photo_size(cameras: Cameras) -> tuple[int, int]:
+    """Return the width and height of the photo that the cameras are of."""
+    lens = cameras.lenses[0] if cameras.lenses else None
+    width, height = cameras.sizes_px[0].tolist() if lens is None else lens.model.size_px
+    return width, height
 
 
 def surface_at(
@@ -34,16 +75,7 @@ def surface_at(
     """Return the depth along z of the surface at a pixel, and its standard deviation; None without a surface.
 
     The standard deviation is that of splats around surfaces (a share of the depth), and how thick the surface is.
-
-    Raises:
-        InputError: a pixel outside of the picture.
     """
-    width, height = camera.sizes_px[0].tolist()
-    if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
-        raise InputError(
-            f"pixel {pixel[0]:g},{pixel[1]:g} lies outside of the image of camera {camera.names[0]} ({width}x{height})",
-            code="pixel_outside",
-        )
     pose = camera.T_frame_camera[0]
     ray = pose[:3, :3] @ ray_of(camera.intrinsics_px[0], pixel)
     found = surface_along(gaussians, pose[:3, 3], ray)
@@ -69,12 +101,12 @@ def picked_point(
         InputError: a pixel outside of the picture.
     """
     found = store.scenes.get(scene)
-    camera = camera_of(store.scenes.cameras(found.id), camera_name, found.name)
+    picked = f"pixel {pixel[0]:g},{pixel[1]:g}"
+    camera, pixel = view_of(camera_of(store.scenes.cameras(found.id), camera_name, found.name), pixel)
     seen = surface_at(store.scenes.gaussians(found.id), camera, pixel, sigma_share)
     if seen is None:
         raise NotFoundError(
-            f"pixel {pixel[0]:g},{pixel[1]:g} of camera {camera.names[0]} of scene {found.name} shows no surface: pick "
-            "one that does",
+            f"{picked} of camera {camera_name} of scene {found.name} shows no surface: pick one that does",
             code="pixel_without_surface",
         )
     depth, sigma = seen

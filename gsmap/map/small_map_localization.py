@@ -7,7 +7,16 @@ from collections.abc import Mapping, Sequence
 
 from gsmap.errors import ConfigError
 from gsmap.formats.scans import is_scan
-from gsmap.map.photo_localization import Numbers, check_named, find_all, frames_of, parse_lens, photos_of, row_of
+from gsmap.map.photo_localization import (
+    Numbers,
+    check_named,
+    find_all,
+    frames_of,
+    lens_notes,
+    parse_lens,
+    photos_of,
+    row_of,
+)
 from gsmap.map.progress_logging import log_progress
 from gsmap.map.settings import settings_of
 from gsmap.map.small_map import SmallLocalizer
@@ -54,4 +63,4 @@ def localize_small(
     found = find_all(localizer, named, where, together or video is not None, log_progress(progress))
     names = {scene.id: scene.name for scene in localizer.small.values()}
     rows = [row_of(names, name, *one) for (name, _), one in zip(named, found, strict=True)]
-    return LocalizeReport(results=tuple(rows))
+    return LocalizeReport(results=tuple(rows), notes=tuple(lens_notes(named)))

@@ -211,6 +211,7 @@ class Arrays:
         files: Sequence[StoredFile],
         *,
         only: Sequence[str] | None = None,
+        optional: Sequence[str] = (),
         rows: Sequence[tuple[int, int]] | None = None,
         shapes: Mapping[str, layout.Shape] | None = None,
     ) -> dict[str, np.ndarray]:
@@ -219,6 +220,7 @@ class Arrays:
         Args:
             files: manifest of the group; missing or short files are detected before anything is read.
             only: names of the arrays to read.
+            optional: names of arrays to read as well if the group has them.
             rows: ranges ``[start, stop)`` of rows, in order; default: all rows.
             shapes: expected shape of each array; None for an unknown length.
 
@@ -240,8 +242,7 @@ class Arrays:
                 )
         try:
             with _open_body(place, kind, files) as body:
-                names = body.array_names() if only is None else only
-                return body.read(body.check_arrays(names, shapes), rows)
+                return body.read(body.check_arrays(body.selected(only, optional), shapes), rows)
         except OSError as error:
             if error.errno in _NOT_ITS_BYTES:
                 with translate_errors(place):

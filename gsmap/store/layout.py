@@ -103,6 +103,11 @@ class GroupReader:
         found = (key.rpartition("/") for key in self.keys)
         return sorted(above for above, _, name in found if name == "zarr.json" and above)
 
+    def selected(self, only: Sequence[str] | None, optional: Sequence[str]) -> list[str]:
+        """Return the names of arrays to read: ``only`` (default: all), and those of ``optional`` that exist."""
+        present = self.array_names() if only is None or optional else []
+        return present if only is None else [*only, *(name for name in optional if name in present)]
+
     @contextmanager
     def _translate_errors(self, at: str) -> Iterator[None]:
         try:

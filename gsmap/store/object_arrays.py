@@ -120,16 +120,17 @@ class ObjectArrays(Arrays):
         files: Sequence[StoredFile],
         *,
         only: Sequence[str] | None = None,
+        optional: Sequence[str] = (),
         rows: Sequence[tuple[int, int]] | None = None,
         shapes: Mapping[str, layout.Shape] | None = None,
     ) -> dict[str, np.ndarray]:
         reader = _ObjectReader(self, kind, name, files)
         try:
-            return self._read(reader, kind, name, files, only, rows, shapes)
+            return self._read(reader, kind, name, files, (only, optional), rows, shapes)
         except CorruptError:
             if not reader.dropped():
                 raise
-        return self._read(_ObjectReader(self, kind, name, files), kind, name, files, only, rows, shapes)
+        return self._read(_ObjectReader(self, kind, name, files), kind, name, files, (only, optional), rows, shapes)
 
     def _read(
         self,
@@ -137,14 +138,13 @@ class ObjectArrays(Arrays):
         kind: str,
         name: str,
         files: Sequence[StoredFile],
-        only: Sequence[str] | None,
+        selection: tuple[Sequence[str] | None, Sequence[str]],
         rows: Sequence[tuple[int, int]] | None,
         shapes: Mapping[str, layout.Shape] | None,
     ) -> dict[str, np.ndarray]:
         try:
             body = self._body(reader, kind, name, files)
-            names = body.array_names() if only is None else only
-            return body.read(body.check_arrays(names, shapes), rows)
+            return body.read(body.check_arrays(body.selected(*selection), shapes), rows)
         except NotFoundError as error:
             raise CorruptError(
                 f"{error}, or it is incomplete: {layout.repair_advice(kind)}", code="arrays_corrupt"

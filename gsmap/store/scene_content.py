@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -18,9 +19,13 @@ from gsmap.store.chunk_boxes import chunk_boxes
 from gsmap.store.layout import Shape
 from gsmap.stream import blocks
 from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Thinning
+from gsmap.types.cameras import PhotoLens
 from gsmap.types.gaussians import CHUNK_ROWS as ROWS_AT_ONCE
 from gsmap.types.gaussians import FIELDS
 from gsmap.types.source import origin_of_source
+
+LENSES = "cameras.lenses"
+"""Name of the array of lenses, which only scenes have whose cameras are not those of their photos."""
 
 
 def scene_id(gaussians: GaussianSource, cameras: Cameras) -> str:
@@ -33,6 +38,7 @@ def scene_id(gaussians: GaussianSource, cameras: Cameras) -> str:
     views = [cameras.T_frame_camera, cameras.intrinsics_px, cameras.sizes_px]
     origin = origin_of_source(gaussians)
     more = [origin] if origin.any() else []
+    more += [lens_array(cameras)] if any(cameras.lenses) else []
     return digest(*arrays, *views, *more, text="\n".join(cameras.names))
 
 
@@ -77,6 +83,7 @@ def shapes_of(row: Row[Any]) -> dict[str, Shape]:
         "cameras.intrinsics_px": (c, 4),
         "cameras.sizes_px": (c, 2),
         "cameras.names": (None,),
+        LENSES: (None,),
     }
     return shapes
 
@@ -153,9 +160,50 @@ def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:
     for name in cameras.names:
         if "\n" in name:
             raise InputError(f"camera name {name!r} has a line break", code="invalid_name")
-    return {
+    arrays = {
         "cameras.T_frame_camera": cameras.T_frame_camera,
         "cameras.intrinsics_px": cameras.intrinsics_px,
         "cameras.sizes_px": cameras.sizes_px,
         "cameras.names": np.frombuffer("\n".join(cameras.names).encode(), np.uint8),
     }
+    return arrays | ({LENSES: lens_array(cameras)} if any(cameras.lenses) else {})
+
+
+def lens_array(cameras: Cameras) -> np.ndarray:
+    """Return the lenses of cameras as the bytes of a JSON list, an object or null for each camera."""
+    lenses = [
+        None
+        if lens is None
+        else {
+            "photo": lens.photo,
+            "model": lens.model.name,
+            "size_px": lens.model.size_px,
+            "params": lens.model.params,
+            "R_photo_camera": lens.R_photo_camera.tolist(),
+        }
+        for lens in cameras.lenses
+    ]
+    return np.frombuffer(json.dumps(lenses, separators=(",", ":")).encode(), np.uint8)
+
+
+def lenses_of(array: np.ndarray, count: int) -> tuple[PhotoLens | None, ...]:
+    """Parse the lenses of ``count`` cameras; see `lens_array`.
+
+    Raises:
+        ValueError, TypeError, KeyError, RuntimeError: it is no such list.
+    """
+    listed = json.loads(array.tobytes())
+    if not isinstance(listed, list) or len(listed) != count:
+        raise ValueError(f"they are no list of {count} lenses")
+    return tuple(None if one is None else _lens(one) for one in listed)
+
+
+def _lens(about: dict[str, Any]) -> PhotoLens:
+    from gsmap.geometry.camera_models import camera_model  # few scenes have lenses
+
+    width, height = (int(side) for side in about["size_px"])
+    turn = np.array(about["R_photo_camera"], np.float64)
+    if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or min(width, height) < 1:
+        raise ValueError("a lens has no rotation, or no size")
+    model = camera_model(str(about["model"]), width, height, tuple(float(value) for value in about["params"]))
+    return PhotoLens(str(about["photo"]), model, turn)

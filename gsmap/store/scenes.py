@@ -24,9 +24,11 @@ from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.facts import Fact
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.scene_content import (
+    LENSES,
     GaussianBlocks,
     StoredGaussians,
     camera_arrays,
+    lenses_of,
     scene_id,
     scene_of,
     shapes_of,
@@ -464,16 +466,17 @@ class Scenes:
             files = _manifest(connection, row)
         names = ("cameras.T_frame_camera", "cameras.intrinsics_px", "cameras.sizes_px", "cameras.names")
         with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
-            arrays = self._arrays.read(KIND, row.group_id, files, only=names, shapes=shapes_of(row))
-        pose, intrinsics, sizes, text_bytes = arrays.values()
+            arrays = self._arrays.read(KIND, row.group_id, files, only=names, optional=(LENSES,), shapes=shapes_of(row))
+        pose, intrinsics, sizes, text_bytes = (arrays[name] for name in names)
         try:
             image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
-        except UnicodeDecodeError as error:
+            lenses = lenses_of(arrays[LENSES], len(pose)) if LENSES in arrays else ()
+        except (ValueError, TypeError, KeyError, RuntimeError, RecursionError) as error:
             raise CorruptError(
-                f"scene {row.name}: the names of its cameras are not valid text: ingest it again",
+                f"scene {row.name}: the names or lenses of its cameras are not valid text: ingest it again",
                 code="catalog_invalid",
             ) from error
-        return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
+        return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised), lenses=lenses)
 
     def remove(self, ref: str) -> Scene:
         """Remove a scene from lists and the next revision, leaving a tombstone; `prune` deletes its arrays later."""

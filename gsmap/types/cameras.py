@@ -3,13 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.types.tensors import to_tensor
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A camera model of COLMAP with its parameters; `gsmap.geometry.camera_models` projects with it.
+
+    Args:
+        name: one of COLMAP's 18 models, such as ``OPENCV_FISHEYE`` or ``EQUIRECTANGULAR``.
+        size_px: width and height of the photo.
+        params: parameters in COLMAP's order.
+    """
+
+    name: str
+    size_px: tuple[int, int]
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoLens:
+    """The photo of which a pinhole camera shows the undistorted content, or a part of it.
+
+    Args:
+        photo: name of the photo.
+        model: the lens that took it.
+        R_photo_camera: (3, 3) rotation from the pinhole camera to the camera of the photo; both have one centre.
+    """
+
+    photo: str
+    model: CameraModel
+    R_photo_camera: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +53,7 @@ class Cameras:
         names: C image names, unique; ids as text where the source has none.
         synthesised: true if gsmap synthesized the cameras because the source had none.
         notes: remarks on how they were read, such as lenses that are not pinholes; not copied to derived cameras.
+        lenses: the photo of each camera and its lens, None where the camera is that of the photo; empty if all are.
 
     Raises:
         InputError: wrong shapes, NaN, a pose that is not rigid, a focal length or image size that is not positive.
@@ -34,6 +65,7 @@ class Cameras:
     names: tuple[str, ...] = ()
     synthesised: bool = False
     notes: tuple[str, ...] = ()
+    lenses: tuple[PhotoLens | None, ...] = ()
 
     def __post_init__(self) -> None:
         pose = np.ascontiguousarray(self.T_frame_camera, dtype=np.float64)
@@ -49,6 +81,8 @@ class Cameras:
         names = tuple(str(n) for n in self.names) or tuple(str(i) for i in range(count))
         if len(names) != count:
             raise InputError(f"{count} cameras but {len(names)} names", code="shape_mismatch")
+        if self.lenses and len(self.lenses) != count:
+            raise InputError(f"{count} cameras but {len(self.lenses)} lenses", code="shape_mismatch")
         bad = ~(np.isfinite(pose).all((1, 2)) & np.isfinite(intrinsics).all(1))
         if bad.any():
             raise InputError(f"camera {names[int(np.argmax(bad))]} holds NaN or infinity", code="not_finite")
@@ -89,6 +123,15 @@ class Cameras:
         return out
 
     @property
+    def photo_rows(self) -> dict[str, list[int]]:
+        """Rows of the cameras of each photo by its name; a panorama has several."""
+        out: dict[str, list[int]] = {}
+        lenses = self.lenses or (None,) * len(self)
+        for row, (name, lens) in enumerate(zip(self.names, lenses, strict=True)):
+            out.setdefault(name if lens is None else lens.photo, []).append(row)
+        return out
+
+    @property
     def K(self) -> np.ndarray:
         """Calibration matrices (C, 3, 3)."""
         out = np.tile(np.eye(3), (len(self), 1, 1))
@@ -116,9 +159,30 @@ class Cameras:
     def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Cameras:
         """Return the cameras at an index, slice, boolean mask or integer array as a `Cameras`, also for one index."""
         rows = np.atleast_1d(np.arange(len(self))[index])
-        names = tuple(self.names[i] for i in rows)
-        return Cameras(
-            self.T_frame_camera[rows], self.intrinsics_px[rows], self.sizes_px[rows], names, self.synthesised
+        return replace(
+            self,
+            T_frame_camera=self.T_frame_camera[rows],
+            intrinsics_px=self.intrinsics_px[rows],
+            sizes_px=self.sizes_px[rows],
+            names=tuple(self.names[i] for i in rows),
+            notes=(),
+            lenses=tuple(self.lenses[i] for i in rows) if self.lenses else (),
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Cameras], notes: tuple[str, ...] = ()) -> Cameras:
+        """Concatenate cameras in order; their names must differ."""
+        if not parts:
+            return cls(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2)), notes=notes)
+        lenses = [lens for part in parts for lens in part.lenses or (None,) * len(part)]
+        return cls(
+            np.concatenate([part.T_frame_camera for part in parts]),
+            np.concatenate([part.intrinsics_px for part in parts]),
+            np.concatenate([part.sizes_px for part in parts]),
+            tuple(name for part in parts for name in part.names),
+            any(part.synthesised for part in parts),
+            notes,
+            tuple(lenses) if any(lens is not None for lens in lenses) else (),
         )
 
     def evenly(self, count: int) -> Cameras:
@@ -134,7 +198,7 @@ class Cameras:
         # Scale by the rounded sizes, so that the principal point stays at the same place of the image.
         ratio = sizes / self.sizes_px
         intrinsics = self.intrinsics_px * np.concatenate([ratio, ratio], axis=1)
-        return Cameras(self.T_frame_camera, intrinsics, sizes, self.names, self.synthesised)
+        return replace(self, intrinsics_px=intrinsics, sizes_px=sizes, notes=())
 
     def __repr__(self) -> str:
         return f"Cameras(n={len(self)}{', synthesised' if self.synthesised else ''})"

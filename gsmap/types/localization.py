@@ -22,6 +22,9 @@ class Photo:
         focal_sigma: relative standard deviation of the focal length: 0 if it is known, inf if unknown.
         name: name for messages.
         known: (H, W) bool mask of pixels that show the place and not a person or object in front; None for all.
+        lens: name of the camera model that was undone; empty for a pinhole.
+        faces: photos of 90 degrees that a panorama or a wide fisheye photo consists of, each with ``R_photo_face``
+            (3, 3); it is localized by these, and has no intrinsics of its own.
 
     Raises:
         InputError: no picture, or intrinsics or a mask that cannot be.
@@ -32,6 +35,8 @@ class Photo:
     focal_sigma: float = 0.0
     name: str = "photo"
     known: np.ndarray | None = None
+    lens: str = ""
+    faces: tuple[tuple[Photo, np.ndarray], ...] = ()
 
     def __post_init__(self) -> None:
         intrinsics = np.array(self.intrinsics_px, dtype=np.float64)

@@ -71,7 +71,7 @@ HOMES = {
     "kiss_matcher": {"register"},
     "open3d": {"formats", "gsmap_synthetic"},
     "av": {"localize"},
-    "pycolmap": {"formats", "localize"},
+    "pycolmap": {"formats", "geometry", "localize"},
     "torch": {"formats", "render", "types"},  # types: conversion only
     "pandas": {"types"},
     "pxr": {"formats"},

@@ -184,16 +184,15 @@ def test_missing(tmp_path):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_a_camera_without_a_focal_length_is_refused(tmp_path, text):
-    """pycolmap ends the process when it is asked for one."""
+def test_a_camera_without_a_focal_length_is_a_panorama(tmp_path, text):
+    """pycolmap ends the process when it is asked for the focal length of one."""
     folder = tmp_path / "sparse"
     write_colmap(folder, some(), text=text)
     if text:
-        (folder / "cameras.txt").write_text("7 EQUIRECTANGULAR 640 480 640 480\n")
+        (folder / "cameras.txt").write_text("7 EQUIRECTANGULAR 640 320 640 320\n")
     else:
-        (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 7, 17, 640, 480, 640, 480))
-    with raises(InputError, code="not_pinholes"):
-        read_cameras(folder)
+        (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 7, 17, 640, 320, 640, 320))
+    assert len(read_cameras(folder)) == 6 * len(some())
 
 
 SIZE = (800, 600)
@@ -250,17 +249,19 @@ def test_distortion_is_noted_with_its_pixels_at_a_corner(tmp_path, model):
 
 
 @pytest.mark.parametrize("model", WIDE)
-def test_what_no_pinhole_stands_for_is_left_out_by_camera(tmp_path, model):
+def test_what_no_pinhole_stands_for_is_seen_by_faces(tmp_path, model):
     pinhole = ("PINHOLE", [700, 700, 400, 300])
     want = write_text_model(tmp_path / "sparse", [pinhole, (model, WIDE[model]), pinhole])
     cameras = read_cameras(tmp_path / "sparse")
-    assert cameras.names == (want.names[0], want.names[2])
-    np.testing.assert_allclose(cameras.T_frame_camera, want.T_frame_camera[[0, 2]], atol=1e-9)
-    assert len(cameras.notes) == 1
-    assert f"({model}): undistort" in cameras.notes[0]
-    write_text_model(tmp_path / "alone", [(model, WIDE[model])])
-    with raises(NotPinholesError, code="not_pinholes", match=model):
-        read_cameras(tmp_path / "alone")
+    assert (cameras.names[0], cameras.names[-1]) == (want.names[0], want.names[2])
+    np.testing.assert_allclose(cameras.T_frame_camera[[0, -1]], want.T_frame_camera[[0, 2]], atol=1e-9)
+    rows = cameras.photo_rows[want.names[1]]
+    assert 1 <= len(rows) <= 6
+    np.testing.assert_allclose(cameras.centers[rows], np.tile(want.centers[1], (len(rows), 1)), atol=1e-9)
+    np.testing.assert_allclose(cameras.T_frame_camera[rows[0]], want.T_frame_camera[1], atol=1e-9)
+    assert cameras.intrinsics_px[rows, 0] == pytest.approx(cameras.sizes_px[rows, 0] / 2)
+    (note,) = cameras.notes
+    assert f"1 of 3 cameras are too wide for one pinhole ({model})" in note
 
 
 def transforms(path, shared: dict, frames: list[dict]) -> None:
@@ -290,23 +291,33 @@ def test_distortion_of_transforms_is_noted(tmp_path, shared, model, params):
     assert f"{shift_at_corners(model, params):.3g} px" in note
 
 
-@pytest.mark.parametrize(
-    "lens",
-    [
-        {"camera_model": "EQUIRECTANGULAR", "fl_x": None},
-        {"camera_model": "OPENCV_FISHEYE", "fl_x": 300},
-        {"camera_model": "FISHEYE624"},
-        {"k1": 0.1, "k4": 0.1},
-    ],
-)
-def test_transforms_without_a_pinhole_are_left_out_by_frame(tmp_path, lens):
+@pytest.mark.parametrize("lens", [{"camera_model": "VR180_L"}, {"k1": 0.1, "k4": 0.1}, {"camera_model": "FISHEYE624"}])
+def test_transforms_of_unknown_lenses_are_left_out_by_frame(tmp_path, lens):
     transforms(tmp_path / "t.json", {}, [{}, lens, {}])
     cameras = read_cameras(tmp_path / "t.json")
     assert cameras.names == ("0.jpg", "2.jpg")
     assert len(cameras.notes) == 1
     transforms(tmp_path / "t.json", lens, [{}])
-    with pytest.raises(NotPinholesError):
+    with raises(NotPinholesError, code="not_pinholes"):
         read_cameras(tmp_path / "t.json")
+
+
+@pytest.mark.parametrize(
+    ("lens", "model"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR", "fl_x": None, "h": 400}, "EQUIRECTANGULAR"),
+        ({"camera_model": "FISHEYE", "fl_x": 300}, "OPENCV_FISHEYE"),
+        (
+            {"camera_model": "FISHEYE624", "fl_x": 300, "distortion_params": [0.01] + [0] * 11},
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+        ),
+    ],
+)
+def test_panoramas_and_wide_lenses_of_transforms_have_faces(tmp_path, lens, model):
+    transforms(tmp_path / "t.json", lens, [{}])
+    cameras = read_cameras(tmp_path / "t.json")
+    assert cameras.names[0] == "0.jpg#front"
+    assert {one.model.name for one in cameras.lenses} == {model}
 
 
 def test_undistorted_cameras_have_no_note(tmp_path):

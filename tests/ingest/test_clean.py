@@ -8,7 +8,7 @@ import gsmap.map
 from gsmap import formats
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.sh import sh0_of_rgb
-from gsmap.ingest import clean
+from gsmap.ingest.clean import clean
 from gsmap.types import Gaussians
 from gsmap_synthetic.perturb import strewn
 

@@ -214,19 +214,21 @@ def nerfstudio_capture(folder, frames: list[dict]) -> None:
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
-def test_lenses_that_are_no_pinholes_are_noted_and_left_out_one_by_one(tmp_path):
-    nerfstudio_capture(tmp_path, [{}, {"k1": -0.1}, {"camera_model": "EQUIRECTANGULAR"}])
+def test_lenses_that_are_no_pinholes_are_noted_one_by_one(tmp_path):
+    nerfstudio_capture(tmp_path, [{}, {"k1": -0.1}, {"camera_model": "EQUIRECTANGULAR"}, {"camera_model": "VR180_L"}])
     (capture,) = read_captures(tmp_path)
-    assert capture.cameras.names == ("0.jpg", "1.jpg")
+    assert capture.cameras.names[:3] == ("0.jpg", "1.jpg", "2.jpg#front")
+    assert list(capture.cameras.photo_rows) == ["0.jpg", "1.jpg", "2.jpg"]
     assert sum("OPENCV" in note and " px" in note for note in capture.notes) == 1
-    assert sum("EQUIRECTANGULAR" in note and "undistort" in note for note in capture.notes) == 1
+    assert sum("EQUIRECTANGULAR" in note and "faces" in note for note in capture.notes) == 1
+    assert sum("VR180_L" in note and "left out" in note for note in capture.notes) == 1
 
 
-def test_a_capture_of_panoramas_alone_is_ingested_without_their_cameras(tmp_path):
-    nerfstudio_capture(tmp_path, [{"camera_model": "EQUIRECTANGULAR"}] * 2)
+def test_a_capture_of_unknown_lenses_alone_is_ingested_without_its_cameras(tmp_path):
+    nerfstudio_capture(tmp_path, [{"camera_model": "VR180_L"}] * 2)
     (capture,) = read_captures(tmp_path)
     assert capture.cameras.synthesised
-    assert any("EQUIRECTANGULAR" in note and "2 of 2" in note for note in capture.notes)
+    assert any("VR180_L" in note and "2 of 2" in note for note in capture.notes)
     with pytest.raises(NotPinholesError):  # the person asked for just these
         read_captures(tmp_path / "splat.ply", cameras=tmp_path / "transforms.json")
 

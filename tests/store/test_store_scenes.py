@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from raising import raises
@@ -5,11 +7,12 @@ from sqlalchemy import text
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
+from gsmap.geometry.camera_models import camera_model, pinhole_views
 from gsmap.geometry.morton import morton_order
-from gsmap.store import Store, scene_id
+from gsmap.store import Store, scene_content, scene_id
 from gsmap.store.chunk_boxes import chunk_boxes
 from gsmap.store.layout import CHUNK_ROWS
-from gsmap.types import Gaussians
+from gsmap.types import Cameras, Gaussians
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
@@ -275,3 +278,35 @@ def test_names_with_characters_that_nobody_sees_are_refused(store, name):
 @pytest.mark.parametrize("name", ["نمی\u200cخواهم", "👩\u200d🚀", "salle à manger", "部屋"])
 def test_names_in_any_script_are_kept(store, name):
     assert store.scenes.add(make_gaussians(), make_cameras(), name=name)[0].name == name
+
+
+def with_lenses() -> Cameras:
+    """A pinhole, a distorted photo and a panorama."""
+    pinhole = make_cameras()[:1]
+    bent = camera_model("OPENCV", 640, 480, (500.0, 510.0, 320.0, 240.0, -0.1, 0.02, 1e-3, 0.0))
+    panorama = camera_model("EQUIRECTANGULAR", 640, 320, (640.0, 320.0))
+    views = [pinhole_views(model, pinhole.T_frame_camera[0], name) for model, name in ((bent, "b"), (panorama, "p"))]
+    return Cameras.concatenate([pinhole, *views])
+
+
+def test_lenses_come_back_and_count_as_content(store):
+    given = with_lenses()
+    g = make_gaussians()
+    scene, _ = store.scenes.add(g, given, name="a")
+    for name in ("a", store.scenes.thin("a", np.ones(len(g), bool)).id):
+        found = store.scenes.cameras(name)
+        assert found.lenses[0] is None
+        for lens, want in zip(found.lenses[1:], given.lenses[1:], strict=True):
+            assert (lens.photo, lens.model) == (want.photo, want.model)
+            np.testing.assert_array_equal(lens.R_photo_camera, want.R_photo_camera)
+        assert found.photo_rows == given.photo_rows
+    assert scene.id != scene_id(g, replace(given, lenses=()))
+    assert scene_id(g, make_cameras()) == scene_id(g, replace(make_cameras(), lenses=(None,) * 3))
+
+
+@pytest.mark.parametrize("wrong", ["[null]", '{"a": 1}', "[{}, 1]", "[" * 9999, "nonsense"])
+def test_damaged_lenses_are_reported(store, monkeypatch, wrong):
+    monkeypatch.setattr(scene_content, "lens_array", lambda cameras: np.frombuffer(wrong.encode(), np.uint8))
+    store.scenes.add(make_gaussians(), with_lenses(), name="a")
+    with raises(CorruptError, code="catalog_invalid"):
+        store.scenes.cameras("a")

@@ -15,7 +15,7 @@ from gsmap.ingest.dates import photo_date
 from gsmap.map.date_filter import parse_moment
 from gsmap.map.photo_names import PhotoMatches, match_photos
 from gsmap.map.photo_poses import LocalizePhotos
-from gsmap.map.pixel_points import surface_at
+from gsmap.map.pixel_points import photo_size, surface_at, view_of
 from gsmap.map.settings import Settings
 from gsmap.map.specified_points import SpecifiedPoint, parse_scene_point
 from gsmap.map.stages.optimize import Solution, solve_observed
@@ -234,9 +234,10 @@ def _read_gcp(
         camera, stranger = of_photo[line.image], placed.get(line.image)
         if camera is not None:
             scene, one = camera
-            pixel = _pixel(line.pixel, one.sizes_px[0].tolist(), request.photo_size_px, where, line.image)
+            named = next(iter(one.photo_rows))
+            picked_px = _pixel(line.pixel, photo_size(one), request.photo_size_px, where, line.image)
+            one, pixel = view_of(one, picked_px)
             pose, intrinsics, covariance = one.T_frame_camera[0], one.intrinsics_px[0], None
-            named = one.names[0]
         elif stranger is not None:
             scene, named = stranger.scene, line.image
             pixel = _pixel(line.pixel, stranger.size_px, request.photo_size_px, where, line.image)
@@ -299,17 +300,18 @@ class _Cameras:
 
     def match(self, photos: Mapping[str, str]) -> PhotoMatches:
         """Match photos to cameras; the values are their sources, see `gsmap.map.photo_names`."""
-        return match_photos(photos, {name: one.names for name, (_, one) in self._of_scene.items()}, photos)
+        names = {name: list(one.photo_rows) for name, (_, one) in self._of_scene.items()}
+        return match_photos(photos, names, photos)
 
     def __getitem__(self, camera: tuple[str, int]) -> tuple[str, Cameras]:
-        """Return the id of a scene and one of its cameras, by the scene's name and the camera's row."""
+        """Return the id of a scene and the cameras of one of its photos, by the scene's name and the photo's number."""
         scene, cameras = self._of_scene[camera[0]]
-        return scene, cameras[[camera[1]]]
+        return scene, cameras[list(cameras.photo_rows.values())[camera[1]]]
 
 
 def _with_depth(store: Store, image: ImagePoint) -> ImagePoint:
     """Add a rendered depth to the observation of a control point that only one photo shows."""
-    size = np.ceil(np.maximum(image.pixel + 1, 2 * image.intrinsics_px[2:])).astype(np.int64)
+    size = np.ceil(2 * image.intrinsics_px[2:]).astype(np.int64)
     camera = Cameras(image.T_scene_camera[None], image.intrinsics_px[None], size[None], (image.image,))
     try:
         gaussians = store.scenes.gaussians(image.scene)
@@ -350,7 +352,9 @@ def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, n
         scene, camera = cameras[matches.cameras[photo]]
         sigma, common, sea_level = one.sigmas(settings.world)
         position = np.array([one.longitude_deg, one.latitude_deg, one.height_m])
-        fix = PositionFix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level)
+        fix = PositionFix(
+            next(iter(camera.photo_rows)), scene, camera.centers[0], WGS84, position, sigma, common, sea_level
+        )
         noted.items.append(fix)
         if photo in bare:
             by_file_name.append((photo, fix))
