@@ -38,8 +38,6 @@ try() {
     here=$(mktemp -d)
     trap 'rm -rf "$here"' EXIT
     "$PYTHON" -m venv "$here/venv"
-    # As tools/setup.sh does: torch by itself first, so that its pin is settled.
-    "$here/venv/bin/pip" install -q -c constraints.txt torch
     "$here/venv/bin/pip" install -q -c constraints.txt dist/gsmapdb-*.whl
     cd "$here"
     PATH=$here/venv/bin:$PATH

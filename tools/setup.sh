@@ -6,19 +6,19 @@
 #   tools/setup.sh test       what working on it needs: installed editable, so that tests test this checkout as it lies,
 #                             with what tests, linters and documents need
 #
-# PYTHON=/path/to/python3.12     another interpreter (3.11 to 3.13)
+# PYTHON=/path/to/python3.12     another interpreter (3.11 to 3.14)
 # GSMAP_VENV=/path/to/venv       another place for the environment
-# GSMAP_TORCH_INDEX=URL          take torch from this index (see README, "Install")
+# GSMAP_TORCH_INDEX=URL          install torch, from this index
 set -eu
 cd "$(dirname "$0")/.."
 venv=${GSMAP_VENV:-.venv}
 say() { printf 'gsmap setup: %s\n' "$*" >&2; }
 die() { say "$*"; exit 1; }
 
-good_python() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; }
+good_python() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' 2>/dev/null; }
 
 find_python() {
-    for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11; do
+    for candidate in ${PYTHON:-} python3 python3.14 python3.13 python3.12 python3.11; do
         if command -v "$candidate" >/dev/null && good_python "$candidate"; then command -v "$candidate"; return; fi
     done
 }
@@ -33,10 +33,12 @@ if [ -z "$python" ] || ! "$python" -c 'import os, sysconfig, sys
 sys.exit(not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.h")))'; then
     packages="$packages python3-dev"
 fi
-for pair in libGL.so.1:libgl1 libEGL.so.1:libegl1 libgomp.so.1:libgomp1 libusb-1.0.so.0:libusb-1.0-0; do
-    # A library the loader knows is installed, whatever package it came from.
-    PATH="$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null | grep -q "${pair%%:*}" || packages="$packages ${pair##*:}"
-done
+if [ "${1:-}" = test ]; then
+    # Libraries of open3d. One that the loader knows is installed, whatever package it came from.
+    for pair in libGL.so.1:libgl1 libEGL.so.1:libegl1 libgomp.so.1:libgomp1 libusb-1.0.so.0:libusb-1.0-0; do
+        PATH="$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null | grep -q "${pair%%:*}" || packages="$packages ${pair##*:}"
+    done
+fi
 # The page of gsmap view is built by Node.js; gsmap does without where it cannot be had.
 node=""
 command -v npm >/dev/null || node="nodejs npm"
@@ -59,7 +61,7 @@ if [ -n "$packages" ]; then
     DEBIAN_FRONTEND=noninteractive $as_root apt-get install -y -qq --no-install-recommends $packages >&2
     python=$(find_python)
 fi
-[ -n "$python" ] || die "no Python 3.11 to 3.13 found: install one and name it with PYTHON=..."
+[ -n "$python" ] || die "no Python 3.11 to 3.14 found: install one and name it with PYTHON=..."
 
 # --- the environment -------------------------------------------------------------------------------------------------
 say "environment $venv with $("$python" --version)"
@@ -68,10 +70,10 @@ if [ -n "${GSMAP_TORCH_INDEX:-}" ]; then
     "$venv/bin/python" -m pip install -q -c constraints.txt --index-url "$GSMAP_TORCH_INDEX" torch
 fi
 say "installing packages and building the native kernels (a few minutes)"
-# torch first and by itself: its pin must be settled before another package's open range can pull in a newer one.
 pip() { "$venv/bin/python" -m pip "$@"; }
-pip install -q -c constraints.txt torch
 if [ "${1:-}" = test ]; then
+    # torch first and by itself: its pin must be settled before another package's open range can pull in a newer one.
+    pip install -q -c constraints.txt torch
     # Without isolation: the module is built by the tools that stay in the environment, again and again.
     pip install -q -c constraints.txt scikit-build-core nanobind cmake ninja
     pip install -q -c constraints.txt --no-build-isolation -e ".[test,lint,docs]"

@@ -22,6 +22,7 @@ from gsmap.errors import MALFORMED, InputError, NotGaussiansError
 from gsmap.formats.quantise import check_size
 from gsmap.geometry.origins import centred
 from gsmap.types import FileInfo, Gaussians
+from gsmap.types.tensors import require_torch
 
 VERSION = 2
 
@@ -105,8 +106,7 @@ def _loaded(path: str | os.PathLike[str]) -> Any:
             )
     if not any(entry.filename.endswith("/data.pkl") for entry in entries):
         raise InputError(f"{path} is a ZIP file, but no torch checkpoint: it has no data.pkl", code="wrong_file_type")
-    import torch
-
+    torch = require_torch("checkpoints")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

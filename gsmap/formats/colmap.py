@@ -17,7 +17,7 @@ from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import unique
 from gsmap.formats.lenses import pinhole_cameras
-from gsmap.geometry.camera_models import camera_model
+from gsmap.geometry.camera_models import camera_model, require_pycolmap
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.types import Cameras
 from gsmap.types.cameras import CameraModel
@@ -119,8 +119,7 @@ def _write_lines(path: Path, lines: list[str]) -> None:
 
 
 def _binary_cameras(data: bytes) -> Iterator[tuple[int, CameraModel]]:
-    import pycolmap
-
+    pycolmap = require_pycolmap()
     (count,) = struct.unpack_from("<Q", data)
     offset = 8
     for _ in range(count):

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.errors import MissingDependencyError
 from gsmap.types.cameras import CameraModel, Cameras, PhotoLens
 
 EQUIRECTANGULAR = "EQUIRECTANGULAR"
@@ -28,10 +29,24 @@ _MIN_COVERED = 0.25  # fraction of a face that the photo must show
 _GRID = 9  # samples along the side of a face
 
 
+def require_pycolmap() -> Any:
+    """Return the module pycolmap.
+
+    Raises:
+        MissingDependencyError: pycolmap is not installed, as on Linux on ARM, for which it has no wheel.
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise MissingDependencyError(
+            "camera models and resection need pycolmap, which has no wheel for this system: build it from source"
+        ) from error
+    return pycolmap
+
+
 @lru_cache(maxsize=64)
 def _camera(model: CameraModel) -> Any:
-    import pycolmap
-
+    pycolmap = require_pycolmap()
     width, height = model.size_px
     camera = pycolmap.Camera(model=model.name, width=width, height=height, params=list(model.params))
     if not camera.verify_params():
@@ -48,8 +63,7 @@ def camera_model(name: object, width: int, height: int, params: tuple[float, ...
     Raises:
         ValueError, RuntimeError: unknown model, or a wrong number of parameters.
     """
-    import pycolmap
-
+    pycolmap = require_pycolmap()
     camera = pycolmap.Camera(model=name, width=width, height=height, params=list(params))
     model = CameraModel(str(camera.model_name), (width, height), tuple(float(value) for value in params))
     _camera(model)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.geometry.camera_models import require_pycolmap
 from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3, skew
 from gsmap.geometry.similarities import rotation_vectors
@@ -68,10 +69,9 @@ def resect(
         points: (K, 3) positions in the map.
         focal_sigma: as in `Photo`; see `is_free`.
     """
-    import pycolmap
-
     if len(pixels) < 4:
         return None
+    pycolmap = require_pycolmap()
     fx, fy, cx, cy = intrinsics_px
     free = is_free(focal_sigma)
     camera = pycolmap.Camera(

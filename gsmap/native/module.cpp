@@ -22,6 +22,7 @@ void bind_parts(nb::module_ &);
 void bind_pictures(nb::module_ &);
 void bind_quaternions(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
+void bind_rays(nb::module_ &);
 void bind_sift(nb::module_ &);
 void bind_signatures(nb::module_ &);
 void bind_stopping(nb::module_ &);
@@ -49,6 +50,7 @@ NB_MODULE(_native, m) {
     gsmap::bind_pictures(m);
     gsmap::bind_quaternions(m);
     gsmap::bind_rasteriser(m);
+    gsmap::bind_rays(m);
     gsmap::bind_sift(m);
     gsmap::bind_signatures(m);
     gsmap::bind_stopping(m);

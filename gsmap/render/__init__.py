@@ -12,6 +12,7 @@ from gsmap.render.index import ChunkIndex
 from gsmap.render.native import num_threads, set_num_threads
 from gsmap.render.outputs import Rendering
 from gsmap.render.rendering import render
+from gsmap.types.tensors import require_torch
 
 if TYPE_CHECKING:
     from gsmap.render.tensors import GaussianTensors
@@ -32,6 +33,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "GaussianTensors":  # needs torch
+    if name == "GaussianTensors":
+        require_torch("tensors of Gaussians")
         return importlib.import_module("gsmap.render.tensors").GaussianTensors
     raise AttributeError(f"module 'gsmap.render' has no attribute {name!r}")

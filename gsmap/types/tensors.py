@@ -15,8 +15,20 @@ def to_tensor(array: np.ndarray, device: str) -> Any:
     Raises:
         MissingDependencyError: torch is not installed.
     """
+    return require_torch("tensors").from_numpy(np.array(array, dtype=np.float32)).to(device)
+
+
+def require_torch(use: str) -> Any:
+    """Return the module torch.
+
+    Args:
+        use: subject of the message, in the plural.
+
+    Raises:
+        MissingDependencyError: torch is not installed.
+    """
     try:
         import torch
     except ImportError as error:
-        raise MissingDependencyError("tensors need torch: pip install torch") from error
-    return torch.from_numpy(np.array(array, dtype=np.float32)).to(device)
+        raise MissingDependencyError(f"{use} need torch, which is not installed", extra="torch") from error
+    return torch

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
+from gsmap._native import QuadRays
 from gsmap_synthetic.surfaces import Surfaces
 
 _LEVELS = 4
@@ -60,18 +60,15 @@ class Skin:
 
     @cached_property
     def _rays(self):
-        return ray_scene(self.corners[self.present])
+        return QuadRays(self.corners[self.present])
 
     def cast(self, origins: np.ndarray, directions: np.ndarray):
         """First hits of rays (n, 3): distance in units of the direction (inf for none), quad index, and its (s, t)."""
-        hit = self._rays.cast_rays(rays_tensor(origins, directions))
-        primitive = hit["primitive_ids"].numpy()
-        found = primitive != 0xFFFFFFFF
-        primitive = np.where(found, primitive, 0).astype(np.int64)
-        b1, b2 = hit["primitive_uvs"].numpy().T
-        first = primitive % 2 == 0  # (p00, p10, p11), the other is (p00, p11, p01)
+        distance, triangle, b1, b2 = self._rays.cast(*rays(origins, directions))
+        triangle = np.maximum(triangle, 0)
+        first = triangle % 2 == 0  # (p00, p10, p11), the other is (p00, p11, p01)
         s, t = np.where(first, b1 + b2, b1), np.where(first, b2, b1 + b2)
-        return hit["t_hit"].numpy(), self.present[primitive // 2], s, t
+        return distance, self.present[triangle // 2], s, t
 
     def colour(self, quad: np.ndarray, s: np.ndarray, t: np.ndarray, footprint_m: np.ndarray) -> np.ndarray:
         """(n, 3) float32 display colours in [0, 1] at (s, t) of quads, averaged over about ``footprint_m``."""
@@ -86,30 +83,14 @@ class Skin:
         return out / np.float32(255)
 
 
-def _open3d() -> Any:
-    """The ray caster, loaded by those who bake alone; its type stubs do not know numpy."""
-    import open3d
-
-    return open3d
-
-
 def _triangles(count: int) -> np.ndarray:
     base = 4 * np.arange(count, dtype=np.uint32)[:, None]
     return (base[:, :, None] + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
 
 
-def ray_scene(corners: np.ndarray) -> Any:
-    o3d = _open3d()
-
-    scene = o3d.t.geometry.RaycastingScene()
-    vertices = o3d.core.Tensor(corners.reshape(-1, 3).astype(np.float32))
-    scene.add_triangles(vertices, o3d.core.Tensor(_triangles(len(corners))))
-    return scene
-
-
-def rays_tensor(origins: np.ndarray, directions: np.ndarray) -> Any:
-    o3d = _open3d()
-    return o3d.core.Tensor(np.concatenate([origins, directions], axis=1).astype(np.float32))
+def rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return origins and directions (n, 3) as `QuadRays` takes them."""
+    return np.ascontiguousarray(origins, np.float64), np.ascontiguousarray(directions, np.float64)
 
 
 def bake(
@@ -158,7 +139,7 @@ def mean_albedo(surfaces: Surfaces, quads: Iterable[int]) -> np.ndarray:
 def _light(surfaces: Surfaces, corners, sizes, mean_albedo):
     """Irradiance on a coarse grid of every quad: the grids' (nu, nv) and all values (P, 3), normalised in exposure."""
     standing = np.flatnonzero(np.array(surfaces.leaves) < 0)  # Doors stand open while the lamps shine.
-    scene = ray_scene(corners[standing])
+    scene = QuadRays(corners[standing])
     grids = np.clip(np.ceil(sizes / _LIGHT_STEP_M).astype(int) + 1, 2, 64)
     at, facing = [], []
     for q, (nu, nv) in enumerate(grids):
@@ -176,16 +157,15 @@ def _light(surfaces: Surfaces, corners, sizes, mean_albedo):
     radiosity = mean_albedo * np.add.reduceat(light, starts) / grids.prod(1)[:, None]
     radiosity += 1.2 * mean_albedo * np.array(surfaces.glows)[:, None]
     bounce = np.zeros_like(light)
-    rays = 24
-    directions = _hemisphere(rays)
+    num_rays = 24
+    directions = _hemisphere(num_rays)
     tangent = np.cross(normals, np.where(np.abs(normals[:, 2:]) > 0.9, [1.0, 0, 0], [0, 0, 1.0]))
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     bitangent = np.cross(normals, tangent)
     for x, y, z in directions:
-        hit = scene.cast_rays(rays_tensor(points, x * tangent + y * bitangent + z * normals))
-        primitive = hit["primitive_ids"].numpy()
-        found = primitive != 0xFFFFFFFF
-        bounce[found] += radiosity[standing[primitive[found] // 2]] / rays
+        _, triangle, _, _ = scene.cast(*rays(points, x * tangent + y * bitangent + z * normals))
+        found = triangle >= 0
+        bounce[found] += radiosity[standing[triangle[found] // 2]] / num_rays
     total = light + 1.5 * bounce + 0.04
     # A point inside other furniture is dark for a reason; expose for the ones that are not.
     return grids, (total * (0.85 / np.median(total[total.mean(1) > 0.1]))).astype(np.float32)
@@ -202,9 +182,7 @@ def _direct(scene, lamps, points, normals) -> np.ndarray:
             distance = np.linalg.norm(way, axis=1)
             cosine = (way * normals[near]).sum(1) / distance
             lit = np.flatnonzero(cosine > 0)
-            rays = rays_tensor(points[near[lit]], way[lit])
-            free = ~scene.test_occlusions(rays, tnear=0.0, tfar=0.98).numpy().astype(bool)
-            lit = lit[free]
+            lit = lit[scene.occluded(*rays(points[near[lit]], way[lit]), 0.98) == 0]
             light[near[lit]] += 0.25 * colour * (cosine[lit] / (distance[lit] ** 2 + 0.15))[:, None]
     return light
 

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gsmap._native import QuadRays
 from gsmap.errors import ConfigError
-from gsmap_synthetic.bake import ray_scene, rays_tensor
+from gsmap_synthetic.bake import rays
 from gsmap_synthetic.edits import Add, Edit, Move, Paint, Remove, apply
 from gsmap_synthetic.furniture import PIECES
 from gsmap_synthetic.layout import door_clearance, door_spans, find_spot, footprint, outline, overlap, walls
@@ -207,7 +208,7 @@ class _Script:
 
     def _free_top(self, room: int, size_m: tuple[float, float]) -> np.ndarray | None:
         """A pose on a level, free surface of one thing, found by looking down from chest height."""
-        scene, owners = ray_scene(np.stack(self.surfaces.corners)), np.array(self.surfaces.owners)
+        scene, owners = QuadRays(np.stack(self.surfaces.corners)), np.array(self.surfaces.owners)
         plan = self.place.rooms[room]
         tops = [o for o in self._present("furniture") if o.room == room and o.name in _CARRIES]
         tops = [o for o in tops if o.id not in self.touched]
@@ -225,11 +226,11 @@ class _Script:
             u, v = np.meshgrid(np.linspace(-0.55, 0.55, 5) * size_m[0], np.linspace(-0.05, 1.05, 5) * size_m[1])
             points = np.stack([u, v, 0 * u, 0 * u + 1], axis=-1).reshape(-1, 4) @ pose.T
             eyes = points[:, :3] + [0, 0, 1.35]
-            hit = scene.cast_rays(rays_tensor(eyes, np.tile([0, 0, -1.0], (len(eyes), 1))))
-            height = 1.35 - hit["t_hit"].numpy()
+            distance, triangle, _, _ = scene.cast(*rays(eyes, np.tile([0, 0, -1.0], (len(eyes), 1))))
+            height = 1.35 - distance
             if not np.isfinite(height).all():
                 continue
-            owner = owners[hit["primitive_ids"].numpy() // 2]
+            owner = owners[triangle // 2]
             on = self.surfaces.objects[owner[0]]
             if (
                 np.ptp(height) < 1e-3

@@ -69,7 +69,7 @@ HOMES = {
     "onnxruntime": {"networks"},
     "small_gicp": {"register"},
     "kiss_matcher": {"register"},
-    "open3d": {"formats", "gsmap_synthetic"},
+    "open3d": {"formats"},
     "av": {"localize"},
     "pycolmap": {"formats", "geometry", "localize"},
     "torch": {"formats", "render", "types"},  # types: conversion only

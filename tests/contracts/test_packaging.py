@@ -30,7 +30,7 @@ def sources(tmp_path_factory):
     return target
 
 
-def test_the_source_archive_can_build_the_page(sources, tmp_path, monkeypatch):
+def test_the_source_archive_holds_the_page_and_its_sources(sources, tmp_path, monkeypatch):
     build = pytest.importorskip("scikit_build_core.build")
     (sources / "gsmap" / "view" / "built").mkdir(exist_ok=True)
     (sources / "gsmap" / "view" / "built" / "page.js").write_text("of this checkout")
@@ -43,7 +43,8 @@ def test_the_source_archive_can_build_the_page(sources, tmp_path, monkeypatch):
     needed = ("package.json", "package-lock.json", "build.mjs", "index.html", "style.css", "src/main.ts")
     assert {f"{page}/{name}" for name in needed} <= names
     assert {"tools/build_page.sh", "CMakeLists.txt", "gsmap/native/module.cpp", "migrations/env.py"} <= names
-    assert not [name for name in names if "node_modules" in name or name.startswith(("gsmap/view/built/", ".ci"))]
+    assert "gsmap/view/built/page.js" in names, "a source archive builds without Node.js"
+    assert not [name for name in names if "node_modules" in name or name.startswith(".ci")]
 
 
 def test_a_package_is_built_with_the_page_and_without_its_sources():

@@ -30,8 +30,7 @@ def _in_place(capture):
 
 
 def test_untrained_gaussians_lie_on_the_surfaces(place, captures):
-    import open3d as o3d
-
+    o3d = pytest.importorskip("open3d")
     scene = o3d.t.geometry.RaycastingScene()
     vertices, triangles = place.skin.with_shut(range(len(place.doors))).mesh()
     scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))

@@ -63,7 +63,7 @@ def read(path: str | os.PathLike[str], params: Params | None = None) -> Scan:
     Raises:
         NotFoundError: no such file.
         InputError: an unknown suffix, a file that is damaged or not what its suffix says, or no finite point.
-        MissingDependencyError: ``.las`` and ``.laz`` need the extra ``las``.
+        MissingDependencyError: ``.las`` and ``.laz`` need the extra ``las``, meshes and ``.pcd`` the extra ``mesh``.
     """
     path, params = Path(path), params or Params()
     suffix = _suffix(path)

@@ -27,9 +27,7 @@ def read(path: Path, params: limits.Params) -> Scan:
         MissingDependencyError: laspy or lazrs is not installed.
     """
     if not all(importlib.util.find_spec(name) for name in ("laspy", "lazrs")):
-        raise MissingDependencyError(
-            f"{path}: .las and .laz are read by laspy, which is not installed", extra="las"
-        )
+        raise MissingDependencyError(f"{path}: .las and .laz are read by laspy, which is not installed", extra="las")
     _require_header(path)
     found = read_in_process(path, "las", params)
     counts, scales, offsets = found.get("counts", np.zeros((0, 3))), found["scales"], found["offsets"]

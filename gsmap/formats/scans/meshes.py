@@ -5,12 +5,13 @@ A mesh becomes points spread evenly over its area, coloured by its textures, els
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsmap.errors import InputError
+from gsmap.errors import InputError, MissingDependencyError
 from gsmap.formats.scans import limits
 from gsmap.formats.scans.points import scan_of
 from gsmap.formats.scans.process import read_in_process
@@ -24,7 +25,12 @@ def read(path: Path, params: limits.Params) -> Scan:
 
     Raises:
         InputError: not what its suffix says, damaged, or beyond the limits of time and memory.
+        MissingDependencyError: open3d is not installed.
     """
+    if importlib.util.find_spec("open3d") is None:
+        raise MissingDependencyError(
+            f"{path}: meshes and .pcd clouds are read by open3d, which is not installed", extra="mesh"
+        )
     kind = "cloud" if path.suffix.lower() == ".pcd" else "mesh"
     if path.suffix.lower() == ".ply":
         _require_vertices(path)
