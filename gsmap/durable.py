@@ -8,7 +8,6 @@ devices.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import re
 import shutil
@@ -20,6 +19,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from gsmap import platform
 from gsmap.errors import BusyError, CorruptError, DiskFullError, InputError, failed_path, of_system
 
 _OWNER = 12  # characters of an owner's id in names of staged folders
@@ -159,7 +159,7 @@ def remove_staged(parent: Path, owner: str, name: str | None = None) -> tuple[in
         if not pattern.fullmatch(entry) or not is_folder(parent / entry):
             continue
         try:
-            handle = lock_folder(parent / entry, fcntl.LOCK_NB)
+            handle = lock_folder(parent / entry, wait=False)
         except BlockingIOError:
             busy.append(parent / entry)
             continue
@@ -187,15 +187,15 @@ def make_locked_folder(path: Path) -> tuple[Path, int]:
         os.close(handle)
 
 
-def lock_folder(folder: Path, how: int = 0) -> int:
+def lock_folder(folder: Path, *, wait: bool = True) -> int:
     """Open and lock a folder, not a link to one; return the descriptor, with which the lock goes.
 
-    Args:
-        how: `fcntl.LOCK_NB` to raise BlockingIOError instead of waiting.
+    Raises:
+        BlockingIOError: another process holds the lock, and ``wait`` is false.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | how)
+        platform.lock(handle, wait=wait)
     except BaseException:
         os.close(handle)
         raise
@@ -231,7 +231,7 @@ def _descriptor(path: Path) -> int | None:
 
     Opening such a path again would truncate a shell redirection, and replacing it would replace another process's file.
     """
-    own = {os.path.realpath(folder) for folder in ("/proc/self/fd", "/dev/fd")}
+    own = platform.descriptor_folders()
     for _ in range(40):  # the system's limit of links
         folder = os.path.realpath(path.parent)
         if folder in own and path.name.isdecimal():
@@ -260,8 +260,8 @@ def _replace(path: Path, staged: Path, write: Callable[[Path], object]) -> None:
     sync_folder(path.parent)
 
 
-def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
-    """Lock an open file or folder (``how``: `fcntl.LOCK_EX`, `fcntl.LOCK_SH`), waiting up to ``patience_s`` for it.
+def lock_within(handle: int, patience_s: float, busy: str, *, shared: bool = False) -> None:
+    """Lock an open file or folder, waiting up to ``patience_s`` for it.
 
     Raises:
         BusyError: another process kept the lock for ``patience_s``; ``busy`` begins the message.
@@ -269,7 +269,7 @@ def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
     deadline = time.monotonic() + patience_s
     while True:
         try:
-            fcntl.flock(handle, how | fcntl.LOCK_NB)
+            platform.lock(handle, shared=shared, wait=False)
             return
         except BlockingIOError:
             if time.monotonic() > deadline:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,17 +19,14 @@ _REPORT_EVERY_S = 0.5
 
 
 def end_with_parent(parent: int) -> None:
-    """Make the kernel kill this process when the thread that started it ends (Linux only).
+    """Make the kernel kill this process when the thread that started it ends, where it can (`gsmap.platform`).
 
     Args:
         parent: id of the process that started this one.
     """
-    if sys.platform == "linux":
-        import ctypes
-        import signal
+    from gsmap import platform
 
-        pr_set_pdeathsig = 1  # <linux/prctl.h>
-        ctypes.CDLL(None, use_errno=True).prctl(pr_set_pdeathsig, signal.SIGKILL)
+    platform.end_with_thread_of_parent()
     if os.getppid() != parent:  # it ended before the call above
         os._exit(1)
 
@@ -105,5 +103,6 @@ def answer(message: bytes) -> bytes:
 
 
 if __name__ == "__main__":
+    sys.path.append(str(Path(__file__).parents[2]))  # where gsmap lies; the parent sends its own path
     end_with_parent(int(sys.argv[2]))
     work(int(sys.argv[1]))

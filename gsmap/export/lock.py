@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import time
@@ -12,6 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
+from gsmap import platform
 from gsmap.durable import make_folder, sync_folder
 from gsmap.errors import BusyError, StoreError
 from gsmap.types.lock_owner import LockOwner, this_process
@@ -72,7 +72,7 @@ def _acquire(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> tu
         if handle is None:
             return None, fresh
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            platform.lock(handle, wait=False)
         except BlockingIOError:
             owner = _owner_of(handle)
             os.close(handle)

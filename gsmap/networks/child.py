@@ -1,22 +1,20 @@
 """Script of the process that runs one ONNX model, with limits on memory and files; it ends with its parent.
 
-It imports nothing from gsmap, and exchanges messages with `gsmap.networks.process` over one socket. Headers are JSON;
-arrays are in shared memory or, if they do not fit there, follow their header. Received data are never executed.
+It imports `gsmap.platform` alone, and exchanges messages with `gsmap.networks.process` over one socket. Headers are
+JSON; arrays are in shared memory or, if they do not fit there, follow their header. Received data are never executed.
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
 import mmap
 import os
-import resource
 import socket
 import struct
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -116,17 +114,17 @@ class Channel:
 
 def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
     """Load the model, send the names of its inputs and outputs, then run it for every request."""
+    from gsmap import platform
+
     channel = Channel(socket.socket(fileno=link), shared)
     _end_with_parent()
-    # If the machine runs out of memory, the system ends this process first.
-    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
-        file.write("1000")
+    platform.prefer_to_be_killed()
     try:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 4  # no log messages, because errors are raised as well
-        _limit(memory_bytes)
+        platform.limit_process(memory_bytes)
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         ends = session.get_inputs(), session.get_outputs()
         inputs, outputs = ([[t.name, list(t.shape), t.type] for t in end] for end in ends)
@@ -149,21 +147,11 @@ def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
             channel.send(_problem(error), [])
 
 
-def _limit(memory_bytes: int) -> None:
-    """Limit this process: memory beyond the mapped libraries, no growing of files, no core dump."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
-    with contextlib.suppress(OSError, ValueError):  # only Linux can limit the memory of a process
-        with open("/proc/self/statm") as file:
-            mapped = int(file.read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (mapped + memory_bytes, mapped + memory_bytes))
-
-
 def _end_with_parent() -> None:
     """End this process with its parent: the parent's end of the pipe closes in any case, even by SIGKILL."""
-    if sys.platform.startswith("linux"):  # the kernel does it, whatever the threads are doing
-        fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
-        fcntl.fcntl(0, fcntl.F_SETFL, fcntl.fcntl(0, fcntl.F_GETFL) | os.O_ASYNC)
+    from gsmap import platform
+
+    platform.end_with_input()  # whatever the threads are doing
 
     def wait() -> None:
         os.read(0, 1)
@@ -179,4 +167,5 @@ def _problem(error: BaseException) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    sys.path.append(str(Path(__file__).parents[2]))  # where gsmap lies
     main(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3], int(sys.argv[4]))

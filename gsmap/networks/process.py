@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 import weakref
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap import platform
 from gsmap.errors import InputError
 from gsmap.networks import child
 from gsmap.types.model import ModelLimits, Tensor
@@ -49,7 +49,7 @@ class ModelProcess:
         self._lock = threading.Lock()
         self._result_bytes = 0
         link, child_link = socket.socketpair()
-        shared = _shared_memory()
+        shared = platform.shared_memory("gsmap-model")
         command = [sys.executable, "-P", child.__file__, str(child_link.fileno()), str(shared)]
         self._process = subprocess.Popen(
             [*command, path, str(self._memory_bytes)],
@@ -144,14 +144,6 @@ def _tensors(listed: list[Any]) -> tuple[Tensor, ...]:
         )
         for name, shape, kind in listed
     )
-
-
-def _shared_memory() -> int:
-    """Open an unnamed file, in memory if the system supports it."""
-    if hasattr(os, "memfd_create"):
-        return os.memfd_create("gsmap-model")
-    with tempfile.TemporaryFile() as file:
-        return os.dup(file.fileno())
 
 
 def _end(process: subprocess.Popen[bytes], link: socket.socket, shared: int) -> None:

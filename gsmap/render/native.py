@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap import platform
 from gsmap._native import View, num_threads, use_instruction_set
 from gsmap._native import set_num_threads as _set_num_threads
 from gsmap.errors import InputError
@@ -35,8 +36,7 @@ def set_num_threads(count: int | None = None) -> None:
         try:
             count = int(os.environ.get("OMP_NUM_THREADS", ""))
         except ValueError:
-            affinity = getattr(os, "sched_getaffinity", None)
-            count = len(affinity(0)) if affinity else os.cpu_count() or 1
+            count = platform.num_processors()
     if count < 1:
         raise InputError(f"the number of threads must be at least 1, got {count}", code="out_of_range")
     _set_num_threads(count)

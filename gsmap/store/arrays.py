@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import os
 import shutil
@@ -25,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmap import platform
 from gsmap.durable import (
     files_below,
     is_folder,
@@ -86,7 +86,7 @@ class Arrays:
         Args:
             kind, name: kind and id of the group.
         """
-        with self._lock_staging(fcntl.LOCK_SH):
+        with self._lock_staging():
             folder = self.staging / uuid.uuid4().hex
             try:
                 folder.mkdir()
@@ -99,7 +99,7 @@ class Arrays:
     @contextlib.contextmanager
     def scratch(self) -> Iterator[Path]:
         """Yield the path of a temporary folder on the disk of the arrays; it does not exist yet."""
-        with self._lock_staging(fcntl.LOCK_SH):
+        with self._lock_staging():
             folder = self.staging / uuid.uuid4().hex
             try:
                 yield folder
@@ -122,7 +122,7 @@ class Arrays:
         Raises:
             CorruptError: a file is missing, or differs from its digest.
         """
-        with self._lock_staging(fcntl.LOCK_SH):
+        with self._lock_staging():
             folder = self.staging / uuid.uuid4().hex
             try:
                 folder.mkdir()
@@ -151,7 +151,7 @@ class Arrays:
             return
         handle = os.open(self.root, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
-            lock_within(handle, fcntl.LOCK_EX, patience_s, f"{self.root}: other processes have been writing arrays")
+            lock_within(handle, patience_s, f"{self.root}: other processes have been writing arrays")
             self._held.depth = 1
             yield
         finally:
@@ -337,7 +337,7 @@ class Arrays:
         if not is_folder(self.staging):
             return freed
         try:
-            with self._lock_staging(fcntl.LOCK_EX | fcntl.LOCK_NB):
+            with self._lock_staging(to_clean=True):
                 for name in _names(self.staging):
                     freed += sum(found.st_size for found in files_below(self.staging / name).values())
                     if not dry_run:
@@ -348,13 +348,13 @@ class Arrays:
         return freed
 
     @contextlib.contextmanager
-    def _lock_staging(self, how: int) -> Iterator[None]:
+    def _lock_staging(self, *, to_clean: bool = False) -> Iterator[None]:
         """Lock the staging folder: shared while staging, exclusive for cleaning up; the kernel frees the lock with the
         process."""
         self._make_staging()
         handle = os.open(self.staging, os.O_RDONLY | os.O_CLOEXEC | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
-            fcntl.flock(handle, how)
+            platform.lock(handle, shared=not to_clean, wait=not to_clean)
             yield
         finally:
             os.close(handle)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
 import os
 import sqlite3
@@ -194,7 +193,7 @@ class Catalog:
             with translate_errors(self.folder, NOT_KEPT):
                 raise error
         try:
-            lock_within(handle, fcntl.LOCK_EX, patience_s, self._busy_message)
+            lock_within(handle, patience_s, self._busy_message)
             with self._locked():
                 yield
         finally:
@@ -360,7 +359,7 @@ def pause_writers(folder: Path, patience_s: float) -> Iterator[None]:
         yield
         return
     try:
-        lock_within(handle, fcntl.LOCK_SH, patience_s, f"{folder}: other processes have been writing")
+        lock_within(handle, patience_s, f"{folder}: other processes have been writing", shared=True)
         yield
     finally:
         os.close(handle)

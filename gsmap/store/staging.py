@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import re
 import time
@@ -57,7 +56,7 @@ def _remove_leftovers(folder: Path) -> None:
         if not (staged.fullmatch(name) and is_folder(path)):
             continue
         with contextlib.suppress(OSError):  # locked by another process, or not permitted
-            handle = lock_folder(path, fcntl.LOCK_NB)
+            handle = lock_folder(path, wait=False)
             try:
                 if all(_PART.fullmatch(part) for part in os.listdir(handle)):
                     remove_tree(folder.parent, name)

@@ -8,7 +8,6 @@ URL without password.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
@@ -19,6 +18,7 @@ from pathlib import Path
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 
+from gsmap import platform
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import MALFORMED, CorruptError, StoreError
 from gsmap.store.column_types import is_digest
@@ -154,7 +154,7 @@ def trust(map_id: str, url: str) -> None:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX)  # concurrent updates would lose one
+            platform.lock(handle)  # concurrent updates would lose one
             known = trusted_urls()
             known[map_id] = tuple(dict.fromkeys((*known.get(map_id, ()), url)))
             text = json.dumps({"catalogs": known}, indent=1) + "\n"

@@ -6,8 +6,8 @@ import os
 import socket
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
-from pathlib import Path
+
+from gsmap import platform
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class LockOwner:
     @property
     def is_gone(self) -> bool:
         """True if the process certainly has ended; always false for a process of another machine."""
-        number, _, rest = self.process.partition(" ")
+        _, _, rest = self.process.partition(" ")
         started, _, machine = rest.partition(" ")
-        if not self.pid or machine != _machine():
+        if not self.pid or machine != platform.machine_id():
             return False
         try:
             os.kill(self.pid, 0)
@@ -59,33 +59,11 @@ class LockOwner:
             return True
         except OSError:
             pass  # another user's
-        now = _started(number)
+        now = platform.process_start(self.pid)
         return now is not None and now != started
 
 
 def this_process(task: str) -> LockOwner:
     """Return this process as the owner of a task that starts now."""
-    process = f"{os.getpid()} {_started('self') or '-'} {_machine()}"
+    process = f"{os.getpid()} {platform.process_start() or '-'} {platform.machine_id()}"
     return LockOwner(task, socket.gethostname(), process, datetime.now(UTC).isoformat(timespec="microseconds"))
-
-
-@cache
-def _machine() -> str:
-    """Return an identifier of the running kernel and pid namespace, which two processes must share to compare pids.
-
-    Containers of one machine may share its name, and a machine its name with another; neither shares both of these.
-    """
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        return f"{boot}/{os.readlink('/proc/self/ns/pid')}"
-    except OSError:
-        return socket.gethostname()
-
-
-def _started(number: str) -> str | None:
-    """Return the start time of a process in ticks since boot; ``ended`` for a zombie; None if it cannot be read."""
-    try:
-        fields = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
-        return "ended" if fields[0] in "ZX" else fields[19]
-    except (OSError, IndexError):
-        return None

@@ -6,19 +6,18 @@ import contextlib
 import os
 import queue
 import socket
-import sys
 import threading
 import time
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from pathlib import Path
 from typing import Any
+
+from gsmap import platform
 
 # A browser opens six; this suffices for a second window and a reload. Each occupies a thread.
 MAX_CONNECTIONS = 16
 # Timeout for a whole request, or the next one; a browser on this machine is faster.
 REQUEST_S = 10.0
-_ESTABLISHED = "01"
 
 Address = tuple[str, int]
 
@@ -115,21 +114,5 @@ def is_of_another_user(client: Address, server: Address) -> bool:
 
     Returns false if unknown: outside Linux, or for a socket that is closing.
     """
-    if not sys.platform.startswith("linux"):
-        return False
-    here, there = _hexadecimal(*client), _hexadecimal(*server)
-    for name, prefix in (("tcp", ""), ("tcp6", "0000000000000000FFFF0000")):  # IPv4 connections of IPv6 sockets
-        try:
-            rows = Path("/proc/net", name).read_text(encoding="ascii").splitlines()[1:]
-        except OSError:
-            continue
-        for row in rows:
-            _, local, remote, state, _, _, _, user, *_ = row.split()
-            if (local, remote, state) == (prefix + here, prefix + there, _ESTABLISHED):
-                return int(user) not in (0, os.getuid(), os.geteuid())
-    return False
-
-
-def _hexadecimal(host: str, port: int) -> str:
-    """Format an IPv4 address as in /proc/net: in the byte order of the machine."""
-    return f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"
+    user = platform.user_of_connection(client, server)
+    return user is not None and user not in (0, os.getuid(), os.geteuid())

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = {"gsmap": ROOT / "gsmap", "gsmap_synthetic": ROOT / "synthetic" / "gsmap_synthetic"}
 
 LAYERS = [
-    {"version"},
+    {"version", "platform"},
     {"reason_codes", "errors", "texts"},
     {"durable"},
     {"types"},

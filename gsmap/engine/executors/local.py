@@ -10,6 +10,7 @@ from itertools import chain, islice
 from operator import length_hint
 from typing import Any
 
+from gsmap import platform
 from gsmap.engine.pool import Pool
 from gsmap.errors import ConfigError
 
@@ -83,4 +84,4 @@ def default_workers() -> int:
     named = os.environ.get("GSMAP_WORKERS", "")
     if named.isdigit() and int(named) > 0:
         return int(named)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    return platform.num_processors()

@@ -1,15 +1,13 @@
 """A process that reads one mesh, cloud, LAS or USD file with a library, within limits that it sets for itself.
 
-It is run as a script, knows nothing of gsmap, and writes one ``.npz`` to the descriptor it is given. What a file makes
+It is run as a script and writes one ``.npz`` to the descriptor it is given. What a file makes
 of the library ends here: crashes, aborts for want of memory, and loops.
 """
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
-import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,8 @@ _CHUNK = 1 << 20  # points
 
 
 def main(out: int, path: str, kind: str, memory_bytes: int, max_points: int) -> None:
+    from gsmap import platform
+
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
@@ -30,7 +30,7 @@ def main(out: int, path: str, kind: str, memory_bytes: int, max_points: int) -> 
         from pxr import Usd, UsdGeom, UsdVol  # noqa: F401
     else:
         import open3d  # noqa: F401
-    _limit(memory_bytes)
+    platform.limit_process(memory_bytes)
     read = {"cloud": _cloud, "mesh": _mesh, "las": _las, "usd": _usd}[kind]
     buffer = io.BytesIO()
     np.savez(buffer, **read(Path(path), max_points))
@@ -122,15 +122,6 @@ def _usd(path: Path, max_points: int) -> dict[str, Any]:
     return arrays | {"count": np.array(count)}
 
 
-def _limit(memory_bytes: int) -> None:
-    """Limit this process to some bytes of memory beyond those of its libraries; forbid writing files and core dumps."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
-    with contextlib.suppress(OSError, ValueError):  # not Linux, where nothing limits the memory of a process
-        with open("/proc/self/statm") as file:
-            mapped = int(file.read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (mapped + memory_bytes, mapped + memory_bytes))
-
-
 if __name__ == "__main__":
+    sys.path.append(str(Path(__file__).parents[3]))  # where gsmap lies
     main(int(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5]))

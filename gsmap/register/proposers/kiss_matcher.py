@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap import platform
 from gsmap.errors import MissingDependencyError
 from gsmap.methods.proposer import Proposal, Scene
 from gsmap.types import Sim3
@@ -54,7 +52,9 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(params.voxel_m))
     # Centred, because the matcher computes in float32.
     centre_t, centre_s = points_t.mean(0), points_s.mean(0)
-    with _one_core():
+    # It sums in the order in which its threads finish, so on several processors its pose varies by centimetres between
+    # runs. Systems that cannot pin a thread (macOS) are not reproducible.
+    with platform.pinned_thread():
         solution = matcher.estimate((points_s - centre_s).astype(np.float32), (points_t - centre_t).astype(np.float32))
     inliers = int(matcher.get_num_final_inliers())
     if not solution.valid or inliers < _MIN_INLIERS:
@@ -65,21 +65,3 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
     translation = translation + centre_t - rotation @ centre_s
     pose = Sim3(rotation, translation / target.unit_m)
     return [Proposal(proposer="kiss_matcher", S_target_source=pose, with_scale=False, num_inliers=inliers)]
-
-
-@contextmanager
-def _one_core() -> Iterator[None]:
-    """Pin the calling thread, and the threads that the library starts from it, to one core.
-
-    KISS-Matcher sums in the order in which its threads finish, so on several cores its pose varies by centimetres
-    between runs. Systems that cannot pin a thread (macOS) are not reproducible.
-    """
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    free = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(free)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, free)
