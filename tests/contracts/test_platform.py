@@ -1,4 +1,4 @@
-"""The one module of calls that differ between systems; nothing else makes them, and gsmap runs without those of Linux."""
+"""The one module of calls that differ between systems: no other makes them, and gsmap runs without those of Linux."""
 
 from __future__ import annotations
 
