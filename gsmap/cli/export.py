@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -23,6 +24,8 @@ from gsmap.cli.console import (
 )
 from gsmap.cli.thin import parse_size
 
+_SURVEY_SUFFIXES = (".las", ".laz", ".tif", ".tiff", ".geojson")
+
 
 class Purpose(StrEnum):
     view = "view"
@@ -37,7 +40,11 @@ class Up(StrEnum):
 def command(
     map: MapPath,
     out: Annotated[
-        str, typer.Argument(metavar="OUT", help="Folder to write; a later export to the same folder updates it.")
+        str,
+        typer.Argument(
+            metavar="OUT",
+            help="Folder to write, which a later export to it updates; or a file .las, .laz, .tif or .geojson.",
+        ),
     ],
     format: Annotated[
         str | None,
@@ -122,6 +129,14 @@ def command(
     wait: Annotated[
         bool, typer.Option("--wait", help="Wait until another export to OUT has ended; default: fail.")
     ] = False,
+    crs: Annotated[
+        str | None,
+        typer.Option("--crs", metavar="EPSG:N", help="CRS of a .las, .laz or .tif file; default: that of the map."),
+    ] = None,
+    pixel_size: Annotated[
+        float | None,
+        typer.Option("--pixel-size", help="Side of a pixel of a .tif file, in the unit of its CRS."),
+    ] = None,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
@@ -133,6 +148,8 @@ def command(
 ) -> None:
     """Write the merged map, one file per component or tiles. Only files that changed since the last export to OUT are
     made, and a further format or OUT merges nothing again.
+
+    If OUT ends in .las, .laz (points), .tif (orthophoto) or .geojson (floor plan), it is one file in world coordinates.
 
     Example: `gsmap export site.gsmap house`, then `gsmap export site.gsmap tiles --format 3dtiles`
     """
@@ -161,6 +178,37 @@ def command(
             },
         )
         return
+    if Path(out).suffix.lower() in _SURVEY_SUFFIXES and format is None and purpose is Purpose.view:
+        not_for_files = {
+            "--tile-size": tile_size,
+            "--budget": budget,
+            "--provenance": provenance or None,
+            "--uncompressed": uncompressed or None,
+            "--up": up,
+            "--wait": wait or None,
+        }
+        _refuse_options(not_for_files, f"a {Path(out).suffix} file")
+        with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
+            report = m.export_survey(
+                out,
+                crs=crs,
+                pixel_size=pixel_size,
+                bbox=bbox,
+                merge=merge,
+                revision=revision,
+                component=component,
+                steps=steps,
+                prefer=prefer,
+                as_of=as_of,
+                static=static,
+            )
+        for note in report.notes:
+            say(note)
+        if json:
+            print_rows("export", report, json)
+        say(f"wrote {out}")
+        return
+    _refuse_options({"--crs": crs, "--pixel-size": pixel_size}, "tiles; name a file that ends in .laz or .tif")
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         if purpose is Purpose.localize:
             small = m.export_small(out, parse_size(budget or "50MB"), static=static)
@@ -226,6 +274,13 @@ def _write_page(
         report = ExportReport(out=out, tiles=(), recomputed=0, reused=0, removed=0, notes=written.notes)
         print_rows("export", report, json)
     say(f"{written.num_bytes:,} bytes in {out}: open it in a browser")
+
+
+def _refuse_options(given: Mapping[str, object], what: str) -> None:
+    from gsmap.errors import ConfigError
+
+    if useless := [option for option, value in given.items() if value is not None]:
+        raise ConfigError(f"{useless[0]} does not apply to {what}", code="conflicting_options")
 
 
 def _seconds(text: str) -> float:

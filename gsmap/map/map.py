@@ -740,6 +740,62 @@ class Map(AbstractContextManager["Map"]):
         made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait, known=known)
         return reports.export_report(self.store, Path(out), made, (*told, *notes))
 
+    def export_survey(
+        self,
+        out: str | os.PathLike[str],
+        *,
+        crs: str | None = None,
+        pixel_size: float | None = None,
+        bbox: Sequence[float] | None = None,
+        merge: str | None = None,
+        revision: int | None = None,
+        component: int | None = None,
+        steps: int | None = None,
+        prefer: str | None = None,
+        as_of: str | None = None,
+        static: bool = False,
+    ) -> ExportReport:
+        """Write a georeferenced component as a file for surveyors (``gsmap export MAP FILE``).
+
+        Args:
+            out: ``.las`` or ``.laz`` (points with colours), ``.tif`` (an orthophoto as GeoTIFF, without ceilings), or
+                ``.geojson`` (footprints of scenes, and a cross section of walls).
+            crs: CRS of the file; default: that of the map.
+            pixel_size: side of a pixel of an orthophoto, in the unit of the CRS; default: 1, 2 or 5 times a power of
+                ten, for at most 8192 pixels on a side.
+            bbox, merge, revision, component, steps, prefer, as_of, static: as in `export`.
+
+        Raises:
+            NotFoundError: no component is georeferenced.
+            ConfigError: several are, and none was chosen; or options that do not fit the kind of file.
+            MissingDependencyError: laspy is not installed.
+        """
+        from gsmap.map.stages.export import Request
+        from gsmap.map.stages.survey_export import SurveyOptions, export_survey
+        from gsmap.types.rows.exports import ExportReport
+
+        request = Request(
+            bbox=bbox,
+            merge=merge,
+            revision=revision,
+            component=component,
+            steps=steps,
+            prefer=prefer,
+            as_of=as_of,
+            static=static,
+        )
+        known, told = self.static_content() if static else (None, ())
+        notes = export_survey(
+            self.store,
+            Path(out),
+            request,
+            SurveyOptions(crs, pixel_size),
+            self.settings,
+            lambda fraction, text: self._progress("export", fraction, text),
+            known,
+        )
+        return ExportReport(out=os.fspath(out), tiles=(), recomputed=1, reused=0, removed=0, notes=(*told, *notes))
+
     def static_content(self) -> tuple[MapObjects, tuple[str, ...]]:
         """Compare all visits, and return the objects of the map with notes on visits that are left out."""
         from gsmap.map.objects import compute_objects

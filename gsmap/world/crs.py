@@ -85,6 +85,11 @@ class Crs:
         return str(self.named.name)
 
     @property
+    def projected_epsg(self) -> int | None:
+        """EPSG code of the projected system of eastings and northings; None if it has none."""
+        return self._horizontal.to_epsg() if self._horizontal.is_projected else None
+
+    @property
     def has_own_heights(self) -> bool:
         """True if heights are in a system of the CRS (a geoid, a tide) rather than above the ellipsoid."""
         return bool(self.named.is_compound or self.named.is_vertical)

@@ -305,7 +305,7 @@ def _export(
     with note_interruption(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
         result = export_tiles(
             planned.tiles,
-            partial(_maker, store, planned, settings),
+            partial(make_content, store, planned, settings),
             out,
             map_id=store.id,
             recipe=planned.recipe,
@@ -375,7 +375,8 @@ def _finish_trees(out: Path, planned: ExportPlan, result: ExportResult) -> str:
     return ""
 
 
-def _maker(store: Store, planned: ExportPlan, settings: Settings, tile: PlannedTile, folder: str) -> TileMaker:
+def make_content(store: Store, planned: ExportPlan, settings: Settings, tile: PlannedTile, folder: str) -> TileMaker:
+    """Return the job that makes the content of a tile."""
     thinned = {scene: one.thinning.thinned_at for scene, one in planned.scenes.items() if one.thinning is not None}
     about = [store.id, planned.recipe.merge_key(tile), {scene: thinned.get(scene) for scene in tile.poses}]
     return TileMaker(
