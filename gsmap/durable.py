@@ -23,6 +23,7 @@ from gsmap import platform
 from gsmap.errors import BusyError, CorruptError, DiskFullError, InputError, failed_path, of_system
 
 _OWNER = 12  # characters of an owner's id in names of staged folders
+_NO_MAP = "gsmap"  # owner of files that show no map
 
 
 def sync_folder(folder: Path) -> None:
@@ -68,15 +69,16 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     _replace(path, path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}"), write)
 
 
-def write_output(path: Path, write: Callable[[Path], object], owner: str | None = None) -> None:
+def write_output(path: Path, write: Callable[[Path], object], owner: str = _NO_MAP) -> None:
     """Let ``write`` fill an output file that the user named.
 
     A file, or the target of a symbolic link, is replaced atomically. A pipe, a character device and an open file of
     this process (``/dev/stdout``) get the bytes once all are written. Nothing else is replaced.
 
     Args:
-        write: fills the file at the path it gets, whose name ends with that of ``path``.
-        owner: id of the map that the file shows, by which a purge finds what a killed process left (`staged_folder`).
+        write: fills the file at the path it gets, whose name is that of ``path``.
+        owner: id of the map that the file shows, by which a purge, too, finds what a killed process left
+            (`staged_folder`).
 
     Raises:
         InputError: a folder, a socket or a block device.
@@ -98,14 +100,11 @@ def write_output(path: Path, write: Callable[[Path], object], owner: str | None 
                 f"cannot write {path}: it is a socket or a block device; name a file, or a pipe", code="not_writable"
             )
     target = Path(os.path.realpath(path))
-    if owner is not None:
-        write_owned(target, owner, write)
-        return
-    # A random name, at which no link can exist, with the requested suffix.
-    _replace(target, target.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}"), write)
+    with staged_folder(target, owner) as folder:
+        _replace(target, folder / path.name, write)  # with the requested suffix, which that of a link's target may not be
 
 
-def write_text_output(path: Path, text: str, owner: str | None = None) -> None:
+def write_text_output(path: Path, text: str, owner: str = _NO_MAP) -> None:
     """Write a text (UTF-8) to an output file that the user named; see `write_output`."""
     write_output(path, lambda staged: staged.write_bytes(text.encode("utf-8")), owner)
 

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gsmap.durable import is_stream, write_output
+from gsmap.durable import is_stream, write_output, write_whole
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats.precision import about_origin, about_zero
 from gsmap.methods import family
@@ -143,7 +143,10 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
         content = gaussians if hasattr(module, "stream") else gaussians.load()
         if not getattr(module, "HOLDS_ORIGIN", False) and origin_of_source(content).any():
             content = about_zero(path, content.load(), getattr(module, "position_step", None))
-        write_output(path, lambda staged: module.write(staged, content, **options))
+        if suffix.startswith("."):
+            write_output(path, lambda staged: module.write(staged, content, **options))
+        else:  # staged beside its other files
+            write_whole(Path(os.path.realpath(path)), lambda staged: module.write(staged, content, **options))
 
 
 def read_cameras(path: str | os.PathLike[str]) -> Cameras:

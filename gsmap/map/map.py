@@ -483,7 +483,7 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.objects import compute_objects, objects_report, write_graph
 
         known = compute_objects(self.store, self.settings, self._progress)
-        write_graph(known, out, format)
+        write_graph(known, out, format, self.store.id)
         return objects_report(known)
 
     def history(self, place: str | None = None, *, box: Sequence[float] | None = None) -> HistoryReport:

@@ -401,7 +401,7 @@ def as_networkx(known: MapObjects) -> Any:
     return object_graph(known.objects, known.dates, known.metres, known.room_rows())
 
 
-def write_graph(known: MapObjects, out: str | os.PathLike[str], format: str) -> Path:
+def write_graph(known: MapObjects, out: str | os.PathLike[str], format: str, map_id: str) -> Path:
     """Write the objects of the map as a graph; after an error, no partial file remains.
 
     Raises:
@@ -413,7 +413,7 @@ def write_graph(known: MapObjects, out: str | os.PathLike[str], format: str) -> 
         )
     path = Path(out)
     if format == "json":
-        write_text_output(path, json.dumps({"schema": SCHEMA, **objects_report(known).to_json()}, indent=1))
+        write_text_output(path, json.dumps({"schema": SCHEMA, **objects_report(known).to_json()}, indent=1), map_id)
         return path
-    write_text_output(path, graphml(as_networkx(known)))
+    write_text_output(path, graphml(as_networkx(known)), map_id)
     return path

@@ -68,7 +68,7 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
     if format == "json":
         rows = [row.to_json() for row in reports.pose_rows(store, crs)]
         text = json.dumps({"schema": SCHEMA, "poses": rows}, indent=1)
-        write_text_output(out, text)
+        write_text_output(out, text, store.id)
         return [out]
     components = sorted({pose.component for pose in placed})
     if len(components) > 1 and is_stream(out):
