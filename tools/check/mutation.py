@@ -68,8 +68,9 @@ def main() -> None:
         os.environ["PYTHONPATH"] = os.pathsep.join(here)  # of processes that tests start
         os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
         mutants = list(_mutants(Path("gsmap") / given.room, given.module))
-        drawn = random.Random(given.seed).sample(mutants, min(given.sample, len(mutants)))
-        session = _Session(Path("gsmap") / given.room, Counter(path for path, _ in mutants), drawn, given.seconds)
+        random.Random(given.seed).shuffle(mutants)
+        sizes = Counter(path for path, _ in sorted(mutants, key=lambda one: one[0]))
+        session = _Session(Path("gsmap") / given.room, sizes, mutants, given.sample, given.seconds)
         tests = given.tests or [f"tests/{given.room}"]
         pytest.main(["-q", "-s", "-p", "no:cacheprovider", *tests], plugins=[session])
 
@@ -150,8 +151,10 @@ class _Reach:
 class _Session:
     """A plugin of pytest: plant each mutant in a fork of the session that has collected the tests."""
 
-    def __init__(self, room: Path, sizes: Counter[Path], drawn: list[tuple[Path, Any]], most_s: float) -> None:
-        self.room, self.sizes, self.drawn, self.most_s = room, sizes, drawn, most_s
+    def __init__(
+        self, room: Path, sizes: Counter[Path], mutants: list[tuple[Path, Any]], count: int, most_s: float
+    ) -> None:
+        self.room, self.sizes, self.mutants, self.count, self.most_s = room, sizes, mutants, count, most_s
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         if session.testsfailed:
@@ -165,8 +168,13 @@ class _Session:
         tests.sort(key=lambda test: test[0])
         planted, killed, unreached = Counter[Path](), Counter[Path](), Counter[Path]()
         survivors = []
-        for path, mutation in self.drawn:
-            reaching, survived, told = self._plant(tests, path, mutation)
+        for path, mutation in self.mutants:
+            if planted.total() == self.count:
+                break
+            try:
+                reaching, survived, told = self._plant(tests, path, mutation)
+            except SyntaxError:  # cosmic-ray takes the bare * of a signature for a product
+                continue
             planted[path] += 1
             killed[path] += not survived
             unreached[path] += not reaching
