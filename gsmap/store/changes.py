@@ -163,7 +163,7 @@ class Changes:
         """Load a comparison with its arrays; row numbers refer to the Gaussians of the scenes as they are stored now.
 
         Raises:
-            NotFoundError: no such comparison, or its arrays were pruned.
+            NotFoundError: no such comparison, or it has no arrays (pruned, or a capture was ingested again).
             CorruptError: bytes on disk are missing or differ, or are not valid results of a comparison.
         """
         with self._catalog.read() as connection:
@@ -178,8 +178,8 @@ class Changes:
             }
         if not found.whole:
             raise NotFoundError(
-                f"the arrays of comparison {comparison} were pruned: gsmap changes MAP computes those of "
-                "current comparisons again",
+                f"the changes of comparison {comparison} have no arrays, because they were pruned or one of the "
+                "captures was ingested again: run gsmap changes MAP, which compares them again",
                 code="arrays_pruned",
             )
         parts: list[dict[str, np.ndarray]] = []

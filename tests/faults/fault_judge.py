@@ -234,8 +234,12 @@ def judge_rows(before: State, after: State, now: State) -> list[str]:
 
 
 def _begun(like: str, after: State) -> bool:
-    """Whether a row is a purge that is not through yet, of a scene that the undisturbed run purged."""
+    """Whether a row is a lookup, which later ones replace, or a purge that is not through yet, of a scene that the
+    undisturbed run purged.
+    """
     place, table, values = json.loads(like)
+    if table == "lookups":
+        return True
     if table != "purges" or "pending" not in values["receipt"]:
         return False
     return any(json.loads(row)[:2] == [place, table] and values["scene"] in row for row in after.alike)

@@ -169,6 +169,7 @@ class Server:
                 os.dup2(handle, number)
                 os.close(handle)
             os.environ["GSMAP_WORKERS"] = "1"
+            os.environ["GSMAP_CACHE"] = str(self.work / "cache")  # what a purge clears must be the same every time
             if before is not None:
                 before()
             try:

@@ -17,6 +17,7 @@ from gsmap import formats
 from gsmap.change import recipe_key
 from gsmap.cli import app
 from gsmap.types import Change, ChangeReport, Gaussians
+from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 from tools.make.tiny_encoder import image_encoder
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
@@ -98,6 +99,38 @@ BASES = {
         ),
     ),
     "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
+    # A map that has everything: dated, thinned and superseded captures, objects with names, reviewed changes, a kept
+    # photo, survey data, a branch, a tag, a backup, and an export of every kind.
+    "complete": (
+        "empty",
+        (
+            "settings MAP --set thin.min_seen_again=0.5 --set thin.min_fidelity_db=0",
+            "ingest MAP IN/then.ply --captured-at 2026-01-01 --scale known",
+            "ingest MAP IN/now.ply --captured-at 2026-02-01 --scale known",
+            "describe MAP",
+            "edge MAP then:now --pose IN/same.txt --sigma 0.1,0.001",
+            "optimize MAP",
+            "georeference MAP --gcp IN/gcp_list.txt --crs EPSG:32632",
+            "georeference MAP --scale-bar then:0,0,0 then:4,0,0 4",
+            "changes MAP",
+            "*photo",
+            "graph MAP HERE/graph.json",
+            "edit MAP o1 --name crate --label box",
+            "confirm MAP c1",
+            "branch MAP what-if",
+            "edit MAP@what-if then --note later",
+            "tag MAP handover",
+            "thin MAP --keep-days 0",
+            "ingest MAP IN/again.ply --supersedes now",
+            "update MAP",
+            "changes MAP",
+            "graph MAP HERE/graph.json",
+            EXPORT,
+            "export MAP HERE/small --for localize",
+            "view MAP --export HERE/www",
+            "report MAP HERE/report.html",
+        ),
+    ),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
 
@@ -150,6 +183,47 @@ VERBS = {
         Verb("tag", "placed", "tag MAP handover", done_says="exists already"),
         Verb("merge", "two", "merge MAP HERE/other.gsmap"),
         Verb("split", "placed", "split MAP HERE/part.gsmap --scenes a", done_says="exists already"),
+        *(
+            Verb(f"complete-{name}", "complete", line, **more)
+            for name, line, more in (
+                ("ingest", "ingest MAP IN/b.ply", {}),
+                ("update", "update MAP IN/b.ply", {}),
+                ("supersede", "ingest MAP IN/later.ply --supersedes now", {"done_says": "is in the map already"}),
+                ("optimize", "optimize MAP", {}),
+                ("edge", "edge MAP then:now --pose IN/same.txt --sigma 0.2,0.002", {}),
+                ("reject", "reject MAP then:now", {}),
+                ("changes", "changes MAP", {"also": ("settings MAP --set change.min_area_m2=0.02",)}),
+                ("reject-change", "reject MAP c2 --note no", {}),
+                ("graph", "graph MAP HERE/graph.json", {"also": ("reject MAP c2",)}),
+                ("edit-object", "edit MAP o1 --name chest", {}),
+                ("bar", "georeference MAP --scale-bar now:0,0,0 now:0,3,0 3", {}),
+                ("bar-remove", "georeference MAP --remove", {}),
+                ("photo-remove", "remove MAP p1 --photo", {"done_says": "no photo"}),
+                ("remove", "remove MAP then", {"done_says": "no scene is called"}),
+                (
+                    "purge",
+                    "remove MAP then --purge --branches",
+                    {"done_says": "no scene is called", "forgets": "samples/then.ply"},
+                ),
+                ("prune", "prune MAP --keep-revisions 1", {}),
+                ("export-static", EXPORT + " --static", {}),
+                ("small", "export MAP HERE/small2 --for localize", {"done_says": "exists"}),
+                ("site", "view MAP --export HERE/www", {}),
+                ("report", "report MAP HERE/report.html", {}),
+                ("backup", "backup MAP HERE/kept", {"then": RESTORED}),
+                (
+                    "backup-keep",
+                    "backup MAP HERE/kept --keep 1",
+                    {"also": ("backup MAP HERE/kept", "edit MAP o1 --name chest"), "then": RESTORED},
+                ),
+                ("clone", "clone MAP HERE/copy.gsmap", {"done_says": "exists already"}),
+                ("merge-branch", "merge MAP MAP@what-if", {}),
+                ("branch-delete", "branch MAP what-if --delete", {"done_says": "no branch"}),
+                ("tag", "tag MAP second", {"done_says": "exists already"}),
+                ("split", "split MAP HERE/part.gsmap --scenes then", {"done_says": "exists"}),
+                ("settings", "settings MAP --set export.max_shift_m=0.01", {}),
+            )
+        ),
     )
 }
 """Verbs by name. A verb that is new is one line here."""
@@ -200,6 +274,25 @@ def compared(site: Path) -> None:
         m.store.changes.save(report, key, older=older.scene, newer=newer.scene, **where)
 
 
+def kept_photo(site: Path) -> None:
+    """A localized photo that shows that the box is gone."""
+    things = (PhotoObjectObservation(np.array([2.3, 1.5, 0.5]), "absent", 0.75),)
+    with gsmap.map.open(site) as m:
+        photo = LocalizedPhoto(
+            digest=f"{1:064x}",
+            name="photo.jpg",
+            scene=m["now"].id,
+            T_scene_camera=np.eye(4),
+            covariance=np.eye(6) * 1e-4,
+            intrinsics_px=np.array([30.0, 30, 32, 24]),
+            size_px=(64, 48),
+            things=things,
+            captured_at="2026-02-03T12:00:00+00:00",
+            probability=0.99,
+        )
+        m.store.photos.add(photo, b"\xff\xd8\xff\xe0 a small picture \xff\xd9")
+
+
 # --- captures --------------------------------------------------------------------------------------------------------
 
 
@@ -209,9 +302,15 @@ def write_samples(folder: Path) -> None:
     for seed, name in enumerate("abc"):
         formats.write(folder / f"{name}.ply", capture(seed))
         (folder / f"{name}.cameras.json").write_text(json.dumps(_frames(name)))
-    for name, gaussians in (("then", room(True)), ("now", room(False)), ("again", room(False, opacity=4.5))):
+    for name, gaussians in (
+        ("then", room(True)),
+        ("now", room(False)),
+        ("again", room(False, opacity=4.5)),
+        ("later", room(False, opacity=4.6)),
+    ):
         formats.write(folder / f"{name}.ply", gaussians)
-        (folder / f"{name}.cameras.json").write_text(json.dumps(_looks()))
+        (folder / f"{name}.cameras.json").write_text(json.dumps(_looks(name)))
+    (folder / "gcp_list.txt").write_text(_control_points("now"))
     for name, x in (("pose", 5.0), ("pose2", 5.1), ("same", 0.0)):
         pose = np.eye(4)
         pose[0, 3] = x
@@ -255,7 +354,7 @@ def _sides(low: tuple[float, ...], high: tuple[float, ...], step: float) -> np.n
     return np.concatenate(sides)
 
 
-def _looks() -> list[dict[str, object]]:
+def _looks(name: str) -> list[dict[str, object]]:
     """Cameras around the middle, which they see."""
     frames = []
     for i, (x, y) in enumerate(((0.6, 0.6), (3.4, 0.6), (3.4, 2.4), (0.6, 2.4), (2.3, 0.4), (0.5, 1.5))):
@@ -265,10 +364,23 @@ def _looks() -> list[dict[str, object]]:
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(ahead, right), ahead], 1)
         frames.append(
-            {"id": i, "img_name": f"{i}", "width": 64, "height": 48, "position": [x, y, 1.4]}
+            {"id": i, "img_name": f"{name}_{i}.jpg", "width": 64, "height": 48, "position": [x, y, 1.4]}
             | {"rotation": axes.tolist(), "fx": 30.0, "fy": 30.0}
         )
     return frames
+
+
+def _control_points(name: str) -> str:
+    """Corners of the room as surveyed in EPSG:32632, each marked in all photos of a capture that show it."""
+    lines = ["EPSG:32632"]
+    for corner in np.stack(np.meshgrid([0.0, 4.0], [0.0, 3.0], [0.0, 2.0]), -1).reshape(-1, 3):
+        east, north, up = corner + np.array([500000.0, 5400000.0, 100.0])
+        for frame in _looks(name):
+            x, y, z = (corner - frame["position"]) @ np.array(frame["rotation"])
+            column, row = 30 * x / z + 32, 30 * y / z + 24
+            if z > 0 and 0 < column < 64 and 0 < row < 48:
+                lines.append(f"{east} {north} {up} {column:.4f} {row:.4f} {frame['img_name']}")
+    return "\n".join(lines)
 
 
 def _frames(name: str) -> list[dict[str, object]]:
@@ -279,7 +391,7 @@ def _frames(name: str) -> list[dict[str, object]]:
     ]
 
 
-FUNCTIONS = {"*litter": litter, "*older": older, "*compared": compared}
+FUNCTIONS = {"*photo": kept_photo, "*litter": litter, "*older": older, "*compared": compared}
 
 
 def copy_map(source: Path, target: Path) -> None:

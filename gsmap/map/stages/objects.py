@@ -115,6 +115,16 @@ def objects_of_components(
             f"changes cannot be assigned to segments of {few(unmapped)}: an older gsmap thinned "
             f"{'it' if len(unmapped) == 1 else 'them'} without a row map; ingest the capture again"
         )
+    outdated = [
+        f"{scenes[one.older].name}:{scenes[one.newer].name}"
+        for one in store.changes.current()
+        if one.changes and not one.whole and one.older in scenes and one.newer in scenes
+    ]
+    if outdated:
+        notes.append(
+            f"changes of {few(outdated)} are not used, because one of their captures was ingested again: run gsmap "
+            "changes MAP, which compares them again"
+        )
     undated = [scene.name for scene in scenes.values() if scene.captured_at is None]
     if undated and len(scenes) > 1:
         notes.append(
@@ -131,7 +141,7 @@ def _key(
     told = [
         f"{one.key} {one.created_at} {[change.status == 'rejected' for change in one.changes]}"
         for one in store.changes.current()
-        if one.changes and {one.older, one.newer} <= ids
+        if one.changes and one.whole and {one.older, one.newer} <= ids
     ]
     unmapped = [scene.thinning is not None and not scene.thinning.has_row_map for scene in captures]
     seen = [
@@ -277,7 +287,9 @@ def _told(
     moved: list[tuple[SegmentId, SegmentId]] = []
     parted: list[tuple[SegmentId, int]] = []
     for comparison in store.changes.current():
-        if comparison.older not in at or comparison.newer not in at or not comparison.changes:
+        if comparison.older not in at or comparison.newer not in at:
+            continue
+        if not comparison.changes or not comparison.whole:
             continue
         older, newer = at[comparison.older], at[comparison.newer]
         found = store.changes.load(comparison.number).changes
