@@ -242,7 +242,7 @@ class _ReportBuilder:
             scenes, metre = members[component], state.metres.get(component, MetricScale())
             island = Island(component, tuple(scene.name for scene in scenes), metre)
             if place < self.params.islands:
-                self.progress("report", 0.6, f"plan of island {component}")
+                self.progress("report", 0.6, f"plan of component {component}")
                 island = self._plan(state, island, scenes, reads, edges)
             islands.append(island)
         return islands
