@@ -101,7 +101,7 @@ def write_output(path: Path, write: Callable[[Path], object], owner: str = _NO_M
             )
     target = Path(os.path.realpath(path))
     with staged_folder(target, owner) as folder:
-        _replace(target, folder / path.name, write)  # with the requested suffix, which that of a link's target may not be
+        _replace(target, folder / path.name, write)  # with the requested suffix; a link's target may have another
 
 
 def write_text_output(path: Path, text: str, owner: str = _NO_MAP) -> None:

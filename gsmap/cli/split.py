@@ -20,7 +20,7 @@ def command(
         typer.Option(
             "--box",
             metavar="X0 Y0 Z0 X1 Y1 Z1",
-            help="Copy the scenes that reach into this box of the component --component; default: the largest component.",
+            help="Copy the scenes that reach into this box of --component; default: the largest component.",
         ),
     ] = None,
     by_name: Annotated[bool, typer.Option("--scenes", help="Copy the scenes named after OUT.")] = False,
