@@ -47,6 +47,14 @@ def test_the_source_archive_holds_the_page_and_its_sources(sources, tmp_path, mo
     assert not [name for name in names if "node_modules" in name or name.startswith(".ci")]
 
 
+def test_an_editable_install_names_both_packages(sources, tmp_path, monkeypatch):
+    build = pytest.importorskip("scikit_build_core.build")
+    monkeypatch.chdir(sources)
+    with zipfile.ZipFile(tmp_path / build.build_editable(str(tmp_path))) as archive:
+        paths = "".join(archive.read(name).decode() for name in archive.namelist() if name.endswith(".pth"))
+    assert {str(sources), str(sources / "synthetic")} <= set(paths.splitlines())
+
+
 def test_a_package_is_built_with_the_page_and_without_its_sources():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["scikit-build"]
     assert settings["cmake"]["define"]["GSMAP_PAGE"] == "ON"
