@@ -146,11 +146,11 @@ def violates_free_space(share: float, num_judged: float, allowed: float) -> bool
         share: fraction of the Gaussians that violate free space; NaN where no camera observed them.
         num_judged: number of these Gaussians; 0 or NaN where it is unknown.
     """
-    from scipy.stats import binom
+    from scipy.special import bdtrc  # imported here, as the recipe key does not need it
 
     if not share > allowed:
         return False
-    return not num_judged > 0 or bool(binom.sf(round(share * num_judged) - 1, num_judged, allowed) < _FREE_SPACE_LEVEL)
+    return not num_judged > 0 or bool(bdtrc(round(share * num_judged) - 1, num_judged, allowed) < _FREE_SPACE_LEVEL)
 
 
 def is_acceptable(proposal: Proposal, evidence: PoseEvidence, params: Params) -> bool:

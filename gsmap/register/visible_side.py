@@ -80,8 +80,7 @@ def _fill_unknown(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tre
     unknown = np.flatnonzero(side == 0)
     if not len(unknown) or len(unknown) == len(side):
         return side
-    _, rows = tree.neighbours(_NUM_NEIGHBOURS)
-    near = rows[unknown]
+    _, near = tree.neighbours(_NUM_NEIGHBOURS, points[unknown])
     there = near < len(points)
     near = np.where(there, near, 0)
     along = (normals[near] * normals[unknown][:, None]).sum(2)
