@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -29,6 +30,7 @@ from gsmap.types import (
 )
 from gsmap.types.localization import SceneFeatures
 from gsmap.types.model import ModelSpec
+from gsmap.types.prepared_scene import PreparedScene
 from gsmap.types.progress import Progress
 
 # A job imports its room when it runs, since listing missing results does not need it.
@@ -66,27 +68,56 @@ def _catalog_file(path: str) -> tuple[str, int]:
         return location, 0
 
 
-@lru_cache(maxsize=4)
+_VIEW_BYTES = 1 << 30  # of the scenes that a worker keeps for its next pairs
+_views: OrderedDict[tuple[str, str, str], SceneView] = OrderedDict()
+
+
 def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
-    """Load a scene for registration. Pairs come ordered by scene, so that a small cache saves most reads."""
+    """Load a scene for registration, or return it from the cache. Pairs come ordered by scene, so that a small cache
+    saves most reads."""
+    key = (str(_catalog_file(path)), scene_id, graph_key)
+    found = _views.pop(key, None)
+    _views[key] = load_view(_store(path), scene_id, graph_key) if found is None else found
+    while len(_views) > 2 and sum(view.num_bytes for view in _views.values()) > _VIEW_BYTES:
+        _views.popitem(last=False)
+    return _views[key]
+
+
+def load_view(store: Store, scene_id: str, graph_key: str) -> SceneView:
+    """Load a described scene for registration, without its Gaussians, which are read when they are used."""
     from gsmap.register import SceneView
+    from gsmap.register.recipe import prepared_key
 
-    store = _store(path)
-    scenes, graphs = store.scenes, store.graphs
-    graph = graphs.load(scene_id, graph_key)
+    scenes, graph = store.scenes, store.graphs.load(scene_id, graph_key)
     assert graph is not None, f"scene {scene_id} was to be registered before it was described"
+    prepared = store.prepared_scenes.load(scene_id, prepared_key().of(scene_id, graph_key))
     policy = scenes.get(scene_id).scale_policy
-    return SceneView(scene_id, scenes.gaussians(scene_id), scenes.cameras(scene_id), graph, policy)
+    return SceneView(scene_id, scenes.unread(scene_id), scenes.cameras(scene_id), graph, policy, prepared)
 
 
-def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec], params: describing.Params) -> SceneGraph:
-    """Build the scene graph of one scene of the map at ``path`` (`Store.location`)."""
+def describe_scene(
+    path: str, scene_id: str, models: Mapping[str, ModelSpec], params: describing.Params
+) -> tuple[SceneGraph, PreparedScene]:
+    """Build the scene graph of one scene of the map at ``path`` (`Store.location`), and prepare its registration."""
     from gsmap import describe as describing
+    from gsmap.register.prepare import prepare
 
     scenes = _store(path).scenes
     policy = scenes.get(scene_id).scale_policy
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
-    return describing.describe(scene_id, gaussians, cameras, params, models, scale_policy=policy)
+    graph = describing.describe(scene_id, gaussians, cameras, params, models, scale_policy=policy)
+    return graph, prepare(scene_id, gaussians, cameras, graph, policy)
+
+
+def prepare_scene(path: str, scene_id: str, graph_key: str) -> PreparedScene:
+    """Prepare a scene of the map at ``path`` that was described by an older release."""
+    from gsmap.register.prepare import prepare
+
+    store = _store(path)
+    graph, scenes = store.graphs.load(scene_id, graph_key), store.scenes
+    assert graph is not None, f"scene {scene_id} was to be prepared before it was described"
+    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
+    return prepare(scene_id, gaussians, cameras, graph, scenes.get(scene_id).scale_policy)
 
 
 def features_of_scene(

@@ -116,10 +116,9 @@ def _same(a: EvaluatedPose, b: EvaluatedPose, target: SceneView, source: SceneVi
 
 def _grey(view: SceneView) -> SceneView:
     """Return the scene without its colours."""
-    g = view.gaussians
-    return replace(
-        view, gaussians=Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, np.zeros((len(g), 1, 3)))
-    )
+    g = view.gaussians.load()
+    grey = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, np.zeros((len(g), 1, 3)))
+    return replace(view, gaussians=grey, known=None)
 
 
 def _reason(scored: Sequence[tuple[float, EvaluatedPose]], source: SceneView, params: verdict.Params) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.register.surface import Surface
-from gsmap.register.view_cache import ViewCache
+from gsmap.register.view_cache import ViewCache, ViewImage
 from gsmap.render import Rendering, render
 from gsmap.types import Sim3
 
@@ -223,16 +223,16 @@ def _cross_view(
     into_other = pose.inverse() @ Sim3(np.eye(3), np.zeros(3), unit_m)
     for row in views.select_views(points / unit_m, num_cameras):
         camera = transform_cameras(views.cameras[[row]], into_other)
-        seen = render(other.splats, camera, backend="native")  # as in `ViewCache`
+        seen = render(other.splats, camera, index=other.index, backend="native")  # as in `ViewCache`
         focal_px = float(np.sqrt(camera.intrinsics_px[0, :2].prod()))
         reach_m = np.inf if row < views.num_own else _SYNTHESIZED_REACH_M
-        _compare(stats, views.render(row), unit_m, seen, pose.scale, focal_px, reach_m)
+        _compare(stats, views.image(row), unit_m, seen, pose.scale, focal_px, reach_m)
     return stats
 
 
 def _compare(
     stats: CrossViewStats,
-    own: Rendering,
+    own: ViewImage,
     unit_m: float,
     other: Rendering,
     scale: float,
@@ -244,10 +244,10 @@ def _compare(
     Args:
         reach_m: space farther than this in front of the surface may be unobserved.
     """
-    depth, other_depth = own.depth[0] * unit_m, other.depth[0] * scale
-    solid = own.alpha[0] > _MIN_ALPHA
+    depth, other_depth = own.depth * unit_m, other.depth[0] * scale
+    solid = np.isfinite(depth)
     near, far = _depth_range(depth, solid)
-    tolerance = _DEPTH_TOLERANCE_M + _DEPTH_TOLERANCE * depth
+    tolerance = _DEPTH_TOLERANCE_M + _DEPTH_TOLERANCE * np.where(solid, depth, 0)
     both = solid & (other.alpha[0] > _MIN_ALPHA)
     in_front = both & (other_depth < near - tolerance)
     agrees = both & ~in_front & (other_depth <= far + tolerance)
@@ -257,7 +257,7 @@ def _compare(
     stats.agrees[other.dominant_id[0][agrees]] = True
     rows, columns = np.nonzero(agrees)
     patch = rows // _PATCH_PX * -(-agrees.shape[1] // _PATCH_PX) + columns // _PATCH_PX
-    a, b = _opponent_colours(own.colour[0][agrees]), _opponent_colours(other.colour[0][agrees])
+    a, b = _opponent_colours(own.colour[agrees]), _opponent_colours(other.colour[0][agrees])
     stats.add_colours(a, b, patch)
     pattern = np.full(agrees.shape, np.nan)
     patch = rows // _PATTERN_PX * -(-agrees.shape[1] // _PATTERN_PX) + columns // _PATTERN_PX

@@ -12,9 +12,16 @@ from gsmap.register.params import Params
 from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
 
-VERSION = 13
+VERSION = 14
+PREPARE_VERSION = 1
 
 _RENDER_BACKEND = "native"  # all renders of this room use it
+
+
+def prepared_key() -> RecipeKey:
+    """Return the recipe of prepared scenes (`gsmap.register.prepare`), without its inputs: the scene and the key of its
+    graph."""
+    return RecipeKey("register", "prepared", {"prepare": PREPARE_VERSION}, backend=_RENDER_BACKEND)
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
@@ -37,7 +44,7 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
     }
     if params.fallback == "never":
         del settings["fallback_proposer"]
-    versions = {"register": VERSION, "probability": probability.VERSION}
+    versions = {"register": VERSION, "prepare": PREPARE_VERSION, "probability": probability.VERSION}
     refiners |= {"colored_icp"}  # estimating covariances uses it, too
     for kind, names in (("proposer", proposers), ("refiner", refiners)):
         for name in sorted(names):

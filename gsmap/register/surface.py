@@ -13,7 +13,9 @@ from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.register import visible_side
 from gsmap.register.view_cache import ViewCache
+from gsmap.render import ChunkIndex
 from gsmap.types import Cameras, Gaussians
+from gsmap.types.prepared_scene import PreparedScene
 
 PLANE_NEIGHBOURS = 20  # cells to which each cell's plane is fitted, the cell itself included, as in small_gicp
 _GRADIENT_NEIGHBOURS = 10
@@ -43,7 +45,8 @@ class Surface:
         splats: the N Gaussians in metres, with their mean colour alone; None where only points are known.
         unit_m: metres per unit of the scene.
         gaussians, cameras: the whole scene in its own unit; None where only points are known.
-        views: renders of the scene through its cameras, which orient its normals; None without cameras.
+        views: views of the scene through its cameras, which orient its normals; None without cameras.
+        prepared: the cells of this surface, if they were computed before.
     """
 
     points: np.ndarray
@@ -54,6 +57,7 @@ class Surface:
     gaussians: Gaussians | None = None
     cameras: Cameras | None = None
     views: ViewCache | None = None
+    prepared: PreparedScene | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -67,28 +71,26 @@ class Surface:
         views: ViewCache | None = None,
     ) -> Surface:
         """Extract the surface of a scene; ``unit_m`` is metres per unit of the scene."""
-        largest = gaussians.log_scales.max(1, initial=-np.inf) + np.log(unit_m)
-        opacities = gaussians.opacities
-        bar = MIN_OPACITY
-        if len(opacities):
-            bar = np.clip(np.quantile(opacities, 1 - MIN_OPAQUE_SHARE), FAINTEST_OPACITY, bar)
-        opaque = opacities >= bar
-        limit = np.log(MAX_SCALE_M)
-        if opaque.any():
-            limit = max(limit, float(np.quantile(largest[opaque], MAX_SCALE_QUANTILE)))
-        keep = np.flatnonzero(opaque & (largest <= limit))
-        colours = np.clip(rgb_of_sh0(gaussians.sh[keep, 0]), 0.0, 1.0)
-        stray, _ = find_floaters(gaussians.means[keep], colours, MIN_FLOATER_COLOUR)
-        keep, colours = keep[~stray], colours[~stray]
-        points = gaussians.means[keep].astype(np.float64) * unit_m
-        splats = Gaussians(
-            points,
-            gaussians.quats[keep],
-            gaussians.log_scales[keep] + np.float32(np.log(unit_m)),
-            gaussians.logit_opacities[keep],
-            gaussians.sh[keep, :1],
-        )
-        return cls(points, colours, RESOLUTION_M, splats, unit_m, gaussians, cameras, views)
+        splats = gaussians.degree_0()[surface_rows(gaussians, unit_m)]
+        return cls.from_splats(splats, unit_m, gaussians, cameras, views)
+
+    @classmethod
+    def from_splats(
+        cls,
+        splats: Gaussians,
+        unit_m: float = 1.0,
+        gaussians: Gaussians | None = None,
+        cameras: Cameras | None = None,
+        views: ViewCache | None = None,
+        prepared: PreparedScene | None = None,
+    ) -> Surface:
+        """Scale the surface Gaussians of a scene, with their mean colour alone, to metres."""
+        points = splats.means.astype(np.float64) * unit_m
+        colours = np.clip(rgb_of_sh0(splats.sh[:, 0]), 0.0, 1.0)
+        if unit_m != 1.0:
+            log_scales = splats.log_scales + np.float32(np.log(unit_m))
+            splats = Gaussians(points, splats.quats, log_scales, splats.logit_opacities, splats.sh)
+        return cls(points, colours, RESOLUTION_M, splats, unit_m, gaussians, cameras, views, prepared)
 
     def scaled(self, factor: float) -> Surface:
         """Multiply all coordinates by ``factor``: convert the surface to a unit that is ``factor`` times smaller."""
@@ -98,6 +100,8 @@ class Surface:
     def coarse(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the cell means (M, 3) of points and of colours at the resolution of the aligned cloud, in a fixed
         order."""
+        if self.prepared is not None:
+            return self.prepared.points.astype(np.float64), self.prepared.colours.astype(np.float32)
         points, colours, _ = cell_means(self.points, self.colours, self.resolution_m)
         return points, colours.astype(np.float32)
 
@@ -126,6 +130,8 @@ class Surface:
     @cached_property
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals at the cell means, of arbitrary sign."""
+        if self.prepared is not None:
+            return self.prepared.normals.astype(np.float64)
         normals: np.ndarray = self.tree.normals(PLANE_NEIGHBOURS)
         return normals
 
@@ -147,8 +153,17 @@ class Surface:
         """(M, 3) normals towards the side that the scene's cameras saw: zeros if unknown, None if all are."""
         if self.views is None or not self.views.num_own or not len(self.coarse[0]):
             return None
-        found = visible_side.orient_normals(self.coarse[0], self.normals, self.tree, self.views, self.unit_m)
-        return found if found.any() else None
+        if self.prepared is not None:
+            sides = self.prepared.sides
+        else:
+            sides = visible_side.find_sides(self.coarse[0], self.normals, self.tree, self.views, self.unit_m)
+        return self.normals * sides[:, None] if sides.any() else None
+
+    @cached_property
+    def index(self) -> ChunkIndex:
+        """Boxes of chunks of the splats, by which renders skip those out of view."""
+        assert self.splats is not None
+        return ChunkIndex.build(self.splats)
 
     def nearest(
         self, points: np.ndarray, radius_m: float, normals: np.ndarray | None = None
@@ -165,3 +180,20 @@ class Surface:
         else:
             distance, rows = self.tree.nearest(points, radius_m, self.oriented_normals, np.ascontiguousarray(normals))
         return distance, rows
+
+
+def surface_rows(gaussians: Gaussians, unit_m: float) -> np.ndarray:
+    """Return the rows of the surface Gaussians of a scene; ``unit_m`` is metres per unit of the scene."""
+    largest = gaussians.log_scales.max(1, initial=-np.inf) + np.log(unit_m)
+    opacities = gaussians.opacities
+    bar = MIN_OPACITY
+    if len(opacities):
+        bar = np.clip(np.quantile(opacities, 1 - MIN_OPAQUE_SHARE), FAINTEST_OPACITY, bar)
+    opaque = opacities >= bar
+    limit = np.log(MAX_SCALE_M)
+    if opaque.any():
+        limit = max(limit, float(np.quantile(largest[opaque], MAX_SCALE_QUANTILE)))
+    keep = np.flatnonzero(opaque & (largest <= limit))
+    colours = np.clip(rgb_of_sh0(gaussians.sh[keep, 0]), 0.0, 1.0)
+    stray, _ = find_floaters(gaussians.means[keep], colours, MIN_FLOATER_COLOUR)
+    return keep[~stray]

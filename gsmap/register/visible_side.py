@@ -18,14 +18,13 @@ NUM_CAMERAS = 16  # of the capture's own cameras, chosen to see most sides
 _REACH_M = 0.08  # cells farther than this from a camera's depth are not seen by it (Tukey's biweight)
 _MIN_CLEAR = 0.5  # the side is known if at least this share of the total weight agrees
 _FILL_ROUNDS = 2  # rounds in which cells without a side take the side of their coplanar neighbours
-_MIN_ALPHA = 0.5  # a fainter pixel shows no surface
 _NUM_NEIGHBOURS = 10
 _MIN_COPLANAR_COSINE = 0.8  # of the normals of coplanar neighbours
 _MAX_COPLANAR_M = 0.03  # distance of a coplanar neighbour from the cell's plane
 
 
-def orient_normals(points: np.ndarray, normals: np.ndarray, tree: Any, views: ViewCache, unit_m: float) -> np.ndarray:
-    """Orient normals towards the capture's own cameras.
+def find_sides(points: np.ndarray, normals: np.ndarray, tree: Any, views: ViewCache, unit_m: float) -> np.ndarray:
+    """Find the side of each cell that the capture's own cameras saw.
 
     Args:
         points: (M, 3) cell means, metres in the scene's axes.
@@ -34,15 +33,14 @@ def orient_normals(points: np.ndarray, normals: np.ndarray, tree: Any, views: Vi
         views: renders of the scene through its cameras, in its own unit of ``unit_m`` metres.
 
     Returns:
-        (M, 3) unit vectors; zeros where the side is unknown, because no camera saw the cell, or cameras saw it from
-        both sides (objects thinner than a cell).
+        (M,) 1 where they saw the side to which the normal points, -1 where they saw the other side; 0 where the side is
+        unknown, because no camera saw the cell, or cameras saw it from both sides (objects thinner than a cell).
     """
     front, back = _weights_of_sides(points, normals, views, unit_m)
     side = _sides(front, back)
     for _ in range(_FILL_ROUNDS):
         side = _fill_unknown(side, points, normals, tree)
-    found: np.ndarray = normals * side[:, None]
-    return found
+    return side
 
 
 def _weights_of_sides(
@@ -53,8 +51,7 @@ def _weights_of_sides(
     own = points / unit_m
     for row in views.select_views_of_sides(own, normals, NUM_CAMERAS):
         camera = views.cameras[[row]]
-        rendered = views.render(row)
-        depth = np.where(rendered.alpha[0] > _MIN_ALPHA, rendered.depth[0], np.inf) * unit_m
+        depth = views.image(row).depth * unit_m
         pixels, z = project(own, camera.T_camera_frame[0], camera.intrinsics_px[0])
         at = np.flatnonzero(in_image(pixels, z, camera.sizes_px[0]))
         column, line = np.floor(pixels[at]).astype(np.int64).T

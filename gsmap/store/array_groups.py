@@ -11,7 +11,7 @@ from gsmap.errors import CorruptError, NotFoundError
 from gsmap.store.arrays import Arrays, StagedGroup, StoredFile
 from gsmap.store.branches import OtherCatalogs
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.schema import files, graphs, groups, view_features
+from gsmap.store.schema import files, graphs, groups, prepared_scenes, view_features
 
 
 def has_group(connection: Connection, group_id: str) -> bool:
@@ -49,8 +49,8 @@ def unname(connection: Connection, group_id: str) -> None:
 
 
 def forget_derived(connection: Connection, scene: str) -> None:
-    """Delete the graphs and view features of a scene, as its stored Gaussians change."""
-    for table in (graphs, view_features):
+    """Delete the graphs, view features and preparation of a scene, as its stored Gaussians change."""
+    for table in (graphs, view_features, prepared_scenes):
         made = table.c.scene == scene
         old = list(connection.execute(select(table.c.group_id).where(made)).scalars())
         connection.execute(delete(table).where(made))

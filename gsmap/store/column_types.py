@@ -20,7 +20,7 @@ from gsmap.errors import CorruptError, GsmapError, InputError
 from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
-KINDS = ("scenes", "graphs", "changes", "indexes", "views", "photos")
+KINDS = ("scenes", "graphs", "changes", "indexes", "views", "photos", "prepared")
 """Kinds of array groups: the folders below ``arrays``."""
 
 

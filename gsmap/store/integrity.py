@@ -39,11 +39,11 @@ from gsmap.store.schema import (
     index_segments,
     models,
     photo_sightings,
+    prepared_scenes,
     revisions,
     scenes,
     view_features,
 )
-from gsmap.store.view_features import KIND as VIEWS
 from gsmap.types.progress import Progress
 
 _WORTH_BYTES = 64 << 10
@@ -333,8 +333,9 @@ def _find_garbage(connection: Connection, keep_revisions: int | None) -> _Garbag
     lost = set(connection.execute(select(scenes.c.id).where(gone)).scalars())
     claimed |= {row.group_id for row in newest_of_all(connection) if not {row.older, row.newer} & lost}
     claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
-    views = select(view_features.c.group_id).where(view_features.c.scene.not_in(lost))
-    claimed |= set(connection.execute(views).scalars())
+    for table in (view_features, prepared_scenes):
+        of_living = select(table.c.group_id).where(table.c.scene.not_in(lost))
+        claimed |= set(connection.execute(of_living).scalars())
     claimed |= claimed_groups(connection, lost)
     known = {(g.kind, g.id) for g in connection.execute(select(groups))}
     return _Garbage(
@@ -353,7 +354,8 @@ def _drop_rows(catalog: Catalog, garbage: _Garbage) -> None:
         forget_dropped(connection)
         connection.execute(delete(graphs).where(graphs.c.key.in_(garbage.graphs)))
         forget_sets(connection, garbage.lost)
-        connection.execute(delete(view_features).where(view_features.c.group_id.in_(ids)))
+        for table in (view_features, prepared_scenes):
+            connection.execute(delete(table).where(table.c.group_id.in_(ids)))
         for table in (scenes, comparisons, photo_sightings):
             connection.execute(update(table).where(table.c.group_id.in_(ids)).values(group_id=None))
         for _, number in garbage.scenes:
@@ -369,8 +371,10 @@ def _advice(connection: Connection, kind: str, group: str, location: str | None)
         return _comparison_advice(connection, group, location)
     if kind == INDEXES:
         return " (the retrieval index: gsmap builds it again when the next scene is added)"
-    if kind == VIEWS:
+    if kind == "views":
         return " (features of a scene's views: gsmap computes them again when the next photo is localized)"
+    if kind == "prepared":
+        return " (surface cells and renders of a scene: gsmap computes them again when the scene is registered)"
     if kind == PHOTOS:
         return " (the preview of a kept photo: remove the photo and add it again)"
     if kind != "graphs":

@@ -282,6 +282,7 @@ def repair_advice(kind: str) -> str:
         "graphs": "compute the graph again (gsmap describe MAP SCENE)",
         "changes": "compare its two scenes again (gsmap changes MAP A:B)",
         "views": "localize a photo: gsmap computes lost features again",
+        "prepared": "describe the scene again (gsmap describe MAP SCENE)",
         "photos": "remove the photo and add it again (gsmap localize MAP PHOTO --add)",
         "indexes": "add a capture: gsmap builds the index again",
     }

@@ -41,6 +41,7 @@ from gsmap.store.schema import (
     observations,
     photo_sightings,
     poses,
+    prepared_scenes,
     priors,
     purges,
     registrations,
@@ -262,6 +263,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     _forget_lookups(connection, scene)
     drop("graphs", graphs, graphs.c.scene == scene)
     drop("view_features", view_features, view_features.c.scene == scene)
+    drop("prepared_scenes", prepared_scenes, prepared_scenes.c.scene == scene)
     drop("photos", photo_sightings, photo_sightings.c.scene == scene)
     counts.update(objects.forget_scene(connection, scene))
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
@@ -271,6 +273,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     claimed |= set(connection.execute(select(comparisons.c.group_id)).scalars())
     claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
     claimed |= set(connection.execute(select(view_features.c.group_id)).scalars())
+    claimed |= set(connection.execute(select(prepared_scenes.c.group_id)).scalars())
     claimed |= set(connection.execute(select(photo_sightings.c.group_id)).scalars())
     unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
     sizes = select(files.c.group_id, func.sum(files.c.size_bytes)).where(files.c.group_id.in_(unclaimed))

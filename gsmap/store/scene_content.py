@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -75,7 +75,7 @@ def thinning_of(value: dict[str, Any] | None) -> Thinning | None:
 def shapes_of(row: Row[Any]) -> dict[str, Shape]:
     """Return the expected shapes of a scene's arrays."""
     n, c = row.num_gaussians, row.num_cameras
-    shapes: dict[str, Shape] = {**gaussian_shapes(n, row.sh_degree)}
+    shapes: dict[str, Shape] = {**gaussian_shapes(n, row.sh_degree), **stored_shapes(n, row.sh_degree)}
     if row.thinned is not None:
         shapes = compact.shapes(n, row.sh_degree)
     shapes |= {
@@ -94,6 +94,40 @@ def gaussian_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
     return {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, k, 3)}
 
 
+def stored_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each stored array of ``count`` Gaussians.
+
+    SH coefficients of degree 0 are stored apart from those of higher degrees, which registration does not read.
+    """
+    shapes = gaussian_shapes(count, sh_degree)
+    if sh_degree:
+        n, k, _ = shapes.pop("sh")
+        shapes |= {"sh0": (n, 1, 3), "sh_rest": (n, k - 1, 3)}
+    return shapes
+
+
+def stored_names(names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the names of the arrays that hold some fields of Gaussians (or ``sh0``), and of those that may.
+
+    Older releases, and those of degree 0, stored all coefficients in one array ``sh``.
+    """
+    either = ["sh", "sh0", "sh_rest"] if "sh" in names else ["sh", "sh0"] if "sh0" in names else []
+    return [name for name in names if name not in either], either
+
+
+def fields_of(stored: dict[str, np.ndarray], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return fields of Gaussians (or ``sh0``) from the stored arrays of `stored_names`."""
+    out = {}
+    for name in names:
+        if name in stored:
+            out[name] = stored[name]
+        elif name == "sh":
+            out[name] = np.concatenate([stored["sh0"], stored["sh_rest"]], axis=1)
+        else:
+            out[name] = stored["sh"][:, :1]
+    return out
+
+
 class GaussianBlocks:
     """The Gaussians of a source as streamed arrays that are written block by block, each block read once.
 
@@ -108,9 +142,9 @@ class GaussianBlocks:
         self._count = 0
         self._block = Gaussians.empty()
         self._boxes: list[np.ndarray] = []
-        shapes = gaussian_shapes(source.num_gaussians, source.sh_degree)
+        shapes = stored_shapes(source.num_gaussians, source.sh_degree)
         self.arrays = {
-            name: StreamedArray(shapes[name], np.dtype(np.float32), partial(self._of, name)) for name in FIELDS
+            name: StreamedArray(shape, np.dtype(np.float32), partial(self._of, name)) for name, shape in shapes.items()
         }
 
     def boxes(self) -> np.ndarray:
@@ -124,6 +158,8 @@ class GaussianBlocks:
             self._count += 1
         if start != self._rows * (self._count - 1):
             raise ValueError(f"rows from {start} on were read out of order")
+        if name in ("sh0", "sh_rest"):
+            return self._block.sh[:, :1] if name == "sh0" else self._block.sh[:, 1:]
         column: np.ndarray = getattr(self._block, name)
         return column
 
@@ -153,6 +189,48 @@ class StoredGaussians:
 
     def load(self) -> Gaussians:
         return self.read(0, self.num_gaussians)
+
+
+class UnreadGaussians(Gaussians):
+    """The stored Gaussians of a scene, of which each field is read whenever it is used, and none is kept.
+
+    `load` reads them all at once, ``degree_0`` no higher coefficients.
+    """
+
+    @classmethod
+    def of(cls, count: int, sh_degree: int, read: Callable[[Sequence[str]], dict[str, np.ndarray]]) -> UnreadGaussians:
+        """Return Gaussians that are read by ``read(names)``, where ``sh0`` names the coefficients of degree 0."""
+        out: UnreadGaussians = object.__new__(cls)
+        out.__dict__.update(origin=np.zeros(3), _count=count, _degree=sh_degree, _read=read)
+        return out
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        if name not in FIELDS or "_read" not in self.__dict__:
+            raise AttributeError(name)
+        found: np.ndarray = self.__dict__["_read"]([name])[name]
+        return found
+
+    def __len__(self) -> int:
+        return int(self.__dict__["_count"])
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self)
+
+    @property
+    def sh_degree(self) -> int:
+        return int(self.__dict__["_degree"])
+
+    def load(self) -> Gaussians:
+        return Gaussians(**self.__dict__["_read"](FIELDS))
+
+    def degree_0(self, mask: np.ndarray | None = None) -> Gaussians:
+        rows = None if mask is None else np.flatnonzero(mask)
+        parts = []
+        for name in (*FIELDS[:-1], "sh0"):  # one by one: memory for one field of the whole scene at a time
+            column = self.__dict__["_read"]([name])[name]
+            parts.append(column if rows is None else column.take(rows, axis=0))
+        return Gaussians(*parts)
 
 
 def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:

@@ -27,11 +27,14 @@ from gsmap.store.scene_content import (
     LENSES,
     GaussianBlocks,
     StoredGaussians,
+    UnreadGaussians,
     camera_arrays,
+    fields_of,
     lenses_of,
     scene_id,
     scene_of,
     shapes_of,
+    stored_names,
     thinning_of,
 )
 from gsmap.store.scene_refs import by_id, find, find_living, find_removed, name_taken, unused_name
@@ -361,7 +364,9 @@ class Scenes:
             holds = np.logical_or.reduceat(within, begins[:-1]) if chunks else np.zeros(0, bool)
             held = np.repeat(holds, np.diff(begins))
             spans = row_ranges([chunk for chunk, some in zip(chunks, holds, strict=True) if some], row.num_gaussians)
-            others = read(only=[name for name in FIELDS if name != "means"], rows=spans)
+            names = [name for name in FIELDS if name != "means"]
+            only, optional = stored_names(names)
+            others = fields_of(read(only=only, optional=optional, rows=spans), names)
         out = Gaussians(means if held.all() else means[held], **others)
         return out if within.all() else out[within[held]]
 
@@ -384,9 +389,7 @@ class Scenes:
                 values: np.ndarray = getattr(read(start, stop), name)
                 return values
             with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
-                shapes = shapes_of(row)
-                span = [(start, stop)]
-                return self._arrays.read(KIND, row.group_id, files, only=[name], rows=span, shapes=shapes)[name]
+                return self._fields(row, files, [name], [(start, stop)])[name]
 
         return StoredGaussians(row.num_gaussians, row.sh_degree, read, column)
 
@@ -396,14 +399,49 @@ class Scenes:
         """Read the Gaussians in ranges of rows, or all Gaussians."""
         shapes = shapes_of(row)
         if row.thinned is None:
-            read = self._arrays.read(KIND, row.group_id, files, only=FIELDS, rows=ranges, shapes=shapes)
-            return Gaussians(**read)
+            return Gaussians(**self._fields(row, files, FIELDS, ranges))
         by_row = [name for name in compact.shapes(0, 0) if name not in compact.WHOLE]
         read = self._arrays.read(KIND, row.group_id, files, only=by_row, rows=ranges, shapes=shapes)
         read |= self._arrays.read(KIND, row.group_id, files, only=compact.WHOLE, shapes=shapes)
         spans = [(0, row.num_gaussians)] if ranges is None else ranges
         rows = np.concatenate([np.arange(*span) for span in spans]) if spans else np.zeros(0, dtype=np.int64)
         return compact.unpack(read, rows)
+
+    def _fields(
+        self,
+        row: Row[Any],
+        files: tuple[StoredFile, ...],
+        names: Sequence[str],
+        ranges: Sequence[tuple[int, int]] | None = None,
+    ) -> dict[str, np.ndarray]:
+        """Read fields of the Gaussians (or ``sh0``) of a scene that is not thinned."""
+        only, optional = stored_names(names)
+        shapes = shapes_of(row)
+        read = self._arrays.read(KIND, row.group_id, files, only=only, optional=optional, rows=ranges, shapes=shapes)
+        try:
+            return fields_of(read, names)
+        except KeyError as error:
+            raise CorruptError(
+                f"scene {row.name!r} has no array {error}: run gsmap check, and ingest it again", code="arrays_corrupt"
+            ) from error
+
+    def unread(self, ref: str) -> Gaussians:
+        """Return a scene's Gaussians (Morton order), of which only the fields that are used are read.
+
+        Raises:
+            CorruptError, NotFoundError: as `gaussians`, now or when they are read.
+        """
+        with self._catalog.read() as connection:
+            row = find(connection, ref)
+            files = _manifest(connection, row)
+        if row.thinned is not None:
+            return self.gaussians(row.id)
+
+        def read(names: Sequence[str]) -> dict[str, np.ndarray]:
+            with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
+                return self._fields(row, files, names)
+
+        return UnreadGaussians.of(row.num_gaussians, row.sh_degree, read)
 
     def thin(self, ref: str, shown: np.ndarray, *, up: Sequence[float] | None = None) -> Scene:
         """Store a living scene compactly, with only some of its Gaussians, and delete its graphs; durable when it

@@ -58,7 +58,7 @@ from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 from gsmap.types.map_object import OBJECT_FACTS
 from gsmap.types.world import OBSERVATION_KINDS
 
-HEAD = "0011"  # the newest migration; numbered, so that versions can be compared without alembic
+HEAD = "0012"  # the newest migration; numbered, so that versions can be compared without alembic
 
 REVISION_COUNTS = (
     "num_scenes",
@@ -114,7 +114,7 @@ about = _table(
 groups = _table(
     "groups",
     Column("id", DigestText, primary_key=True),  # digest of the content
-    Column("kind", ArrayKindText, nullable=False),  # scenes, graphs, changes, indexes, views, photos
+    Column("kind", ArrayKindText, nullable=False),  # `KINDS`
     Column("created_at", Text, nullable=False),
 )
 files = _table(
@@ -257,6 +257,21 @@ view_features = _table(
     Column("num_views", Integer, nullable=False),
     Column("num_features", Integer, nullable=False),
     Column("summaries", LargeBinary, nullable=False),  # empty; older maps hold a vector of each view
+    Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
+    Column("created_at", Text, nullable=False),
+)
+
+# Surface cells and renders of a scene, for its registrations; recomputed if lost.
+prepared_scenes = _table(
+    "prepared_scenes",
+    Column("key", KeyText, primary_key=True),  # RecipeKey.digest
+    _recipe(),
+    _scene("scene", index=True),
+    Column("unit_m", Real, nullable=False),  # working metres per unit of the scene
+    Column("num_gaussians", Integer, nullable=False),
+    Column("num_cells", Integer, nullable=False),
+    Column("num_views", Integer, nullable=False),
+    Column("num_own", Integer, nullable=False),
     Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )

@@ -9,7 +9,9 @@ import tempfile
 import uuid
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sqlalchemy import insert, select
 
@@ -40,21 +42,24 @@ from gsmap.store.registrations import Registrations
 from gsmap.store.remote_map import RemoteMap
 from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
-from gsmap.store.view_features import ViewFeatures
 from gsmap.store.world import WorldObservations
 from gsmap.store.written import time_written
 from gsmap.types.progress import Progress
 from gsmap.version import __version__
 
+if TYPE_CHECKING:
+    from gsmap.store.prepared_scenes import PreparedScenes
+    from gsmap.store.view_features import ViewFeatures
+
 
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
-    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``indexes``, ``view_features``, ``photos``,
-    ``registrations``, ``changes``, ``revisions``, ``priors``, ``world``, ``models``, ``exports``, ``branches``,
-    ``backups``, ``leases`` and ``set_aside``. Every method that changes something is one transaction, durable when it
-    returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store;
-    processes open their own.
+    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``indexes``, ``view_features``, ``prepared_scenes``,
+    ``photos``, ``registrations``, ``changes``, ``revisions``, ``priors``, ``world``, ``models``, ``exports``,
+    ``branches``, ``backups``, ``leases`` and ``set_aside``. Every method that changes something is one transaction,
+    durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may
+    share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -84,7 +89,6 @@ class Store:
         self.recipes = Recipes(catalog)
         self.graphs = Graphs(catalog, self.arrays)
         self.indexes = Indexes(catalog, self.arrays)
-        self.view_features = ViewFeatures(catalog, self.arrays)
         self.photos = Photos(catalog, self.arrays)
         self.registrations = Registrations(catalog)
         self.changes = Changes(catalog, self.arrays)
@@ -98,6 +102,20 @@ class Store:
         self.backups = Backups(catalog)
         self.leases = Leases(catalog)
         self.quarantine = Quarantine(catalog)
+
+    @cached_property
+    def view_features(self) -> ViewFeatures:
+        """Features of the views of each scene."""
+        from gsmap.store.view_features import ViewFeatures  # imported here, as verbs that only read rows do not need it
+
+        return ViewFeatures(self.catalog, self.arrays)
+
+    @cached_property
+    def prepared_scenes(self) -> PreparedScenes:
+        """What is prepared of each scene for its registrations."""
+        from gsmap.store.prepared_scenes import PreparedScenes
+
+        return PreparedScenes(self.catalog, self.arrays)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:

@@ -137,6 +137,16 @@ class Gaussians:
     def nbytes(self) -> int:
         return sum(a.nbytes for a in (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh))
 
+    def degree_0(self, mask: np.ndarray | None = None) -> Gaussians:
+        """Return the Gaussians in a mask (N,), by default all, with their view-independent colour alone."""
+        out = self if self.sh.shape[1] == 1 else replace(self, sh=self.sh[:, :1])
+        return out if mask is None else out[mask]
+
+    @property
+    def num_bytes(self) -> int:
+        """Return the size in memory."""
+        return sum(int(getattr(self, name).nbytes) for name in FIELDS)
+
     def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
         """Return the Gaussians at a boolean mask, integer array or slice."""
         if not isinstance(index, np.ndarray):

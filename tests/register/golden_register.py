@@ -18,6 +18,8 @@ from gsmap.methods import family
 from gsmap.register import Params, register_pair
 from gsmap.register.metric_scene import MetricScene
 from gsmap.register.proposers import graph, kiss_matcher
+from gsmap.register.surface import Surface
+from gsmap.register.view_cache import ViewCache
 from gsmap.types import Proposal, Registration, Sim3
 
 
@@ -73,7 +75,10 @@ def _refined(name: str) -> Callable[[], dict[str, np.ndarray]]:
         world, out = _world(), {}
         # Renders of so few points only match those of the same points; what else there is refines another sampling.
         same = name == "photometric"
-        target, source = world.target.surface(), (world.target if same else world.source).surface()
+        target, source = (
+            Surface.of(view.gaussians, 1.0, view.cameras, ViewCache(view.gaussians, view.cameras))
+            for view in (world.target, world.target if same else world.source)
+        )
         middle = source.points.mean(0)
         turn = exp_so3([0.0, 0.004, 0.007])
         start = Sim3(turn, middle - turn @ middle + [0.01, 0.0, 0.02])

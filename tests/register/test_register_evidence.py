@@ -180,18 +180,6 @@ def test_haze_that_only_a_foreign_camera_meets_is_not_held_against_a_scene():
         assert found.colour_correlation > 0.95
 
 
-def test_view_cache_renders_each_view_once_and_keeps_a_bounded_number():
-    wall, count = _wall(3.0, step=0.1), 80
-    cache = ViewCache(wall, _cameras(*[(0.01 * i, 0, 0) for i in range(count)]), image_size_px=64)
-    first = cache.render(0)
-    assert cache.render(0) is first
-    assert first.colour.shape == (1, 48, 64, 3)
-    for row in range(count):
-        cache.render(row)
-    assert len(cache._renders) < count
-    assert np.array_equal(cache.render(0).colour, first.colour)
-
-
 def test_view_cache_prefers_cameras_that_nothing_hides_the_points_from():
     # A screen before the first camera hides the wall from it.
     scene = Gaussians.concatenate([_wall(3.0), _wall(0.5, width=0.8, height=0.7)])

@@ -6,6 +6,7 @@ from gsmap.methods import RecipeKey
 from gsmap.store.objects import ComputedObjects, ObjectSet
 from gsmap.types import Cameras, Change, ChangeReport, Gaussians, MapObject, ObjectObservation, Sim3
 from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
+from gsmap.types.prepared_scene import PreparedScene
 
 
 def key(stage: str, *inputs: str, **settings: object) -> RecipeKey:
@@ -48,6 +49,27 @@ def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newe
 
 
 JPEG = b"\xff\xd8\xff\xe0" + bytes(range(200))
+
+
+def made_prepared(scene: str, cells: int = 5) -> PreparedScene:
+    """A prepared scene of made cells and two views of 4 x 3 pixels."""
+    rng = np.random.default_rng(cells)
+    cameras = Cameras(np.tile(np.eye(4), (2, 1, 1)), np.tile([4.0, 4, 2, 1.5], (2, 1)), np.tile([4, 3], (2, 1)))
+    return PreparedScene(
+        scene=scene,
+        unit_m=0.5,
+        centre=rng.normal(size=3),
+        is_surface=rng.uniform(size=21) > 0.5,
+        points=rng.normal(size=(cells, 3)).astype(np.float32),
+        colours=rng.uniform(size=(cells, 3)).astype(np.float16),
+        normals=rng.normal(size=(cells, 3)).astype(np.float32),
+        sides=rng.integers(-1, 2, cells).astype(np.int8),
+        sample=rng.normal(size=(3, 3)).astype(np.float32),
+        cameras=cameras,
+        num_own=1,
+        image_colours=rng.integers(0, 256, (24, 3)).astype(np.uint8),
+        image_depths=np.append(rng.uniform(1, 2, 23), np.inf).astype(np.float16),
+    )
 
 
 def kept_photo(scene: str, number: int = 0, **values) -> LocalizedPhoto:

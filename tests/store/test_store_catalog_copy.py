@@ -12,6 +12,7 @@ from store_samples import (
     kept_photo,
     key,
     made_change,
+    made_prepared,
     make_cameras,
     make_gaussians,
     save_comparison,
@@ -52,6 +53,7 @@ def fill(store):
     shown, angles = np.zeros((0, 128), np.int8), np.zeros(0, np.uint8)
     views = SceneFeatures(a.id, cameras, starts, np.zeros((0, 3), np.float32), shown, angles)
     store.view_features.save(views, key("localize", a.id))
+    store.prepared_scenes.save(made_prepared(a.id), key("register", a.id))
     store.photos.add(kept_photo(a.id), JPEG)
     keep_objects(store, {a.id: [[0, 0, 0], [1, 1, 1]]})
     store.objects.edit(1, name="sofa")

@@ -115,6 +115,7 @@ def test_nothing_of_it_is_left(place):
             "changes": 0,
             "change_reviews": 0,
             "view_features": 0,
+            "prepared_scenes": 0,
             "photos": 0,
             "object_sets": 0,
             "object_places": 0,

@@ -219,7 +219,8 @@ class Filled:
         Args:
             lookup: which pairs are tried is asked of the map; else it is the captures before.
         """
-        with mock.patch.object(describe, "run_jobs", self._describe):
+        unprepared = mock.patch.object(register, "prepare_missing")
+        with unprepared, mock.patch.object(describe, "run_jobs", self._describe):
             if lookup:  # within another one that looks nothing up, too
                 asks = mock.patch.object(register, "register", _REGISTER)
                 with asks, mock.patch.object(register, "run_jobs", self._register):
@@ -237,9 +238,9 @@ class Filled:
             finally:
                 counts["graphs"] = loaded.times["graphs"]
 
-    def _describe(self, job: Any, arguments: Any, *_: Any, **__: Any) -> Iterator[tuple[int, SceneGraph]]:
+    def _describe(self, job: Any, arguments: Any, *_: Any, **__: Any) -> Iterator[tuple[int, tuple[SceneGraph, None]]]:
         for i, (_, scene, *_rest) in enumerate(arguments):
-            yield i, replace(self.made.graph, scene_id=scene)
+            yield i, (replace(self.made.graph, scene_id=scene), None)
 
     def _register(self, job: Any, arguments: Any, *_: Any, **__: Any) -> Iterator[tuple[int, Registration]]:
         place = {scene: k for k, scene in enumerate(self.order)}

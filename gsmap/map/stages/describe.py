@@ -66,10 +66,14 @@ def describe(
     shared = SharedJobs(store, "describe", "graph", jobs, about, done, progress, again=verify)
     results = shared.results(lambda arguments: run_jobs(describe_scene, arguments, settings.engine))
     there = len(scenes) - len(missing)
+    from gsmap.register.recipe import prepared_key  # imports the registration, which reading a map does not need
+
     kept = note_interruption(lambda: f"{there + shared.num_kept()} of {len(scenes)} scenes are described and kept")
     with kept, closing(results):
-        for key, graph in results:
+        for key, (graph, prepared) in results:
             store.graphs.save(graph, keys[graph.scene_id])
+            if prepared is not None:
+                store.prepared_scenes.save(prepared, prepared_key().of(graph.scene_id, key))
             shared.saved(key, f"{names[key]}: {graph.num_nodes} nodes")
     if verify:  # those of other recipes cannot be made again, and nothing needs them any more
         others = [graph.key for graph in store.graphs.list() if graph.scene in keys]

@@ -19,6 +19,7 @@ from gsmap.ingest import read_captures
 from gsmap.localize.scan import AGREE_SIGMAS, as_gaussians
 from gsmap.localize.scan_consensus import ConsensusPose, PoseTolerance, ScanPose, combine_poses
 from gsmap.map import models
+from gsmap.map.jobs import load_view
 from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.map.scene_lookup import look_up_graph
 from gsmap.map.settings import Settings
@@ -129,7 +130,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     supports: list[ScanPose] = []
     for number, scene in enumerate(candidates):
         told(0.3 + 0.7 * number / len(candidates), f"comparing with {scenes[scene].name}")
-        target = _view(store, scenes[scene], known[scene].digest)
+        target = load_view(store, scene, known[scene].digest)
         if sought.coloured:
             found.append(register.register_pair(target, source, settings.register))
         else:
@@ -223,13 +224,6 @@ def _near(store: Store, near: str) -> set[str]:
     if not found:
         raise NotFoundError(f"no scene of the map lies near {near}", code="nothing_near")
     return found
-
-
-def _view(store: Store, scene: Scene, graph_key: str) -> SceneView:
-    graph = store.graphs.load(scene.id, graph_key)
-    assert graph is not None
-    gaussians, cameras = store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id)
-    return SceneView(scene.id, gaussians, cameras, graph, scene.scale_policy)
 
 
 def _row(

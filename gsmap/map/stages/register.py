@@ -19,6 +19,7 @@ from gsmap.map.scene_lookup import keys_of_lookups, look_up_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import SharedJobs, note_interruption
 from gsmap.map.stages.describe import graph_keys, without_graph
+from gsmap.map.stages.prepare import prepare_missing
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import PairSchedule, ScenePosition, directed, neighbours
@@ -91,6 +92,8 @@ class _RegistrationContext:
             again: retry quarantined pairs.
         """
         store, settings = self.store, self.settings
+        ends = sorted({scene for pair in pairs for scene in pair})
+        prepare_missing(store, [(scene, self.graphs[scene].digest) for scene in ends], settings)
         edges = {self.key(a, b).digest: (a, b) for a, b in pairs}
         jobs = {
             key: (store.location, (a, self.graphs[a].digest), (b, self.graphs[b].digest), settings.register)

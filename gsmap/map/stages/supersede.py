@@ -14,11 +14,13 @@ from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.ingest import Capture
 from gsmap.map import models
+from gsmap.map.jobs import load_view
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.register import SceneView, recipe_key
 from gsmap.register.metric_scene import target_unit_m
+from gsmap.register.recipe import prepared_key
 from gsmap.render import backend
 from gsmap.store import Store, scene_id
 from gsmap.store.registrations import StoredRegistration
@@ -102,7 +104,9 @@ def supersede(
             dated_by=capture.dated_by if dated else dated_by,
         )
         inherit(store, old.id, scene.id)
-        store.graphs.save(graph, graph_keys(store, [scene], settings)[scene.id])
+        key = graph_keys(store, [scene], settings)[scene.id]
+        store.graphs.save(graph, key)
+        store.prepared_scenes.save(view.prepared, prepared_key().of(scene.id, key.digest))
         for one in carried:
             store.registrations.save(one.edge, one.key)
             if one.review is not None:
@@ -135,11 +139,12 @@ def _describe(store: Store, new_id: str, capture: Capture, settings: Settings) -
 
 def _view(store: Store, scene: Scene, settings: Settings) -> SceneView:
     """Return a scene for registration; compute a missing graph without storing it."""
+    key = graph_keys(store, [scene], settings)[scene.id]
+    if store.graphs.find(key) is not None:
+        return load_view(store, scene.id, key.digest)
     gaussians, cameras = store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id)
-    graph = store.graphs.load(scene.id, graph_keys(store, [scene], settings)[scene.id])
-    if graph is None:
-        capture = Capture(gaussians, cameras, scene.name, scale_policy=scene.scale_policy)
-        graph = _describe(store, scene.id, capture, settings)
+    capture = Capture(gaussians, cameras, scene.name, scale_policy=scene.scale_policy)
+    graph = _describe(store, scene.id, capture, settings)
     return SceneView(scene.id, gaussians, cameras, graph, scene.scale_policy)
 
 

@@ -49,8 +49,8 @@ def refine(
     unit_t, unit_s = target.unit_m, source.unit_m
     start_in_units = Sim3(start.rotation, start.translation / unit_t, start.scale * (unit_s / unit_t))
     aligned = _align(
-        target.gaussians,
-        source.gaussians,
+        target.gaussians.load(),
+        source.gaussians.load(),
         target.cameras,
         start_in_units,
         unit_m=unit_t,

@@ -1,0 +1,131 @@
+"""Prepared scenes (`PreparedScene`), which are stored under their recipe and inputs and can be recomputed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Row
+
+from gsmap.errors import MALFORMED, CorruptError, InputError
+from gsmap.methods import RecipeKey
+from gsmap.store.arrays import Arrays
+from gsmap.store.catalog import Catalog
+from gsmap.store.derived_arrays import DerivedArrays
+from gsmap.store.layout import Shape
+from gsmap.store.schema import prepared_scenes
+from gsmap.types import Cameras
+from gsmap.types.prepared_scene import PreparedScene
+
+KIND = "prepared"
+
+_TYPES = {
+    "centre": np.float64,
+    "surface": np.uint8,
+    "points": np.float32,
+    "colours": np.float16,
+    "normals": np.float32,
+    "sides": np.int8,
+    "sample": np.float32,
+    "poses": np.float64,
+    "intrinsics": np.float64,
+    "sizes": np.int64,
+    "image_colours": np.uint8,
+    "image_depths": np.float16,
+}
+
+
+class PreparedScenes(DerivedArrays):
+    """The prepared scenes of a map."""
+
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
+        super().__init__(catalog, arrays, prepared_scenes, KIND, "what was prepared of scene")
+
+    def save(self, found: PreparedScene, key: RecipeKey) -> None:
+        """Store a prepared scene in place of all earlier ones of that scene.
+
+        Args:
+            key: its recipe; the scene must be among its inputs.
+        """
+        arrays: dict[str, np.ndarray] = {
+            "centre": found.centre[None],
+            "surface": np.packbits(found.is_surface),
+            "points": found.points,
+            "colours": found.colours,
+            "normals": found.normals,
+            "sides": found.sides,
+            "sample": found.sample,
+            "poses": found.cameras.T_frame_camera.reshape(-1, 16),
+            "intrinsics": found.cameras.intrinsics_px,
+            "sizes": found.cameras.sizes_px,
+            "image_colours": found.image_colours,
+            "image_depths": found.image_depths,
+        }
+        columns = {
+            "unit_m": float(found.unit_m),
+            "num_gaussians": len(found.is_surface),
+            "num_cells": len(found.points),
+            "num_views": len(found.cameras),
+            "num_own": found.num_own,
+        }
+        self.put(found.scene, key, {name: arrays[name].astype(_TYPES[name], copy=False) for name in arrays}, columns)
+
+    def load(self, scene: str, key: RecipeKey | str) -> PreparedScene | None:
+        """Load the prepared scene with this key; None without such a scene.
+
+        Raises:
+            CorruptError: bytes on disk are missing, differ, or are no prepared scene.
+            NotFoundError: another process replaced them meanwhile.
+        """
+        found = self.get(scene, key, _shapes)
+        if found is None:
+            return None
+        row, arrays = found
+        try:
+            return _prepared(row, arrays)
+        except (InputError, *MALFORMED) as error:
+            raise CorruptError(
+                f"what was prepared of scene {scene[:12]} is invalid ({error}): run gsmap check", code="arrays_corrupt"
+            ) from error
+
+
+def _shapes(row: Row[Any]) -> dict[str, Shape]:
+    M, V = row.num_cells, row.num_views
+    return {
+        "centre": (1, 3),
+        "surface": (-(-row.num_gaussians // 8),),
+        "points": (M, 3),
+        "colours": (M, 3),
+        "normals": (M, 3),
+        "sides": (M,),
+        "sample": (None, 3),
+        "poses": (V, 16),
+        "intrinsics": (V, 4),
+        "sizes": (V, 2),
+        "image_colours": (None, 3),
+        "image_depths": (None,),
+    }
+
+
+def _prepared(row: Row[Any], arrays: dict[str, np.ndarray]) -> PreparedScene:
+    for name, dtype in _TYPES.items():
+        if arrays[name].dtype != dtype:
+            raise InputError(f"{name} are {arrays[name].dtype}", code="invalid_record")
+    for name in ("centre", "points", "colours", "normals", "sample"):
+        if not np.isfinite(arrays[name]).all():
+            raise InputError(f"{name} hold NaN or infinity", code="not_finite")
+    return PreparedScene(
+        scene=row.scene,
+        unit_m=row.unit_m,
+        centre=arrays["centre"][0],
+        is_surface=np.unpackbits(arrays["surface"], count=row.num_gaussians).astype(bool),
+        points=arrays["points"],
+        colours=arrays["colours"],
+        normals=arrays["normals"],
+        sides=arrays["sides"],
+        sample=arrays["sample"],
+        cameras=Cameras(arrays["poses"].reshape(-1, 4, 4), arrays["intrinsics"], arrays["sizes"]),
+        num_own=row.num_own,
+        image_colours=arrays["image_colours"],
+        image_depths=arrays["image_depths"],
+    )
