@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+
+if TYPE_CHECKING:
+    from gsmap.types.rows.objects import HistoryReport
 
 TAKES_POINTS = True
 
@@ -29,8 +32,6 @@ def command(
 
     Example: `gsmap history site.gsmap 1.5,0.2,0.8`
     """
-    from gsmap.types.rows.objects import ObjectFactRow, ObjectObservationRow, ObjectRow
-
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         report = m.history(place, box=box)
     for note in report.notes:
@@ -38,6 +39,13 @@ def command(
     if json:
         print_rows("history", report, json)
         return
+    print_history(report)
+
+
+def print_history(report: HistoryReport) -> None:
+    """Print the objects of a place, their observations and annotations."""
+    from gsmap.types.rows.objects import ObjectFactRow, ObjectObservationRow, ObjectRow
+
     print_table("objects", ObjectRow.columns, report.objects)
     print_table("sightings", ObjectObservationRow.columns, report.sightings)
     if report.words:

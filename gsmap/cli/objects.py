@@ -79,6 +79,7 @@ OBJECTS: dict[str, Object] = {
     "show SCENE": OneRow("scenes.SceneReport"),
     "show A:B": OneRow("pairs.PairReport"),
     "show CHANGE": OneRow("changes.ChangeDetail"),
+    "show OBJECT": OneRow("objects.HistoryReport"),
     "why A:B": OneRow("pairs.PairExplanation"),
     "diff": ManyRows("scenes", "revisions.PoseChangeRow"),
     "poses": ManyRows("poses", "scenes.PoseRow"),

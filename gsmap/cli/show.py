@@ -1,4 +1,4 @@
-"""gsmap show: show the details of a scene, a pair or a change."""
+"""gsmap show: show the details of a scene, a pair, a change or an object."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table, say
+from gsmap.cli.history import print_history
 from gsmap.texts import shown
 
 if TYPE_CHECKING:
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from gsmap.types import Sim3
     from gsmap.types.metric_scale import MetricScale
     from gsmap.types.rows.changes import ChangeDetail
+    from gsmap.types.rows.objects import HistoryReport
     from gsmap.types.rows.pairs import PairReport
     from gsmap.types.rows.scenes import SceneReport
 
@@ -25,8 +27,9 @@ def command(
     thing: Annotated[
         str,
         typer.Argument(
-            metavar="SCENE|A:B|CHANGE",
-            help="A scene, a pair of scenes, or a change such as c12; scene names take precedence.",
+            metavar="SCENE|A:B|CHANGE|OBJECT",
+            help="A scene, a pair of scenes, a change such as c12, or an object such as o12; scene names take "
+            "precedence.",
         ),
     ],
     nodes: Annotated[bool, typer.Option("--nodes", help="Also list the nodes of the scene graph.")] = False,
@@ -35,39 +38,54 @@ def command(
         typer.Option(
             "--picture",
             metavar="FILE.png",
-            help="Also draw the scene graph, both captures of the pair from the same cameras, or the change.",
+            help="Also draw the scene graph, both captures of the pair from the same cameras, the change, or the "
+            "object.",
         ),
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Show all details of one scene, one pair of scenes or one change.
+    """Show all details of one scene, one pair of scenes, one change or one object.
 
     Example: `gsmap show site.gsmap monday --picture monday.png`
     """
     from gsmap.types.rows.changes import ChangeDetail
+    from gsmap.types.rows.objects import HistoryReport
     from gsmap.types.rows.pairs import PairReport
     from gsmap.types.rows.scenes import SceneReport
 
     with opened(map) as m:
         report = _report(m, thing)
         if picture:
-            draw = {SceneReport: m.draw_graph, PairReport: m.draw_pair, ChangeDetail: m.draw_change}
+            draw = {
+                SceneReport: m.draw_graph,
+                PairReport: m.draw_pair,
+                ChangeDetail: m.draw_change,
+                HistoryReport: m.draw_object,
+            }
             draw[type(report)](thing, picture)
             say(f"wrote {picture}")
     if json:
-        kinds = {SceneReport: "show SCENE", PairReport: "show A:B", ChangeDetail: "show CHANGE"}
+        kinds = {
+            SceneReport: "show SCENE",
+            PairReport: "show A:B",
+            ChangeDetail: "show CHANGE",
+            HistoryReport: "show OBJECT",
+        }
         print_rows(kinds[type(report)], report, json)
     elif isinstance(report, SceneReport):
         _print_scene(report, nodes)
     elif isinstance(report, ChangeDetail):
         _print_change(report)
+    elif isinstance(report, HistoryReport):
+        print_history(report)
     else:
         _print_pair(report)
 
 
-def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail:
+def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail | HistoryReport:
     from gsmap.errors import NotFoundError
     from gsmap.map.changes import change_number
+    from gsmap.store.objects import number_of
 
     try:
         return m.show_scene(thing)  # a scene name may contain a colon, or look like a change
@@ -76,6 +94,8 @@ def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail:
             return m.show_change(thing)
         if ":" in thing:
             return m.show_pair(thing)
+        if number_of(thing) is not None:
+            return m.history(thing)
         raise
 
 

@@ -62,9 +62,9 @@ def embed_query_text(text: str, params: Params, models: Mapping[str, ModelSpec])
     method = family("embedder").get(name)
     if not hasattr(method, "embed_text"):
         raise ConfigError(
-            f"the embedder {name} has no text tower: add an image encoder with one (gsmap models add MAP clip "
-            "IMAGE.onnx, then clip-text TEXT.onnx and clip-tokenizer tokenizer.json) and run gsmap update; or query "
-            "by --picture FILE, --like SCENE:NODE or --at X,Y,Z",
+            f"the embedder {name} reads no text: search by --like o12, --at X,Y,Z or --picture FILE, or add a CLIP "
+            "model, which docs/how-to/find.md says how to get: gsmap models add MAP clip IMAGE.onnx, then clip-text "
+            "TEXT.onnx and clip-tokenizer tokenizer.json",
             code="model_required",
         )
     limited = {kind: replace(model, limits=params.limits) for kind, model in models.items()}

@@ -8,6 +8,9 @@ import numpy as np
 
 from gsmap.find.similarity import SegmentDescriptor, SimilarityModel, differences
 
+_PRIOR, _WEIGHT = 0.05, 20  # share of objects that are of one kind, and the number of objects that it counts as
+_STEPS = 20
+
 
 def rank_by_similarity(
     query: Sequence[SegmentDescriptor],
@@ -24,7 +27,7 @@ def rank_by_similarity(
         objects: observations of each object.
 
     Returns:
-        The (N,) probabilities at a prior of 0.5, and the (N,) index of each object's observation that matched best; 0
+        The (N,) probabilities, see `calibrated`, and the (N,) index of each object's observation that matched best; 0
         and -1 for objects without observations.
     """
     model = model or SimilarityModel.load()
@@ -35,8 +38,22 @@ def rank_by_similarity(
         odds = np.maximum(odds, model.log_odds(differences(one, flat)))
     scores, best = best_per_owner(odds, owner, len(objects))
     first = np.concatenate([[0], np.cumsum([len(observations) for observations in objects])[:-1]]).astype(np.int64)
-    with np.errstate(over="ignore"):
-        return 1.0 / (1.0 + np.exp(-scores)), np.where(best < 0, -1, best - first)
+    return calibrated(scores), np.where(best < 0, -1, best - first)
+
+
+def calibrated(log_odds: np.ndarray) -> np.ndarray:
+    """Return (N,) probabilities from log-odds at a prior of 0.5, by the prior that the objects of this map suggest.
+
+    Few objects of a place are of one kind, so most of those that score 0.87 at even odds are not. The prior is the mean
+    of the probabilities that it leads to, found by iteration (Saerens et al. 2002, "Adjusting the outputs of a
+    classifier to new a priori probabilities"), held near one in twenty where there are few objects.
+    """
+    prior = _PRIOR
+    for _ in range(_STEPS):
+        with np.errstate(over="ignore"):
+            found: np.ndarray = 1.0 / (1.0 + np.exp(-log_odds) * (1.0 - prior) / prior)
+        prior = (_PRIOR * _WEIGHT + float(found.sum())) / (_WEIGHT + len(found))
+    return found
 
 
 def cosine_similarities(query: np.ndarray, valid: np.ndarray, embeddings: np.ndarray) -> np.ndarray:

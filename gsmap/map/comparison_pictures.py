@@ -30,8 +30,10 @@ from gsmap.types.rows.changes import ChangeRow
 _log = logging.getLogger("gsmap.map")
 FILE_NAME = "changes.json"
 _VERSION = 1
-_PICTURE = re.compile(r"c\d+\.png|why-[0-9a-f]{8}-[0-9a-f]{8}\.png|find-[0-9a-f]{16}\.png")
-VIEWS_PER_SCENE = 2  # maximum number of cameras of each scene of a pair that both are drawn from
+_PICTURE = re.compile(r"c\d+\.png|why-[A-Za-z0-9_.-]{1,100}\.png|find-[0-9a-f]{16}\.png")
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
+VIEWS_PER_SCENE = 2  # maximum number of cameras, for each scene of a pair, that both are drawn from
+_TRIED_PER_SCENE = 14  # cameras of each scene, evenly along its capture, among which these are chosen
 _MAX_BYTES = 1 << 26
 
 
@@ -127,7 +129,8 @@ def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
     if stored is None or picture is None:
         return None
     edge = stored.registration
-    name = f"why-{edge.target[:8]}-{edge.source[:8]}.png"
+    called = "-".join(_UNSAFE.sub("_", store.scenes.get(end).name)[:40] for end in (edge.target, edge.source))
+    name = f"why-{called}-{text_digest(edge.target + edge.source)[:8]}.png"
     make_folder(folder)
     _note(store, folder)
     known.scenes[name] = [edge.target, edge.source]
@@ -150,13 +153,15 @@ def picture_of_pair(store: Store, a: str, b: str, side_px: int = 320) -> np.ndar
         return None
     from gsmap.view.pair_picture import draw_pair
 
-    seen = pair_views(store, stored.registration)
-    return draw_pair(seen.target, seen.source, seen.cameras, unit_m=seen.unit_m, side_px=side_px)
+    edge = stored.registration
+    seen = pair_views(store, edge)
+    names = store.scenes.get(edge.target).name, store.scenes.get(edge.source).name
+    return draw_pair(seen.target, seen.source, seen.cameras, unit_m=seen.unit_m, side_px=side_px, names=names)
 
 
 @dataclass(frozen=True, eq=False)
 class PairViews:
-    """Two scenes in the target's frame, the cameras that see most of the other scene, and metres per unit."""
+    """Two scenes in the target's frame, the cameras whose pictures decide on their pose, and metres per unit."""
 
     target: PosedScene
     source: PosedScene
@@ -165,20 +170,34 @@ class PairViews:
 
 
 def pair_views(store: Store, edge: Registration) -> PairViews:
-    """Return both scenes of an edge with a pose, and at most `VIEWS_PER_SCENE` cameras of each."""
+    """Return both scenes of an edge with a pose, and as many cameras as `num_views` of both, best first."""
+    from gsmap.view.pair_picture import choose_cameras
+
     assert edge.S_target_source is not None
     target, source = (
         posed_scene(store, edge.target, Sim3.identity()),
         posed_scene(store, edge.source, edge.S_target_source),
     )
     graph = store.graphs.load(edge.target)
-    chosen = []
+    unit_m = 1.0 if graph is None else graph.unit_m
+    tried = []
     for one, other in ((target, source), (source, target)):
         if one.cameras is not None and len(one.cameras):
             cache = ViewCache(one.gaussians, one.cameras, synthesize=False)
             rows = cache.select_views(other.gaussians.means, VIEWS_PER_SCENE)
-            chosen += [one.cameras[[row]] for row in rows]
-    return PairViews(target, source, chosen, 1.0 if graph is None else graph.unit_m)
+            evenly = np.linspace(0, len(one.cameras) - 1, min(len(one.cameras), _TRIED_PER_SCENE)).astype(int)
+            tried += [one.cameras[[row]] for row in dict.fromkeys([*rows, *evenly.tolist()])]
+    count = num_views([0 if one.cameras is None else len(one.cameras) for one in (target, source)])
+    return PairViews(target, source, choose_cameras(target, source, tried, count, unit_m), unit_m)
+
+
+def num_views(num_cameras: Sequence[int]) -> int:
+    """Return the number of cameras from which a pair is drawn.
+
+    Args:
+        num_cameras: number of cameras of each of both scenes.
+    """
+    return sum(min(VIEWS_PER_SCENE, count) for count in num_cameras)
 
 
 def picture_of_change(store: Store, row: ChangeRow, side_px: int = 320) -> np.ndarray | None:

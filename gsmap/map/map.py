@@ -1112,6 +1112,19 @@ class Map(AbstractContextManager["Map"]):
             )
         save_picture(picture, path)
 
+    def draw_object(self, ref: str, path: str | os.PathLike[str]) -> None:
+        """Draw an object by its id or name (``gsmap show MAP o12 --picture``).
+
+        Raises:
+            NotFoundError: no such object.
+        """
+        from gsmap.map.comparison_pictures import save_picture
+        from gsmap.map.object_pictures import ObjectPictures
+        from gsmap.map.objects import compute_objects
+
+        known = compute_objects(self.store, self.settings, self._progress)
+        save_picture(ObjectPictures(self.store, known).draw(ref), path)
+
     def draw_change(self, name: str, path: str | os.PathLike[str]) -> None:
         """Draw the place before and after a change (``gsmap show MAP c12 --picture``).
 

@@ -27,7 +27,7 @@ from gsmap.store import Store
 from gsmap.store.facts import Fact
 from gsmap.store.objects import ComputedObjects, number_of
 from gsmap.texts import few
-from gsmap.types import MapObject, Room, Scene, SceneGraph
+from gsmap.types import MapObject, ObjectAnnotations, Room, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.base import SCHEMA
 from gsmap.types.rows.objects import (
@@ -52,7 +52,7 @@ class MapObjects:
     """The objects of a map with the scenes, rooms and annotations needed to report them.
 
     Args:
-        objects: the objects of all components.
+        objects: the objects of all components, without parts of the building that nobody annotated.
         scenes: the placed scenes by id.
         notes: scenes without objects, with the reason.
         metres: metres per map unit, by component.
@@ -61,6 +61,7 @@ class MapObjects:
         facts: all annotations, by object id.
         rooms: rotation (3, 3) from the component's frame to a level one, and the rooms in that frame in metres.
         parted: id of the object from which each was split when its component fell apart.
+        building: segments that are rather parts of the building than objects; they have numbers, too.
     """
 
     objects: list[MapObject]
@@ -72,6 +73,7 @@ class MapObjects:
     facts: Mapping[str, Sequence[Fact]] = field(default_factory=dict)
     rooms: Mapping[int, tuple[np.ndarray, tuple[Room, ...]]] = field(default_factory=dict)
     parted: Mapping[str, str] = field(default_factory=dict)
+    building: Sequence[MapObject] = ()
 
     @property
     def dates(self) -> dict[str, str | None]:
@@ -132,6 +134,10 @@ class MapObjects:
         found = found or [one for one in self.objects if one.words.name.casefold() == text.casefold()]
         if not found and _HEX.fullmatch(text):
             found = [one for one in self.objects if one.id.startswith(text)]
+        if not found and ids & {one.id for one in self.building}:
+            raise NotFoundError(
+                f"{text} is a wall, a room or another part of the building, not an object", code="object_not_found"
+            )
         if len(found) != 1:
             why = (
                 f"{', '.join(one.id for one in found)} all have this name"
@@ -178,8 +184,10 @@ def compute_objects(
         objects = add_photo_observations(objects, kept, scenes, at, metres, components)
     progress("objects", 1.0, f"{len(objects)} objects")
     photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
+    building = [one for one in objects if one.is_building and one.words == ObjectAnnotations()]
+    left_out = {one.id for one in building}
     return MapObjects(
-        objects,
+        [one for one in objects if one.id not in left_out],
         scenes,
         (*notes, *(said if graphs is None else ())),
         metres,
@@ -188,6 +196,7 @@ def compute_objects(
         store.objects.facts(),
         rooms,
         parted,
+        building,
     )
 
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmap.errors import ConfigError, NotFoundError
-from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_poses
 from gsmap.map import reports
 from gsmap.map.changes import change_row, changes_report, parse_change_id
-from gsmap.map.comparison_pictures import VIEWS_PER_SCENE, pair_views, picture_of_change, posed_scene
+from gsmap.map.comparison_pictures import num_views, pair_views, picture_of_change
 from gsmap.map.floor_plans import MAX_GAUSSIANS, MAX_SCENES, box_of, plan_of_component, read_scene
 from gsmap.map.metric_scales import map_metres
+from gsmap.map.object_pictures import ObjectPictures
 from gsmap.map.objects import MapObjects, compute_objects, history_report, objects_report
 from gsmap.map.page_pairs import pair_detail
 from gsmap.map.photos import photo_rows
@@ -29,11 +29,10 @@ from gsmap.map.stages.optimize import pose_basis
 from gsmap.methods import text_digest
 from gsmap.report.content import EdgeEntry
 from gsmap.store import Store, cache
-from gsmap.types import GaussianSource, PosedScene, PoseGraph, Prior, Scene
+from gsmap.types import GaussianSource, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
 from gsmap.types.world import ImagePoint
 from gsmap.view import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
-from gsmap.view.change_picture import draw_place
 from gsmap.view.content import up_of
 from gsmap.view.page_source import Action, PairPictures
 from gsmap.view.pair_picture import looks_at
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
 _NODES = 2_000  # of a layer of a scene graph that are sent, by weight
 _CAMERAS = 300  # of a scene that are sent, evenly along its capture
 _PICTURE_PX = 640  # longer side of the pictures of a pair or a change
-_THUMBNAIL_PX = 400  # longer side of the picture of an object
 _PLAN_PX = 640  # longer side of the picture under a floor plan
 _CAMERA_M = 0.1  # how long a camera is drawn
 
@@ -76,7 +74,7 @@ class MapPageSource:
         self._read: tuple[str | None, ViewMap] | None = None
         self._objects: tuple[str | None, MapObjects] | None = None
         self._objects_lock = threading.Lock()
-        self._posed: tuple[tuple[str, str], PosedScene] | None = None  # the scene that was last drawn
+        self._drawer: tuple[MapObjects, ObjectPictures] | None = None
         self._tiles = tiles
         self._merged = {} if tiles is None else merged_tilesets(store, tiles)
 
@@ -195,9 +193,7 @@ class MapPageSource:
         ends = [self._entry(scene).scene for scene in (stored.registration.target, stored.registration.source)]
         if sum(scene.num_gaussians for scene in ends) > self._settings.view.picture_gaussians:
             return ()
-        return tuple(
-            f"{scene.name}, view {k + 1}" for scene in ends for k in range(min(VIEWS_PER_SCENE, scene.num_cameras))
-        )
+        return tuple(f"view {k + 1}" for k in range(num_views([scene.num_cameras for scene in ends])))
 
     def pair_pictures(self, target: str, source: str) -> PairPictures:
         stored, names = self._store.registrations.get(target, source), self.pair_cameras(target, source)
@@ -259,19 +255,11 @@ class MapPageSource:
 
     def object_picture(self, id: str) -> np.ndarray:
         known = self._known()
-        thing = known.named(id)
-        shown = [one for one in thing.sightings if one.box is not None and one.scene in known.scenes]
-        if not shown:
-            raise NotFoundError(f"no scene shows {id}", code="object_not_shown")
-        best = max(shown, key=lambda one: one.thing >= 0)  # the first that has a segment of its own
-        assert best.box is not None
-        metres = known.metres[thing.component]
         with self._objects_lock:
-            S = in_metres(self._entry(best.scene).S_map_scene, metres)
-            key = best.scene, self.content().state
-            if self._posed is None or self._posed[0] != key:
-                self._posed = key, posed_scene(self._store, best.scene, S)
-            return draw_place(self._posed[1], best.box * metres, _THUMBNAIL_PX)
+            if self._drawer is None or self._drawer[0] is not known:
+                self._drawer = known, ObjectPictures(self._store, known)
+            drawer = self._drawer[1]
+        return drawer.draw(id)
 
     def history(self, at: str, component: int) -> dict[str, Any]:
         known, places = self._known(), self._places()

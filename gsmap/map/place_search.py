@@ -284,7 +284,8 @@ def _shown(store: Store, request: Request, settings: Settings) -> _QueryVector |
             features = embed_query_text(request.text, params, specs)
         except ConfigError as error:
             raise ConfigError(
-                f"no object is called {request.text!r} (gsmap edit MAP o12 --name), and {error}",
+                f"no object has the name or label {request.text!r}: give names in gsmap view, or by gsmap edit MAP "
+                f"o12 --name. Words for unnamed objects need a network; {error}",
                 code="object_not_found",
             ) from error
         return _QueryVector(features, np.ones(len(features), bool))

@@ -74,7 +74,7 @@ def find_dynamic_content(store: Store, known: MapObjects) -> dict[str, DynamicCo
     """Return the dynamic content of each placed scene, by scene id, reading only the catalog."""
     graphs = {graph.scene: graph.key for graph in store.graphs.list()}
     things: dict[str, set[int]] = {}
-    for thing in known.objects:
+    for thing in (*known.objects, *known.building):  # what could not be split may have moved, too
         if is_dynamic(thing):
             for sighting in thing.sightings:
                 if sighting.thing >= 0:
@@ -138,12 +138,13 @@ def dynamic_rows(store: Store, scene: str, passing: DynamicContent) -> np.ndarra
 
 def dynamic_notes(known: MapObjects, passing: Mapping[str, DynamicContent]) -> list[str]:
     """Return notes on the dynamic content that is left out."""
-    gone = [thing for thing in known.objects if is_dynamic(thing)]
-    once = sum(thing.looks < 2 for thing in known.objects)
+    every = [*known.objects, *known.building]
+    gone = [thing for thing in every if is_dynamic(thing)]
+    once = sum(thing.looks < 2 for thing in every)
     called = [thing.words.name or thing.words.label or thing.id for thing in gone]
     told = sum(len(one.changes) for one in passing.values())
     said = [
-        f"{len(gone)} of {len(known.objects)} objects are left out, since they moved or were observed to be "
+        f"{len(gone)} of {len(every)} objects are left out, since they moved or were observed to be "
         f"absent{': ' + ', '.join(called[:8]) if gone else ''}{' ...' if len(gone) > 8 else ''}"
     ]
     if told:

@@ -8,15 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap import render as rendering
+from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey, text_digest
+from gsmap.objects.building_parts import is_building_part
 from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse
 from gsmap.objects.visibility import LONGEST_SIDE_PX, MAX_VIEWS, RenderedViews, classify_observation, observe_points
 from gsmap.types import MapObject, ObjectObservation, ObservationState, Segments, Sim3
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
-VERSION = 1
+VERSION = 2
 """Version, raised whenever the objects of the same scenes change, also through other modules of `gsmap.objects`."""
+
+_FLOOR_AND_CEILING = (0.01, 0.995)  # quantiles of the heights of a scene's segments
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,7 @@ def make_objects(
     render: Callable[[SegmentedScene], RenderedViews],
     *,
     metres: float = 1.0,
+    up: np.ndarray | None = None,
     moved: Sequence[tuple[SegmentId, SegmentId]] = (),
     parted: Sequence[tuple[SegmentId, int]] = (),
     find_earlier: Callable[[int, SegmentId], tuple[ObservationState, float] | None] = lambda capture, node: None,
@@ -75,7 +80,7 @@ def make_objects(
     params: Params | None = None,
     progress: Progress = silent,
 ) -> list[MapObject]:
-    """Construct the objects of one component of the map, the largest first.
+    """Construct the objects of one component of the map, the largest first, and after them parts of the building.
 
     A scene is rendered at most once, and only if an object of other scenes lies in the frustum of its cameras. So the
     cost of a scene depends only on its own segments and on the objects at its place.
@@ -84,6 +89,7 @@ def make_objects(
         captures: scenes of the component, oldest first.
         render: function that renders the views of a scene; it is called at most once for each scene.
         metres: metres per unit of the map.
+        up: (3,) direction against gravity in the map frame; default: z.
         moved: pairs of segments, by index, of one moved object.
         parted: pairs of a segment and the index of a scene that does not show the segment in place.
         find_earlier: function that returns, from an earlier run, the state and observed fraction of a segment of
@@ -150,8 +156,9 @@ def make_objects(
                 state, observed_at = "absent", ""  # a review may revert it, so it is not kept as an observation
             box = np.array([points[i].min(0), points[i].max(0)]) if state == "seen" else None
             sightings[i][c] = ObjectObservation(capture.scene, state, -1, box, share, observed_at)
+    is_building = _building_parts(placed, [group for group, _ in kept], up)
     objects = []
-    for (group, _), mine in zip(kept, sightings, strict=True):
+    for (group, _), mine, of_building in zip(kept, sightings, is_building, strict=True):
         first, last = group[0], group[-1]
         own = captures[first[0]].segments.positions[first[1]] * captures[first[0]].segments.unit_m
         name = text_digest(f"{captures[first[0]].scene} {np.round(own, 1).tolist()}")[:8]
@@ -159,9 +166,25 @@ def make_objects(
         assert box is not None
         middle = captures[last[0]].S_map_scene.apply(captures[last[0]].segments.positions[last[1]][None])[0]
         colour = captures[last[0]].segments.colours[last[1]]
-        objects.append(MapObject(name, component, box, middle, colour, tuple(mine[c] for c in range(len(captures)))))
-    objects.sort(key=lambda obj: (-float(np.prod(obj.box[1] - obj.box[0])), obj.id))
+        observed = tuple(mine[c] for c in range(len(captures)))
+        objects.append(MapObject(name, component, box, middle, colour, observed, is_building=of_building))
+    objects.sort(key=lambda obj: (obj.is_building, -float(np.prod(obj.box[1] - obj.box[0])), obj.id))
     return _distinct(objects)
+
+
+def _building_parts(
+    placed: Sequence[PlacedSegments], groups: Sequence[tuple[SegmentId, ...]], up: np.ndarray | None
+) -> list[bool]:
+    """Return whether each group of segments is a part of the building, by its segment with most samples."""
+    level = np.eye(3) if up is None else level_frame(up)
+    points = [capture.points @ level.T for capture in placed]
+    ends = [np.quantile(one[:, 2], _FLOOR_AND_CEILING) if len(one) else np.zeros(2) for one in points]
+    out = []
+    for group in groups:
+        rows = {c: np.flatnonzero(placed[c].segments == t) for c, t in group}
+        c = max(rows, key=lambda one: len(rows[one]))
+        out.append(is_building_part(points[c][rows[c]], placed[c].lab[rows[c]], *ends[c].tolist()))
+    return out
 
 
 def _placed(capture: SegmentedScene, metres: float) -> PlacedSegments:

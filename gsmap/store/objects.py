@@ -456,6 +456,7 @@ def _value(made: ObjectSet) -> dict[str, Any]:
                 "box": plain(thing.box),
                 "position": plain(thing.position),
                 "colour": plain(thing.colour),
+                "building": thing.is_building,
                 # Observations of captures that cannot see the object are not stored.
                 "sightings": [
                     [at[s.scene], s.state, s.thing, plain(s.box), s.looked, at.get(s.asked, -1)]
@@ -511,7 +512,8 @@ def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, 
     )
     colour = _numbers(one["colour"], (3,)).astype(np.float32)
     box, position = _numbers(one["box"], (2, 3)), _numbers(one["position"], (3,))
-    return MapObject(str(one["id"]), int(one["component"]), box, position, colour, every)
+    is_building = bool(one.get("building", False))
+    return MapObject(str(one["id"]), int(one["component"]), box, position, colour, every, is_building=is_building)
 
 
 def _room(one: Mapping[str, Any], count: int) -> Room:

@@ -68,6 +68,7 @@ class MapObject:
         colour: (3,) float32 median, CIE L*a*b* (D65).
         sightings: observations by all placed captures of the component, oldest first.
         words: annotations.
+        is_building: it is rather a part of the building, a room or debris (`gsmap.objects.building_parts`).
     """
 
     id: str
@@ -77,6 +78,7 @@ class MapObject:
     colour: np.ndarray
     sightings: tuple[ObjectObservation, ...]
     words: ObjectAnnotations = ObjectAnnotations()
+    is_building: bool = False
 
     @property
     def seen(self) -> int:

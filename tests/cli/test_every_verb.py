@@ -72,6 +72,7 @@ RUNS = {
     "show SCENE": "show MAP left",
     "show A:B": "show MAP left:right",
     "show CHANGE": "show MAP c1",
+    "show OBJECT": "show MAP o1",
     "why A:B": "why MAP left:right --pictures TMP/why",
     "report": "report MAP TMP/report.html --since 2024-05-31",
     "diff": "diff MAP 1 2",

@@ -212,12 +212,18 @@ def _made(
         gaussians, cameras = store.scenes.gaussians(capture.scene), store.scenes.cameras(capture.scene)
         return render_views(gaussians, cameras, settings.objects.max_views, settings.objects.longest_side_px)
 
+    up = np.array([0.0, 0, 1])
+    known = {scene: graph for scene in poses if (graph := graphs[scene]) is not None}
+    ups = [poses[scene].rotation @ graph.up for scene, graph in known.items() if graph.up is not None]
+    if ups and np.linalg.norm(np.sum(ups, axis=0)) > 0:
+        up = np.sum(ups, axis=0) / np.linalg.norm(np.sum(ups, axis=0))
     moved, parted = _told(store, captures)
     objects = make_objects(
         captures,
         component,
         eyes,
         metres=unit,
+        up=up,
         moved=moved,
         parted=parted,
         find_earlier=looked,
@@ -229,11 +235,8 @@ def _made(
         {one.scene: things[one.scene].extents[one.thing] for one in thing.sightings if one.thing >= 0}
         for thing in objects
     ]
-    up, rooms = np.array([0.0, 0, 1]), list[Room]()
+    rooms = list[Room]()
     if key is not None:
-        known = {scene: graph for scene in poses if (graph := graphs[scene]) is not None}
-        ups = [poses[scene].rotation @ graph.up for scene, graph in known.items() if graph.up is not None]
-        up = np.sum(ups, axis=0) / np.linalg.norm(np.sum(ups, axis=0)) if ups else up
         told(1.0, "rooms")
         rooms = _rooms(store, settings, poses, up, unit)
     names = ("", "") if key is None else (key.digest, key.recipe)

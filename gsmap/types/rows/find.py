@@ -17,8 +17,8 @@ class FindHit(Row):
 
     Args:
         rank: rank, from 1.
-        score: a probability for ``likeness``, a cosine for ``embedding``, the fraction of matching words for ``name``;
-            see ``by`` of the report.
+        score: the probability that both are of one kind, for ``likeness``; a cosine for ``embedding``, the fraction of
+            matching words for ``name``; see ``by`` of the report.
         object: id of the object (`gsmap graph`); null if no object was segmented there.
         name: name of the object; null if it has none.
         scene: id of the capture that matched best.

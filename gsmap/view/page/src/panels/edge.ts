@@ -210,7 +210,9 @@ export class Edge extends Panel {
               <button class="plain square" aria-label="Previous camera" @click=${() => actions.view(-1, count)}>
                 ${icon("back")}
               </button>
-              <span class="muted small anywhere">camera ${at + 1} of ${count}: ${shown.camera}</span>
+              <span class="muted small anywhere" title="The most telling first">
+                camera ${at + 1} of ${count}: ${shown.camera}
+              </span>
               <button class="plain square" aria-label="Next camera" @click=${() => actions.view(1, count)}>
                 ${icon("next")}
               </button>
