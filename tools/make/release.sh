@@ -26,7 +26,7 @@ pyproject-build --sdist --outdir dist .
 if [ -z "${SKIP_WHEEL:-}" ]; then tools/build_wheels.sh x86_64 >/dev/null; fi
 find dist -maxdepth 1 -name "gsmapdb-*" -exec twine check --strict {} +
 # Of the installed environment: what this release was built and tested with.
-cyclonedx-py environment --pyproject pyproject.toml --output-file "dist/gsmapdb-$version.cdx.json"
+cyclonedx-py environment --pyproject pyproject.toml "$(command -v python)" --output-file "dist/gsmapdb-$version.cdx.json"
 (cd dist && sha256sum -- gsmapdb-* >SHA256SUMS && cat SHA256SUMS)
 cat >&2 <<NEXT
 made gsmapdb $version. Next:
