@@ -11,6 +11,7 @@ import numpy as np
 from gsmap.render.backends import backend as resolved
 from gsmap.render.fitter import FitOptions, Fitter, LearningRates
 from gsmap.types import Gaussians
+from gsmap.types.tensors import require_torch
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +38,7 @@ def make_fitter(
         MissingDependencyError: gsplat is requested but not installed.
     """
     if resolved(backend) == "gsplat":
+        require_torch("fits by gsplat")
         from gsmap.render.gsplat_fit import GsplatFitter
 
         return GsplatFitter(gaussians, learning_rates, frozen=frozen, options=options)

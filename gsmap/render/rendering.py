@@ -13,6 +13,7 @@ from gsmap.render import backends, native
 from gsmap.render.index import ChunkIndex
 from gsmap.render.outputs import Rendering, image_size
 from gsmap.types import Cameras, Gaussians
+from gsmap.types.tensors import require_torch
 
 if TYPE_CHECKING:
     import torch
@@ -72,6 +73,7 @@ def render(
             )
         images = native.allocate(len(cameras), height, width, len(gaussians), depth, dominant_id, max_weight)
         if chosen == "gsplat":
+            require_torch("renderings by gsplat")
             from gsmap.render import gsplat
 
             try:
