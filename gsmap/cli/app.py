@@ -17,7 +17,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import expect_json, left, print_json_error, start_logging
+from gsmap.cli.console import expect_json, left, print_json_error, print_wide_tables, start_logging
 from gsmap.errors import (
     ConfigError,
     DiskFullError,
@@ -82,11 +82,15 @@ def _root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
     quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only: no progress and no notes.")] = False,
+    wide: Annotated[
+        bool, typer.Option("--wide", help="Print tables with all columns at full width, also in a pipe.")
+    ] = False,
     verbose: Annotated[
         int, typer.Option("-v", "--verbose", count=True, help="Log each step; -vv logs every detail.")
     ] = 0,
 ) -> None:
     start_logging(verbose, quiet)
+    print_wide_tables(wide)
 
 
 def build(verbs: Sequence[str] = VERBS) -> typer.Typer:

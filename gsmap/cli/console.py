@@ -5,9 +5,12 @@ Names, notes and paths may come from untrusted files and maps, so all printed te
 
 from __future__ import annotations
 
+import itertools
 import json as _json
 import logging
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -124,7 +127,6 @@ def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: s
 
 
 _has_printed_json = False
-_MANY_ROWS = 500
 
 
 def print_json(data: dict[str, Any]) -> None:
@@ -168,45 +170,103 @@ def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
 
 
 def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> None:
-    """Print fields of rows as a table on stdout, with numbers right-aligned; a pipe gets all columns at full width."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
+    """Print fields of rows as a table on stdout.
 
+    A terminal gets a table that fits its width: sentences are wrapped between words, and columns that have no room are
+    left out, which a note says. ``--wide`` prints all columns at full width. A pipe or file gets lines of values
+    separated by tabs, headings first.
+    """
     from gsmap.types.notebook import cell_text
 
-    table = Table(title=Text(escaped(title), "table.title"), title_justify="left", box=box.SIMPLE_HEAD)
     values = [[getattr(row, name) for name in columns] for row in rows]
+    cells = [[cell_text(name, value) for name, value in zip(columns, line, strict=True)] for line in values]
+    headings = list(columns.values())
+    if not (_is_wide or sys.stdout.isatty()):
+        print(*("\t".join(line) for line in (headings, *cells)), sep="\n", flush=True)
+        return
     numeric = [
         any(isinstance(line[i], (int, float)) and not isinstance(line[i], bool) for line in values)
         for i in range(len(columns))
     ]
-    cells = [[cell_text(name, value) for name, value in zip(columns, line, strict=True)] for line in values]
-    if len(cells) > _MANY_ROWS:  # which rich draws at some milliseconds each
-        _print_lines(escaped(title), list(columns.values()), cells, numeric)
-        return
-    for heading, is_numeric in zip(columns.values(), numeric, strict=True):
-        table.add_column(heading, justify="right" if is_numeric else "left", overflow="fold")
-    for texts in cells:
-        table.add_row(*map(Text, texts))
-    _print(table)
+    shown_columns, widths = list(range(len(headings))), None
+    if not _is_wide:
+        shown_columns, widths = _fitting(headings, cells, shutil.get_terminal_size().columns)
+    chosen = [[line[i] for i in shown_columns] for line in (headings, *cells)]
+    _print_lines(escaped(title), chosen, widths or _widths(chosen), [numeric[i] for i in shown_columns])
+    left_out = [heading for i, heading in enumerate(headings) if i not in shown_columns]
+    if left_out:
+        say(f"no room for {', '.join(left_out)}: gsmap --wide {' '.join(sys.argv[1:2])} prints all columns")
 
 
-def _print_lines(title: str, headings: list[str], cells: list[list[str]], numeric: Sequence[bool]) -> None:
-    """Print a table as `print_table`, without folding cells to the width of the terminal."""
+_is_wide = False
+
+
+def print_wide_tables(wide: bool) -> None:
+    """Choose whether tables are printed with all columns at full width, wherever they go (``--wide``)."""
+    global _is_wide
+    _is_wide = wide
+
+
+_INDENT, _GAP = 2, 3  # of tables, in characters
+_MIN_SENTENCE = 20  # characters of a wrapped column, at least
+
+
+def _widths(lines: Sequence[Sequence[str]]) -> list[int]:
     from rich.cells import cell_len
 
-    lines = [headings, *cells]
-    widths = [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
+    return [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
+
+
+def _fitting(headings: Sequence[str], cells: Sequence[Sequence[str]], width: int) -> tuple[list[int], list[int]]:
+    """Return the columns of a table that fit a width, and their widths.
+
+    Columns with sentences are narrowed first, but not below their longest word; then columns are left out from the
+    right, those with sentences last, and never the first.
+    """
+    natural = _widths([headings, *cells])
+    least = list(natural)
+    for i in range(1, len(headings)):
+        texts = [heading_and_cells[i] for heading_and_cells in (headings, *cells)]
+        if any(" " in text for text in texts[1:]):
+            words = _widths([[word] for text in texts for word in text.split() or [""]])[0]
+            least[i] = min(natural[i], max(words, _MIN_SENTENCE))
+    kept = list(range(len(headings)))
+    while len(kept) > 1 and _total([least[i] for i in kept]) > width:
+        plain = [i for i in kept[1:] if least[i] == natural[i]]
+        kept.remove(plain[-1] if plain else kept[-1])
+    widths = {i: least[i] for i in kept}
+    room = width - _total(list(widths.values()))
+    for i in sorted(kept, key=lambda i: natural[i] - least[i]):
+        share = min(natural[i] - least[i], max(room, 0))
+        widths[i], room = widths[i] + share, room - share
+    return kept, [widths[i] for i in kept]
+
+
+def _total(widths: Sequence[int]) -> int:
+    return _INDENT + sum(widths) + _GAP * (len(widths) - 1)
+
+
+def _print_lines(title: str, lines: Sequence[Sequence[str]], widths: Sequence[int], numeric: Sequence[bool]) -> None:
+    """Print a table, headings first, with numbers right-aligned and longer texts wrapped between words."""
+    from rich.cells import cell_len
+
     out = []
-    for line in lines:
-        padded = (
-            " " * (width - cell_len(text)) + text if right else text + " " * (width - cell_len(text))
-            for text, width, right in zip(line, widths, numeric, strict=True)
-        )
-        out.append(f"  {'   '.join(padded)}".rstrip())
-    out.insert(1, f" {'─' * (sum(widths) + 3 * len(widths) - 1)}")
-    print(title, *out, sep="\n")
+    for number, line in enumerate(lines):
+        wrapped = [
+            [text]
+            if cell_len(text) <= width
+            else textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
+            for text, width in zip(line, widths, strict=True)
+        ]
+        for part in itertools.zip_longest(*wrapped, fillvalue=""):
+            padded = (
+                " " * (width - cell_len(text)) + text if right else text + " " * (width - cell_len(text))
+                for text, width, right in zip(part, widths, numeric, strict=True)
+            )
+            out.append(f"{' ' * _INDENT}{(' ' * _GAP).join(padded)}".rstrip())
+        if number == 0:
+            out.append(f" {'─' * (_total(widths) - _INDENT + 1)}")
+    print(title, *out, sep="\n", flush=True)
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
