@@ -18,6 +18,7 @@ import pytest
 from raising import raises
 from sqlalchemy import insert, select, update
 
+from gsmap import platform
 from gsmap.errors import BusyError, StoreError
 from gsmap.store import Store, schema
 from gsmap.store.leases import Leases
@@ -94,6 +95,7 @@ def test_what_a_killed_process_held_is_free_at_once(store: Store, another: subpr
     assert [lease.task for lease in store.leases.list()] == ["update"]
 
 
+@pytest.mark.skipif(not platform.IS_LINUX, reason="only Linux knows when a process started")
 def test_a_killed_process_that_nobody_buried_is_gone(store: Store, another: subprocess.Popen[str]) -> None:
     another.send_signal(signal.SIGKILL)
     deadline = time.monotonic() + 10
@@ -103,6 +105,7 @@ def test_a_killed_process_that_nobody_buried_is_gone(store: Store, another: subp
     assert store.leases.list() == []
 
 
+@pytest.mark.skipif(not platform.IS_LINUX, reason="only Linux knows when a process started")
 def test_a_later_process_of_the_same_number_is_another_one() -> None:
     me = this_process("update")
     number, started, machine = me.process.split(" ")

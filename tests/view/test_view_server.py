@@ -7,7 +7,6 @@ import json
 import os
 import re
 import socket
-import sys
 import threading
 import time
 from dataclasses import replace
@@ -17,6 +16,7 @@ from headless import Page
 from raising import raises
 from view_room import A, B, C, MadeDoors, act, ask, page_folder, told
 
+from gsmap import platform
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats import spz
 from gsmap.geometry.transforms import transform_gaussians
@@ -163,7 +163,7 @@ def test_a_busy_server_ends_at_once(server):
         one.close()
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells whose a connection is")
+@pytest.mark.skipif(not platform.IS_LINUX, reason="only Linux tells whose a connection is")
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can act for another user")
 @pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
 def test_another_user_is_not_answered_even_with_the_token(server, family):
