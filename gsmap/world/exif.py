@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ _LATITUDE, _LONGITUDE, _ALTITUDE, _ERROR, _DATUM = 2, 4, 6, 31, 18
 _HEIGHT_FACTOR = 2.0  # satellite heights are less accurate than horizontal positions by this factor
 _SEA_LEVEL_SIGMA_M = 40.0  # of the geoid's height above the ellipsoid, an error that a whole map shares
 _CORRECTED_SIGMA_M = 0.5  # receivers with corrections report less, including their common error
+_RTK = re.compile(rb"drone-dji:Rtk(Flag|StdLat|StdLon|StdHgt)(?:=[\"']|>)\s*([-+0-9.eE]+)")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 
 
@@ -29,6 +31,7 @@ class PhotoPosition:
         height_m: height as in EXIF, or None.
         above_ellipsoid: the height is above the ellipsoid (EXIF 3), not above sea level.
         sigma_m: horizontal positioning error of the receiver, or None.
+        height_sigma_m: vertical positioning error of the receiver, or None.
     """
 
     image: str
@@ -37,6 +40,7 @@ class PhotoPosition:
     height_m: float | None
     above_ellipsoid: bool
     sigma_m: float | None
+    height_sigma_m: float | None = None
 
     def sigmas(self, params: Params) -> tuple[tuple[float, float], tuple[float, float], float]:
         """Return three standard deviations: (horizontal, vertical) of this photo alone, (horizontal, vertical) of the
@@ -46,7 +50,8 @@ class PhotoPosition:
         if self.sigma_m is not None and self.sigma_m < _CORRECTED_SIGMA_M:
             common = self.sigma_m
         sea_level = 0.0 if self.above_ellipsoid else _SEA_LEVEL_SIGMA_M
-        return (own, own * _HEIGHT_FACTOR), (common, common * _HEIGHT_FACTOR), sea_level
+        ratio = _HEIGHT_FACTOR if self.height_sigma_m is None else self.height_sigma_m / own
+        return (own, own * ratio), (common, common * ratio), sea_level
 
 
 def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | None]:
@@ -70,6 +75,7 @@ def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
     try:
         with open_picture(path) as picture:
             gps = picture.getexif().get_ifd(_GPS)
+            rtk = _rtk_sigmas(picture.info.get("xmp") or picture.info.get("XML:com.adobe.xmp") or b"")
     except GsmapError:
         return None
     datum = str(gps.get(_DATUM, "WGS-84")).strip("\0 ").upper().replace(" ", "").replace("-", "")
@@ -84,9 +90,18 @@ def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
     if height is not None and code in (1, 3):
         height = -height
     error = _number(gps.get(_ERROR))
-    return PhotoPosition(
-        Path(path).as_posix(), longitude, latitude, height, code in (2, 3), error if error and error > 0 else None
-    )
+    horizontal, vertical = rtk or (error if error and error > 0 else None, None)
+    return PhotoPosition(Path(path).as_posix(), longitude, latitude, height, code in (2, 3), horizontal, vertical)
+
+
+def _rtk_sigmas(xmp: bytes | str) -> tuple[float, float] | None:
+    """Return the horizontal and vertical standard deviations in metres that DJI's XMP states for a position with
+    corrections (``drone-dji:RtkFlag`` is not 0); None without them."""
+    text = xmp if isinstance(xmp, bytes) else xmp.encode()
+    found = {name: _number(value) for name, value in _RTK.findall(text)}
+    flag, *values = (found.get(name) for name in (b"Flag", b"StdLat", b"StdLon", b"StdHgt"))
+    sigmas = [value for value in values if value is not None and value > 0]
+    return (max(sigmas[:2]), sigmas[2]) if flag and len(sigmas) == len(values) else None
 
 
 def _degrees(value: Any, reference: Any, letters: str) -> float | None:

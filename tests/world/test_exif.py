@@ -44,6 +44,50 @@ def test_a_position_without_an_error_has_the_default_one(tmp_path: Path) -> None
     assert (own[0], common[0]) == (2.0, 5.0)
 
 
+def rtk(**values: str) -> str:
+    return f"<d {' '.join(f'drone-dji:Rtk{name}={value!r}' for name, value in values.items())}/>"
+
+
+def with_xmp(path: Path, body: str) -> Path:
+    """A photo at a position, with an XMP packet."""
+    picture = Image.new("RGB", (8, 8))
+    tags = picture.getexif()
+    tags.get_ifd(0x8825).update({1: "N", 2: (48.0, 8.0, 13.2), 3: "E", 4: (11.0, 34.0, 30.0), 6: 520.5, 31: 4.0})
+    picture.save(path, exif=tags, xmp=f"<x:xmpmeta>{body}</x:xmpmeta>".encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        rtk(Flag="50", StdLon="0.011", StdLat="0.013", StdHgt="0.024"),
+        "<drone-dji:RtkFlag>50</drone-dji:RtkFlag><drone-dji:RtkStdLon>0.011</drone-dji:RtkStdLon>"
+        "<drone-dji:RtkStdLat>0.013</drone-dji:RtkStdLat><drone-dji:RtkStdHgt>0.024</drone-dji:RtkStdHgt>",
+    ],
+)
+def test_the_errors_of_a_position_with_corrections_come_from_xmp(tmp_path: Path, body: str) -> None:
+    found = exif.read(with_xmp(tmp_path / "a.jpg", body))
+    assert found is not None
+    own, common, _ = found.sigmas(Params())
+    assert own == pytest.approx((0.013, 0.024))
+    assert common == pytest.approx((0.013, 0.024))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        rtk(Flag="0", StdLon="0.011", StdLat="0.013", StdHgt="0.024"),
+        rtk(Flag="50", StdLon="0.0", StdLat="0.013", StdHgt="0.024"),
+        rtk(Flag="50", StdLat="0.013"),
+        rtk(Flag="x", StdLon="1e", StdLat="-", StdHgt="nan"),
+    ],
+)
+def test_xmp_without_corrections_or_with_other_values_counts_for_nothing(tmp_path: Path, body: str) -> None:
+    found = exif.read(with_xmp(tmp_path / "a.jpg", body))
+    assert found is not None
+    assert found.sigmas(Params())[0] == pytest.approx((4.0, 8.0))
+
+
 @pytest.mark.parametrize("name", ["area_margin_deg", "gcp_sigma_m", "gnss_sigma_m", "survey_sigma_m"])
 def test_sigmas_are_positive(name: str) -> None:
     with pytest.raises(ConfigError):
