@@ -9,7 +9,7 @@ import numpy as np
 from gsmap._native import place_points
 from gsmap.compare.neighbourhoods import depth_extremes, erode
 from gsmap.geometry.voxels import voxel_labels
-from gsmap.render import render
+from gsmap.render import ChunkIndex, render
 from gsmap.types import Cameras, Gaussians, PosedScene
 
 LONGEST_SIDE_PX, MAX_VIEWS = 240, 48  # default size and number of the views of a capture
@@ -106,8 +106,9 @@ def render_views(
     count = len(scene.gaussians)
     largest = np.zeros(count, dtype=np.float32)
     views = []
+    index = ChunkIndex.build(scene.gaussians)
     for camera in select_cameras(scene, longest_side_px, max_views):
-        view, weight = _view(scene.gaussians, camera)
+        view, weight = _view(scene.gaussians, camera, index)
         views.append(view)
         np.maximum(largest, weight, out=largest)
     times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
@@ -192,8 +193,8 @@ def project_points(points: np.ndarray, view: View, nearest_m: float) -> Projecte
     )
 
 
-def _view(gaussians: Gaussians, camera: Cameras) -> tuple[View, np.ndarray]:
-    seen = render(gaussians, camera, max_weight=True)
+def _view(gaussians: Gaussians, camera: Cameras, index: ChunkIndex) -> tuple[View, np.ndarray]:
+    seen = render(gaussians, camera, max_weight=True, index=index)
     return make_view(seen.colour[0], seen.alpha[0], seen.depth[0], seen.dominant_id[0], camera), seen.max_weight
 
 

@@ -21,7 +21,7 @@ from gsmap.compare.capture_views import (
 from gsmap.compare.colours import Balance, balance, colours_differ
 from gsmap.compare.evidence import REPAINTED, ChangeEvidence, EvidenceCounts
 from gsmap.geometry.sh import rgb_of_sh0
-from gsmap.render import render
+from gsmap.render import ChunkIndex, render
 from gsmap.types import Gaussians
 
 UNSURE, AGREE, COLOUR, OTHER_IN_FRONT, OTHER_BEHIND = 0, 1, 2, 3, 4
@@ -137,21 +137,22 @@ def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
 
 
-def _surface(capture: CaptureViews) -> tuple[Gaussians, np.ndarray]:
+def _surface(capture: CaptureViews) -> tuple[Gaussians, ChunkIndex, np.ndarray]:
     rows = np.flatnonzero(capture.surface)
-    return (capture.gaussians if len(rows) == len(capture.surface) else capture.gaussians[rows]), rows
+    surface = capture.gaussians if len(rows) == len(capture.surface) else capture.gaussians[rows]
+    return surface, ChunkIndex.build(surface), rows
 
 
-def _seen_by(view: View, surface: Gaussians, rows: np.ndarray, capture: CaptureViews) -> View:
+def _seen_by(view: View, surface: Gaussians, index: ChunkIndex, rows: np.ndarray, capture: CaptureViews) -> View:
     """Render the surface of a capture into a view of another; only what the capture observed well is solid.
 
     That is a surface which several of its own views observe, from about this direction: the two faces of a thin wall
     lie within the tolerance of one surface, and the unobserved face would be compared by the colours of the other.
 
     Args:
-        surface, rows: the Gaussians on surfaces, and their rows in the capture.
+        surface, index, rows: the Gaussians on surfaces, boxes of their chunks, and their rows in the capture.
     """
-    seen = render(surface, view.camera)
+    seen = render(surface, view.camera, index=index)
     dominant = seen.dominant_id[0]
     whole = np.where(dominant >= 0, rows[np.maximum(dominant, 0)] if len(rows) else -1, -1).astype(np.int32)
     made = make_view(seen.colour[0], seen.alpha[0], seen.depth[0], whole, view.camera)

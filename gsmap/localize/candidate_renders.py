@@ -133,7 +133,7 @@ def render_scenes(
             out.append(reused[one.scene])
             continue
         camera = one.camera(T_metric_camera, intrinsics_px, size_px)
-        rendered = render(one.gaussians, camera, dominant_id=False, backend="native")
+        rendered = render(one.gaussians, camera, dominant_id=False, index=one.index, backend="native")
         rgb = np.clip(np.nan_to_num(rendered.colour[0]), 0, 1)
         depth = rendered.depth[0] * np.float32(one.S_metric_scene.scale)
         smooth = features.smooth_depth(rendered) > 0

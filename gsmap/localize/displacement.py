@@ -48,7 +48,8 @@ def displacement_map(
     by = max(1, round(longest / RENDER_SIDE_PX))
     small = (size_px[0] // by, size_px[1] // by)
     camera = scene.camera(T_metric_camera, intrinsics_px / by, small)
-    rendered = render(scene.coloured_by_position, camera, depth=False, dominant_id=False, backend="native")
+    coloured, index = scene.coloured_by_position, scene.index
+    rendered = render(coloured, camera, depth=False, dominant_id=False, index=index, backend="native")
     alpha = rendered.alpha[0]
     low, span = scene.box
     means = rendered.colour[0] / np.maximum(alpha, 1e-3)[..., None] * span + low

@@ -7,7 +7,7 @@ import numpy as np
 from gsmap.localize import views
 from gsmap.localize.filters import maximum, minimum
 from gsmap.methods.extractor import Extractor
-from gsmap.render import Rendering, render
+from gsmap.render import ChunkIndex, Rendering, render
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.localization import Keypoints, SceneFeatures
 
@@ -38,10 +38,11 @@ def scene_features(
     """
     params = params or views.Params()
     chosen = views.select_views(gaussians, cameras, params)
+    index = ChunkIndex.build(gaussians)
     points, descriptors, angles, kept = [], [], [], []
     for row in range(len(chosen)):
         camera = chosen[row]
-        rendered = render(gaussians, camera, dominant_id=False, backend="native")
+        rendered = render(gaussians, camera, dominant_id=False, index=index, backend="native")
         if (rendered.alpha[0] > _MIN_ALPHA).mean() < _MIN_COVERAGE:
             continue
         found = extractor.extract(to_uint8(rendered))

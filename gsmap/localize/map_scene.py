@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.geometry.sh import sh0_of_rgb
+from gsmap.render.index import ChunkIndex
 from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
 
@@ -53,9 +54,14 @@ class MapScene:
         sh = sh0_of_rgb((self.gaussians.means - low) / span)[:, None].astype(np.float32)
         return replace(self.gaussians, sh=sh)
 
+    @cached_property
+    def index(self) -> ChunkIndex:
+        """Boxes of chunks of the Gaussians, by which renders skip those out of view."""
+        return ChunkIndex.build(self.gaussians)
+
     def drop(self) -> None:
         """Release the arrays."""
-        for name in ("gaussians", "features", "box", "coloured_by_position"):
+        for name in ("gaussians", "index", "features", "box", "coloured_by_position"):
             self.__dict__.pop(name, None)
 
     def camera(self, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray, size_px: tuple[int, int]) -> Cameras:

@@ -198,8 +198,16 @@ class GroupReader:
             raise ValueError(f"its shard {span.file.rpartition('/')[2]} lacks chunks")
         return [ByteRange(span.file, span.start + start, length) for start, length in places]
 
-    def read(self, arrays: Mapping[str, ArrayLayout], rows: Sequence[Range] | None = None) -> dict[str, np.ndarray]:
+    def read(
+        self,
+        arrays: Mapping[str, ArrayLayout],
+        rows: Sequence[Range] | None = None,
+        out: Mapping[str, np.ndarray] | None = None,
+    ) -> dict[str, np.ndarray]:
         """Read rows of arrays that `check_arrays` validated: ranges ``[start, stop)`` in order, default: all.
+
+        Args:
+            out: by name, arrays to read into, of the shape and type of the rows.
 
         Raises:
             CorruptError: a chunk fails its checksum, or has another decompressed size.
@@ -210,11 +218,11 @@ class GroupReader:
                 wanted.setdefault(frame.file, []).append((frame.start, frame.start + frame.size))
         for file, ranges in wanted.items():
             self._reader.expect(file, ranges)
-        out = {}
+        found = {}
         for name, array in arrays.items():
             with self._translate_errors(f"{self.at}/{name}"):
-                out[name] = array.read(self._bytes, rows)
-        return out
+                found[name] = array.read(self._bytes, rows, (out or {}).get(name))
+        return found
 
 
 @dataclass(frozen=True)
@@ -247,12 +255,19 @@ class ArrayLayout:
         if _unpacked_bytes(frame) != self.chunk_bytes:
             raise ValueError("one of its chunks does not decompress to its recorded size")
 
-    def read(self, bytes_of: Callable[[ByteRange], bytes], rows: Sequence[Range] | None) -> np.ndarray:
-        """Read ranges ``[start, stop)`` of rows, in order; default: all."""
+    def read(
+        self, bytes_of: Callable[[ByteRange], bytes], rows: Sequence[Range] | None, out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Read ranges ``[start, stop)`` of rows, in order, default: all; into ``out`` if it is given."""
         count = self.shape[0]
         ranges = [(0, count)] if rows is None else [(start, min(stop, count)) for start, stop in rows]
-        out = np.zeros((sum(max(0, stop - start) for start, stop in ranges), *self.shape[1:]), self.dtype)
+        shape = (sum(max(0, stop - start) for start, stop in ranges), *self.shape[1:])
+        if out is None:
+            out = np.zeros(shape, self.dtype)
+        if out.shape != shape or out.dtype != self.dtype:
+            raise ValueError(f"its rows are {shape} {self.dtype}, not {out.shape} {out.dtype}")
         if not self.frames:
+            out[:] = 0
             return out
         at, held, chunk = 0, -1, out
         for start, stop in ranges:

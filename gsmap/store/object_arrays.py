@@ -123,32 +123,24 @@ class ObjectArrays(Arrays):
         optional: Sequence[str] = (),
         rows: Sequence[tuple[int, int]] | None = None,
         shapes: Mapping[str, layout.Shape] | None = None,
+        out: Mapping[str, np.ndarray] | None = None,
     ) -> dict[str, np.ndarray]:
+        def read(reader: _ObjectReader) -> dict[str, np.ndarray]:
+            try:
+                body = self._body(reader, kind, name, files)
+                return body.read(body.check_arrays(body.selected(only, optional), shapes), rows, out)
+            except NotFoundError as error:
+                raise CorruptError(
+                    f"{error}, or it is incomplete: {layout.repair_advice(kind)}", code="arrays_corrupt"
+                ) from error
+
         reader = _ObjectReader(self, kind, name, files)
         try:
-            return self._read(reader, kind, name, files, (only, optional), rows, shapes)
+            return read(reader)
         except CorruptError:
             if not reader.dropped():
                 raise
-        return self._read(_ObjectReader(self, kind, name, files), kind, name, files, (only, optional), rows, shapes)
-
-    def _read(
-        self,
-        reader: _ObjectReader,
-        kind: str,
-        name: str,
-        files: Sequence[StoredFile],
-        selection: tuple[Sequence[str] | None, Sequence[str]],
-        rows: Sequence[tuple[int, int]] | None,
-        shapes: Mapping[str, layout.Shape] | None,
-    ) -> dict[str, np.ndarray]:
-        try:
-            body = self._body(reader, kind, name, files)
-            return body.read(body.check_arrays(body.selected(*selection), shapes), rows)
-        except NotFoundError as error:
-            raise CorruptError(
-                f"{error}, or it is incomplete: {layout.repair_advice(kind)}", code="arrays_corrupt"
-            ) from error
+        return read(_ObjectReader(self, kind, name, files))
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
         out = []

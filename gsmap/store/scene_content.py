@@ -115,16 +115,21 @@ def stored_names(names: Sequence[str]) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in either], either
 
 
-def fields_of(stored: dict[str, np.ndarray], names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return fields of Gaussians (or ``sh0``) from the stored arrays of `stored_names`."""
-    out = {}
-    for name in names:
-        if name in stored:
-            out[name] = stored[name]
-        elif name == "sh":
-            out[name] = np.concatenate([stored["sh0"], stored["sh_rest"]], axis=1)
-        else:
-            out[name] = stored["sh"][:, :1]
+def fields_of(
+    stored: dict[str, np.ndarray], names: Sequence[str], together: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """Return fields of Gaussians (or ``sh0``) from the stored arrays of `stored_names`.
+
+    Args:
+        together: (N, K, 3) array into which ``sh0`` and ``sh_rest`` were read.
+    """
+    out = {name: stored[name] for name in names if name in stored}
+    if "sh" in names and "sh" not in stored:
+        if not {"sh0", "sh_rest"} <= set(stored) or together is None:
+            raise KeyError("sh")
+        out["sh"] = together
+    if "sh0" in names and "sh0" not in stored:
+        out["sh0"] = stored["sh"][:, :1]
     return out
 
 

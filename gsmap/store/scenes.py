@@ -365,8 +365,7 @@ class Scenes:
             held = np.repeat(holds, np.diff(begins))
             spans = row_ranges([chunk for chunk, some in zip(chunks, holds, strict=True) if some], row.num_gaussians)
             names = [name for name in FIELDS if name != "means"]
-            only, optional = stored_names(names)
-            others = fields_of(read(only=only, optional=optional, rows=spans), names)
+            others = self._fields(row, files, names, spans)
         out = Gaussians(means if held.all() else means[held], **others)
         return out if within.all() else out[within[held]]
 
@@ -416,10 +415,21 @@ class Scenes:
     ) -> dict[str, np.ndarray]:
         """Read fields of the Gaussians (or ``sh0``) of a scene that is not thinned."""
         only, optional = stored_names(names)
-        shapes = shapes_of(row)
-        read = self._arrays.read(KIND, row.group_id, files, only=only, optional=optional, rows=ranges, shapes=shapes)
+        whole = [(0, row.num_gaussians)] if ranges is None else ranges
+        count = sum(max(0, min(stop, row.num_gaussians) - start) for start, stop in whole)
+        together = np.empty((count, (row.sh_degree + 1) ** 2, 3), np.float32) if "sh" in names else None
+        read = self._arrays.read(
+            KIND,
+            row.group_id,
+            files,
+            only=only,
+            optional=optional,
+            rows=ranges,
+            shapes=shapes_of(row),
+            out=None if together is None else {"sh0": together[:, :1], "sh_rest": together[:, 1:]},
+        )
         try:
-            return fields_of(read, names)
+            return fields_of(read, names, together)
         except KeyError as error:
             raise CorruptError(
                 f"scene {row.name!r} has no array {error}: run gsmap check, and ingest it again", code="arrays_corrupt"

@@ -193,7 +193,12 @@ def main() -> None:
     for millions in [] if options.data else options.millions:
         folder = options.cache / f"{millions:g}m"
         if not (folder / "photo.jpg").exists():
-            make_pair(options.house, folder, int(1e6 * millions))
+            # In a process of its own, since Linux counts the peak memory of a parent for the processes that it starts.
+            making = multiprocessing.get_context("spawn").Process(
+                target=make_pair, args=(options.house, folder, int(1e6 * millions))
+            )
+            making.start()
+            making.join()
         folders.append((f"{millions:g} M", folder))
     for size, folder in folders:
         path = str(options.cache / f"{folder.name}.gsmap")
