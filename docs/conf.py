@@ -1,4 +1,4 @@
-"""How Sphinx builds the documents: `tools/make/docs.py` runs their commands, takes the pictures and calls it."""
+"""How Sphinx builds the documents: `tools/make/docs.py` runs their commands and calls it."""
 
 from __future__ import annotations
 

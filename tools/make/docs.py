@@ -1,28 +1,26 @@
-"""Build the documents as a static site, with generated reference pages and new pictures.
+"""Build the documents as a static site, with generated reference pages.
 
     python -m tools.make.docs [--out docs/site] [--keep DIR]
 
 Runs the commands of docs/start.md (blocks marked ``sh``) in a folder, in order; the notebook runs on the map that they
-leave, and pictures show that map, those of the page in a headless Chromium. Writes the reference of settings, commands
-and JSON keys, then calls Sphinx, where a warning is an error. Needs what `tools/setup.sh test` installs.
+leave. Writes the reference of settings, commands and JSON keys, then calls Sphinx, where a warning is an error. The
+pictures of the documents are in the repository; `tools.make.doc_pictures` makes them anew. Needs what
+`tools/setup.sh test` installs.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 from tools.harness import argument_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-PICTURES = DOCS / "_pictures"
 SETTINGS = DOCS / "_build_settings.md"
 COMMANDS = DOCS / "_build_commands.md"
 JSON = DOCS / "_build_json.md"
@@ -58,62 +56,6 @@ def _programs(folder: Path) -> Path:
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m gsmap "$@"\n')
     program.chmod(0o755)
     return programs
-
-
-def make_pictures(folder: Path) -> None:
-    """Make the pictures of the documents from the map in a folder."""
-    from PIL import Image
-
-    shutil.rmtree(PICTURES, ignore_errors=True)
-    PICTURES.mkdir()
-    shutil.copy(folder / "trial" / "map.png", PICTURES / "demo.png")
-    (pair,) = sorted((folder / "why").glob("*.png"))[:1]
-    Image.open(pair).save(PICTURES / "pair.png")
-    Image.open(folder / "seen" / "c1.png").save(PICTURES / "change.png")
-    page_pictures(folder / "home.gsmap")
-
-
-def page_pictures(path: Path) -> None:
-    """Take screenshots of `gsmap view`: the map, an edge and a change under review, and a phone."""
-    sys.path.insert(0, str(ROOT / "tests" / "view"))
-    from hands import Hands
-    from headless import Page
-
-    import gsmap.map
-
-    def settled(hands: Hands) -> None:
-        hands.wait("globalThis.gsmap?.settled && findAll('img').every((e) => e.naturalWidth)", 180)
-
-    with gsmap.map.open(path) as m, m.view().start() as server, tempfile.TemporaryDirectory() as profile:
-        with Page(server.url, Path(profile) / "desk", 1280, 800) as page:
-            hands = Hands(page)
-            settled(hands)
-            hands.press("h", "f")  # rooms from above
-            settled(hands)
-            _save(page, "page")
-            hands.press("h")
-            hands.press("2")
-            hands.click("button", "All")
-            hands.click("button.choose", "capture_b")
-            hands.wait("findAll('img').length >= 2", 60)
-            settled(hands)
-            _save(page, "page_review")
-            hands.press("Escape", "3")
-            hands.click("button.choose", "isappeared")
-            hands.wait("findAll('img').length >= 1", 60)
-            settled(hands)
-            _save(page, "page_time")
-        with Page(server.url, Path(profile) / "phone", 390, 844) as page:
-            hands = Hands(page)
-            hands.resize(390, 844, mobile=True)
-            settled(hands)
-            _save(page, "page_phone")
-
-
-def _save(page: Any, name: str) -> None:
-    from PIL import Image
-
-    Image.fromarray((page.picture() * 255).astype("uint8")).save(PICTURES / f"{name}.png", optimize=True)
 
 
 def write_settings() -> None:
@@ -156,7 +98,6 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / "home.gsmap").exists():
             run_commands(commands_of((DOCS / "start.md").read_text()), folder)
-        make_pictures(folder)
         write_settings()
         write_commands()
         write_json()
