@@ -200,6 +200,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "no_graph": "A scene has no graph yet.",
     "no_placed_scene": "No described scene has a pose in the map.",
     "no_pose_of_pair": "A pair of scenes has no relative pose.",
+    "no_plan": "A component has no content of which a plan could be drawn.",
     "no_poses": "The map has no poses yet.",
     "not_removed": "The scene was not removed.",
     "nothing_near": "No scene or object lies near the given place.",
@@ -224,6 +225,7 @@ ERRORS: Final[Mapping[str, str]] = {
     # Objects and kept photos.
     "already_same": "The two objects were already marked as the same.",
     "object_not_found": "There is no object of this name.",
+    "object_not_shown": "No scene shows the object.",
     "object_out_of_range": "The scene has no object of this number.",
     "object_without_number": "The object has no number, since the map is open for reading only.",
     "objects_differ": "Two objects cannot be the same.",
