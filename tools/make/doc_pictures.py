@@ -32,9 +32,7 @@ def make_pictures(folder: Path) -> None:
 
 
 def page_pictures(path: Path) -> None:
-    """Take screenshots of `gsmap view`: the map from above, a pair and a change under review, the objects,
-    and a phone.
-    """
+    """Take screenshots of `gsmap view`: the map from above, a pair and a change under review, and the objects."""
     sys.path.insert(0, str(ROOT / "tests" / "view"))
     from hands import Hands
     from headless import Page
@@ -62,11 +60,6 @@ def page_pictures(path: Path) -> None:
             hands.press("Escape", "4")
             hands.wait("findAll('img').length >= 3", 200)
             take(hands, "page_things")
-        with Page(server.url, Path(profile) / "phone", 390, 844) as page:
-            hands = Hands(page)
-            hands.resize(390, 844, mobile=True)
-            hands.wait("globalThis.gsmap?.isShown", 600)
-            take(hands, "page_phone")
 
 
 def save(picture: np.ndarray, name: str) -> None:

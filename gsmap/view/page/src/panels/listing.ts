@@ -71,13 +71,13 @@ export class Listing extends LitElement {
         gap: 1px;
       }
       .choose.pictured {
-        grid-template-columns: 84px minmax(0, 1fr);
+        grid-template-columns: 76px minmax(0, 1fr);
         column-gap: 10px;
       }
       .pictured img {
         grid-row: 1 / 4;
-        width: 84px;
-        height: 63px;
+        width: 76px;
+        height: 52px;
         object-fit: cover;
         border-radius: 4px;
         background: var(--line);

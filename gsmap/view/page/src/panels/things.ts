@@ -143,7 +143,7 @@ export class Things extends Panel {
         title=${titleOf(one)}
         @click=${() => actions.select({ kind: "object", key: one.id })}
       >
-        ${picture ? html`<img src=${picture} alt="Picture of ${one.id}" loading="lazy" decoding="async" width="84" height="63" />` : nothing}
+        ${picture ? html`<img src=${picture} alt="Picture of ${one.id}" loading="lazy" decoding="async" width="76" height="52" />` : nothing}
         <span class="name">${titleOf(one)}</span>
         <span class="detail">${sizeOf(one, unit)}</span>
         <span class="detail"
