@@ -43,23 +43,27 @@ def page_pictures(path: Path) -> None:
         hands.wait("globalThis.gsmap?.settled && findAll('img').every((e) => e.naturalWidth)", 600)
         save((hands.page.picture() * 255).astype(np.uint8), name)
 
-    with gsmap.map.open(path) as m, m.view().start() as server, tempfile.TemporaryDirectory() as profile:
-        with Page(server.url, Path(profile) / "desk", 1000, 640) as page:
-            hands = Hands(page)
-            hands.wait("globalThis.gsmap?.isShown", 600)
-            take(hands, "page")
-            hands.press("2")
-            hands.click("button", "All")
-            hands.click("button.choose", "capture_b")
-            hands.wait("findAll('img').length >= 2", 60)
-            take(hands, "page_review")
-            hands.press("Escape", "3")
-            hands.click("button.choose", "isappeared")
-            hands.wait("findAll('img').length >= 1", 60)
-            take(hands, "page_time")
-            hands.press("Escape", "4")
-            hands.wait("findAll('img').length >= 3", 200)
-            take(hands, "page_things")
+    with (
+        gsmap.map.open(path) as m,
+        m.view().start() as server,
+        tempfile.TemporaryDirectory() as profile,
+        Page(server.url, Path(profile) / "desk", 1000, 640) as page,
+    ):
+        hands = Hands(page)
+        hands.wait("globalThis.gsmap?.isShown", 600)
+        take(hands, "page")
+        hands.press("2")
+        hands.click("button", "All")
+        hands.click("button.choose", "capture_b")
+        hands.wait("findAll('img').length >= 2", 60)
+        take(hands, "page_review")
+        hands.press("Escape", "3")
+        hands.click("button.choose", "isappeared")
+        hands.wait("findAll('img').length >= 1", 60)
+        take(hands, "page_time")
+        hands.press("Escape", "4")
+        hands.wait("findAll('img').length >= 3", 200)
+        take(hands, "page_things")
 
 
 def save(picture: np.ndarray, name: str) -> None:
