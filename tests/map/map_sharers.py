@@ -24,7 +24,7 @@ def _note(text: str) -> None:
     time.sleep(float(os.environ[SECONDS]))
 
 
-def describe_scene(path: str, scene: str, *_: Any) -> SceneGraph:
+def describe_scene(path: str, scene: str, *_: Any) -> tuple[SceneGraph, None]:
     _note(f"graph {scene}")
     rng = np.random.default_rng(0)
     embeddings = rng.normal(size=(4, 8)).astype(np.float32)
@@ -38,7 +38,7 @@ def describe_scene(path: str, scene: str, *_: Any) -> SceneGraph:
         features=np.zeros((4, 1)),
         descriptor_id="test",
     )
-    return SceneGraph(scene, {"objects": layer}, np.array([0.0, 0, 1]), 1.0)
+    return SceneGraph(scene, {"objects": layer}, np.array([0.0, 0, 1]), 1.0), None
 
 
 def register_scenes(path: str, target: tuple[str, str], source: tuple[str, str], *_: Any) -> Registration:
@@ -53,6 +53,7 @@ def main() -> None:
     from gsmap.map.stages import describe, register
 
     describe.describe_scene, register.register_scenes = describe_scene, register_scenes
+    register.prepare_missing = lambda *_: None
     os.environ |= {LOG: sys.argv[2], SECONDS: sys.argv[3], "SHARERS_RUN": str(os.getpid())}
     start_logging(0, False)
 
