@@ -99,7 +99,7 @@ def test_a_scene_that_is_named_gets_its_damaged_graph_again(site: Map, monkeypat
     def jobs(job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Any) -> Iterator[tuple[int, Any]]:
         for i, (_, scene, *_) in enumerate(arguments):
             described.append(scene)
-            yield i, _graph(scene)
+            yield i, (_graph(scene), None)
 
     def spoil(which: str = "*") -> None:
         for path in site.store.home.glob(f"arrays/graphs/{which}/arrays.zip"):
