@@ -46,7 +46,7 @@ class SceneView:
 
     @cached_property
     def prepared(self) -> PreparedScene:
-        """What all pairs of the scene share; computed unless it is known."""
+        """Preparation that all pairs of the scene share; computed unless it is known."""
         if self.known is not None:
             return self.known
         return prepare(self.id, self.gaussians.load(), self.cameras, self.graph, self.scale_policy)

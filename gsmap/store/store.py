@@ -112,7 +112,7 @@ class Store:
 
     @cached_property
     def prepared_scenes(self) -> PreparedScenes:
-        """What is prepared of each scene for its registrations."""
+        """Preparation of each scene for its registrations."""
         from gsmap.store.prepared_scenes import PreparedScenes
 
         return PreparedScenes(self.catalog, self.arrays)
