@@ -128,7 +128,8 @@ def _finish(store: Store, begun: Purge) -> Purge:
             elif os.path.lexists(out / PICTURES):
                 if gone := PictureFolder.load(out, store.id).forget(out, begun.scene):
                     begun = purging.record_files(store, begun, str(out), gone)
-            else:
+            elif not (is_folder(out.parent) and str(out) in begun.receipt["pending"].get("tiles", {})):
+                # Else a purge that was interrupted has cleaned it.
                 unreachable.append(f"{out}: it is not there, or nothing in it was written by gsmap")
         except (OSError, GsmapError) as error:
             if (passing := _passing(error)) is not None:
