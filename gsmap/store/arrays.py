@@ -214,7 +214,7 @@ class Arrays:
         optional: Sequence[str] = (),
         rows: Sequence[tuple[int, int]] | None = None,
         shapes: Mapping[str, layout.Shape] | None = None,
-        out: Mapping[str, np.ndarray] | None = None,
+        out: Callable[[], Mapping[str, np.ndarray]] | None = None,
     ) -> dict[str, np.ndarray]:
         """Read arrays of a group.
 
@@ -224,7 +224,8 @@ class Arrays:
             optional: names of arrays to read as well if the group has them.
             rows: ranges ``[start, stop)`` of rows, in order; default: all rows.
             shapes: expected shape of each array; None for an unknown length.
-            out: by name, arrays to read into, of the shape and type of the rows.
+            out: called once the group has proved to hold what the shapes say; returns by name the arrays to read into,
+                of the shape and type of the rows.
 
         Raises:
             CorruptError: a file is missing, short, or fails its checksum, or has a layout that gsmap does not write.
@@ -244,7 +245,8 @@ class Arrays:
                 )
         try:
             with _open_body(place, kind, files) as body:
-                return body.read(body.check_arrays(body.selected(only, optional), shapes), rows, out)
+                checked = body.check_arrays(body.selected(only, optional), shapes)
+                return body.read(checked, rows, None if out is None else out())
         except OSError as error:
             if error.errno in _NOT_ITS_BYTES:
                 with translate_errors(place):

@@ -417,7 +417,13 @@ class Scenes:
         only, optional = stored_names(names)
         whole = [(0, row.num_gaussians)] if ranges is None else ranges
         count = sum(max(0, min(stop, row.num_gaussians) - start) for start, stop in whole)
-        together = np.empty((count, (row.sh_degree + 1) ** 2, 3), np.float32) if "sh" in names else None
+        together: np.ndarray | None = None
+
+        def target() -> dict[str, np.ndarray]:
+            nonlocal together
+            together = np.empty((count, (row.sh_degree + 1) ** 2, 3), np.float32)
+            return {"sh0": together[:, :1], "sh_rest": together[:, 1:]}
+
         read = self._arrays.read(
             KIND,
             row.group_id,
@@ -426,7 +432,7 @@ class Scenes:
             optional=optional,
             rows=ranges,
             shapes=shapes_of(row),
-            out=None if together is None else {"sh0": together[:, :1], "sh_rest": together[:, 1:]},
+            out=target if "sh" in names else None,
         )
         try:
             return fields_of(read, names, together)
