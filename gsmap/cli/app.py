@@ -17,7 +17,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import expect_json, left, print_json_error, print_wide_tables, start_logging
+from gsmap.cli.console import begin_output, left, print_json_error, print_wide_tables, start_logging
 from gsmap.errors import (
     ConfigError,
     DiskFullError,
@@ -124,7 +124,7 @@ def run(arguments: list[str] | None = None) -> None:
         arguments: Command-line arguments; default: those of the process.
     """
     left()
-    expect_json()
+    begin_output()
     given = sys.argv[1:] if arguments is None else arguments
     # Attaching all verbs takes longer than most of them do.
     first = next((one for one in given if not one.startswith("-")), "")

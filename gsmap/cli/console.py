@@ -126,7 +126,7 @@ def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: s
     print_table(title or verb, OBJECTS[verb].type.columns, many)
 
 
-_has_printed_json = False
+_has_printed_json = _has_printed_table = False
 
 
 def print_json(data: dict[str, Any]) -> None:
@@ -144,10 +144,10 @@ def print_json_error(code: str, message: str) -> None:
         print_json({"schema": SCHEMA, "error": {"code": code, "message": message}})
 
 
-def expect_json() -> None:
-    """Forget that JSON was printed, as a new command begins."""
-    global _has_printed_json
-    _has_printed_json = False
+def begin_output() -> None:
+    """Forget what was printed, as a new command begins."""
+    global _has_printed_json, _has_printed_table
+    _has_printed_json = _has_printed_table = False
 
 
 def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
@@ -174,14 +174,19 @@ def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> 
 
     A terminal gets a table that fits its width: sentences are wrapped between words, and columns that have no room are
     left out, which a note says. ``--wide`` prints all columns at full width. A pipe or file gets lines of values
-    separated by tabs, headings first.
+    separated by tabs, headings first; before each table but the first an empty line and ``# title``.
     """
     from gsmap.types.notebook import cell_text
+
+    global _has_printed_table
 
     values = [[getattr(row, name) for name in columns] for row in rows]
     cells = [[cell_text(name, value) for name, value in zip(columns, line, strict=True)] for line in values]
     headings = list(columns.values())
     if not (_is_wide or sys.stdout.isatty()):
+        if _has_printed_table:
+            print(f"\n# {escaped(title)}")
+        _has_printed_table = True
         print(*("\t".join(line) for line in (headings, *cells)), sep="\n", flush=True)
         return
     numeric = [
