@@ -9,6 +9,7 @@ import re
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.durable import open_file
-from gsmap.errors import ConfigError, CorruptError, NotFoundError
+from gsmap.errors import ConfigError, CorruptError, GsmapError, NotFoundError
 from gsmap.view.content import ServerState, ViewMap, ViewScene, summary
 from gsmap.view.levels import Levels
 from gsmap.view.making import PendingResult
@@ -70,8 +71,10 @@ class Answers:
     def __init__(self, page_source: PageSource, levels: Levels) -> None:
         self._page_source, self._levels = page_source, levels
         self._pictures: OrderedDict[str, bytes] = OrderedDict()
-        self._drawing, self._reading = threading.Lock(), threading.Lock()
+        self._drawing, self._reading, self._planning = threading.Lock(), threading.Lock(), threading.Lock()
         self._content: tuple[str, ViewMap] | None = None
+        self._plans: tuple[str, dict[int, Answer]] = "", {}
+        self._ahead: threading.Thread | None = None
         self._routes: list[tuple[re.Pattern[str], Callable[..., Answer]]] = [
             (re.compile(pattern), route)
             for pattern, route in (
@@ -175,8 +178,30 @@ class Answers:
     def _revision(self, number: str) -> Answer:
         return Answer.json(self._page_source.revision(int(number)))
 
+    def draw_ahead(self) -> None:
+        """Start to draw the floor plan that a page shows first, before the page asks for it."""
+        if self._ahead is None:
+            self._ahead = threading.Thread(target=self._draw_first_plan, daemon=True)
+            self._ahead.start()
+
+    def close(self) -> None:
+        """Wait until nothing is drawn ahead."""
+        if self._ahead is not None:
+            self._ahead.join()
+
+    def _draw_first_plan(self) -> None:
+        with suppress(GsmapError):
+            self._plan("0")
+
     def _plan(self, component: str) -> Answer:
-        return Answer.json(self._page_source.plan(int(component)))
+        state, number = self.content().state, int(component)
+        with self._planning:
+            if self._plans[0] != state:
+                self._plans = state, {}
+            plans = self._plans[1]
+            if number not in plans:
+                plans[number] = Answer.json(self._page_source.plan(number))
+            return plans[number]
 
     def _graph(self) -> Answer:
         return Answer.json(self._page_source.graph())

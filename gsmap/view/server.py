@@ -111,7 +111,7 @@ class ViewServer:
                 f"cannot serve on port {port}: {error}; try another --port, or 0", code="port_unavailable"
             ) from error
         self.levels = Levels(page_source, TreeCache(cache, int(params.cache_gib * 2**30)), params.workers)
-        handler.answers = Answers(page_source, self.levels)
+        self._answers = handler.answers = Answers(page_source, self.levels)
         self._thread: threading.Thread | None = None
 
     @cached_property
@@ -142,6 +142,7 @@ class ViewServer:
             self._thread.join()
             self._thread = None
         self._http.server_close()
+        self._answers.close()
         self.levels.close()
 
     def __enter__(self) -> ViewServer:
@@ -281,6 +282,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _welcome(self) -> None:
         """Set the token as a cookie, and redirect to the address without it."""
+        self.answers.draw_ahead()
         self.send_response(HTTPStatus.SEE_OTHER)
         self.send_header("Location", "/")
         self.send_header("Set-Cookie", f"{self._cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/")

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from rich.cells import cell_len
 
-from gsmap.cli.console import json_object, print_facts, print_rows, print_table
+from gsmap.cli.console import begin_output, json_object, print_facts, print_rows, print_table
 from gsmap.texts import shown
 from gsmap.types import Sim3, rows
 from gsmap.types.rows.base import Row
@@ -175,6 +175,11 @@ def test_coordinates_name_their_frame_and_unit(row: type[Row]) -> None:
     assert not of_map or in_scene or in_a_titled_table or "component" in row.columns
 
 
+@pytest.fixture(autouse=True)
+def new_command() -> None:
+    begin_output()
+
+
 @pytest.fixture
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Makes stdout a terminal of a width."""
@@ -251,6 +256,8 @@ def test_a_pipe_gets_values_between_tabs(capsys: pytest.CaptureFixture[str]) -> 
     assert lines[0].split("\t") == list(EdgeNote.columns.values())
     assert [line.split("\t")[0] for line in lines[1:3]] == [row.pair for row in rows[:2]]
     assert [len(line.split("\t")) for line in lines] == [5] * 4
+    print_table("more", EdgeNote.columns, rows)
+    assert capsys.readouterr().out.splitlines() == ["", "# more", *lines]
 
 
 def test_wide_tables_have_all_columns_everywhere(cli: Callable[..., Any], site: Path) -> None:
