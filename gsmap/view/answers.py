@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.durable import open_file
-from gsmap.errors import ConfigError, CorruptError, GsmapError, NotFoundError
+from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.view.content import ServerState, ViewMap, ViewScene, summary
 from gsmap.view.levels import Levels
 from gsmap.view.making import PendingResult
@@ -190,7 +190,7 @@ class Answers:
             self._ahead.join()
 
     def _draw_first_plan(self) -> None:
-        with suppress(GsmapError):
+        with suppress(Exception):  # the page's own request reports it
             self._plan("0")
 
     def _plan(self, component: str) -> Answer:
