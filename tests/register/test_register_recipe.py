@@ -19,6 +19,7 @@ def test_the_key_names_all_that_takes_part_and_nothing_else():
     assert (key.stage, key.method) == ("register", "pair")
     assert set(key.version) == {
         "register",
+        "prepare",
         "probability",
         "proposer.graph",
         "proposer.kiss_matcher",

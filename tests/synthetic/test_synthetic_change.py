@@ -72,7 +72,7 @@ def test_what_a_seed_builds_does_not_change(place):
         hashlib.sha256(corners.tobytes()).hexdigest()
         == "03639954bbce3acf1a9512af037fa766bb9b720e20eafe79eb23bcf8d4591a9a"
     )
-    assert place.skin.texels[0].mean() == pytest.approx(113.84568, rel=1e-3)  # noise differs between processors
+    assert place.skin.texels[0].mean() == pytest.approx(114.13488, rel=1e-3)  # noise differs between processors
     assert [round(float(r.obstacles_m.sum()), 3) for r in place.rooms] == [26.742, 45.342, 79.854]
 
 
