@@ -90,8 +90,8 @@ def test_a_newcomer_alone_asks(made: Described, site: Path, read: Counter[str]) 
         assert len(asked) == 4
         (new,) = set(asked) - set(before)
         assert asked[new][1] == 0
-        # Its graph once to be asked with, and once to be prepared, as these tests describe without that; the others' and
-        # its own where its pairs are worked on, not before.
+        # Its graph once to be asked with, and once to be prepared, since these tests describe without that; the others'
+        # and its own where its pairs are worked on, not before.
         assert read["graphs"] <= 1 + 1 + 4
         assert len(m.store.indexes.lookups([new])[0].candidates) == 3
         (segment,) = m.store.indexes.segments(_recipe(m))
