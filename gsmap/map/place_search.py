@@ -223,6 +223,8 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
     for stored in store.graphs.list():  # oldest first
         if stored.scene in scenes and stored.recipe not in (None, THINGS.recipe):
             made.setdefault(stored.recipe, {})[stored.scene] = stored.key
+    # Of a thinned scene only the segments are kept, which describe objects by shape and colour.
+    thinned = {g.scene: g.key for g in store.graphs.list() if g.scene in scenes and g.recipe == THINGS.recipe}
     # What a scene is described under names its scale, too: of the present recipe only what is of use now counts.
     mine = {scene: key for scene, key in made.get(now, {}).items() if keys[scene].digest == key}
     made = {recipe: graphs for recipe, graphs in made.items() if recipe != now} | ({now: mine} if mine else {})
@@ -240,12 +242,12 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
             f"searched the graphs of an earlier recipe, which has {len(made[recipe])} of {len(scenes)} captures; "
             f"the current recipe has {len(mine)}: gsmap update describes the rest"
         )
-    elif len(mine) < len(scenes):
+    elif num_without := len(scenes.keys() - mine.keys() - thinned.keys()):
         notes.append(
-            f"{len(scenes) - len(mine)} of {len(scenes)} captures are not described by the present recipe and take no "
+            f"{num_without} of {len(scenes)} captures are not described by the present recipe and take no "
             "part: gsmap update describes them"
         )
-    keys_of = made[recipe]
+    keys_of = thinned | made[recipe]
     graphs = {scene: store.graphs.load(scene, key) for scene, key in keys_of.items()}
     there = {scene: graph for scene, graph in graphs.items() if graph is not None}
     known = compute_objects(store, settings, progress, there)

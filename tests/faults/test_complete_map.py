@@ -119,3 +119,21 @@ def test_what_is_static_and_what_localizes_is_without_the_crate(
         inside[kind] = int(((means > CRATE[0] + 0.03) & (means < CRATE[1] + [-0.03, -0.03, 0.03])).all(1).sum())
     assert inside["whole"] > 20
     assert inside["static"] == 0
+
+
+READING = (
+    *("status MAP", "list MAP scenes", "list MAP edges", "list MAP revisions", "list MAP tiles", "list MAP photos"),
+    *("show MAP then", "show MAP then:now", "show MAP c1", "show MAP o1", "why MAP then:now", "history MAP o1"),
+    *("diff MAP 1 2", "poses MAP --crs EPSG:32632", "poses MAP HERE/poses.g2o --format g2o", "settings MAP"),
+    *("georeference MAP", "find MAP --like o1", "models list MAP", "branch MAP", "tag MAP", "prune MAP --dry-run"),
+    *("thin MAP --keep-days 0 --dry-run", "graph MAP HERE/graph.graphml", "register MAP", "describe MAP", "update MAP"),
+)
+
+
+@pytest.mark.parametrize("stage", ["before thin", "complete"])
+def test_every_verb_answers_before_and_after(stages: dict[str, Path], tmp_path: Path, stage: str) -> None:
+    copy_map(stages[stage], tmp_path)
+    for line in READING:
+        gsmap(line, tmp_path)
+    (hit,) = json.loads(gsmap("find MAP --like o1 --json", tmp_path))["hits"]
+    assert (hit["object"], hit["scene_name"]) == ("o1", "then")
