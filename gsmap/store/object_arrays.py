@@ -123,12 +123,13 @@ class ObjectArrays(Arrays):
         optional: Sequence[str] = (),
         rows: Sequence[tuple[int, int]] | None = None,
         shapes: Mapping[str, layout.Shape] | None = None,
-        out: Mapping[str, np.ndarray] | None = None,
+        out: Callable[[], Mapping[str, np.ndarray]] | None = None,
     ) -> dict[str, np.ndarray]:
         def read(reader: _ObjectReader) -> dict[str, np.ndarray]:
             try:
                 body = self._body(reader, kind, name, files)
-                return body.read(body.check_arrays(body.selected(only, optional), shapes), rows, out)
+                checked = body.check_arrays(body.selected(only, optional), shapes)
+                return body.read(checked, rows, None if out is None else out())
             except NotFoundError as error:
                 raise CorruptError(
                     f"{error}, or it is incomplete: {layout.repair_advice(kind)}", code="arrays_corrupt"
