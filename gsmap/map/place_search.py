@@ -139,7 +139,7 @@ def find_places(
         by="embedding" if isinstance(asked, _QueryVector) else "likeness",
         recipe=index.recipe,
         embedder=index.embedder,
-        described=len(index.graphs),
+        described=sum(bool(graph.layers) for graph in index.graphs.values()),  # not thinned ones
         placed=len(index.scenes),
         hits=tuple(hits),
         notes=tuple(notes),

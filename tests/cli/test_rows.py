@@ -276,3 +276,14 @@ def test_a_long_table_is_printed_at_once(terminal: Callable[[int], None], capsys
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3 + len(many)
     assert len({line.index("部屋") for line in lines[3:]}) == 1
+
+
+def test_a_row_with_an_array_is_one_line_in_python() -> None:
+    @dataclass(frozen=True, eq=False, kw_only=True)
+    class Place(Row):
+        columns: ClassVar[Mapping[str, str]] = {"name": "name", "at": "at (m)"}
+
+        name: str
+        at: np.ndarray
+
+    assert repr(Place(name="", at=np.array([1.0, 2, 3]))) == "Place(at=[1. 2. 3.])"

@@ -46,7 +46,11 @@ class Row:
         """Return one line with what tables show of the row; long values are shortened."""
         names = self.columns or [field.name for field in fields(self)]  # type: ignore[arg-type]
         values = ((name, getattr(self, name)) for name in names)
-        shown = ", ".join(f"{name}={_short(value)}" for name, value in values if value is not None and value != "")
+        shown = ", ".join(
+            f"{name}={_short(value)}"
+            for name, value in values
+            if not (value is None or (isinstance(value, str) and not value))
+        )
         return f"{type(self).__name__}({shown})"
 
     def _repr_html_(self) -> str:
