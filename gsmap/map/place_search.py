@@ -76,7 +76,8 @@ class _SearchIndex:
     Args:
         recipe: digest of the recipe.
         embedder: name of the embedder.
-        graphs: scene graphs of that recipe by scene id, placed scenes only.
+        graphs: scene graphs of that recipe by scene id, placed scenes only; of thinned scenes what is left of theirs.
+        num_described: number of graphs of that recipe.
         poses, scenes: poses and scenes of all placed scenes.
         known: the objects of these graphs.
         notes: remarks on the choice of the recipe.
@@ -85,6 +86,7 @@ class _SearchIndex:
     recipe: str
     embedder: str
     graphs: Mapping[str, SceneGraph]
+    num_described: int
     poses: PoseGraph
     scenes: Mapping[str, Scene]
     known: MapObjects
@@ -139,7 +141,7 @@ def find_places(
         by="embedding" if isinstance(asked, _QueryVector) else "likeness",
         recipe=index.recipe,
         embedder=index.embedder,
-        described=sum(bool(graph.layers) for graph in index.graphs.values()),  # not thinned ones
+        described=index.num_described,
         placed=len(index.scenes),
         hits=tuple(hits),
         notes=tuple(notes),
@@ -251,7 +253,8 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
     graphs = {scene: store.graphs.load(scene, key) for scene, key in keys_of.items()}
     there = {scene: graph for scene, graph in graphs.items() if graph is not None}
     known = compute_objects(store, settings, progress, there)
-    return _SearchIndex(recipe, _embedder(store, recipe), there, poses, scenes, known, tuple(notes))
+    num_described = len(there.keys() & made[recipe].keys())
+    return _SearchIndex(recipe, _embedder(store, recipe), there, num_described, poses, scenes, known, tuple(notes))
 
 
 def _embedder(store: Store, recipe: str) -> str:
