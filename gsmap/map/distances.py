@@ -235,7 +235,7 @@ def _world_covariance(solved: _PoseUncertainty, end: _LocatedPoint) -> np.ndarra
         return out
     turn = _turn(solved.graph, end)
     joint = solved.joint(end.component, [end.place.scene])
-    if joint is None:
+    if joint is None or not np.isfinite(joint).all():  # as in a part of a map without its control points
         return None
     picked = big @ turn @ end.place.covariance @ turn.T @ big.T
     J = np.concatenate([big @ _moves(end.map), big @ turn @ _moves(end.place.point)], axis=1)

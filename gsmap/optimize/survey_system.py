@@ -72,7 +72,8 @@ class Factor:
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Solve for right-hand sides (size, K)."""
-        out: np.ndarray = self.lu.solve(np.ascontiguousarray(rhs / self.root[:, None])) / self.root[:, None]
+        with np.errstate(over="ignore"):  # infinite where nothing holds
+            out: np.ndarray = self.lu.solve(np.ascontiguousarray(rhs / self.root[:, None])) / self.root[:, None]
         return out
 
     def columns(self, wanted: np.ndarray) -> np.ndarray:
