@@ -90,7 +90,10 @@ def load_view(store: Store, scene_id: str, graph_key: str) -> SceneView:
 
     scenes, graph = store.scenes, store.graphs.load(scene_id, graph_key)
     assert graph is not None, f"scene {scene_id} was to be registered before it was described"
-    prepared = store.prepared_scenes.load(scene_id, prepared_key().of(scene_id, graph_key))
+    try:
+        prepared = store.prepared_scenes.load(scene_id, prepared_key().of(scene_id, graph_key))
+    except CorruptError:
+        prepared = None  # it is computed again; gsmap check reports the damage
     policy = scenes.get(scene_id).scale_policy
     return SceneView(scene_id, scenes.unread(scene_id), scenes.cameras(scene_id), graph, policy, prepared)
 

@@ -66,6 +66,16 @@ class DerivedArrays:
         with self._catalog.read() as connection:
             return recipes.stored_keys(connection, self._table.c.key, keys)
 
+    def forget_damaged(self, scenes: Iterable[str]) -> None:
+        """Forget arrays of these scenes that differ from their digests; reads every byte."""
+        table = self._table
+        with self._catalog.write() as connection:
+            mine = select(table.c.key, table.c.group_id).where(table.c.scene.in_(list(scenes)))
+            for row in connection.execute(mine).all():
+                if self._arrays.problems(self._kind, row.group_id, manifest(connection, row.group_id)):
+                    connection.execute(delete(table).where(table.c.key == row.key))
+                    unname(connection, row.group_id)
+
     def get(
         self, scene: str, key: RecipeKey | str, shapes: Callable[[Row[Any]], Mapping[str, Shape]]
     ) -> tuple[Row[Any], dict[str, np.ndarray]] | None:

@@ -374,7 +374,10 @@ def _advice(connection: Connection, kind: str, group: str, location: str | None)
     if kind == "views":
         return " (features of a scene's views: gsmap computes them again when the next photo is localized)"
     if kind == "prepared":
-        return " (surface cells and renders of a scene: gsmap computes them again when the scene is registered)"
+        return (
+            " (surface cells and renders of a scene: gsmap describe MAP SCENE forgets damaged ones, and the next "
+            "registration stores them again)"
+        )
     if kind == PHOTOS:
         return " (the preview of a kept photo: remove the photo and add it again)"
     if kind != "graphs":

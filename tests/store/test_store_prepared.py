@@ -6,8 +6,10 @@ from raising import raises
 from store_samples import key, made_prepared, make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError
+from gsmap.map.jobs import load_view
+from gsmap.register.recipe import prepared_key
 from gsmap.store.prepared_scenes import KIND
-from gsmap.types import Cameras, Gaussians
+from gsmap.types import Cameras, Gaussians, SceneGraph
 
 
 @pytest.fixture
@@ -59,6 +61,32 @@ def test_damage_is_found_and_named(store, scene):
     with raises(CorruptError, code="arrays_missing"):
         store.prepared_scenes.load(scene.id, key("register", scene.id))
     assert any("surface cells" in problem for problem in store.check().problems)
+
+
+def test_damaged_ones_are_forgotten_and_stored_again(store, scene):
+    made, mine = made_prepared(scene.id), key("register", scene.id)
+    store.prepared_scenes.save(made, mine)
+    store.prepared_scenes.forget_damaged([scene.id])
+    assert store.prepared_scenes.stored_keys([mine])
+    (name,) = (name for kind, name in store.arrays.groups() if kind == KIND)
+    file = store.folder / "arrays" / KIND / name / "arrays.zip"
+    file.write_bytes(file.read_bytes()[:-100])
+    store.prepared_scenes.forget_damaged([scene.id])
+    assert not store.prepared_scenes.stored_keys([mine])
+    store.prepared_scenes.save(made, mine)
+    assert len(store.prepared_scenes.load(scene.id, mine).points) == len(made.points)
+    assert store.check().ok
+
+
+def test_a_scene_whose_preparation_is_damaged_is_registered_nevertheless(store, scene):
+    graph_key = key("describe", scene.id)
+    store.graphs.save(SceneGraph(scene.id), graph_key)
+    store.prepared_scenes.save(made_prepared(scene.id), prepared_key().of(scene.id, graph_key.digest))
+    assert load_view(store, scene.id, graph_key.digest).known is not None
+    (name,) = (name for kind, name in store.arrays.groups() if kind == KIND)
+    file = store.folder / "arrays" / KIND / name / "arrays.zip"
+    file.write_bytes(file.read_bytes()[:-100])
+    assert load_view(store, scene.id, graph_key.digest).known is None
 
 
 def test_its_key_must_name_the_scene(store, scene):

@@ -50,6 +50,8 @@ def describe(
     """
     keys: dict[str, RecipeKey] = graph_keys(store, scenes, settings)
     damaged: set[str] = store.graphs.damaged(keys.values()) if verify else set()
+    if verify:
+        store.prepared_scenes.forget_damaged(keys)
     lacking = {*without_graph(store, keys), *(scene for scene, key in keys.items() if key.digest in damaged)}
     missing = [scene for scene in scenes if scene.id in lacking]
     specs = models.specs(store)
