@@ -27,7 +27,7 @@ from gsmap.map.floor_plans import read_scene
 from gsmap.map.objects import MapObjects
 from gsmap.map.settings import Settings
 from gsmap.map.stages.export import ExportPlan, Request, make_content, plan
-from gsmap.map.world import GeoreferencedComponent
+from gsmap.map.world import GeoreferencedComponent, world_notes
 from gsmap.report import PlanScene, make_plan
 from gsmap.report.plan import rings
 from gsmap.store import Store
@@ -101,9 +101,12 @@ def export_survey(
     else:
         eyes = _eyes(store, planned, placed)
         whole = Gaussians.concatenate(list(parts))
-        write = _write_orthophoto if kind == "orthophoto" else _write_floor_plan
-        notes = write(out, whole, eyes, placed, system, options, store, planned)
-    return (*(note for note in planned.notes if "ply" not in note), *notes)
+        if kind == "orthophoto":
+            notes = _write_orthophoto(out, whole, eyes, placed, system, options.pixel_size)
+        else:
+            notes = _write_floor_plan(out, whole, eyes, placed, _footprints(store, planned, placed))
+    of_tiles = world_notes(planned.world, planned.recipe.format, planned.recipe.up)
+    return (*(note for note in planned.notes if note not in of_tiles), *notes)
 
 
 def _component(planned: ExportPlan, wanted: int | None) -> tuple[int, GeoreferencedComponent]:
@@ -170,10 +173,9 @@ def _write_orthophoto(
     eyes: np.ndarray,
     placed: GeoreferencedComponent,
     system: str,
-    options: SurveyOptions,
-    store: Store,
-    planned: ExportPlan,
+    pixel: float | None,
 ) -> tuple[str, ...]:
+    """Write an orthophoto with pixels of ``pixel`` units of the CRS; None selects their size."""
     here = crs(system)
     epsg = here.projected_epsg
     if epsg is None:
@@ -187,7 +189,7 @@ def _write_orthophoto(
     target = from_frame(placed.frame, box, system)
     flat = _plane_similarity(box[:, :2], target[:, :2])  # convergence, scale, unit
     low, high = target[:, :2].min(0), target[:, :2].max(0)
-    pixel = pixel_size(high - low, options.pixel_size, _LONGEST_PX, _MOST_PX)
+    pixel = pixel_size(high - low, pixel, _LONGEST_PX, _MOST_PX)
     off = np.linalg.norm(flat.apply(box)[:, :2] - target[:, :2], axis=1).max()
     if off > pixel:
         raise InputError(
@@ -234,16 +236,13 @@ def _write_floor_plan(
     whole: Gaussians,
     eyes: np.ndarray,
     placed: GeoreferencedComponent,
-    system: str,
-    options: SurveyOptions,
-    store: Store,
-    planned: ExportPlan,
+    footprints: Iterator[tuple[dict[str, object], Sequence[np.ndarray]]],
 ) -> tuple[str, ...]:
     def geographic(ring: np.ndarray) -> np.ndarray:
         return from_frame(placed.frame, np.c_[ring, np.zeros(len(ring))], WGS84)[:, :2]
 
     features = []
-    for properties, found in (*_footprints(store, planned, placed), *_walls(whole, eyes)):
+    for properties, found in (*footprints, *_walls(whole, eyes)):
         polygons = [[geographic(ring) for ring in polygon] for polygon in polygons_of(found)]
         if polygons:
             features.append((properties, polygons))
