@@ -175,6 +175,8 @@ def command(
                 "--static": static or None,
                 "--tile-size": tile_size,
                 "--up": up,
+                "--crs": crs,
+                "--pixel-size": pixel_size,
             },
         )
         return
@@ -258,14 +260,9 @@ def _write_page(
     map: str, out: str, megabytes: float, sets: Sets, preset: Preset, json: bool, asked: Mapping[str, object]
 ) -> None:
     """Write the page with the unmerged captures of the map as one file."""
-    from gsmap.errors import ConfigError
     from gsmap.types.rows.exports import ExportReport
 
-    if useless := [option for option, value in asked.items() if value is not None]:
-        raise ConfigError(
-            f"{useless[0]} does not apply to --format html, which shows the captures without merging them",
-            code="conflicting_options",
-        )
+    _refuse_options(asked, "--format html, which shows the captures without merging them")
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         written = m.write_page(out, megabytes=megabytes)
     for note in written.notes:
