@@ -76,7 +76,8 @@ class _SearchIndex:
     Args:
         recipe: digest of the recipe.
         embedder: name of the embedder.
-        graphs: scene graphs of that recipe by scene id, placed scenes only; of thinned scenes what is left of theirs.
+        graphs: scene graphs of that recipe by scene id, placed scenes only, and of thinned scenes graphs with segments
+            alone.
         num_described: number of graphs of that recipe.
         poses, scenes: poses and scenes of all placed scenes.
         known: the objects of these graphs.
