@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,11 @@ def test_a_part_of_it_keeps_what_is_said_of_its_scene(stages: dict[str, Path], t
     copy_map(stages["complete"], tmp_path)
     gsmap("split MAP HERE/part.gsmap --scenes then", tmp_path)
     check_answers(tmp_path, "HERE/part.gsmap", ("then",))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ends = json.loads(gsmap("measure HERE/part.gsmap then:0,0,0 then:4,3,0 --json", tmp_path))
+    # The control points are marked in photos of the other scene, so nothing ties this one to the world.
+    assert ends["a"]["sigma_m"] is None
 
 
 def test_what_is_static_and_what_localizes_is_without_the_crate(

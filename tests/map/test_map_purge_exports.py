@@ -14,11 +14,12 @@ from complete_map import BENCH, BOX, room
 from raising import raises
 
 import gsmap.map
-from gsmap.durable import remove_staged, staged_folder, write_owned
+from gsmap.durable import remove_staged, staged_folder, write_owned, write_text_output
 from gsmap.errors import GsmapError
 from gsmap.map import Map
 from gsmap.map.comparison_pictures import note_target
 from gsmap.map.small_map import SmallLocalizer
+from gsmap.store import purging
 from gsmap.types import Cameras, PoseGraph, ScenePose, Sim3
 from gsmap.view.tree_cache import TreeCache
 
@@ -104,6 +105,23 @@ def test_a_purge_names_what_it_cannot_reach(site: Map, tmp_path: Path) -> None:
     found = {Path(text.split(":")[0]) for text in unreachable}
     assert {tmp_path / ".www.0123abcd", tmp_path / ".0123abcd.page.html", tmp_path / "foreign", living} <= found
     assert hidden(tmp_path) == [".0123abcd.page.html", ".www.0123abcd"]
+
+
+def test_what_a_killed_process_left_of_a_file_goes_with_the_next_one(tmp_path: Path) -> None:
+    kill_export(tmp_path / "poses.txt", "gsmap")
+    assert len(hidden(tmp_path)) == 1
+    write_text_output(tmp_path / "poses.txt", "whole")
+    assert ((tmp_path / "poses.txt").read_text(), hidden(tmp_path)) == ("whole", [])
+
+
+def test_a_target_that_an_interrupted_purge_cleaned_is_not_unreachable(site: Map, tmp_path: Path) -> None:
+    for name in ("cleaned", "elsewhere"):
+        note_target(site.store, tmp_path / name, {})
+    begun = purging.begin(site.store, site.store.scenes.get("attic").id)
+    purging.record_files(site.store, begun, str(tmp_path / "cleaned"), 2)
+    receipt = site.purge("attic")
+    assert [text.split(":")[0] for text in receipt.unreachable] == [str(tmp_path / "elsewhere")]
+    assert str(tmp_path / "cleaned") in receipt.exports
 
 
 def test_a_cache_forgets_what_it_holds_half_made_of_a_scene(tmp_path: Path) -> None:
