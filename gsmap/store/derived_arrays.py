@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from sqlalchemy import Row, Table, delete, insert, select
 
-from gsmap.errors import InputError
+from gsmap.errors import MALFORMED, CorruptError, InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.array_groups import manifest, publish, unless_pruned, unname
@@ -18,6 +18,8 @@ from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.layout import Shape
 from gsmap.store.scene_refs import resolve
 
+Value = TypeVar("Value")
+
 
 class DerivedArrays:
     """Array groups of one kind, one per scene.
@@ -25,13 +27,16 @@ class DerivedArrays:
     Args:
         table: with the columns key, recipe, scene, group_id and created_at.
         kind: of the array groups.
+        types: type of each array.
         noun: description for messages.
     """
 
-    def __init__(self, catalog: Catalog, arrays: Arrays, table: Table, kind: str, noun: str) -> None:
+    def __init__(
+        self, catalog: Catalog, arrays: Arrays, table: Table, kind: str, types: Mapping[str, np.dtype[Any]], noun: str
+    ) -> None:
         self._catalog = catalog
         self._arrays = arrays
-        self._table, self._kind, self._noun = table, kind, noun
+        self._table, self._kind, self._types, self._noun = table, kind, types, noun
 
     def put(self, scene: str, key: RecipeKey, arrays: Mapping[str, np.ndarray], columns: Mapping[str, Any]) -> None:
         """Store arrays of a scene in place of all earlier ones of that scene.
@@ -77,15 +82,20 @@ class DerivedArrays:
                     unname(connection, row.group_id)
 
     def get(
-        self, scene: str, key: RecipeKey | str, shapes: Callable[[Row[Any]], Mapping[str, Shape]]
-    ) -> tuple[Row[Any], dict[str, np.ndarray]] | None:
-        """Read the row and arrays of a scene with this key; None without such arrays.
+        self,
+        scene: str,
+        key: RecipeKey | str,
+        shapes: Callable[[Row[Any]], Mapping[str, Shape]],
+        parse: Callable[[Row[Any], dict[str, np.ndarray]], Value],
+    ) -> Value | None:
+        """Read the arrays of a scene with this key; None without such arrays.
 
         Args:
             shapes: returns the shapes of the arrays from the row.
+            parse: returns what the row and the arrays describe, or raises InputError or one of `MALFORMED`.
 
         Raises:
-            CorruptError: bytes on disk are missing or differ.
+            CorruptError: bytes on disk are missing, differ, or describe nothing valid.
             NotFoundError: another process replaced them meanwhile.
         """
         table = self._table
@@ -97,4 +107,13 @@ class DerivedArrays:
             files = manifest(connection, row.group_id)
         with unless_pruned(self._catalog, row.group_id, f"{self._noun} {scene[:12]} were computed again"):
             known = shapes(row)
-            return row, self._arrays.read(self._kind, row.group_id, files, only=list(known), shapes=known)
+            arrays = self._arrays.read(self._kind, row.group_id, files, only=list(known), shapes=known)
+        try:
+            for name, dtype in self._types.items():
+                if arrays[name].dtype != dtype:
+                    raise InputError(f"{name} are {arrays[name].dtype}", code="invalid_record")
+            return parse(row, arrays)
+        except (InputError, *MALFORMED) as error:
+            raise CorruptError(
+                f"{self._noun} {scene[:12]} are invalid ({error}): run gsmap check", code="arrays_corrupt"
+            ) from error

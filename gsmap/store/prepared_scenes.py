@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Row
 
-from gsmap.errors import MALFORMED, CorruptError, InputError
+from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
@@ -19,19 +19,19 @@ from gsmap.types.prepared_scene import PreparedScene
 
 KIND = "prepared"
 
-_TYPES = {
-    "centre": np.float64,
-    "surface": np.uint8,
-    "points": np.float32,
-    "colours": np.float16,
-    "normals": np.float32,
-    "sides": np.int8,
-    "sample": np.float32,
-    "poses": np.float64,
-    "intrinsics": np.float64,
-    "sizes": np.int64,
-    "image_colours": np.uint8,
-    "image_depths": np.float16,
+_TYPES: dict[str, np.dtype[Any]] = {
+    "centre": np.dtype(np.float64),
+    "surface": np.dtype(np.uint8),
+    "points": np.dtype(np.float32),
+    "colours": np.dtype(np.float16),
+    "normals": np.dtype(np.float32),
+    "sides": np.dtype(np.int8),
+    "sample": np.dtype(np.float32),
+    "poses": np.dtype(np.float64),
+    "intrinsics": np.dtype(np.float64),
+    "sizes": np.dtype(np.int64),
+    "image_colours": np.dtype(np.uint8),
+    "image_depths": np.dtype(np.float16),
 }
 
 
@@ -39,7 +39,7 @@ class PreparedScenes(DerivedArrays):
     """The prepared scenes of a map."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
-        super().__init__(catalog, arrays, prepared_scenes, KIND, "what was prepared of scene")
+        super().__init__(catalog, arrays, prepared_scenes, KIND, _TYPES, "the surface cells and views of scene")
 
     def save(self, found: PreparedScene, key: RecipeKey) -> None:
         """Store a prepared scene in place of all earlier ones of that scene.
@@ -77,16 +77,7 @@ class PreparedScenes(DerivedArrays):
             CorruptError: bytes on disk are missing, differ, or are no prepared scene.
             NotFoundError: another process replaced them meanwhile.
         """
-        found = self.get(scene, key, _shapes)
-        if found is None:
-            return None
-        row, arrays = found
-        try:
-            return _prepared(row, arrays)
-        except (InputError, *MALFORMED) as error:
-            raise CorruptError(
-                f"what was prepared of scene {scene[:12]} is invalid ({error}): run gsmap check", code="arrays_corrupt"
-            ) from error
+        return self.get(scene, key, _shapes, _prepared)
 
 
 def _shapes(row: Row[Any]) -> dict[str, Shape]:
@@ -108,9 +99,6 @@ def _shapes(row: Row[Any]) -> dict[str, Shape]:
 
 
 def _prepared(row: Row[Any], arrays: dict[str, np.ndarray]) -> PreparedScene:
-    for name, dtype in _TYPES.items():
-        if arrays[name].dtype != dtype:
-            raise InputError(f"{name} are {arrays[name].dtype}", code="invalid_record")
     for name in ("centre", "points", "colours", "normals", "sample"):
         if not np.isfinite(arrays[name]).all():
             raise InputError(f"{name} hold NaN or infinity", code="not_finite")

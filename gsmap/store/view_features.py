@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Row
 
-from gsmap.errors import MALFORMED, CorruptError, InputError
+from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
@@ -22,7 +22,7 @@ from gsmap.types.localization import SceneFeatures
 
 KIND = "views"
 
-_ARRAYS = {
+_ARRAYS: dict[str, np.dtype[Any]] = {
     "starts": np.dtype(np.int64),
     "points": np.dtype(np.float32),
     "descriptors": np.dtype(np.int8),
@@ -37,7 +37,7 @@ class ViewFeatures(DerivedArrays):
     """The view features of a map, one set per scene."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
-        super().__init__(catalog, arrays, view_features, KIND, "the features of scene")
+        super().__init__(catalog, arrays, view_features, KIND, _ARRAYS, "the features of scene")
 
     def save(self, found: SceneFeatures, key: RecipeKey) -> None:
         """Store the features of a scene in place of all earlier features of that scene.
@@ -64,16 +64,7 @@ class ViewFeatures(DerivedArrays):
             CorruptError: bytes on disk are missing, differ, or are not valid features.
             NotFoundError: another process replaced them meanwhile.
         """
-        found = self.get(scene, key, _shapes)
-        if found is None:
-            return None
-        row, arrays = found
-        try:
-            return _features(scene, arrays, row.num_features)
-        except (InputError, *MALFORMED) as error:
-            raise CorruptError(
-                f"the features of scene {scene[:12]} are invalid ({error}): run gsmap check", code="arrays_corrupt"
-            ) from error
+        return self.get(scene, key, _shapes, _features)
 
 
 def _shapes(row: Row[Any]) -> dict[str, Shape]:
@@ -89,14 +80,11 @@ def _shapes(row: Row[Any]) -> dict[str, Shape]:
     }
 
 
-def _features(scene: str, arrays: dict[str, np.ndarray], num_features: int) -> SceneFeatures:
-    for name, dtype in _ARRAYS.items():
-        if arrays[name].dtype != dtype:
-            raise InputError(f"{name} are {arrays[name].dtype}", code="invalid_record")
+def _features(row: Row[Any], arrays: dict[str, np.ndarray]) -> SceneFeatures:
     starts = arrays["starts"]
-    if starts[0] != 0 or starts[-1] != num_features or (np.diff(starts) < 0).any():
+    if starts[0] != 0 or starts[-1] != row.num_features or (np.diff(starts) < 0).any():
         raise InputError("its views do not partition its features", code="invalid_record")
     if not np.isfinite(arrays["points"]).all():
         raise InputError("a point holds NaN or infinity", code="not_finite")
     cameras = Cameras(arrays["poses"].reshape(-1, 4, 4), arrays["intrinsics"], arrays["sizes"])
-    return SceneFeatures(scene, cameras, starts, arrays["points"], arrays["descriptors"], arrays["angles"])
+    return SceneFeatures(row.scene, cameras, starts, arrays["points"], arrays["descriptors"], arrays["angles"])
