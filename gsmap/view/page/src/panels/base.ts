@@ -26,6 +26,24 @@ export class Panel extends LitElement {
   }
 }
 
+/** An element over the 3D view, told after every picture. */
+export abstract class CanvasPanel extends Panel {
+  private canvas: HTMLElement | null = null;
+
+  protected abstract readonly drawn: () => void;
+
+  override connectedCallback(): void {
+    super.connectedCallback();
+    this.canvas = document.getElementById("canvas");
+    this.canvas?.addEventListener("drawn", this.drawn);
+  }
+
+  override disconnectedCallback(): void {
+    super.disconnectedCallback();
+    this.canvas?.removeEventListener("drawn", this.drawn);
+  }
+}
+
 /** `<div ${vars({ "--at": "50%" })}>`: set through the object model, as the page's CSP has no inline styles. */
 class Vars extends Directive {
   constructor(part: PartInfo) {

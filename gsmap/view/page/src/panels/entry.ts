@@ -5,14 +5,14 @@ import * as actions from "../actions";
 import type { FloorPlan } from "../contract";
 import * as derive from "../derive";
 import { page } from "../state";
-import { Panel } from "./base";
+import { CanvasPanel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
 
 const WIDTH = 1000; // of the drawing's own units
 
 @customElement("gs-entry")
-export class Entry extends Panel {
+export class Entry extends CanvasPanel {
   static override styles = [
     shared,
     css`
@@ -72,20 +72,8 @@ export class Entry extends Panel {
 
   @state() private isAbove = false;
   @state() private isDrawn = false;
-  private canvas: HTMLElement | null = null;
 
-  override connectedCallback(): void {
-    super.connectedCallback();
-    this.canvas = document.getElementById("canvas");
-    this.canvas?.addEventListener("drawn", this.look);
-  }
-
-  override disconnectedCallback(): void {
-    super.disconnectedCallback();
-    this.canvas?.removeEventListener("drawn", this.look);
-  }
-
-  private readonly look = (): void => {
+  protected readonly drawn = (): void => {
     const known = page.stage?.state;
     this.isAbove = known?.isAbove ?? false;
     this.isDrawn = known?.isShown ?? false;

@@ -8,14 +8,14 @@ import type { SceneEntry } from "../contract";
 import * as derive from "../derive";
 import { page } from "../state";
 import { posesOf } from "../driver";
-import { Panel } from "./base";
+import { CanvasPanel } from "./base";
 import { shared } from "./css";
 
 const HIGH = 26; // px, of a label and its margin
 const MOST = 200; // of a component that are labelled
 
 @customElement("gs-labels")
-export class Labels extends Panel {
+export class Labels extends CanvasPanel {
   static override styles = [
     shared,
     css`
@@ -61,19 +61,6 @@ export class Labels extends Panel {
     `,
   ];
 
-  private canvas: HTMLElement | null = null;
-
-  override connectedCallback(): void {
-    super.connectedCallback();
-    this.canvas = document.getElementById("canvas");
-    this.canvas?.addEventListener("drawn", this.place);
-  }
-
-  override disconnectedCallback(): void {
-    super.disconnectedCallback();
-    this.canvas?.removeEventListener("drawn", this.place);
-  }
-
   private scenes(): { scene: SceneEntry; index: number }[] {
     const { map, left, drag } = this.state;
     if (!map || drag || this.state.revision !== null) return [];
@@ -102,11 +89,11 @@ export class Labels extends Panel {
 
   protected override updated(changed: PropertyValues): void {
     super.updated(changed);
-    this.place();
+    this.drawn();
   }
 
   /** Where two would cover each other, the larger scene keeps its name. */
-  private readonly place = (): void => {
+  protected readonly drawn = (): void => {
     const { stage } = page;
     const taken: { x: number; y: number; half: number }[] = [];
     const scenes = new Map(this.scenes().map(({ scene }) => [scene.id, scene]));
