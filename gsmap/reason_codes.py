@@ -295,6 +295,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "map_damaged": "The map has a missing or damaged file, so that it is not backed up.",
     "map_not_found": "No map lies at the path.",
     "map_too_new": "The map was written by a newer gsmap.",
+    "map_not_released": "The map was written by a development version of gsmap before the first release.",
     "map_too_old": "The map was written by an older gsmap and needs a migration.",
     "migration_breaks_references": "A migration would break references between rows.",
     "no_migrations": "A package was installed without its migrations.",

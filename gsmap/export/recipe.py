@@ -167,8 +167,6 @@ def dirty_reason(
     """
     if tile is None:
         return "new"
-    if not tile.key:
-        return "an older gsmap made it"
     if tile.key != recipe.key(planned):
         return _first_change(planned, tile, recipe)
     corners = box_corners(planned.bounds)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmap.engine import WorkerSession
-from gsmap.errors import ConfigError, NotFoundError
+from gsmap.errors import ConfigError, NotFoundError, SchemaVersionError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.map.metric_scales import metres_at
@@ -64,8 +64,17 @@ def create(
 
 
 def open(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
-    """Open a map, or a branch or tag (``MAP@NAME``); read-only if its folder cannot be written."""
-    return Map(Store.open(path, "w" if Store.can_write(path) else "r"), progress)
+    """Open a map, or a branch or tag (``MAP@NAME``); read-only if its folder cannot be written, or if an older release
+    wrote it (see `migrate`).
+    """
+    if not Store.can_write(path):
+        return Map(Store.open(path, "r"), progress)
+    try:
+        return Map(Store.open(path, "w"), progress)
+    except SchemaVersionError as error:
+        if error.code != "map_too_old":
+            raise
+        return Map(Store.open(path, "r"), progress)
 
 
 def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:

@@ -42,7 +42,7 @@ from gsmap.view.tree_cache import TreeCache
 
 _log = logging.getLogger("gsmap.map")
 SITE = "gsmap-site.json"
-_WITHOUT_LIST, _VERSION = 1, 2
+_VERSION = 2
 _MAX_BYTES = 1 << 28
 _ENTRIES = ("map.json", "index.html")  # what a browser asks for first
 _MIN_MB, _MAX_MB = 0.001, 100_000
@@ -123,7 +123,6 @@ def remove_site(folder: Path) -> int:
     """Delete the files of a page, no other files, and folders that become empty; return the number of files.
 
     Raises:
-        ConfigError: it was written by a gsmap that kept no list of its files.
         CorruptError: a folder on the way to one is a link.
         OSError: the system refused.
     """
@@ -136,33 +135,17 @@ def remove_site(folder: Path) -> int:
 
 
 def site_files(folder: Path) -> list[str]:
-    """List the files of a page except `SITE`, relative to its folder; empty if the folder has no page.
-
-    Raises:
-        ConfigError: it was written by a gsmap that kept no list of its files.
-    """
+    """List the files of a page except `SITE`, relative to its folder; empty if the folder has no page."""
     said = _marker(folder)
-    if said is None:
-        return []
-    if said[1] is None:
-        raise ConfigError(
-            f"{folder} holds a page of an older gsmap, which kept no list of its files: move your own files out of it, "
-            "delete it, and export again",
-            code="foreign_export",
-        )
-    return said[1]
+    return [] if said is None else said[1]
 
 
-def _marker(folder: Path) -> tuple[str, list[str] | None] | None:
-    """Return the map id and the files of the page in a folder (None for an old page without a list); None without a
-    page.
-    """
+def _marker(folder: Path) -> tuple[str, list[str]] | None:
+    """Return the map id and the files of the page in a folder; None without a page."""
     try:
         with open(open_file(folder / SITE), "rb") as file:
             said = json.loads(file.read(_MAX_BYTES))
         map_id, version = str(said["map_id"]), said["version"]
-        if version == _WITHOUT_LIST:
-            return map_id, None
         files = said["files"]
         if version != _VERSION or not isinstance(files, list) or not all(isinstance(path, str) for path in files):
             return None
@@ -190,7 +173,6 @@ def _check_folder(store: Store, folder: Path) -> None:
             f"{folder} holds other files than a page of this map: give an empty or a new folder",
             code="folder_not_empty",
         )
-    site_files(folder)
 
 
 def _in_order(files: Iterable[str]) -> list[str]:

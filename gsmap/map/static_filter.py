@@ -16,7 +16,7 @@ import numpy as np
 from gsmap.errors import NotFoundError
 from gsmap.methods import text_digest
 from gsmap.store import Store
-from gsmap.types import MapObject, Scene
+from gsmap.types import MapObject
 from gsmap.types.plain import canonical
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def find_dynamic_content(store: Store, known: MapObjects) -> dict[str, DynamicCo
                 (one.older, "before", change.num_before),
                 (one.newer, "after", change.num_after),
             ):
-                if count and scene in known.scenes and _has_rows(known.scenes[scene]):
+                if count and scene in known.scenes:
                     changes.setdefault(scene, []).append((one.number, change.place, side))
                     told.setdefault(scene, []).append(f"{one.key} {one.created_at}")
     return {
@@ -101,11 +101,6 @@ def find_dynamic_content(store: Store, known: MapObjects) -> dict[str, DynamicCo
         )
         for scene in known.scenes
     }
-
-
-def _has_rows(scene: Scene) -> bool:
-    """Return true if row numbers of changes are valid in a scene, unlike in a scene that an older gsmap thinned."""
-    return scene.thinning is None or scene.thinning.has_row_map
 
 
 def dynamic_rows(store: Store, scene: str, passing: DynamicContent) -> np.ndarray:

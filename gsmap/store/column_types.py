@@ -88,7 +88,7 @@ class DigestText(_CheckedText):
 
 
 class KeyText(_CheckedText):
-    """The key of a result, which is never used as a path: a digest, or any text in maps of schema 0001."""
+    """The key of a result, which is never used as a path: a digest, or empty."""
 
     cache_ok = True
     what = "a text without control characters"
@@ -296,7 +296,6 @@ def is_thinning(value: Any) -> bool:
         and isinstance(value.get("at"), str)
         and isinstance(value.get("num_gaussians"), int)
         and (value.get("up") is None or is_direction(value["up"]))
-        and isinstance(value.get("row_map", False), bool)
     )
 
 

@@ -121,14 +121,13 @@ def _target(path: str | os.PathLike[str]) -> str:
 
 
 def _tile(row: Row[Any]) -> Tile:
-    older = {"method": row.older_recipe} if row.older_recipe else {}
     return Tile(
         key=row.key,
         component=row.component,
         bounds=to_array(row.bounds),
         poses={scene: to_pose(pose) for scene, pose in row.poses.items()},
         num_gaussians=row.num_gaussians,
-        recipe=older if row.recipe is None else recipes.recipe_json(row),
+        recipe={} if row.recipe is None else recipes.recipe_json(row),
         truncated=bool(row.truncated),
         path=row.path,
         sha256=row.sha256,

@@ -57,14 +57,12 @@ def to_arrays(graph: SceneGraph) -> tuple[dict[str, np.ndarray], dict[str, Any]]
     return {key: array for key, (array, _) in kept.items()}, about
 
 
-def shapes_of(about: Mapping[str, Any]) -> dict[str, Shape] | None:
-    """Return the shapes of a graph's arrays from its metadata; None for rows of schema 0006 and older, which lack them.
+def shapes_of(about: Mapping[str, Any]) -> dict[str, Shape]:
+    """Return the shapes of a graph's arrays from its metadata.
 
     Raises:
         CorruptError: invalid metadata.
     """
-    if "arrays" not in about:
-        return None
     return {key: encoded_shape(how) for key, how in about["arrays"].items()}
 
 
@@ -74,12 +72,10 @@ def from_arrays(scene_id: str, about: Mapping[str, Any], stored: Mapping[str, np
     Raises:
         CorruptError: arrays and metadata do not match.
     """
-    up, unit_m, known = to_array(about["up"]), about["unit_m"], about.get("arrays")
-    # Older releases: use metres if plausible.
-    working_m = about.get("working_m", 1.0 if "landmarks" in about["layers"] else unit_m)
+    up, unit_m, known = to_array(about["up"]), about["unit_m"], about["arrays"]
     try:
-        whole = stored if known is None else {key: decode_array(array, known[key]) for key, array in stored.items()}
-        layers = _older_layers(about, whole) if known is None else _layers(about, whole)
+        whole = {key: decode_array(array, known[key]) for key, array in stored.items()}
+        layers = _layers(about, whole)
         things = None
         if (segments := about.get("things")) is not None:
             own: dict[str, Any] = {name: whole[f"things.{name}"] for name in _THINGS}
@@ -89,7 +85,7 @@ def from_arrays(scene_id: str, about: Mapping[str, Any], stored: Mapping[str, np
             f"the graph of scene {scene_id[:12]} does not match its row in the catalog ({error!r}): run gsmap check",
             code="catalog_invalid",
         ) from error
-    return SceneGraph(scene_id, layers, up, unit_m, tuple(about["notes"]), things, working_m)
+    return SceneGraph(scene_id, layers, up, unit_m, tuple(about["notes"]), things, about["working_m"])
 
 
 def _layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[str, NodeLayer]:
@@ -106,15 +102,6 @@ def _layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[s
         out[name] = NodeLayer(**own, **layer["rest"])
         if len(out[name]) != layer["count"]:
             raise ValueError(f"layer {name} has {len(out[name])} nodes of {layer['count']}")
-    return out
-
-
-def _older_layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[str, NodeLayer]:
-    """Rebuild the layers of schema 0006 and older, where each layer has its own arrays, named by its number."""
-    out = {}
-    for i, (name, layer) in enumerate(about["layers"].items()):
-        own: dict[str, Any] = {key.split(".", 1)[1]: array for key, array in whole.items() if key.startswith(f"{i}.")}
-        out[name] = NodeLayer(**own, **layer["rest"])
     return out
 
 

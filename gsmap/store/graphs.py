@@ -37,7 +37,7 @@ class StoredGraph:
         layers: number of nodes by layer.
         unit_m: estimated metres per scene unit.
         up: (3,) direction against gravity in the scene frame, or None.
-        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in maps that schema 0001 wrote.
+        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`).
     """
 
     key: str
@@ -46,7 +46,7 @@ class StoredGraph:
     created_at: str
     unit_m: float = 1.0
     up: tuple[float, ...] | None = None
-    recipe: str | None = None
+    recipe: str = ""
 
     @property
     def num_nodes(self) -> int:
@@ -132,9 +132,8 @@ class Graphs:
                 return None
             files = manifest(connection, row.group_id)
         shapes = shapes_of(row.about)
-        only = None if shapes is None else list(shapes)
         with unless_pruned(self._catalog, row.group_id, f"the graph of scene {row.scene[:12]} was dropped or replaced"):
-            arrays = self._arrays.read(KIND, row.group_id, files, only=only, shapes=shapes)
+            arrays = self._arrays.read(KIND, row.group_id, files, only=list(shapes), shapes=shapes)
         return self._with_kept_members(from_arrays(row.scene, row.about, arrays))
 
     def _with_whole_members(self, graph: SceneGraph) -> SceneGraph:

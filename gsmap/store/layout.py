@@ -5,8 +5,7 @@ an untrusted source, so everything that differs from what `gsmap.store.arrays` w
 missing chunks, chunks of other sizes, shapes that contradict the catalog, and arrays far larger than real data compress
 to. What is left is decompressing zstd frames, which needs no zarr (zarr would take a millisecond per array).
 
-A group is one archive (`gsmap.store.array_archive`); in maps of schema 0006 and older it is a folder with one file per
-key.
+A group is one archive (`gsmap.store.array_archive`).
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ from gsmap.store import array_archive
 from gsmap.store.array_archive import ByteRange
 
 CHUNK_ROWS = 16_384
-_SHARD_ROWS = 16 * CHUNK_ROWS  # in groups that are folders
 Shape = tuple[int | None, ...]
 Range = tuple[int, int]
 
@@ -72,14 +70,14 @@ class GroupReader:
         self.kind = kind
         self.num_bytes = sum(sizes.values())
         self._reader = reader
-        self.keys: Mapping[str, ByteRange] = {path: ByteRange(path, 0, size) for path, size in sizes.items()}
-        if set(sizes) == {array_archive.FILE}:
+        with self._translate_errors(at):
+            if set(sizes) != {array_archive.FILE}:
+                raise ValueError("it is not one archive")
             size = sizes[array_archive.FILE]
             reader.expect(array_archive.FILE, [(max(0, size - array_archive.TAIL_BYTES), size)])
-            with self._translate_errors(at):
-                self.keys = array_archive.read_members(
-                    size, lambda start, stop: self._bytes(ByteRange(array_archive.FILE, start, stop - start))
-                )
+            self.keys: Mapping[str, ByteRange] = array_archive.read_members(
+                size, lambda start, stop: self._bytes(ByteRange(array_archive.FILE, start, stop - start))
+            )
 
     def _bytes(self, span: ByteRange) -> bytes:
         found = self._reader.read(span.file, span.start, span.start + span.size)
@@ -163,17 +161,17 @@ class GroupReader:
             wanted = ", ".join("any" if length is None else str(length) for length in known)
             raise ValueError(f"its shape is {shape}, but the catalog records ({wanted})")
         grid = about["chunk_grid"]
-        outer = grid["configuration"]["chunk_shape"]
-        inner, sharded = _inner_chunks(about["codecs"], outer)
+        chunks = grid["configuration"]["chunk_shape"]
+        _require_codecs(about["codecs"])
         rows = [max(1, length) for length in shape[1:]]
-        if grid["name"] != "regular" or not all(_are_lengths(c, least=1) and c[1:] == rows for c in (outer, inner)):
-            raise ValueError(f"its chunks {outer!r} are not rows")
-        if inner[0] > CHUNK_ROWS or outer[0] > _SHARD_ROWS or outer[0] % inner[0]:
-            raise ValueError(f"its chunks {inner} in {outer} do not have the sizes that gsmap writes")
-        out = ArrayLayout(tuple(shape), np.dtype(kind), inner[0], [])
+        if grid["name"] != "regular" or not _are_lengths(chunks, least=1) or chunks[1:] != rows:
+            raise ValueError(f"its chunks {chunks!r} are not rows")
+        if chunks[0] > CHUNK_ROWS:
+            raise ValueError(f"its chunks {chunks} do not have the sizes that gsmap writes")
+        out = ArrayLayout(tuple(shape), np.dtype(kind), chunks[0], [])
         if not out.num_bytes:
             return out
-        files = -(-shape[0] // outer[0])
+        files = -(-shape[0] // chunks[0])
         if files > len(self.keys):
             raise ValueError(f"its shape is {shape}, but most of its chunks are missing")
         others = "/0" * len(rows)
@@ -181,22 +179,8 @@ class GroupReader:
         if len(spans) < files:
             missing = next(i for i in range(files) if f"{name}/c/{i}{others}" not in self.keys)
             raise ValueError(f"its chunk {missing} is missing")
-        if not sharded:
-            out.frames.extend(spans)
-            return out
-        for i, span in enumerate(spans):
-            used = -(-min(outer[0], shape[0] - i * outer[0]) // inner[0])
-            out.frames.extend(self._in_shard(span, used, outer[0] // inner[0]))
+        out.frames.extend(spans)
         return out
-
-    def _in_shard(self, span: ByteRange, used: int, count: int) -> list[ByteRange]:
-        """Return the zstd frames of the first ``used`` chunks of a shard, which has ``count`` chunks."""
-        end = span.size - 16 * count - 4
-        index = self._bytes(ByteRange(span.file, span.start + end, 16 * count)) if end > 0 else b""
-        places = list(struct.iter_unpack("<QQ", index))[:used]
-        if len(places) < used or any(start + length > end for start, length in places):
-            raise ValueError(f"its shard {span.file.rpartition('/')[2]} lacks chunks")
-        return [ByteRange(span.file, span.start + start, length) for start, length in places]
 
     def read(
         self,
@@ -304,29 +288,11 @@ def repair_advice(kind: str) -> str:
     return f"run gsmap check, and {again.get(kind, 'ingest the scene again')}"
 
 
-def _inner_chunks(codecs: Any, outer: list[int]) -> tuple[list[int], bool]:
-    """Return the shape of separately compressed chunks and whether they are sharded; raises for other codecs."""
-    names = _codec_names(codecs)
-    if names == ["bytes", "zstd"] and _is_little_endian(codecs[0]):
-        return outer, False
-    if names == ["sharding_indexed"]:
-        shard = codecs[0]["configuration"]
-        index = _codec_names(shard["index_codecs"])
-        at_end = shard.get("index_location", "end") == "end"
-        inner = shard["codecs"]
-        plain = _codec_names(inner) == ["bytes", "zstd"] and index == ["bytes", "crc32c"]
-        if plain and at_end and _is_little_endian(inner[0]) and _is_little_endian(shard["index_codecs"][0]):
-            return shard["chunk_shape"], True
-        names += [*_codec_names(inner), *index]
-    raise ValueError(f"its codecs are {', '.join(names)[:100]}, which gsmap does not use")
-
-
-def _codec_names(codecs: Any) -> list[str]:
-    return [str(codec["name"]) for codec in codecs]
-
-
-def _is_little_endian(codec: Any) -> bool:
-    return bool(codec.get("configuration", {}).get("endian", "little") == "little")
+def _require_codecs(codecs: Any) -> None:
+    """Raise an error for codecs other than little-endian bytes in zstd."""
+    names = [str(codec["name"]) for codec in codecs]
+    if names != ["bytes", "zstd"] or codecs[0].get("configuration", {}).get("endian", "little") != "little":
+        raise ValueError(f"its codecs are {', '.join(names)[:100]}, which gsmap does not use")
 
 
 def _unpacked_bytes(head: bytes) -> int:

@@ -50,6 +50,7 @@ def require_current(catalog: Catalog) -> None:
             code="map_too_new",
         )
     if found < schema.HEAD:
+        _require_released(folder, found)
         raise SchemaVersionError(
             f"{folder} was written by an older gsmap (schema {found}, now {schema.HEAD}): run gsmap migrate {folder}",
             code="map_too_old",
@@ -57,6 +58,15 @@ def require_current(catalog: Catalog) -> None:
     if catalog.is_sqlite:  # a server belongs to the user and is trusted
         with catalog.read() as connection:
             _require_tables(connection, folder)
+
+
+def _require_released(folder: Path, found: str) -> None:
+    if found < schema.FIRST:
+        raise SchemaVersionError(
+            f"{folder} was written by a development version of gsmap (schema {found}) that was never released: ingest "
+            "its captures into a new map",
+            code="map_not_released",
+        )
 
 
 def _require_tables(connection: Connection, folder: Path) -> None:
@@ -95,11 +105,13 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
     An existing SQLite catalog is first copied to ``map.sqlite.VERSION.bak``.
 
     Raises:
-        SchemaVersionError: the database is newer than this gsmap.
+        SchemaVersionError: the database is newer than this gsmap, or older than its first release.
     """
     before = version(catalog.engine, catalog.folder)
     if before is not None and before > schema.HEAD:
         require_current(catalog)
+    if before is not None:
+        _require_released(catalog.folder, before)
     if before == schema.HEAD and revision == "head":
         return before, before
     with catalog.lock():

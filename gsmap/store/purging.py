@@ -144,7 +144,7 @@ def list_purges(store: Store) -> list[Purge]:
 def record_files(store: Store, purge: Purge, target: str, num_files: int) -> Purge:
     """Record the number of files to delete in a folder before deleting them, as a crash may leave none to count."""
     pending = purge.receipt["pending"]
-    known = pending.get("tiles", {})  # missing in purges begun by an older gsmap
+    known = pending.get("tiles", {})
     noted = {**known, target: max(num_files, known.get(target, 0))}
     return _save(store, purge, {**purge.receipt, "pending": {**pending, "tiles": noted}})
 

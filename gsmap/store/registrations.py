@@ -51,8 +51,7 @@ class StoredRegistration:
     Args:
         number: unique in the map, growing.
         key: `RecipeKey.digest` of its recipe and inputs; empty for a manual measurement.
-        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None for a manual measurement, and in rows
-            that schema 0001 wrote.
+        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None for a manual measurement.
         review: the review of the pair in force: ``confirm``, ``reject`` or None.
         adopts: number of the earlier registration that this one makes current again; None for a computed one.
     """

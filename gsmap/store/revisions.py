@@ -56,8 +56,8 @@ class Revision:
             All counts are as of its creation and include scenes purged since.
         note: why it was made.
         dropped_at: when `prune` dropped it; None while it is kept.
-        key: `RecipeKey.digest` of what it was solved from; of another kind in revisions that schema 0001 wrote.
-        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in those.
+        key: `RecipeKey.digest` of what it was solved from.
+        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`).
         settings, provenance, notes: as in `gsmap.types.PoseGraph`.
         origin: ``map`` (its id) and ``number`` of a revision that another map solved; None for one solved by this map.
     """

@@ -29,8 +29,7 @@ class RowIndexMap:
     Args:
         num_whole: number of Gaussians as ingested.
         num_kept: number of Gaussians stored now.
-        rows: (num_kept,) whole row of each kept one, ascending; None if all are kept, or if an older gsmap thinned the
-            capture without storing the mapping.
+        rows: (num_kept,) whole row of each kept one, ascending; None if all are kept, or once the arrays are pruned.
     """
 
     num_whole: int
@@ -119,7 +118,7 @@ class RowIndexMaps:
         thinning = thinning_of(row.thinned)
         if thinning is None:
             return RowIndexMap(row.num_gaussians, row.num_gaussians)
-        if not thinning.has_row_map or not files:
+        if not files:
             return RowIndexMap(thinning.num_gaussians, row.num_gaussians)
         shapes = {compact.KEPT: compact.kept_shape(thinning.num_gaussians)}
         with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):

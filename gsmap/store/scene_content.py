@@ -69,7 +69,7 @@ def thinning_of(value: dict[str, Any] | None) -> Thinning | None:
         return None
     up = value["up"]
     up = None if up is None else tuple(up)
-    return Thinning(value["at"], value["num_gaussians"], up, value.get("row_map", False))
+    return Thinning(value["at"], value["num_gaussians"], up)
 
 
 def shapes_of(row: Row[Any]) -> dict[str, Shape]:

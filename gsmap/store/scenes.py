@@ -495,7 +495,6 @@ class Scenes:
                     "at": now(),
                     "num_gaussians": row.num_gaussians,
                     "up": None if up is None else list(up),
-                    "row_map": True,
                 }
                 values = {"group_id": group_id, "num_gaussians": len(own), "thinned": about}
                 connection.execute(update(scenes).where(scenes.c.id == row.id).values(**values))

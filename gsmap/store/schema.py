@@ -13,7 +13,6 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
-    LargeBinary,
     MetaData,
     Table,
     Text,
@@ -58,7 +57,8 @@ from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 from gsmap.types.map_object import OBJECT_FACTS
 from gsmap.types.world import OBSERVATION_KINDS
 
-HEAD = "0012"  # the newest migration; numbered, so that versions can be compared without alembic
+HEAD = "0013"  # the newest migration; numbered, so that versions can be compared without alembic
+FIRST = "0013"  # the schema of the first release; older ones are of development versions and cannot be migrated
 
 REVISION_COUNTS = (
     "num_scenes",
@@ -99,7 +99,7 @@ def _scene(name: str, **options: Any) -> Column[str]:
 
 
 def _recipe() -> Column[str]:
-    """Return the column of a recipe, which is null in rows that schema 0001 wrote."""
+    """Return the column of a recipe, which is null in rows of manual measurements."""
     return Column("recipe", DigestText, ForeignKey("recipes.digest"))
 
 
@@ -256,7 +256,6 @@ view_features = _table(
     _scene("scene", index=True),
     Column("num_views", Integer, nullable=False),
     Column("num_features", Integer, nullable=False),
-    Column("summaries", LargeBinary, nullable=False),  # empty; older maps hold a vector of each view
     Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )
@@ -469,7 +468,6 @@ tiles = _table(
     Column("export", Integer, ForeignKey("exports.number"), nullable=False),
     Column("key", KeyText, nullable=False, index=True),  # RecipeKey.digest
     _recipe(),
-    Column("older_recipe", Text),  # of rows that schema 0001 wrote: merger and parameters as one text
     Column("component", Integer, nullable=False),
     Column("bounds", JsonText(is_box), nullable=False),
     Column("poses", JsonText(is_poses_by_scene), nullable=False),  # S_map_scene by scene id

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import stat
 import tempfile
@@ -16,16 +17,16 @@ from typing import TYPE_CHECKING
 from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
-from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
-from gsmap.store import branches, integrity, migrate, remote_map, schema, staging, trust
+from gsmap.errors import ConfigError, CorruptError, NotFoundError, SchemaVersionError, StoreError
+from gsmap.store import branches, integrity, migrate, remote_map, schema, sqlite, staging, trust
 from gsmap.store import catalog as _catalog
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.backups import Backups
 from gsmap.store.branches import Branches, MapLocation
 from gsmap.store.catalog import Catalog
-from gsmap.store.catalog_copy import empty_catalog
+from gsmap.store.catalog_copy import empty_catalog, open_sqlite_catalog
 from gsmap.store.changes import Changes
-from gsmap.store.error_translation import translate_errors
+from gsmap.store.error_translation import set_display_name, translate_errors
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.indexes import Indexes
@@ -51,6 +52,8 @@ if TYPE_CHECKING:
     from gsmap.store.prepared_scenes import PreparedScenes
     from gsmap.store.view_features import ViewFeatures
 
+_log = logging.getLogger("gsmap.store")
+
 
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
@@ -75,6 +78,8 @@ class Store:
     """
 
     def __init__(self, place: MapLocation, catalog: Catalog) -> None:
+        self._place = place
+        self._copied: tempfile.TemporaryDirectory[str] | None = None
         self.home = place.home
         self.folder = place.folder
         self.branch = place.branch
@@ -165,11 +170,17 @@ class Store:
             NotFoundError: no such folder.
             StoreError: not a map, not writable, or its catalog is on a server that the user has not trusted.
             CorruptError: it holds links or other entries that gsmap never makes, or another map's catalog.
-            SchemaVersionError: written by a newer gsmap, or an older one (``gsmap migrate``).
+            SchemaVersionError: written by a newer gsmap, or an older one (``gsmap migrate``); a map of an older release
+                with an SQLite catalog can be read.
         """
         store = cls._connect(path, mode, catalog_url)
         try:
-            migrate.require_current(store.catalog)
+            try:
+                migrate.require_current(store.catalog)
+            except SchemaVersionError as error:
+                if mode == "w" or error.code != "map_too_old" or not store.catalog.is_sqlite:
+                    raise
+                return store._migrated_copy()
             if not store.catalog.is_sqlite:
                 store._check_id()
         except BaseException:
@@ -356,9 +367,31 @@ class Store:
         """Delete arrays and models that no row names, and leftovers of crashes."""
         return integrity.reclaim(self.catalog, self.arrays)
 
+    def _migrated_copy(self) -> Store:
+        """Return a store that reads a migrated copy of this older catalog; closes this store."""
+        copied = tempfile.TemporaryDirectory(prefix="gsmap_", ignore_cleanup_errors=True)
+        folder = Path(copied.name)
+        set_display_name(folder, self.location)
+        with contextlib.closing(self):
+            self.catalog.copy(folder / sqlite.FILE)
+        with contextlib.closing(open_sqlite_catalog(folder)) as catalog:
+            found, _ = migrate.upgrade(catalog)
+        message = (
+            f"{self.location} was written by an older gsmap (schema {found}): run gsmap migrate {self.location} to "
+            "change it"
+        )
+        _log.info("reading a migrated copy of the catalog: %s", message)
+        engine = _catalog.open_engine(folder, writable=False)
+        store = Store(self._place, Catalog(folder, engine, writable=False, read_only_message=message))
+        store._copied = copied
+        migrate.require_current(store.catalog)
+        return store
+
     def close(self) -> None:
         self.leases.close()
         self.catalog.close()
+        if self._copied is not None:
+            self._copied.cleanup()
 
     def __enter__(self) -> Store:
         return self

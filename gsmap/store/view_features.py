@@ -54,7 +54,7 @@ class ViewFeatures(DerivedArrays):
             "intrinsics": found.cameras.intrinsics_px,
             "sizes": found.cameras.sizes_px,
         }
-        columns = {"num_views": found.num_views, "num_features": found.num_features, "summaries": b""}
+        columns = {"num_views": found.num_views, "num_features": found.num_features}
         self.put(found.scene, key, arrays, columns)
 
     def load(self, scene: str, key: RecipeKey | str) -> SceneFeatures | None:

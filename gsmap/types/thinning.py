@@ -13,10 +13,8 @@ class Thinning:
         thinned_at: ISO 8601 time with zone.
         num_gaussians: number of Gaussians before.
         up: (3,) up direction in its frame by its former graph; or None.
-        has_row_map: true if its arrays map old rows to kept ones; false if an older gsmap thinned it.
     """
 
     thinned_at: str
     num_gaussians: int
     up: tuple[float, ...] | None = None
-    has_row_map: bool = False

@@ -21,7 +21,7 @@ class Tile:
             (``low <= x < high``).
         poses: the ``S_map_scene`` it was made with, by scene id.
         num_gaussians: number of it holds.
-        recipe: `gsmap.methods.RecipeKey.to_json` of what made it; ``{"method": text}`` in maps of schema 0001.
+        recipe: `gsmap.methods.RecipeKey.to_json` of what made it.
         truncated: a time budget cut its optimisation short.
         path: relative to the export's folder.
         sha256: of the file written.

@@ -28,7 +28,7 @@ class Client:
 
     def __init__(self) -> None:
         self.root = Path(tempfile.mkdtemp(prefix="gsmap-faults-", dir=memory_folder())).resolve()
-        there = os.pathsep.join([str(ROOT), str(ROOT / "synthetic"), str(HERE)])
+        there = os.pathsep.join([str(ROOT), str(ROOT / "synthetic"), str(HERE), str(HERE.parent)])
         environment = os.environ | {"LD_PRELOAD": str(built()), "PYTHONPATH": there, "GSMAP_WORKERS": "1"}
         # A fork must not meet threads that other libraries keep.
         environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

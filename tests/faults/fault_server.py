@@ -21,13 +21,14 @@ from typing import Any
 
 import fault_judge
 import fault_power
+import next_schema
 from fault_judge import State, Verdict
 from fault_shim import MODES, PASS, Shim, changes
 from fault_verbs import BASES, FUNCTIONS, VERBS, Verb, copy_map, words, write_samples
 
 from gsmap.cli.app import run
 from gsmap.errors import GsmapError
-from gsmap.store import Store
+from gsmap.store import Store, schema
 
 PATIENCE_S = 120.0
 
@@ -170,6 +171,7 @@ class Server:
                 os.close(handle)
             os.environ["GSMAP_WORKERS"] = "1"
             os.environ["GSMAP_CACHE"] = str(self.work / "cache")  # what a purge clears must be the same every time
+            self._update_gsmap(line)
             if before is not None:
                 before()
             try:
@@ -200,13 +202,14 @@ class Server:
     def _judge(
         self, verb: Verb, before: State, after: State, code: int | None, stderr: str, fired: bool, *, end: bool = False
     ) -> Verdict:
+        self._update_gsmap(verb.line)
         site, out = self.work / "site.gsmap", Verdict()
         now = fault_judge.state(self.work)
         out.lost += fault_judge.judge_rows(before, after, now)
         if end and not now.same(after):
             out.lost.append(f"what was done is not there: {fault_judge.differences(after, now)}")
         out.tracebacks += fault_judge.tracebacks(stderr)
-        problems = self._problems() if verb.base != "older" else []
+        problems = self._problems()
         out.lost += problems + fault_judge.tiles_problems(self.work)
         out.untrue += fault_judge.judge_words(code, stderr, before, after, now, whole=not problems)
         if code is None and not fired and not end:
@@ -229,6 +232,11 @@ class Server:
             out.lost.append(f"does not open to be pruned: {error}")
         out.left += fault_judge.leftovers(self.work, locks=again == 0)
         return out
+
+    def _update_gsmap(self, line: str) -> None:
+        """Make this child a gsmap that is newer than the map, if a line migrates."""
+        if line.startswith("migrate ") and schema.HEAD != next_schema.NUMBER:
+            next_schema.install(self.root / "migrations")
 
     def _problems(self) -> list[str]:
         """What `check` finds in any map, or why one does not open."""

@@ -6,7 +6,6 @@ import importlib.util
 import json
 import os
 import shutil
-import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from gsmap.types import Change, ChangeReport, Gaussians
 from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 from tools.make.tiny_encoder import image_encoder
 
-OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --format ply --merge union --tile-size 3"
 EXPORT_3DTILES = EXPORT.replace("ply", "3dtiles")
 
@@ -74,7 +72,6 @@ BASES = {
     "modelled": ("placed", ("models add MAP clip IN/encoder.onnx --preset unit",)),
     # Everything that prune takes: a removed scene with its graph, revisions, an orphan, what a dead writer left.
     "littered": ("placed", ("remove MAP b", "optimize MAP", "*litter")),
-    "older": ("nothing", ("*older",)),
     "kept": ("placed", ("backup MAP HERE/kept",)),
     "grown": ("kept", ("ingest MAP IN/c.ply",)),
     "branched": ("placed", ("branch MAP what-if", "edit MAP@what-if a --note later")),
@@ -161,7 +158,7 @@ VERBS = {
         Verb("restore-from", "two", "restore-scene MAP c --from HERE/other.gsmap"),
         Verb("models-add", "placed", "models add MAP clip IN/encoder.onnx --preset unit", needs="onnx"),
         Verb("models-again", "modelled", "models add MAP clip IN/encoder2.onnx --preset unit", needs="onnx"),
-        Verb("migrate", "older", "migrate MAP"),
+        Verb("migrate", "branched", "migrate MAP"),
         Verb("confirm", "placed", "confirm MAP a:b"),
         Verb("reject", "placed", "reject MAP a:b"),
         Verb("changes", "visited", "changes MAP"),
@@ -253,13 +250,6 @@ def litter(site: Path) -> None:
     for folder in (site / "arrays" / "scenes" / ("0" * 32), site / "arrays" / "staging" / ("1" * 32) / "means"):
         folder.mkdir(parents=True)
         (folder / "zarr.json").write_text("{}")
-
-
-def older(site: Path) -> None:
-    """A map of schema 0001."""
-    with tarfile.open(OLDER) as archive:
-        archive.extractall(site.parent, filter="data")
-    os.rename(site.parent / "old.gsmap", site)
 
 
 def compared(site: Path) -> None:
@@ -391,7 +381,7 @@ def _frames(name: str) -> list[dict[str, object]]:
     ]
 
 
-FUNCTIONS = {"*photo": kept_photo, "*litter": litter, "*older": older, "*compared": compared}
+FUNCTIONS = {"*photo": kept_photo, "*litter": litter, "*compared": compared}
 
 
 def copy_map(source: Path, target: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[1] / "describe"))
 from made_room import Room, looking_about
 from raising import raises
-from sqlalchemy import delete, select, update
+from sqlalchemy import delete
 
 import gsmap.map
 from gsmap import formats
@@ -244,22 +244,10 @@ def test_objects_of_a_component_that_comes_apart_have_numbers_of_their_own(site:
         assert (other.component, other.id in before) == (1, False)
         assert m.history(other.id).objects[0].seen == 1
         assert [hit.object for hit in m.find("cupboard").hits] == [cupboard.id]
-        give_twice(m, other.id, cupboard.id)
-        numbers = [row.id for row in m.objects().objects]
-        assert len(set(numbers)) == len(numbers), "though an older gsmap gave one twice"
         m.store.revisions.save(placed)
         again = m.objects().objects
         assert {row.id for row in again} == before
         assert all(row.split_from is None for row in again)
-
-
-def give_twice(m: Map, number: str, other: str) -> None:
-    """Let what was computed say of an object that it is another one."""
-    with m.store.catalog.write() as connection:
-        for row in connection.execute(select(schema.object_sets)).all():
-            things = [thing | {"id": other} if thing["id"] == number else thing for thing in row.value["objects"]]
-            mine = schema.object_sets.c.number == row.number
-            connection.execute(update(schema.object_sets).where(mine).values(value=row.value | {"objects": things}))
 
 
 def counted(patched: pytest.MonkeyPatch) -> list[str]:

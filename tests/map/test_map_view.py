@@ -337,10 +337,6 @@ def test_a_page_is_not_written_over_files_of_others(folder, tmp_path):
             m.write_site(out)
         assert told(out) == before
         (out / "map.json").rmdir()
-        (out / "gsmap-site.json").write_text(json.dumps({"version": 1, "map_id": m.store.id}))
-        with raises(ConfigError, code="foreign_export"):
-            m.write_site(out)
-        assert "older gsmap" in json.dumps(m.purge("yard").to_json())
 
 
 def test_a_site_is_whole_or_not_there(folder, tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ from store_postgres import NoServer, make_database, running_server
 from store_samples import make_cameras, make_gaussians
 from store_swift import Swift, why_not
 
-from gsmap.store import Store
+from gsmap.store import Store, migrate, schema
 from tools.check import flips as check_flips
 
 
@@ -100,3 +100,10 @@ def guarded_database(postgres_url):
         connection.execute(text("CREATE DATABASE guarded"))
     admin.dispose()
     return postgres_url.format("guarded").replace("gsmap@", "gsmap:secret@")
+
+
+@pytest.fixture
+def keep_schema(monkeypatch):
+    """Undo what `next_schema.install` does."""
+    monkeypatch.setattr(migrate, "folder", migrate.folder)
+    monkeypatch.setattr(schema, "HEAD", schema.HEAD)

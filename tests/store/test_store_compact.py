@@ -6,13 +6,12 @@ import shutil
 import numpy as np
 import pytest
 from raising import raises
-from sqlalchemy import update
 from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 
 from gsmap.errors import CorruptError, InputError
 from gsmap.geometry.morton import morton_order
 from gsmap.geometry.rotations import quats_to_matrices
-from gsmap.store import Store, compact, purging, schema
+from gsmap.store import Store, compact, purging
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.merging import merge
 from gsmap.types import Gaussians, SceneGraph, Segments
@@ -233,16 +232,3 @@ def test_things_of_a_thinned_capture_fit_the_whole_one_that_they_are_merged_into
         assert other.scenes.get(ids[0]).thinning is None
         np.testing.assert_array_equal(other.graphs.load(ids[0], key("thin", ids[0])).segments.members, members)
         np.testing.assert_array_equal(other.changes.load(number).changes[0].before, [3, 8, 40, 59])
-
-
-def test_rows_of_a_capture_that_an_older_gsmap_thinned_are_not_guessed(store):
-    ids, members, number = two_captures(store)
-    stays = keep_every_third_out(store, ids[0])
-    with store.catalog.write() as connection:
-        about = {"at": "2026-01-01T00:00:00+00:00", "num_gaussians": 60, "up": None}
-        connection.execute(update(schema.scenes).where(schema.scenes.c.id == ids[0]).values(thinned=about))
-    (change,) = store.changes.load(number).changes
-    assert (len(change.before), len(change.after)) == (0, 2)
-    assert store.graphs.load(ids[0]).segments is None
-    store.graphs.save(SceneGraph(ids[0], segments=things_of(members[stays])), key("older", ids[0]))
-    np.testing.assert_array_equal(store.graphs.load(ids[0], key("older", ids[0])).segments.members, members[stays])

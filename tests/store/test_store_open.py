@@ -58,7 +58,7 @@ def test_foreign_database(tmp_path):
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("version", "code"), [("9999", "map_too_new"), ("0000", "map_too_old")])
+@pytest.mark.parametrize(("version", "code"), [("9999", "map_too_new"), ("0000", "map_not_released")])
 def test_other_schema_is_refused(tmp_path, version, code):
     Store.create(tmp_path / "m").close()
     with sqlite3.connect(tmp_path / "m" / "map.sqlite") as connection:

@@ -4,11 +4,11 @@ import os
 import shutil
 import time
 
+import next_schema
 import pytest
 from raising import raises
 from sqlalchemy import create_engine, text
 from store_backups import PASSING, files_of, fill, holdings, make_snapshot, put, tables_of
-from store_older import check_all, unpack
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, DiskError, NotFoundError, SchemaVersionError, StoreError
@@ -260,19 +260,15 @@ def test_links_in_a_backup_are_not_followed(site, place, tmp_path):
     assert sorted(outside.rglob("*")) == before
 
 
-def test_an_older_schema_is_restored_and_asks_to_be_migrated(tmp_path, place):
-    old = unpack(tmp_path)
-    engine = create_engine(f"sqlite:///{old / 'map.sqlite'}")
-    with engine.connect() as connection:
-        map_id = connection.execute(text("SELECT id FROM about")).scalar_one()
-    engine.dispose()
-    make_snapshot(place, map_id, files_of(old), schema="0001")
-    assert restore(place, tmp_path / "r").schema == "0001"
+def test_an_older_schema_is_restored_and_asks_to_be_migrated(site, tmp_path, place, keep_schema):
+    with Store.open(site) as store:
+        save(store, place)
+    next_schema.install(tmp_path / "migrations")
+    assert restore(place, tmp_path / "r").schema < next_schema.NUMBER
     with raises(SchemaVersionError, code="map_too_old"):
         Store.open(tmp_path / "r")
-    Store.migrate(tmp_path / "r")
-    with Store.open(tmp_path / "r") as store:
-        check_all(store)
+    assert Store.migrate(tmp_path / "r")[1] == next_schema.NUMBER
+    assert holdings(tmp_path / "r") == holdings(site)
 
 
 def test_into_postgres(site, place, tmp_path, postgres_database):
@@ -289,16 +285,14 @@ def test_into_postgres(site, place, tmp_path, postgres_database):
     assert not (tmp_path / "r2").exists()
 
 
-def test_an_older_schema_into_postgres(tmp_path, place, postgres_database):
-    old = unpack(tmp_path)
-    engine = create_engine(f"sqlite:///{old / 'map.sqlite'}")
-    with engine.connect() as connection:
-        map_id = connection.execute(text("SELECT id FROM about")).scalar_one()
-    engine.dispose()
-    make_snapshot(place, map_id, files_of(old), schema="0001")
+def test_an_older_schema_into_postgres(site, tmp_path, place, postgres_database, keep_schema):
+    with Store.open(site) as store:
+        save(store, place)
+    next_schema.install(tmp_path / "migrations")
     restore(place, tmp_path / "r", catalog_url=postgres_database)
+    assert holdings(tmp_path / "r") == holdings(site)
     with Store.open(tmp_path / "r") as store:
-        check_all(store)
+        assert {scene.source.split()[0] for scene in store.scenes.list()} == {"migrated"}
 
 
 @pytest.mark.guards("data")

@@ -103,7 +103,6 @@ _OPTIONS = {
     "up": "--up",
 }
 _TILES_SHARE = 0.8  # of an export's time, where a tree is written over the tiles
-_OLDER_SETTINGS = {"up": "z"}  # of exports recorded before an option existed
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,7 +437,7 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
     found: dict[str, tuple[int, Request]] = {}
     known = {one.name for one in fields(Request)}
     for target in store.exports.targets():
-        stored = _OLDER_SETTINGS | newest[target].settings
+        stored = newest[target].settings
         request = Request(**{key: value for key, value in stored.items() if key in known})
         try:
             planned = plan(store, request, settings)

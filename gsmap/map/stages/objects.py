@@ -86,8 +86,6 @@ def objects_of_components(
         key = _key(store, settings, mine[component], described, unit) if graphs is None else None
         poses = {scene.id: placed.poses[scene.id].S_map_scene for scene in mine[component]}
         kept = None if key is None else next((one for one in sets if one.key == key.digest), None)
-        if kept is not None and given & {thing.id for thing in kept.objects}:
-            kept = None  # an older gsmap gave numbers twice
         still = {} if kept is None else _unmoved(kept.poses, poses, scenes, unit)
         if kept is not None and still.keys() == poses.keys():
             parts.append(ComponentObjects(component, kept, None, None))
@@ -108,12 +106,6 @@ def objects_of_components(
         notes.append(
             f"{few(list(thinned))} {'is' if len(thinned) == 1 else 'are'} thinned: their segments are kept, "
             "and their earlier observations of other objects; they are not searched again"
-        )
-    unmapped = [name for name, thinning in thinned.items() if not thinning.has_row_map]
-    if unmapped:
-        notes.append(
-            f"changes cannot be assigned to segments of {few(unmapped)}: an older gsmap thinned "
-            f"{'it' if len(unmapped) == 1 else 'them'} without a row map; ingest the capture again"
         )
     outdated = [
         f"{scenes[one.older].name}:{scenes[one.newer].name}"
@@ -143,11 +135,7 @@ def _key(
         for one in store.changes.current()
         if one.changes and one.whole and {one.older, one.newer} <= ids
     ]
-    unmapped = [scene.thinning is not None and not scene.thinning.has_row_map for scene in captures]
-    seen = [
-        f"{scene.id} {described[scene.id]}{' without row map' if lacks else ''}"
-        for scene, lacks in zip(captures, unmapped, strict=True)
-    ]
+    seen = [f"{scene.id} {described[scene.id]}" for scene in captures]
     return recipe_key(settings.objects).of(*seen, f"metres {unit!r}", *told)
 
 

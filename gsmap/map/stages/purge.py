@@ -144,12 +144,6 @@ def _clean_staged(store: Store, out: Path, begun: Purge) -> tuple[Purge, list[st
     if num_files := sum(count for count, _ in found):
         begun = purging.record_files(store, begun, f"{out} (interrupted exports)", num_files)
     left = [f"{path}: another process is writing it" for _, busy in found for path in busy]
-    name = re.escape(out.name)
-    # As an older gsmap named them, without the id of the map.
-    older = re.compile(rf"\.{name}\.[0-9a-f]{{8}}|\.[0-9a-f]{{8}}\.{name}")
-    for entry in sorted(os.listdir(out.parent)) if is_folder(out.parent) else []:
-        if older.fullmatch(entry):
-            left.append(f"{out.parent / entry}: an interrupted export of an older gsmap may have left it: delete it")
     return begun, left
 
 
