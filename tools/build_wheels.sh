@@ -1,13 +1,15 @@
 #!/bin/sh
 # Wheels and what can be known of other machines.
 #
-#   tools/build_wheels.sh x86_64     a wheel for manylinux x86-64 in dist/ (auditwheel, patchelf)
-#   tools/build_wheels.sh try        those of dist/ installed in a fresh environment and a small map made with them, away
-#                                    from the sources
-#   tools/build_wheels.sh aarch64    the native module compiled for aarch64 by a cross compiler (g++-aarch64-linux-gnu),
+#   tools/build_wheels.sh x86_64     a wheel for manylinux x86-64 in dist/ (auditwheel, patchelf): of CPython 3.11, or of
+#                                    3.12 and newer, as PYTHON is
+#   tools/build_wheels.sh try        that of dist/ installed in a fresh environment and a small map made with it, away from
+#                                    the sources
+#   tools/build_wheels.sh kernels    the native module compiled for aarch64 by a cross compiler (g++-aarch64-linux-gnu),
 #                                    and run under qemu-user against this machine's numbers (tools/check/kernels.py)
+#   tools/build_wheels.sh aarch64    a wheel for aarch64 by that cross compiler in dist/; tools/check/bare_install.sh tries it
 #
-# PYTHON=python3          the interpreter to build for, with what pyproject.toml builds with (and numpy for aarch64)
+# PYTHON=python3          the interpreter to build for, with what pyproject.toml builds with (and numpy for kernels)
 # AARCH64_ROOT=folder     where an aarch64 Python of the same version lies, with numpy in its folder site/; made from
 #                         Debian's packages and PyPI's wheel where the variable is not set (needs dpkg and apt-get)
 #
@@ -22,15 +24,27 @@ export PATH
 
 need() { for tool in "$@"; do command -v "$tool" >/dev/null || { echo "this needs $tool" >&2; exit 1; }; done; }
 
+# The tag of the wheel that $PYTHON builds and installs.
+tag() { "$PYTHON" -c 'import sys; print("cp311" if sys.version_info < (3, 12) else "cp312")'; }
+
 wheel() {
     need auditwheel patchelf npm
-    rm -rf dist/raw dist/gsmapdb-*.whl
+    rm -rf dist/raw dist/gsmapdb-*-"$(tag)"-*"_$1.whl"
     # The page of gsmap view in it, or no wheel.
     GSMAP_PAGE=REQUIRED "$PYTHON" -m pip wheel -q --no-deps --no-build-isolation -w dist/raw .
     auditwheel repair -w dist dist/raw/gsmapdb-*.whl
     rm -rf dist/raw
-    auditwheel show dist/gsmapdb-*.whl
     ls -l dist
+}
+
+# Python's headers are the same on both machines (64 bits, little endian); symbols are resolved where it is loaded.
+cross_wheel() {
+    need aarch64-linux-gnu-g++
+    suffix=.cpython-311-aarch64-linux-gnu.so
+    [ "$(tag)" = cp311 ] || suffix=.abi3.so
+    export _PYTHON_HOST_PLATFORM=linux-aarch64
+    export CMAKE_ARGS="-DCMAKE_TOOLCHAIN_FILE=$PWD/tools/aarch64.cmake -DNB_SUFFIX=$suffix -DNB_SUFFIX_S=$suffix"
+    wheel aarch64
 }
 
 try() {
@@ -38,7 +52,7 @@ try() {
     here=$(mktemp -d)
     trap 'rm -rf "$here"' EXIT
     "$PYTHON" -m venv "$here/venv"
-    "$here/venv/bin/pip" install -q -c constraints.txt dist/gsmapdb-*.whl
+    "$here/venv/bin/pip" install -q -c constraints.txt dist/gsmapdb-*-"$(tag)"-*_x86_64.whl
     cd "$here"
     PATH=$here/venv/bin:$PATH
     unset PYTHONPATH
@@ -113,12 +127,11 @@ arm_root() {
     touch "$root/whole"
 }
 
-arm() {
+kernels() {
     need cmake aarch64-linux-gnu-g++ qemu-aarch64
     "$PYTHON" -c 'import nanobind, numpy' || { echo "$PYTHON needs nanobind and numpy" >&2; exit 1; }
     build=build/aarch64
     command -v ninja >/dev/null && generator=Ninja || generator="Unix Makefiles"
-    # Python's headers are the same on both machines (64 bits, little endian); symbols are resolved where it is loaded.
     cmake -S . -B $build -G "$generator" -DCMAKE_TOOLCHAIN_FILE=tools/aarch64.cmake -DCMAKE_BUILD_TYPE=Release \
         -DPython_EXECUTABLE="$PYTHON" >/dev/null
     cmake --build $build -j "$(nproc)"
@@ -137,8 +150,9 @@ arm() {
 }
 
 case "${1:-}" in
-x86_64) wheel ;;
+x86_64) wheel x86_64 ;;
 try) try ;;
-aarch64) arm ;;
-*) sed -n '2,18s/^# \{0,1\}//p' "$0" >&2; exit 2 ;;
+kernels) kernels ;;
+aarch64) cross_wheel ;;
+*) sed -n '2,20s/^# \{0,1\}//p' "$0" >&2; exit 2 ;;
 esac

@@ -3,22 +3,31 @@
 #
 #   tools/check/dependencies.sh lowest     uv's --resolution lowest-direct, of what builds gsmap too
 #   tools/check/dependencies.sh newest     whatever is newest today
+#   tools/check/dependencies.sh lowest --wheel dist/gsmapdb-*-cp311-*_x86_64.whl tests/store
+#                                          of a wheel with the extras for servers, and without torch
 #
-# torch alone stays where constraints.txt pins it, and as a build without CUDA: where the resolution names a CUDA package
-# nothing is installed, and GSMAP_TORCH_INDEX (see tools/setup.sh) or UV_FIND_LINKS can name where a CPU build lies.
+# Of the checkout, torch alone stays where constraints.txt pins it, and as a build without CUDA: where the resolution names
+# a CUDA package nothing is installed, and GSMAP_TORCH_INDEX (see tools/setup.sh) or UV_FIND_LINKS can name where a CPU
+# build lies.
 #
 # PYTHON=python3          the interpreter; the lowest bounds are those of the oldest supported, 3.11
 # GSMAP_VENV=folder       where the environment is made (default: build/dependencies-lowest or -newest)
-# Arguments after the first go to pytest.
+# Further arguments go to pytest.
 set -eu
 cd "$(dirname "$0")/../.."
 which=${1:-}
 case "$which" in
 lowest) resolution=lowest-direct ;;
 newest) resolution=highest ;;
-*) sed -n '2,12s/^# \{0,1\}//p' "$0" >&2; exit 2 ;;
+*) sed -n '2,16s/^# \{0,1\}//p' "$0" >&2; exit 2 ;;
 esac
 shift
+wheel=
+if [ "${1:-}" = --wheel ]; then
+    [ -f "${2:-}" ] || { echo "no such wheel: ${2:-}" >&2; exit 2; }
+    wheel=$(cd "$(dirname "$2")" && pwd)/$(basename "$2")
+    shift 2
+fi
 PYTHON=$(command -v "${PYTHON:-python3}")
 venv=${GSMAP_VENV:-$PWD/build/dependencies-$which}
 uv=$(PATH=$(dirname "$PYTHON"):$PATH command -v uv || true)
@@ -36,6 +45,22 @@ VIRTUAL_ENV=$(cd "$venv" && pwd)
 export VIRTUAL_ENV
 PATH=$VIRTUAL_ENV/bin:$PATH
 install() { "$uv" pip install --resolution "$resolution" "$@"; }
+
+if [ -n "$wheel" ]; then
+    # A wheel's dependencies are not direct ones; the checkout's are. The tests' own tools are the newest.
+    versions=$VIRTUAL_ENV/versions.txt
+    "$uv" pip compile -q --resolution "$resolution" --extra cloud --extra cluster --extra postgres --no-header \
+        --no-annotate --python "$VIRTUAL_ENV/bin/python" --output-file "$versions" pyproject.toml
+    "$uv" pip install -q -c "$versions" "${wheel}[cloud,cluster,postgres]"
+    "$uv" pip install -q -c "$versions" pytest pytest-xdist hypothesis onnx laspy lazrs tokenizers pandas
+    "$uv" pip list
+    # The tests' tools are imported from the checkout, gsmap from the wheel: what a path file names comes last.
+    echo "$PWD" >"$("$VIRTUAL_ENV/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/checkout.pth"
+    unset PYTHONPATH
+    export GSMAP_TEST_INSTALLED=1
+    "$VIRTUAL_ENV/bin/python" -P -c 'import gsmap; print("testing", gsmap.__file__)'
+    exec "$VIRTUAL_ENV/bin/python" -P -m pytest -o pythonpath= "$@"
+fi
 
 # What builds gsmap: pyproject.toml's own bounds, and cmake's from CMakeLists.txt.
 build=$("$PYTHON" -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"])')
