@@ -1,10 +1,10 @@
 """Register the smallest pair of synthetic captures with the installed gsmap; compare the edge with another machine's.
 
-    python tools/check/pair.py FOLDER                     make the captures unless they are there; write FOLDER/edge.json
-    python tools/check/pair.py FOLDER --compare EDGE.json and exit with 1 unless it is the same edge
+    python tools/check/pair.py FOLDER                      make captures unless they are there; write FOLDER/edge.json
+    python tools/check/pair.py FOLDER --compare EDGE.json  exit with 1 unless it is the same edge, too
 
-Same edge: the same status, a rotation within 0.05 degrees, a position within 5 mm, the same picture within 1 %. It needs
-nothing but gsmap, and can be run by itself where there is no checkout.
+Same edge: the same status, a rotation within 0.05 degrees, a position within 5 mm, the same picture within 1 %. This
+needs nothing but gsmap, and can be run by itself where there is no checkout.
 """
 
 from __future__ import annotations
