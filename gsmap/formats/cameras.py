@@ -1,21 +1,43 @@
-"""Camera files and folders: ``cameras.json``, ``transforms.json`` and COLMAP models."""
+"""Camera files and folders of trainers, photogrammetry programs and phone scanners."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from gsmap.errors import MALFORMED, GsmapError, InputError
-from gsmap.formats import cameras_json, colmap, nerfstudio
+from gsmap.formats import cameras_json, colmap, metashape, nerfstudio, opf, phone_scans
 from gsmap.formats.camera_files import load_json
 from gsmap.types import Cameras
 
+_NAMES = ("cameras.json", "transforms.json", "cameras.xml", "metadata.json")
+
+
+def find(folder: Path) -> Path | None:
+    """Return the file or folder with the cameras of the captures in a folder; None without one that gsmap reads."""
+    for name in _NAMES[:2]:
+        if (folder / name).is_file():
+            return folder / name
+    if (model := colmap.find_model(folder)) is not None:
+        return model
+    for name in _NAMES[2:]:
+        if (folder / name).is_file() and (name != "metadata.json" or _is_record3d(folder / name)):
+            return folder / name
+    projects = sorted(folder.glob("*.opf"))
+    if len(projects) == 1:
+        return projects[0]
+    if any((folder / name).is_dir() for name in phone_scans.POLYCAM):
+        return next(folder / name for name in phone_scans.POLYCAM if (folder / name).is_dir())
+    return folder if all((folder / name).is_file() for name in phone_scans.STRAY) else None
+
 
 def read(path: str | os.PathLike[str]) -> Cameras:
-    """Read a ``cameras.json`` (INRIA), a ``transforms.json`` (nerfstudio, instant-ngp), or a COLMAP model folder.
+    """Read the cameras of a file or a folder, in the frame of the Gaussians beside it.
 
-    A folder may be the model itself, or hold ``sparse/0``, ``sparse`` or ``transforms.json``. A file
-    ``dataparser_transforms.json`` beside ``transforms.json`` is applied. Frames: the Gaussians' own.
+    Files: ``cameras.json`` (INRIA), ``transforms.json`` (nerfstudio, instant-ngp; ``dataparser_transforms.json`` beside
+    it is applied), ``.xml`` of Metashape, ``.opf`` projects, ``metadata.json`` of Record3D. Folders: a COLMAP model,
+    ``corrected_cameras`` of Polycam, a scan of Stray Scanner, or one with any of these in it (`find`).
 
     Raises:
         NotFoundError: The file or folder is missing.
@@ -24,19 +46,7 @@ def read(path: str | os.PathLike[str]) -> Cameras:
     """
     path = Path(path)
     try:
-        if path.is_dir():
-            model = colmap.find_model(path)
-            if model is not None:
-                return colmap.read(model)
-            if not (path / "transforms.json").is_file():
-                raise InputError(
-                    f"{path} holds no cameras: the folder has no COLMAP model (cameras.bin/.txt) and no "
-                    "transforms.json",
-                    code="no_cameras",
-                )
-            path = path / "transforms.json"
-        content = load_json(path)
-        return cameras_json.parse(content, path) if isinstance(content, list) else nerfstudio.parse(content, path)
+        return _reader(path)()
     except OSError as error:
         raise InputError(
             f"cannot read cameras from {path}: {error.strerror or error}", code="file_unreadable"
@@ -46,3 +56,37 @@ def read(path: str | os.PathLike[str]) -> Cameras:
             raise
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"{path} is not a camera file: {what}", code="invalid_cameras") from error
+
+
+def _reader(path: Path) -> Callable[[], Cameras]:
+    if path.is_dir():
+        if (model := colmap.find_model(path)) is not None:
+            return lambda: colmap.read(model)
+        if path.name in {name.rpartition("/")[2] for name in phone_scans.POLYCAM}:
+            return lambda: phone_scans.read_polycam(path)
+        found = find(path)
+        if found is None:
+            raise InputError(
+                f"{path} holds no cameras: the folder has no COLMAP model (cameras.bin/.txt), no transforms.json, no "
+                "cameras.xml of Metashape, no .opf project and no scan of Polycam, Record3D or Stray Scanner",
+                code="no_cameras",
+            )
+        return (lambda: phone_scans.read_stray(path)) if found == path else _reader(found)
+    if path.suffix.lower() == ".xml":
+        return lambda: metashape.read(path)
+    if path.suffix.lower() == ".opf":
+        return lambda: opf.read(path)
+    content = load_json(path)
+    if isinstance(content, list):
+        return lambda: cameras_json.parse(content, path)
+    if "poses" in content and "K" in content:
+        return lambda: phone_scans.parse_record3d(content, path)
+    return lambda: nerfstudio.parse(content, path)
+
+
+def _is_record3d(path: Path) -> bool:
+    try:
+        content = load_json(path)
+    except GsmapError:
+        return False
+    return isinstance(content, dict) and {"poses", "K", "w", "h"} <= content.keys()

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from gsmap import formats
 from gsmap.errors import GsmapError, InputError, NotFoundError
-from gsmap.formats import colmap, scans
+from gsmap.formats import scans
+from gsmap.formats.cameras import find as find_cameras
 
 MAX_DEPTH = 5
 # Generic file names of trainers; the folder has a better name.
@@ -266,14 +267,7 @@ def _shared_cameras(path: Path) -> Path | None:
     places = [folder]
     if re.fullmatch(r"iteration_\d+", folder.name) and folder.parent.name == "point_cloud":
         places.append(folder.parent.parent)
-    for place in places:
-        for name in ("cameras.json", "transforms.json"):
-            if (place / name).is_file():
-                return place / name
-        model = colmap.find_model(place)
-        if model is not None:
-            return model
-    return None
+    return next((found for place in places if (found := find_cameras(place)) is not None), None)
 
 
 def _unknown(path: Path) -> str:
