@@ -28,6 +28,9 @@ Scale = Annotated[
         "--scale", help="Unit of the captures: `known` (metres), `unknown`, or `auto` (registration decides)."
     ),
 ]
+Clean = Annotated[
+    bool, typer.Option("--clean", help="Remove invalid Gaussians, floaters and background; see gsmap clean.")
+]
 NoCreate = Annotated[
     bool, typer.Option("--no-create", help="Fail if MAP is missing, for example because its disk is not mounted.")
 ]
@@ -40,9 +43,15 @@ def command(
     name: Name = None,
     captured_at: CapturedAt = None,
     scale: Scale = "auto",
-    clean: Annotated[
-        bool, typer.Option("--clean", help="Remove invalid Gaussians, floaters and background; see gsmap clean.")
-    ] = False,
+    clean: Clean = False,
+    bbox: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            "--bbox",
+            metavar="X0 Y0 Z0 X1 Y1 Z1",
+            help="With --clean, remove everything outside this box, too, in the coordinates of the file.",
+        ),
+    ] = None,
     supersedes: Annotated[
         str | None,
         typer.Option(
@@ -68,7 +77,7 @@ def command(
         )
     create = False
     if supersedes is None and not no_create:
-        create = makes_map(map, paths, captured_at, cameras=cameras, name=name, scale=scale, clean=clean)
+        create = makes_map(map, paths, captured_at, cameras=cameras, name=name, scale=scale, clean=clean, bbox=bbox)
     with opened(map, create=create, bars=True) as m:
         if create:
             say(f"created {map}")
@@ -79,6 +88,7 @@ def command(
             captured_at=captured_at,
             scale=scale,
             clean=clean,
+            bbox=bbox,
             supersedes=supersedes,
         )
     for row in rows:
@@ -96,6 +106,7 @@ def makes_map(
     name: str | None = None,
     scale: str = "auto",
     clean: bool = False,
+    bbox: Sequence[float] | None = None,
 ) -> bool:
     """Return true if MAP is missing and these captures can be ingested into a new map.
 
@@ -107,7 +118,7 @@ def makes_map(
 
     if Store.exists(map):
         return False
-    check_captures(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean)
+    check_captures(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean, bbox=bbox)
     return True
 
 

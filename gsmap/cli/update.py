@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets, opened, print_rows, print_table, say
-from gsmap.cli.ingest import CapturedAt, NoCreate, makes_map, refuse_capture_as_map
+from gsmap.cli.ingest import CapturedAt, Clean, NoCreate, makes_map, refuse_capture_as_map
 from gsmap.texts import escaped
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ def command(
         list[str] | None, typer.Argument(metavar="[FILE_OR_FOLDER...]", help="Captures to ingest first.")
     ] = None,
     captured_at: CapturedAt = None,
+    clean: Clean = False,
     no_create: NoCreate = False,
     sets: Sets = None,
     preset: Preset = None,
@@ -43,11 +44,11 @@ def command(
         raise NotFoundError(
             f"no map at {map}: pass captures to create it, or run gsmap init {map}", code="map_not_found"
         )
-    create = not no_create and makes_map(map, paths or [], captured_at)
+    create = not no_create and makes_map(map, paths or [], captured_at, clean=clean)
     with opened(map, create=create, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         if create:
             say(f"created {map}")
-        report = m.update(*(paths or ()), captured_at=captured_at)
+        report = m.update(*(paths or ()), captured_at=captured_at, clean=clean)
         status = None if json else m.status()
         held = [] if status is None or not status.tentative else m.edge_rows(status="tentative")
     for row in report.ingested:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
@@ -101,6 +101,7 @@ def read_capture(
     captured_at: str | datetime | None = None,
     scale_policy: str = "auto",
     clean: bool = False,
+    bbox: Sequence[float] | None = None,
 ) -> Capture:
     """Read and check a capture from `find_captures`; see `read_captures` and `take_capture`."""
     given_date(captured_at)  # refuses what is none before a large file is read
@@ -121,6 +122,7 @@ def read_capture(
         captured_at=captured_at,
         scale_policy=scale_policy,
         clean=clean,
+        bbox=bbox,
         source=str(found.path),
         cameras_source="" if source is None else str(source),
     )
@@ -141,6 +143,7 @@ def take_capture(
     captured_at: str | datetime | None = None,
     scale_policy: str = "auto",
     clean: bool = False,
+    bbox: Sequence[float] | None = None,
     source: str = "",
     cameras_source: str = "",
 ) -> Capture:
@@ -149,12 +152,15 @@ def take_capture(
     Args:
         gaussians, cameras: in one frame; see `Capture` on its origin.
         clean: remove what is no surface first (`gsmap.ingest.clean`).
+        bbox: with ``clean``, remove everything outside this box, too; x0 y0 z0 x1 y1 z1 in coordinates of the source.
 
     Raises:
         InputError: what makes no capture; see `gsmap.ingest.validate`.
-        ConfigError: an unknown scale policy, or a date that is none.
+        ConfigError: an unknown scale policy, a date that is none, or a box without ``clean``.
     """
     check_scale(scale_policy)
+    if bbox is not None and not clean:
+        raise ConfigError("--bbox needs --clean, which removes what lies outside", code="option_not_applicable")
     date = given_date(captured_at)
     where = source or f"capture {name!r}"
     if isinstance(gaussians, Gaussians):
@@ -163,7 +169,7 @@ def take_capture(
     if clean:
         from gsmap.ingest import clean as cleaning
 
-        cleaned = cleaning.clean(gaussians.load(), where=where)
+        cleaned = cleaning.clean(gaussians.load(), bbox, where=where)
         gaussians = cleaned.gaussians
         notes.append(cleaned.note)
     notes += validate_gaussians(gaussians, where)

@@ -237,6 +237,7 @@ class Map(AbstractContextManager["Map"]):
         captured_at: str | None = None,
         scale: str = "auto",
         clean: bool = False,
+        bbox: Sequence[float] | None = None,
         supersedes: str | None = None,
     ) -> Table[IngestRow]:
         """Add captures from files and folders, or one capture from memory; validate each capture before writing it.
@@ -253,6 +254,7 @@ class Map(AbstractContextManager["Map"]):
             scale: ``known`` (metres), ``unknown`` (any unit) or ``auto`` (estimated by registration).
             clean: remove invalid Gaussians, floaters and background (`gsmap.ingest.clean`); notes say how many of each.
                 Superseding the scene by the same file without it undoes this, and the other way round.
+            bbox: with ``clean``, remove everything outside this box, too: x0 y0 z0 x1 y1 z1 in coordinates of the file.
             supersedes: scene to replace by a retrained capture of the same frames in the same coordinates. The capture
                 takes over its pose, annotations and edges, which are verified but not searched again.
 
@@ -270,6 +272,7 @@ class Map(AbstractContextManager["Map"]):
             "captured_at": captured_at,
             "scale": scale,
             "clean": clean,
+            "bbox": bbox,
         }
         if supersedes is not None:
             found, _ = readers(captures, **options)
@@ -357,11 +360,13 @@ class Map(AbstractContextManager["Map"]):
             number = optimize(self.store, self.settings, self._progress)
         return reports.revision_row(self.store, number)
 
-    def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
+    def update(
+        self, *captures: str | os.PathLike[str], captured_at: str | None = None, clean: bool = False
+    ) -> UpdateReport:
         """Ingest captures, then compute missing scene graphs, edges and poses; report what changed.
 
         Args:
-            captured_at: as in `ingest`.
+            captured_at, clean: as in `ingest`.
         """
         from gsmap.map.stages.describe import describe, unthinned
         from gsmap.map.stages.optimize import solve
@@ -372,9 +377,11 @@ class Map(AbstractContextManager["Map"]):
                 "--captured-at needs captures: name their files, or change the date of a scene with gsmap edit",
                 code="option_not_applicable",
             )
+        if clean and not captures:
+            raise ConfigError("--clean needs captures: name their files", code="option_not_applicable")
         before = reports.history_position(self.store)
         with announce_work(self.store, "update"):
-            ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
+            ingested = self.ingest(*captures, captured_at=captured_at, clean=clean) if captures else []
             describe(self.store, unthinned(self.store.scenes.summaries()), self.settings, self._progress)
             known = RegisteredPairs()
             register(self.store, "auto", self.settings, self._progress, known)

@@ -135,6 +135,18 @@ def test_ingest_refuses_what_it_cleans_on_request(room, tmp_path):
         assert any("1 with invalid values, 1 floaters" in note for note in row.notes)
 
 
+def test_ingest_keeps_a_region(room, tmp_path):
+    formats.write(tmp_path / "room.ply", room)
+    half = [-1.0, -1, -1, 2.5, 9, 9]
+    with gsmap.map.create(tmp_path / "site.gsmap") as m:
+        with raises(ConfigError, code="option_not_applicable", match="clean"):
+            m.ingest(tmp_path / "room.ply", bbox=half)
+        with raises(ConfigError, code="option_not_applicable"):
+            m.update(clean=True)
+        m.ingest(tmp_path / "room.ply", clean=True, bbox=half)
+        assert m["room"].num_gaussians == (room.means[:, 0] <= 2.5).sum()
+
+
 @pytest.mark.slow
 def test_superseding_by_the_same_file_undoes_cleaning(room, tmp_path):
     formats.write(tmp_path / "room.ply", with_one_floater(room))

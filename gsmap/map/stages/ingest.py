@@ -75,11 +75,14 @@ def ingest(
     captured_at: str | None,
     scale: str,
     clean: bool,
+    bbox: Sequence[float] | None,
     progress: StageProgress,
 ) -> list[IngestResult]:
     """Ingest every capture that is found in ``sources``; see `gsmap.map.Map.ingest`."""
     dates = {scene.id: scene.captured_at for scene in store.scenes.list()}
-    found, search = readers(sources, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean)
+    found, search = readers(
+        sources, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean, bbox=bbox
+    )
     skipped, bad, good = list(search.skipped), list(search.unreadable), list[Path]()
     is_only_one = len(found) == 1 and not bad and _is_named(found[0], sources)
     results: list[IngestResult] = []
@@ -148,13 +151,16 @@ def check_captures(
     captured_at: str | None = None,
     scale: str = "auto",
     clean: bool = False,
+    bbox: Sequence[float] | None = None,
 ) -> None:
     """Raise an error for invalid captures before a map is created.
 
     Raises:
         NotFoundError, InputError, ConfigError: see `gsmap.map.Map.ingest`.
     """
-    found, search = readers(paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean)
+    found, search = readers(
+        paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, clean=clean, bbox=bbox
+    )
     if len(found) == 1 and not search.unreadable and _is_named(found[0], paths):
         found[0].read()
 
@@ -167,6 +173,7 @@ def readers(
     captured_at: str | None,
     scale: str,
     clean: bool,
+    bbox: Sequence[float] | None,
 ) -> tuple[list[CaptureReader], SearchResult]:
     """Find captures; return a reader for each capture, and the search result; see `gsmap.map.Map.ingest`."""
     given_date(captured_at)  # refuses what is none before anything is searched
@@ -178,7 +185,7 @@ def readers(
         if cameras is not None and not isinstance(cameras, Cameras):
             raise ConfigError("pass gsmap.Cameras or None with in-memory Gaussians", code="in_memory_mismatch")
         called = name or "capture"
-        options: dict[str, Any] = {"captured_at": captured_at, "scale_policy": scale, "clean": clean}
+        options: dict[str, Any] = {"captured_at": captured_at, "scale_policy": scale, "clean": clean, "bbox": bbox}
         take = partial(take_capture, memory[0], cameras, name=called, **options)
         return [CaptureReader(called, take)], SearchResult()
     if isinstance(cameras, Cameras):
@@ -199,6 +206,7 @@ def readers(
         "captured_at": captured_at,
         "scale_policy": scale,
         "clean": clean,
+        "bbox": bbox,
     }
     return [CaptureReader(files.name, partial(read_capture, files, **options), files.path) for files in found], search
 
