@@ -132,7 +132,7 @@ def command(
 
 
 def _print(map: str, report: WorldReport) -> None:
-    from gsmap.types.rows.world import GeoreferenceRow, ResidualRow
+    from gsmap.types.rows.world import GeoreferenceRow, ResidualRow, ResidualSummaryRow
 
     origin = None
     if report.origin is not None:
@@ -148,6 +148,8 @@ def _print(map: str, report: WorldReport) -> None:
     print_facts("world", facts)
     for tie in report.components:
         print_table(f"component {tie.component}", GeoreferenceRow.columns, [tie])
+        if tie.by_kind:
+            print_table("residuals by kind", ResidualSummaryRow.columns, tie.by_kind)
         print_table("residuals", ResidualRow.columns, tie.residuals)
         for note in tie.notes:
             say(f"component {tie.component}: {note}")

@@ -250,6 +250,13 @@ def test_a_point_in_one_photo_lies_on_the_surface(tmp_path: Path) -> None:
     assert tie.problem == ""
     assert tie.rms_check_m is not None
     assert tie.rms_check_m < 0.06
+    kinds = {row.kind: row for row in tie.by_kind}
+    assert list(kinds) == ["point", "check"]
+    errors = np.array([row.error_m for row in tie.residuals if (row.kind, row.use) == ("point", "used")])
+    assert (kinds["point"].count, kinds["point"].num_outliers) == (len(errors), tie.num_outliers)
+    np.testing.assert_allclose(kinds["point"].rms_m, np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-12)
+    assert kinds["point"].max_m == tuple(np.abs(errors).max(0))
+    assert np.linalg.norm(kinds["check"].rms_m) == pytest.approx(tie.rms_check_m)
     sigmas = [row.sigma_m for row in tie.residuals if row.kind == "point"]
     assert min(min(sigma) for sigma in sigmas) > 0.003
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from gsmap.map.snapshot_read import snapshot_read
 from gsmap.reason_codes import reason_code
 from gsmap.store import Store
 from gsmap.types import ScenePose
-from gsmap.types.rows.world import ContradictionRow, GeoreferenceRow, ResidualRow, WorldReport
+from gsmap.types.rows.world import ContradictionRow, GeoreferenceRow, ResidualRow, ResidualSummaryRow, WorldReport
 from gsmap.types.world import Contradiction, Georeference, Residual, Survey
 
 
@@ -74,12 +74,30 @@ def _tie_row(tie: Georeference, num_scenes: int, name_of: Mapping[str, str]) -> 
         rms_m=_rms(controls),
         rms_check_m=_rms(checks),
         num_outliers=sum(row.use == "outlier" for row in tie.residuals),
+        by_kind=tuple(_by_kind(tie.residuals)),
         residuals=tuple(residual_row(row, name_of) for row in tie.residuals),
         problem=tie.problem,
         problem_code=tie.problem_code,
         contradictions=tuple(_contradiction_row(one, name_of) for one in tie.contradictions),
         notes=tie.notes,
     )
+
+
+def _by_kind(residuals: Sequence[Residual]) -> Iterator[ResidualSummaryRow]:
+    """Yield a summary of the residuals of control points, check points, positions and bars that a component has."""
+    for kind in ("point", "check", "fix", "bar"):
+        source, uses = ("point", ("check",)) if kind == "check" else (kind, ("used", "outlier"))
+        mine = [row for row in residuals if row.kind == source and row.use in uses]
+        errors = np.array([row.error_m for row in mine if row.error_m and row.use != "outlier"], np.float64)
+        num_outliers = sum(row.use == "outlier" for row in mine)
+        if len(errors) or num_outliers:
+            yield ResidualSummaryRow(
+                kind=kind,
+                count=len(errors),
+                num_outliers=num_outliers,
+                rms_m=tuple(np.sqrt((errors**2).mean(0)).tolist()) if len(errors) else (),
+                max_m=tuple(np.abs(errors).max(0).tolist()) if len(errors) else (),
+            )
 
 
 def _contradiction_row(one: Contradiction, name_of: Mapping[str, str]) -> ContradictionRow:

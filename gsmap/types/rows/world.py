@@ -68,6 +68,44 @@ class ResidualRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ResidualSummaryRow(Row):
+    """The residuals of one kind of observation, in metres.
+
+    Args:
+        kind: ``point`` (used control points), ``check`` (points held out), ``fix`` (positions of cameras and scenes) or
+            ``bar`` (distances).
+        count: number of used observations; of check points, of all.
+        num_outliers: number left out, because they contradict the others.
+        rms_m: root mean square error east, north, up; of bars, one number.
+        max_m: largest error along each of them.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "kind": "kind",
+        "count": "count",
+        "num_outliers": "outliers",
+        "rms": "RMS E N U, m",
+        "largest": "largest E N U, m",
+    }
+
+    kind: str
+    count: int
+    num_outliers: int
+    rms_m: tuple[float, ...]
+    max_m: tuple[float, ...]
+
+    @property
+    def rms(self) -> str:
+        """The root mean square errors as text."""
+        return " ".join(f"{value:.4f}" for value in self.rms_m)
+
+    @property
+    def largest(self) -> str:
+        """The largest errors as text."""
+        return " ".join(f"{value:.4f}" for value in self.max_m)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ContradictionRow(Row):
     """A group of observations that contradicts another group by more than the common errors of both groups explain.
 
@@ -133,6 +171,7 @@ class GeoreferenceRow(Row):
         rms_m: root mean square error of the used control points, fixes and bars; null without any.
         rms_check_m: root mean square error of the check points; null without any.
         num_outliers: number of outliers.
+        by_kind: summary of the residuals of each kind of observation.
         residuals: residuals of all its observations.
         problem: reason why ``S_world_map`` is missing, or empty.
         problem_code: ``undetermined`` (observations are missing), ``contradiction`` (groups contradict each other and
@@ -160,6 +199,7 @@ class GeoreferenceRow(Row):
     rms_m: float | None
     rms_check_m: float | None
     num_outliers: int
+    by_kind: tuple[ResidualSummaryRow, ...]
     residuals: tuple[ResidualRow, ...]
     problem: str
     problem_code: str
