@@ -13,7 +13,6 @@ from pathlib import Path
 from gsmap import formats
 from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import scans
-from gsmap.formats.cameras import find as find_cameras
 
 MAX_DEPTH = 5
 # Generic file names of trainers; the folder has a better name.
@@ -267,6 +266,8 @@ def _shared_cameras(path: Path) -> Path | None:
     places = [folder]
     if re.fullmatch(r"iteration_\d+", folder.name) and folder.parent.name == "point_cloud":
         places.append(folder.parent.parent)
+    from gsmap.formats.cameras import find as find_cameras  # imported here, as verbs that read no file do not need it
+
     return next((found for place in places if (found := find_cameras(place)) is not None), None)
 
 
