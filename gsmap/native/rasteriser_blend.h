@@ -38,10 +38,11 @@ INLINE void blend_group(const Round &round, BlendBlock &s, const Lanes &lanes, i
         V most{};
         for (int v = 0; v < kGroup; v++) {
             const V exponent = splat.exponent(splat.u_at(column));
-            const V alpha = min(exp2_in_range(exponent), set1(kMaxAlpha));
             splat.next_row();
-            const V weight = alpha * t[v], rest = fnma(alpha, t[v], t[v]);
             const M touched = both(ge(exponent, set1(kMinLog2Alpha)), alive[v]);
+            if (!any(touched)) continue;
+            const V alpha = min(exp2_in_range(exponent), set1(kMaxAlpha));
+            const V weight = alpha * t[v], rest = fnma(alpha, t[v], t[v]);
             const M drawn = gt(touched, rest, set1(kMinTransmittance));
             alive[v] = first_not_second(alive[v], differ(touched, drawn));  // who would fall to 1e-4 stops before
             r[v] = fma_where(drawn, weight, cr, r[v]);
@@ -57,8 +58,7 @@ INLINE void blend_group(const Round &round, BlendBlock &s, const Lanes &lanes, i
             if (kWeight) most = max(most, zero_unless(drawn, weight));
         }
         if (kWeight) {
-            float largest = 0.f;
-            for (int l = 0; l < W; l++) largest = most[l] > largest ? most[l] : largest;
+            const float largest = max_of_lanes(most);
             if (largest > 0.f) {  // positive floats order as integers; raising a maximum does not depend on the order
                 int32_t *cell = (int32_t *)max_weight + ids[j], mine, seen = __atomic_load_n(cell, __ATOMIC_RELAXED);
                 __builtin_memcpy(&mine, &largest, 4);

@@ -179,6 +179,16 @@ template <int S> INLINE void transpose_step(V *r) {
 // In place: lane j of r[i] <-> lane i of r[j].
 INLINE void transpose(V *r) { transpose_step<W / 2>(r); }
 
+template <int S, int... J> INLINE V swap_lanes(V a, std::integer_sequence<int, J...>) {
+    return __builtin_shufflevector(a, a, (J ^ S)...);
+}
+template <int S> INLINE V max_step(V a) {
+    if constexpr (S > 0) return max_step<S / 2>(max(a, swap_lanes<S>(a, std::make_integer_sequence<int, W>{})));
+    return a;
+}
+// The largest lane.
+INLINE float max_of_lanes(V a) { return max_step<W / 2>(a)[0]; }
+
 template <int S> INLINE void sum_step(V *r) {
     if constexpr (S > 0) {
         for (int i = 0; i < S; i++) r[i] = mix_low<S>(r[i], r[i + S]) + mix_high<S>(r[i], r[i + S]);
