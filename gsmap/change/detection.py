@@ -22,7 +22,7 @@ from gsmap.types.change import Change, ChangeReport
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
-VERSION = 2
+VERSION = 3
 """Version, raised whenever the report on the same two captures changes."""
 
 
@@ -58,6 +58,8 @@ def compare(
         InputError: the vertical has length zero, or is not finite.
     """
     params, report = params or Params(), progress or silent
+    # View-dependent colour is extrapolated where the other capture looks from, and most of the Gaussians' bytes.
+    older, newer = (replace(scene, gaussians=scene.gaussians.degree_0()) for scene in (older, newer))
     upright = _upright(up)
     if upright is not None:
         older, newer = (_rotated(scene, upright) for scene in (older, newer))
@@ -66,7 +68,7 @@ def compare(
     report(0.15, "rendering the newer capture")
     views_newer = comparison.render_views(newer, longest_side_px=params.longest_side_px, max_views=params.max_views)
     report(0.3, "comparing both captures")
-    found = comparison.compare(views_older, views_newer)
+    found = comparison.observe(views_older, views_newer)
     report(0.7, "detecting changes")
     both = compare_surfaces(views_older, views_newer, found)
     cells = classify_cells(both)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from gsmap._native import beyond_ranges
 from gsmap.change.poses import tints
-from gsmap.compare import CaptureViews, ComparedView, Comparison, View
+from gsmap.compare import CaptureViews, ComparedView, Observations, View, count_looks_at
 from gsmap.compare.colours import FLOOR, Balance, log_colours
 from gsmap.compare.structure import normals_of
 from gsmap.geometry.cells import cell_labels, group_means
@@ -85,37 +85,46 @@ class SurfaceCells:
 
 
 @dataclass(eq=False)
-class _Sums:
-    """Sums of pixel values by the dominant Gaussian of each pixel."""
+class _Cells:
+    """The surface of a capture by cells, with sums over the pixels that show each of the M cells.
 
+    Args:
+        rows: (R,) Gaussians on surfaces; ``label`` (R,) is the cell of each, ``counts`` (M,) their number in each.
+        cell_of: (N,) cell of each Gaussian, -1 for Gaussians off surfaces.
+    """
+
+    rows: np.ndarray
+    label: np.ndarray
+    counts: np.ndarray
+    cell_of: np.ndarray
     offset: np.ndarray
     colour: np.ndarray
     strength: np.ndarray
     pixels: np.ndarray
 
     @classmethod
-    def zeros(cls, count: int) -> _Sums:
-        return cls(np.zeros(count), np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+    def of(cls, capture: CaptureViews) -> _Cells:
+        rows = np.flatnonzero(capture.surface)
+        label, counts = cell_labels(np.floor(capture.gaussians.means[rows].astype(np.float64) / CELL_M))
+        cell_of = np.full(len(capture.surface), -1, dtype=np.int64)
+        cell_of[rows] = label
+        m = len(counts)
+        return cls(rows, label, counts, cell_of, np.zeros(m), np.zeros((m, 3)), np.zeros(m), np.zeros(m))
 
 
-def compare_surfaces(
-    older: CaptureViews, newer: CaptureViews, comparison: Comparison
-) -> tuple[SurfaceCells, SurfaceCells]:
+def compare_surfaces(older: CaptureViews, newer: CaptureViews, seen: Observations) -> tuple[SurfaceCells, SurfaceCells]:
     """Accumulate the evidence on the surface cells of both captures."""
-    sums = _Sums.zeros(len(older.gaussians)), _Sums.zeros(len(newer.gaussians))
-    limits = _limits(comparison.balance)
+    cells = _Cells.of(older), _Cells.of(newer)
+    limits = _limits(seen.balance)
     # Use every second view of each capture, because neighbouring views along a path show the same content.
-    for picture in comparison.newer_views[::2]:
-        _add(sums, (picture.other, picture.own), picture, comparison, limits)
-    for picture in comparison.older_views[1::2]:
-        _add(sums, (picture.own, picture.other), picture, comparison, limits)
-    made = [
-        _side(capture, evidence, one, comparison.balance if k == 0 else None)
-        for k, (capture, evidence, one) in enumerate(
-            zip((older, newer), (comparison.older, comparison.newer), sums, strict=True)
-        )
-    ]
-    return made[0], made[1]
+    for picture in seen.newer_views[::2]:
+        _add(cells, (picture.other, picture.own), picture, seen, limits)
+    for picture in seen.older_views[1::2]:
+        _add(cells, (picture.own, picture.other), picture, seen, limits)
+    return (
+        _side(older, cells[0], newer, seen.newer_views, seen.tolerance_m, seen.balance),
+        _side(newer, cells[1], older, seen.older_views, seen.tolerance_m, None),
+    )
 
 
 def _limits(line: Balance) -> tuple[float, float]:
@@ -127,27 +136,29 @@ def _limits(line: Balance) -> tuple[float, float]:
 
 
 def _add(
-    sums: tuple[_Sums, _Sums],
+    cells: tuple[_Cells, _Cells],
     views: tuple[View, View],
     picture: ComparedView,
-    comparison: Comparison,
+    seen: Observations,
     limits: tuple[float, float],
 ) -> None:
     """Add the views of the older and the newer capture from one camera."""
     a, b = views
-    base, share = comparison.tolerance_m
+    base, share = seen.tolerance_m
     one = a.solid & b.solid & (a.dominant_id >= 0) & (b.dominant_id >= 0)
     one &= np.abs(a.depth - b.depth) <= base + share * a.depth
-    plain, beyond = _colour(a.colour, b.colour, comparison.balance, limits)
+    plain, beyond = _colour(a.colour, b.colour, seen.balance, limits)
     difference, beyond = plain[one], beyond[one]
     offset = np.clip((b.depth - a.depth) * _along_normal(picture.own), -_CLIP_M, _CLIP_M)[one]
-    for into, view, sign in zip(sums, views, (1.0, -1.0), strict=True):
-        ids, count = view.dominant_id[one], len(into.pixels)
-        into.pixels += np.bincount(ids, minlength=count)
-        into.strength += np.bincount(ids, beyond, count)
+    for into, view, sign in zip(cells, views, (1.0, -1.0), strict=True):
+        cell, count = into.cell_of[view.dominant_id[one]], len(into.pixels)
+        shown = np.flatnonzero(cell >= 0)
+        cell = cell[shown]
+        into.pixels += np.bincount(cell, minlength=count)
+        into.strength += np.bincount(cell, beyond[shown], count)
         for k in range(3):
-            into.colour[:, k] += np.bincount(ids, difference[:, k], count)
-        into.offset += np.bincount(ids, sign * offset, count)
+            into.colour[:, k] += np.bincount(cell, difference[shown, k], count)
+        into.offset += np.bincount(cell, sign * offset[shown], count)
 
 
 def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
@@ -193,25 +204,36 @@ def _along_normal(view: Any) -> np.ndarray:
     return np.clip(np.abs((normal * rays).sum(-1)), _STEEPEST, 1.0)
 
 
-def _side(capture: CaptureViews, evidence: Any, sums: _Sums, line: Balance | None) -> SurfaceCells:
-    rows = np.flatnonzero(capture.surface)
-    gaussians = capture.gaussians
-    points = gaussians.means[rows].astype(np.float64)
-    label, counts = cell_labels(np.floor(points / CELL_M))
-    colours = np.clip(rgb_of_sh0(gaussians.sh[rows, 0]).astype(np.float64), 0, 1)
+def _side(
+    capture: CaptureViews,
+    cells: _Cells,
+    other: CaptureViews,
+    pictures: tuple[ComparedView, ...],
+    tolerance_m: tuple[float, float],
+    line: Balance | None,
+) -> SurfaceCells:
+    """Return the surface cells of a capture.
+
+    Args:
+        other: the other capture; ``pictures`` are its views.
+        line: map of the capture's colours to those of the other capture; None for the identity.
+    """
+    rows, label, counts = cells.rows, cells.label, cells.counts
+    points = capture.gaussians.means[rows].astype(np.float64)
+    colours = np.clip(rgb_of_sh0(capture.gaussians.sh[rows, 0]).astype(np.float64), 0, 1)
     if line is not None:
         colours = np.clip(np.exp(np.log(colours + FLOOR) * line.slope + line.offset) - FLOOR, 0, 1)
-    total = lambda values: np.bincount(label, values[rows], len(counts))  # noqa: E731
-    counts_seen = total(sums.pixels)
+    looks = count_looks_at(capture.gaussians.means[rows], other, pictures, tolerance_m)
+    counts_seen = np.maximum(cells.pixels, 1)
     return SurfaceCells(
         rows,
         label,
         group_means(points, label, counts),
         group_means(colours, label, counts),
-        total(evidence.through.astype(np.float64)),
-        total(evidence.on_surface.astype(np.float64)),
-        total(sums.offset) / np.maximum(counts_seen, 1),
-        np.stack([total(sums.colour[:, k]) for k in range(3)], axis=1) / np.maximum(counts_seen, 1)[:, None],
-        total(sums.strength) / np.maximum(counts_seen, 1),
-        counts_seen,
+        np.bincount(label, looks.through, len(counts)),
+        np.bincount(label, looks.on_surface, len(counts)),
+        cells.offset / counts_seen,
+        cells.colour / counts_seen[:, None],
+        cells.strength / counts_seen,
+        cells.pixels,
     )

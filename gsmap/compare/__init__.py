@@ -13,7 +13,10 @@ from gsmap.compare.comparison import (
     UNSURE,
     ComparedView,
     Comparison,
+    Observations,
     compare,
+    count_looks_at,
+    observe,
 )
 from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, ChangeEvidence
 from gsmap.compare.neighbourhoods import dilate, local_ranges
@@ -39,8 +42,11 @@ __all__ = [
     "ChangeEvidence",
     "CaptureViews",
     "ComparedView",
+    "Observations",
     "View",
     "compare",
+    "count_looks_at",
+    "observe",
     "dilate",
     "combine_views",
     "render_views",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -104,16 +104,11 @@ def render_views(
 ) -> CaptureViews:
     """Render a capture from its own cameras; without cameras it has no views and is no evidence on other captures."""
     count = len(scene.gaussians)
-    largest = np.zeros(count, dtype=np.float32)
-    views = []
     index = ChunkIndex.build(scene.gaussians)
-    for camera in select_cameras(scene, longest_side_px, max_views):
-        view, weight = _view(scene.gaussians, camera, index)
-        views.append(view)
-        np.maximum(largest, weight, out=largest)
+    views, largest = _render(scene.gaussians, select_cameras(scene, longest_side_px, max_views), index)
     times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
     directions = np.full(count, 0 if views else 2 ** len(DIRECTIONS) - 1, dtype=np.uint32)  # all, if nothing is known
-    placed = tuple(project_points(scene.gaussians.means, view, NEAREST_M) for view in views)
+    placed = tuple(_project_visible(scene.gaussians.means, view, index) for view in views)
     for view, at in zip(views, placed, strict=True):
         margin = MIN_TOLERANCE_M
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
@@ -168,13 +163,12 @@ def max_per_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.nd
     return out
 
 
-def select_cameras(scene: PosedScene, longest_side_px: int, max_views: int) -> list[Cameras]:
+def select_cameras(scene: PosedScene, longest_side_px: int, max_views: int) -> Cameras:
     """Select at most ``max_views`` cameras of a capture, evenly along its path; none if the cameras were
     synthesized."""
     if scene.cameras is None or scene.cameras.synthesised or not len(scene.cameras) or not len(scene.gaussians):
-        return []
-    small = scene.cameras.evenly(max_views).resized(longest_side_px)
-    return [small[i] for i in range(len(small))]
+        return Cameras.concatenate([])
+    return scene.cameras.evenly(max_views).resized(longest_side_px)
 
 
 def project_points(points: np.ndarray, view: View, nearest_m: float) -> ProjectedPoints:
@@ -193,9 +187,27 @@ def project_points(points: np.ndarray, view: View, nearest_m: float) -> Projecte
     )
 
 
-def _view(gaussians: Gaussians, camera: Cameras, index: ChunkIndex) -> tuple[View, np.ndarray]:
-    seen = render(gaussians, camera, max_weight=True, index=index)
-    return make_view(seen.colour[0], seen.alpha[0], seen.depth[0], seen.dominant_id[0], camera), seen.max_weight
+def _project_visible(points: np.ndarray, view: View, index: ChunkIndex) -> ProjectedPoints:
+    """Return `project_points` of the means of Gaussians, of which only visible chunks are projected."""
+    camera = view.camera
+    lens, (width, height) = camera.intrinsics_px[0], camera.sizes_px[0].tolist()
+    ranges = index.visible_ranges(camera.T_camera_frame[0], lens, width, height)
+    rows = np.concatenate([np.zeros(0, np.int64), *(np.arange(start, stop) for start, stop in ranges)])
+    at = project_points(points[rows], view, NEAREST_M)
+    return replace(at, index=rows[at.index].astype(at.index.dtype))
+
+
+def _render(gaussians: Gaussians, cameras: Cameras, index: ChunkIndex) -> tuple[list[View], np.ndarray]:
+    """Render Gaussians from cameras; return the views, and the (N,) largest weight of each Gaussian in any view."""
+    largest = np.zeros(len(gaussians), dtype=np.float32)
+    views: dict[int, View] = {}
+    for size in np.unique(cameras.sizes_px, axis=0):  # one call for a size, which allocates the weights once
+        rows = np.flatnonzero((cameras.sizes_px == size).all(1))
+        seen = render(gaussians, cameras[rows], max_weight=True, index=index)
+        np.maximum(largest, seen.max_weight, out=largest)
+        for k, i in enumerate(rows.tolist()):
+            views[i] = make_view(seen.colour[k], seen.alpha[k], seen.depth[k], seen.dominant_id[k], cameras[i])
+    return [views[i] for i in range(len(cameras))], largest
 
 
 def make_view(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,36 +60,38 @@ class ComparedView:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
-    """Result of comparing two captures.
+class Observations:
+    """Two captures as the cameras of both show them.
 
     Args:
-        older, newer: evidence on the Gaussians of each capture, from the views of the other capture.
         older_views, newer_views: each capture's own views, with renders of the other capture.
         balance: map from colours of the older capture to colours of the newer capture.
         tolerance_m: (base, slope); two depths differ if their difference exceeds ``base + slope * depth``.
     """
 
-    older: ChangeEvidence
-    newer: ChangeEvidence
     older_views: tuple[ComparedView, ...]
     newer_views: tuple[ComparedView, ...]
     balance: Balance
     tolerance_m: tuple[float, float]
 
 
-def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
-    """Compare two captures in one metric frame.
+@dataclass(frozen=True, eq=False)
+class Comparison(Observations):
+    """Result of comparing two captures.
 
-    The surfaces of each capture are rendered once from the cameras of the other capture. Floaters are left out, because
-    they would hide surfaces from positions where the capture has no cameras.
+    Args:
+        older, newer: evidence on the Gaussians of each capture, from the views of the other capture.
     """
-    from gsmap.compare.segments import (  # imports scipy, which the recipe key does not need
-        SegmentedCapture,
-        find_remnants,
-        label_shells,
-    )
 
+    older: ChangeEvidence
+    newer: ChangeEvidence
+
+
+def observe(older: CaptureViews, newer: CaptureViews) -> Observations:
+    """Render the surfaces of each of two captures, in one metric frame, from the cameras of the other capture.
+
+    Floaters are left out, because they would hide surfaces from positions where the capture has no cameras.
+    """
     surfaces = {id(one): _surface(one) for one in (older, newer)}
     crossed = [
         [
@@ -100,16 +103,44 @@ def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
     tolerance = _tolerance([pair for pairs in crossed for pair in pairs])
     line = _line(crossed, tolerance)
     pictured = [
-        [_outcomes(own, sure, other, line, sign, tolerance) for own, sure, other in pairs]
+        tuple(_outcomes(own, sure, other, line, sign, tolerance) for own, sure, other in pairs)
         for pairs, sign in zip(crossed, (-1, 1), strict=True)
     ]
-    tallies = EvidenceCounts(len(older.gaussians)), EvidenceCounts(len(newer.gaussians))
-    for judged, judge, by, of in ((tallies[0], tallies[1], newer, older), (tallies[1], tallies[0], older, newer)):
-        for picture, sure, own in zip(pictured[by is newer], by.sure, by.placed, strict=True):
-            at = project_points(of.gaussians.means, picture.own, NEAREST_M)
-            _count(judged, at, picture, sure, tolerance)
-            _count_colour(judge, own, picture, tolerance)
-    both = older, newer
+    return Observations(pictured[0], pictured[1], line, tolerance)
+
+
+def count_looks_at(
+    points: np.ndarray, by: CaptureViews, pictures: Sequence[ComparedView], tolerance_m: tuple[float, float]
+) -> EvidenceCounts:
+    """Count how points (N, 3) of one capture lie relative to the surfaces in the views of another capture.
+
+    Args:
+        by: the other capture; ``pictures`` are its views.
+        tolerance_m: see `Observations`.
+    """
+    counts = EvidenceCounts(len(points))
+    for picture, sure in zip(pictures, by.sure, strict=True):
+        _count(counts, project_points(points, picture.own, NEAREST_M), picture, sure, tolerance_m)
+    return counts
+
+
+def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
+    """Compare two captures in one metric frame, and classify every Gaussian of both."""
+    from gsmap.compare.segments import (  # imports scipy, which the recipe key does not need
+        SegmentedCapture,
+        find_remnants,
+        label_shells,
+    )
+
+    seen = observe(older, newer)
+    both, pictures, tolerance = (older, newer), (seen.older_views, seen.newer_views), seen.tolerance_m
+    tallies = [
+        count_looks_at(of.gaussians.means, by, shown, tolerance)
+        for of, by, shown in zip(both, both[::-1], pictures[::-1], strict=True)
+    ]
+    for tally, of, shown in zip(tallies, both, pictures, strict=True):
+        for picture, own in zip(shown, of.placed, strict=True):
+            _count_colour(tally, own, picture, tolerance)
     walls = label_shells([(one.gaussians.means, one.surface) for one in both])
     evidence = [
         tally.evidence(
@@ -118,7 +149,7 @@ def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
             shell,
             other.gaussians.means[other.surface],
             len(other.views),
-            line,
+            seen.balance,
         )
         for tally, one, other, shell in zip(tallies, both, both[::-1], walls, strict=True)
     ]
@@ -134,7 +165,7 @@ def compare(older: CaptureViews, newer: CaptureViews) -> Comparison:
     )
     for found, rest in zip(evidence, find_remnants((older_end, newer_end)), strict=True):
         found.state[rest] = REPAINTED
-    return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
+    return Comparison(*pictures, seen.balance, tolerance, evidence[0], evidence[1])
 
 
 def _surface(capture: CaptureViews) -> tuple[Gaussians, ChunkIndex, np.ndarray]:

@@ -159,8 +159,9 @@ def compare_scenes(
 
 
 def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> PosedScene:
+    """Return a scene in the map frame with its view-independent colour, which is all that comparisons use."""
     scenes = _store(path).scenes
-    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
+    gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
     return PosedScene(
         transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene), scene_id, captured_at
     )

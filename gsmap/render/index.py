@@ -28,7 +28,7 @@ class ChunkIndex:
     radius: np.ndarray
 
     @classmethod
-    def build(cls, gaussians: Gaussians, chunk: int = 4096) -> ChunkIndex:
+    def build(cls, gaussians: Gaussians, chunk: int = 1024) -> ChunkIndex:
         """Compute the boxes of runs of ``chunk`` Gaussians in stored order.
 
         Sort scattered Gaussians first (`gsmap.geometry.morton`); scenes from the store are sorted already.
@@ -93,11 +93,18 @@ class ChunkIndex:
                 normal[axis], normal[2] = sign, -sign * border
                 distance = normal @ center + half @ np.abs(normal @ rotation) + grow
                 visible &= distance > 0
-        chunks = np.flatnonzero(visible)
-        if len(chunks) == 0:
-            return np.zeros((0, 2), np.int64)
-        # Merge neighbouring chunks into one range.
-        breaks = np.flatnonzero(np.diff(chunks) > 1)
-        first = chunks[np.append(0, breaks + 1)]
-        last = chunks[np.append(breaks, len(chunks) - 1)]
-        return np.ascontiguousarray(np.stack([self.starts[first], self.starts[last + 1]], axis=1))
+        return join_ranges(self.starts, np.flatnonzero(visible))
+
+
+def join_ranges(starts: np.ndarray, chunks: np.ndarray) -> np.ndarray:
+    """Return the ranges (R, 2) int64 of rows of chunks (M,), which ascend; neighbouring chunks share a range.
+
+    Args:
+        starts: (C + 1,) first row of each chunk, followed by the number of rows.
+    """
+    if len(chunks) == 0:
+        return np.zeros((0, 2), np.int64)
+    breaks = np.flatnonzero(np.diff(chunks) > 1)
+    first = chunks[np.append(0, breaks + 1)]
+    last = chunks[np.append(breaks, len(chunks) - 1)]
+    return np.ascontiguousarray(np.stack([starts[first], starts[last + 1]], axis=1))
