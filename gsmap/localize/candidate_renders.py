@@ -10,13 +10,13 @@ import numpy as np
 from gsmap.geometry.projection import project
 from gsmap.localize import displacement, features
 from gsmap.localize.map_scene import MapScene
-from gsmap.render import render
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in a grey value (Rec. 601)."""
 
 _STRIDE_PX = 12  # spacing of the rows and columns at which the motion of a render is measured
 _MOTION_QUANTILE = 0.9
+_MAX_MOTION_WINDOWS = 0.25  # displacements are computed again if the content moves farther than this share of a window
 
 
 def downsample(image: np.ndarray, by: int) -> np.ndarray:
@@ -65,6 +65,10 @@ class SceneRender:
     T_metric_camera: np.ndarray
     intrinsics_px: np.ndarray
     displacement: np.ndarray | None = None
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        return self.depth_m.shape[1], self.depth_m.shape[0]
 
     def downsampled(self, by: int) -> SceneRender:
         """Return the render at a smaller size; all pixels with content count as smooth."""
@@ -123,23 +127,47 @@ def render_scenes(
     """Render every scene by itself from one camera, because two captures in one render blur each other.
 
     Args:
-        previous: renders of this size; those whose content moved by at most ``max_motion_px`` are reused.
+        previous: renders of any size; those of this size whose content moved by at most ``max_motion_px`` are reused.
         with_displacement: also compute the displacement map of each render.
     """
-    reused = {one.scene: one for one in previous if one.motion_px(T_metric_camera, intrinsics_px) <= max_motion_px}
+    reused = {
+        one.scene: one
+        for one in previous
+        if one.size_px == size_px and one.motion_px(T_metric_camera, intrinsics_px) <= max_motion_px
+    }
     out = []
     for one in scenes:
         if one.scene in reused:
             out.append(reused[one.scene])
             continue
         camera = one.camera(T_metric_camera, intrinsics_px, size_px)
-        rendered = render(one.gaussians, camera, dominant_id=False, index=one.index, backend="native")
+        rendered = one.render(camera)
         rgb = np.clip(np.nan_to_num(rendered.colour[0]), 0, 1)
         depth = rendered.depth[0] * np.float32(one.S_metric_scene.scale)
         smooth = features.smooth_depth(rendered) > 0
         moved = None
         if with_displacement:
-            moved = displacement.displacement_map(one, T_metric_camera, intrinsics_px, size_px)
+            moved = _displacement_map(one, T_metric_camera, intrinsics_px, size_px, previous)
         alpha = rendered.alpha[0]
         out.append(SceneRender(one.scene, rgb, rgb @ GREY, alpha, depth, smooth, T_metric_camera, intrinsics_px, moved))
     return out
+
+
+def _displacement_map(
+    scene: MapScene,
+    T_metric_camera: np.ndarray,
+    intrinsics_px: np.ndarray,
+    size_px: tuple[int, int],
+    previous: Sequence[SceneRender],
+) -> np.ndarray:
+    """Return the displacement map of a render, or that of a previous render whose content moved little.
+
+    A map is a mean over windows, so that it hardly changes if the content moves by a fraction of their width.
+    """
+    for one in previous:
+        if one.scene == scene.scene and one.displacement is not None:
+            larger = max(size_px) / max(one.size_px)
+            limit = _MAX_MOTION_WINDOWS * displacement.WINDOW_PX * max(one.size_px) / 480
+            if one.motion_px(T_metric_camera, intrinsics_px / larger) <= limit:
+                return one.displacement * np.float32(larger)
+    return displacement.displacement_map(scene, T_metric_camera, intrinsics_px, size_px)

@@ -21,7 +21,6 @@ from gsmap.localize.candidate_renders import GREY, SceneRender, render_scenes
 from gsmap.localize.localization import scale_photo
 from gsmap.localize.map_scene import MapScene
 from gsmap.localize.refinement import MAX_SCENES
-from gsmap.render import render
 from gsmap.types import Cameras
 from gsmap.types.change import ChangeKind
 from gsmap.types.localization import Photo
@@ -106,7 +105,7 @@ def render_capture_views(scene: MapScene, cameras: Cameras | None) -> CaptureVie
         return CaptureViews((), ())
     small = cameras.evenly(_CAPTURE_VIEWS).resized(_CAPTURE_VIEW_SIDE_PX)
     views = tuple(small[i] for i in range(len(small)))
-    seen = [render(scene.gaussians, view, dominant_id=False, backend="native") for view in views]
+    seen = [scene.render(view) for view in views]
     return CaptureViews(views, tuple(np.where(one.alpha[0] > 0.8, one.depth[0], np.float32(0)) for one in seen))
 
 

@@ -14,7 +14,6 @@ import numpy as np
 from gsmap.geometry.projection import project
 from gsmap.localize.filters import box_means
 from gsmap.localize.map_scene import MapScene
-from gsmap.render import render
 
 FRACTION = 0.16
 """Share of the distance from a pixel to the means of its Gaussians that remains after training
@@ -48,11 +47,7 @@ def displacement_map(
     by = max(1, round(longest / RENDER_SIDE_PX))
     small = (size_px[0] // by, size_px[1] // by)
     camera = scene.camera(T_metric_camera, intrinsics_px / by, small)
-    coloured, index = scene.coloured_by_position, scene.index
-    rendered = render(coloured, camera, depth=False, dominant_id=False, index=index, backend="native")
-    alpha = rendered.alpha[0]
-    low, span = scene.box
-    means = rendered.colour[0] / np.maximum(alpha, 1e-3)[..., None] * span + low
+    means, alpha = scene.render_positions(camera)
     points = scene.S_metric_scene.apply(means.reshape(-1, 3).astype(np.float64))
     at, depth = project(points, np.linalg.inv(T_metric_camera), intrinsics_px / by)
     row, column = np.mgrid[0 : small[1], 0 : small[0]]

@@ -299,7 +299,10 @@ def _supporting_scenes(
 
 def _count_visible(scene: MapScene, refined: RefinedPose, photo: ScaledPhoto) -> int:
     camera = scene.camera(refined.T_metric_camera, refined.intrinsics_px, photo.size_px)
-    pixels, depth = project(scene.gaussians.means, camera.T_camera_frame[0], camera.intrinsics_px[0])
+    gaussians, index = scene.chunked.seen_from(camera)
+    ranges = index.visible_ranges(camera.T_camera_frame[0], camera.intrinsics_px[0], *camera.sizes_px[0].tolist())
+    means = np.concatenate([np.zeros((0, 3), np.float32), *(gaussians.means[a:b] for a, b in ranges)])
+    pixels, depth = project(means, camera.T_camera_frame[0], camera.intrinsics_px[0])
     inside = np.flatnonzero(in_image(pixels, depth, camera.sizes_px[0]))
     one = next(render for render in refined.renders if render.scene == scene.scene)
     column, row = pixels[inside].astype(np.int64).T

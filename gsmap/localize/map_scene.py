@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from gsmap.geometry.sh import sh0_of_rgb
-from gsmap.render.index import ChunkIndex
+from gsmap.render import Rendering, render
+from gsmap.render.chunked import ChunkedGaussians
 from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
+from gsmap.types.source import ChunkSource
 
 
 @dataclass(eq=False)
@@ -24,6 +25,7 @@ class MapScene:
         component: number of the component.
         covariance: (7, 7) of the scene's pose, on the scene's side and in its unit, or None.
         read_gaussians, read_features: functions that return the arrays, in the scene's frame and unit.
+        read_chunks: function that returns the same Gaussians in chunks, of which renders read only the visible ones.
     """
 
     scene: str
@@ -32,6 +34,7 @@ class MapScene:
     covariance: np.ndarray | None
     read_gaussians: Callable[[], Gaussians]
     read_features: Callable[[], SceneFeatures]
+    read_chunks: Callable[[], ChunkSource] | None = None
 
     @cached_property
     def gaussians(self) -> Gaussians:
@@ -42,26 +45,32 @@ class MapScene:
         return self.read_features()
 
     @cached_property
-    def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Minimum (3,) and extent (3,) of the Gaussians' means, in the scene's frame."""
-        low = self.gaussians.means.min(0).astype(np.float64)
-        return low, np.maximum(self.gaussians.means.max(0) - low, 1e-9)
+    def chunked(self) -> ChunkedGaussians:
+        """The Gaussians, of which each chunk is read when it is first seen."""
+        if self.read_chunks is None:
+            return ChunkedGaussians.of(self.gaussians)
+        return ChunkedGaussians(self.read_chunks())
 
-    @cached_property
-    def coloured_by_position(self) -> Gaussians:
-        """The Gaussians with their means, scaled to the box, as colours: renders of them show positions."""
-        low, span = self.box
-        sh = sh0_of_rgb((self.gaussians.means - low) / span)[:, None].astype(np.float32)
-        return replace(self.gaussians, sh=sh)
+    def render(self, camera: Cameras) -> Rendering:
+        """Render colour, alpha and depth of the scene from one camera in its frame."""
+        gaussians, index = self.chunked.seen_from(camera)
+        return render(gaussians, camera, dominant_id=False, index=index, backend="native")
 
-    @cached_property
-    def index(self) -> ChunkIndex:
-        """Boxes of chunks of the Gaussians, by which renders skip those out of view."""
-        return ChunkIndex.build(self.gaussians)
+    def render_positions(self, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+        """Render the positions of the Gaussians from one camera in the scene's frame.
+
+        Returns:
+            (H, W, 3) positions in the scene's frame, valid where (H, W) alpha is large.
+        """
+        gaussians, index = self.chunked.coloured_by_position(camera)
+        rendered = render(gaussians, camera, depth=False, dominant_id=False, index=index, backend="native")
+        low, high = self.chunked.box
+        alpha = rendered.alpha[0]
+        return rendered.colour[0] / np.maximum(alpha, 1e-3)[..., None] * (high - low) + low, alpha
 
     def drop(self) -> None:
         """Release the arrays."""
-        for name in ("gaussians", "index", "features", "box", "coloured_by_position"):
+        for name in ("gaussians", "features", "chunked"):
             self.__dict__.pop(name, None)
 
     def camera(self, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray, size_px: tuple[int, int]) -> Cameras:

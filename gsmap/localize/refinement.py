@@ -154,7 +154,7 @@ def _refine_once(
         if len(found.pixels):
             aligned, pose, lens = found, found.T_metric_camera, 2 * found.intrinsics_px
 
-    renders = render_scenes(scenes, pose, lens, photo.size_px, with_displacement=True)
+    renders = render_scenes(scenes, pose, lens, photo.size_px, renders, with_displacement=True)
     patches = _track_patches(photo, 1.0, renders, NEAR_PX)
     known = None if aligned is None else covariance.alignment_covariance(aligned, half.size_px, photo.focal_sigma)
     fit: resection.LeastSquaresPose | None = None

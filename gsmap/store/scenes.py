@@ -19,7 +19,7 @@ from gsmap.store.array_archive import StreamedArray
 from gsmap.store.array_groups import forget_derived, has_group, manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.catalog import Catalog, next_timestamp, now
-from gsmap.store.chunk_boxes import chunk_boxes, chunks_touching, put_boxes, row_ranges
+from gsmap.store.chunk_boxes import chunk_boxes, chunks_touching, get_boxes, put_boxes, row_ranges
 from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.facts import Fact
 from gsmap.store.layout import CHUNK_ROWS
@@ -44,7 +44,7 @@ from gsmap.stream import shift_origin, sorted_along_morton_curve
 from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Sim3, Thinning
 from gsmap.types.gaussians import FIELDS
 from gsmap.types.progress import Progress
-from gsmap.types.source import origin_of_source
+from gsmap.types.source import ChunkSource, origin_of_source
 
 KIND = "scenes"
 _SIGMAS = 3.0
@@ -391,6 +391,28 @@ class Scenes:
                 return self._fields(row, files, [name], [(start, stop)])[name]
 
         return StoredGaussians(row.num_gaussians, row.sh_degree, read, column)
+
+    def chunks(self, ref: str) -> ChunkSource:
+        """Return a scene's Gaussians (Morton order), to be read chunk by chunk.
+
+        Raises:
+            CorruptError, NotFoundError: as `gaussians`, now or when they are read.
+        """
+        with self._catalog.read() as connection:
+            row = find(connection, ref)
+            files = _manifest(connection, row)
+            boxes = get_boxes(connection, row.number)
+        if len(boxes) != -(-row.num_gaussians // CHUNK_ROWS):
+            raise CorruptError(
+                f"scene {row.name!r} lacks the boxes of its chunks: run gsmap check, and ingest it again",
+                code="arrays_corrupt",
+            )
+
+        def read(ranges: Sequence[tuple[int, int]]) -> Gaussians:
+            with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
+                return self._read(row, files, ranges)
+
+        return ChunkSource(row.num_gaussians, boxes, CHUNK_ROWS, read)
 
     def _read(
         self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -63,3 +64,20 @@ def gathered(source: GaussianSource, name: str, rows: np.ndarray) -> np.ndarray:
         start += len(column)
     found: np.ndarray = np.concatenate(out)
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkSource:
+    """Stored chunks of the N Gaussians of a scene.
+
+    Args:
+        num_gaussians: N.
+        boxes: (C, 2, 3) boxes around the chunks in stored order, extended by three standard deviations along each axis.
+        rows: number of Gaussians of a chunk; the last chunk may have fewer.
+        read: reads ranges ``[start, stop)`` of rows.
+    """
+
+    num_gaussians: int
+    boxes: np.ndarray
+    rows: int
+    read: Callable[[Sequence[tuple[int, int]]], Gaussians]

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gsmap.geometry.sh import rgb_of_sh0
+from gsmap.geometry.voxels import reached_box
 from gsmap.render import ChunkIndex, GaussianTensors, render
+from gsmap.render.chunked import ChunkedGaussians
 from gsmap.types import Cameras, Gaussians
+from gsmap.types.source import ChunkSource
 
 
 def site(n: int, seed: int, largest: float) -> Gaussians:
@@ -18,18 +22,25 @@ def site(n: int, seed: int, largest: float) -> Gaussians:
     return Gaussians(means, rng.normal(size=(n, 4)), log_scales, rng.normal(size=n) * 2, rng.normal(size=(n, 1, 3)))
 
 
+def some_cameras(count: int) -> list[Cameras]:
+    """Cameras inside and around the site, from fisheye-like to narrow."""
+    rng = np.random.default_rng(1)
+    found = []
+    for _ in range(count):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("yxz", rng.uniform(-1, 1, 3) * [np.pi, 0.3, 0.2]).as_matrix()
+        T[:3, 3] = rng.uniform(-1, 1, 3) * [22, 1.5, 22]
+        focal = rng.uniform(30, 120)
+        found.append(Cameras(T[None], [[focal, 1.1 * focal, 40, 21]], [[64, 48]]))
+    return found
+
+
 @pytest.mark.parametrize("largest", [-3.0, 0.5, 3.0])
 def test_index_changes_no_bit(largest):
     gaussians = site(30_000, 0, largest)
     index = ChunkIndex.build(gaussians, chunk=100)
-    rng = np.random.default_rng(1)
     skipped = 0
-    for _ in range(12):
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("yxz", rng.uniform(-1, 1, 3) * [np.pi, 0.3, 0.2]).as_matrix()
-        T[:3, 3] = rng.uniform(-1, 1, 3) * [22, 1.5, 22]
-        focal = rng.uniform(30, 120)  # from fisheye-like to narrow
-        cameras = Cameras(T[None], [[focal, 1.1 * focal, 40, 21]], [[64, 48]])
+    for cameras in some_cameras(12):
         all_, some = render(gaussians, cameras), render(gaussians, cameras, index=index)
         for name in ("colour", "depth", "alpha", "dominant_id"):
             assert np.array_equal(getattr(all_, name), getattr(some, name)), name
@@ -62,3 +73,34 @@ def test_index_ignores_rows_with_nan():
     a, b = render(broken, cameras), render(broken, cameras, index=ChunkIndex.build(broken, chunk=50))
     assert np.array_equal(a.colour, b.colour)
     assert a.alpha.any()
+
+
+@pytest.mark.parametrize("largest", [-3.0, 0.5, 3.0])
+def test_chunks_that_are_read_when_seen_change_no_bit(largest):
+    gaussians, rows, reads = site(30_000, 4, largest), 1024, []
+
+    def read(ranges):
+        reads.extend(ranges)
+        return gaussians[np.concatenate([np.zeros(0, int), *(np.arange(a, b) for a, b in ranges)])]
+
+    boxes = np.array([reached_box(gaussians[a : a + rows], 3.0) for a in range(0, len(gaussians), rows)])
+    chunked = ChunkedGaussians(ChunkSource(len(gaussians), boxes, rows, read))
+    reads_of_first = 0
+    for cameras in some_cameras(6):
+        some, index = chunked.seen_from(cameras)
+        reads_of_first = reads_of_first or sum(b - a for a, b in reads)
+        a, b = render(gaussians, cameras), render(some, cameras, index=index)
+        for name in ("colour", "depth", "alpha", "dominant_id"):
+            assert np.array_equal(getattr(a, name), getattr(b, name)), name
+    covered = [row for a, b in reads for row in range(a, b)]
+    assert len(covered) == len(set(covered))  # no row is read twice
+    if largest < 0:
+        assert reads_of_first < len(gaussians)
+
+
+def test_positions_as_colours_are_those_of_the_rows_that_were_read():
+    gaussians = site(5000, 5, -2.0)
+    chunked = ChunkedGaussians.of(gaussians)
+    coloured, _ = chunked.coloured_by_position(some_cameras(1)[0])
+    low, high = chunked.box
+    assert np.allclose(rgb_of_sh0(coloured.sh[:, 0]) * (high - low) + low, gaussians.means, atol=1e-4)

@@ -164,6 +164,22 @@ def test_what_lies_within_bounds_is_read_and_of_chunks_without_any_only_means(st
     np.testing.assert_array_equal(rows(store.scenes.gaussians_within("a", box)), rows(compact[within]))
 
 
+def test_chunks_are_read_by_ranges_and_lie_in_their_boxes(store):
+    g = make_gaussians(3 * CHUNK_ROWS + 7)
+    store.scenes.add(g, make_cameras(), name="a")
+    for _ in range(2):
+        whole, found = store.scenes.gaussians("a"), store.scenes.chunks("a")
+        assert (found.num_gaussians, found.rows, len(found.boxes)) == (len(g), CHUNK_ROWS, 4)
+        low, high = found.boxes[:, 0], found.boxes[:, 1]
+        chunk = np.arange(len(g)) // CHUNK_ROWS
+        assert (whole.means >= low[chunk]).all()
+        assert (whole.means <= high[chunk]).all()
+        part = found.read([(0, CHUNK_ROWS), (3 * CHUNK_ROWS, len(g))])
+        expected = whole[np.r_[0:CHUNK_ROWS, 3 * CHUNK_ROWS : len(g)]]
+        np.testing.assert_array_equal(rows(part), rows(expected))
+        store.scenes.thin("a", np.ones(len(g), bool))
+
+
 def test_bounds_read_few_chunks(store, monkeypatch):
     store.scenes.add(make_gaussians(8 * CHUNK_ROWS), make_cameras(), name="a")
     asked = []

@@ -32,6 +32,7 @@ from gsmap.types import Gaussians, PoseGraph, Scene
 from gsmap.types.localization import LocalizationResult, Photo, SceneFeatures
 from gsmap.types.progress import StageProgress
 from gsmap.types.segments import InMemory
+from gsmap.types.source import ChunkSource
 
 _Said = TypeVar("_Said")
 _log = logging.getLogger("gsmap.map")
@@ -112,6 +113,7 @@ class Localizer:
                 poses[scene].covariance,
                 partial(self._gaussians, scene),
                 partial(self._features, scene),
+                partial(self._chunks, scene),
             )
             for scene in self.scenes
         }
@@ -184,6 +186,10 @@ class Localizer:
     def _gaussians(self, scene: str) -> Gaussians:
         self._use(scene)
         return self.store.scenes.gaussians(scene)
+
+    def _chunks(self, scene: str) -> ChunkSource:
+        self._use(scene)
+        return self.store.scenes.chunks(scene)
 
     def _features(self, scene: str) -> SceneFeatures:
         self._use(scene)
