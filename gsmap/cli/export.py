@@ -24,7 +24,7 @@ from gsmap.cli.console import (
 )
 from gsmap.cli.thin import parse_size
 
-_SURVEY_SUFFIXES = (".las", ".laz", ".tif", ".tiff", ".geojson")
+_SURVEY_SUFFIXES = (".las", ".laz", ".tif", ".tiff", ".geojson", ".dxf")
 
 
 class Purpose(StrEnum):
@@ -43,7 +43,7 @@ def command(
         str,
         typer.Argument(
             metavar="OUT",
-            help="Folder to write, which a later export to it updates; or a file .las, .laz, .tif or .geojson.",
+            help="Folder to write, which a later export to it updates; or a file .las, .laz, .tif, .geojson or .dxf.",
         ),
     ],
     format: Annotated[
@@ -149,7 +149,8 @@ def command(
     """Write the merged map, one file per component or tiles. Only files that changed since the last export to OUT are
     made, and a further format or OUT merges nothing again.
 
-    If OUT ends in .las, .laz (points), .tif (orthophoto) or .geojson (floor plan), it is one file in world coordinates.
+    If OUT ends in .las, .laz (points), .tif (orthophoto), .geojson or .dxf (floor plan), it is one file in world
+    coordinates.
 
     Example: `gsmap export site.gsmap house`, then `gsmap export site.gsmap tiles --format 3dtiles`
     """

@@ -1,9 +1,10 @@
-"""Write point clouds (LAS, LAZ), orthophotos (GeoTIFF) and floor plans (GeoJSON), as surveyors hand them over."""
+"""Write point clouds (LAS, LAZ), orthophotos (GeoTIFF) and floor plans (GeoJSON, DXF), as surveyors hand them over."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,14 +21,21 @@ _FAR = 300.0  # height of the camera in sizes of the picture: rays are parallel 
 _BLOCK_PX = 2048
 _MODEL_PIXEL_SCALE, _MODEL_TIEPOINT, _GEO_KEYS, _GEO_TEXT = 33550, 33922, 34735, 34737
 _DOUBLE, _SHORT, _TEXT = 12, 3, 2
+_DXF_UNITS = {1.0: 6, 0.3048: 2, 0.3048006: 21}  # $INSUNITS: metres, feet, US survey feet
+_NOT_IN_LAYERS = re.compile(r'[<>/\\":;?*|=`,\x00-\x1f]')
 
 
-def require_points_library(path: Path) -> None:
-    """Raise an error if LAS files cannot be written.
+def require_library(path: Path) -> None:
+    """Raise an error if a file cannot be written for want of a library.
 
     Raises:
-        MissingDependencyError: laspy or lazrs is not installed.
+        MissingDependencyError: laspy or lazrs (.las, .laz), or ezdxf (.dxf) is not installed.
     """
+    suffix = path.suffix.lower()
+    if suffix == ".dxf" and not importlib.util.find_spec("ezdxf"):
+        raise MissingDependencyError(f"{path}: .dxf is written by ezdxf, which is not installed", extra="dxf")
+    if suffix not in (".las", ".laz"):
+        return
     if not all(importlib.util.find_spec(name) for name in ("laspy", "lazrs")):
         raise MissingDependencyError(f"{path}: .las and .laz are written by laspy, which is not installed", extra="las")
 
@@ -164,6 +172,28 @@ def write_geojson(path: Path, features: Iterable[tuple[dict[str, Any], list[list
         ],
     }
     path.write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
+
+
+def write_dxf(path: Path, features: Iterable[tuple[dict[str, Any], list[list[np.ndarray]]]], unit_m: float) -> None:
+    """Write the rings of polygons as closed polylines of a DXF drawing (R2010), with one layer for each feature.
+
+    Args:
+        features: properties, and polygons of rings (K, 2) of eastings and northings. Layers are named by ``kind`` and
+            ``scene``.
+        unit_m: metres per unit of the rings.
+    """
+    import ezdxf
+
+    drawing = ezdxf.new("R2010", units=_DXF_UNITS.get(round(unit_m, 7), 0))
+    space = drawing.modelspace()
+    for properties, polygons in features:
+        words = [str(properties[name]) for name in ("kind", "scene") if name in properties]
+        layer = _NOT_IN_LAYERS.sub("_", " ".join(words))
+        if layer not in drawing.layers:
+            drawing.layers.add(layer)
+        for ring in (ring for polygon in polygons for ring in polygon):
+            space.add_lwpolyline(ring.tolist(), close=True, dxfattribs={"layer": layer})
+    drawing.saveas(path, encoding="utf-8")
 
 
 def pixel_size(extent: np.ndarray, wanted: float | None, longest_px: int, most_px: int) -> float:

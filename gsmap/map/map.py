@@ -775,7 +775,7 @@ class Map(AbstractContextManager["Map"]):
 
         Args:
             out: ``.las`` or ``.laz`` (points with colours), ``.tif`` (an orthophoto as GeoTIFF, without ceilings), or
-                ``.geojson`` (footprints of scenes, and a cross section of walls).
+                ``.geojson`` or ``.dxf`` (footprints of scenes, and a cross section of walls).
             crs: CRS of the file; default: that of the map.
             pixel_size: side of a pixel of an orthophoto, in the unit of the CRS; default: 1, 2 or 5 times a power of
                 ten, for at most 8192 pixels on a side.
@@ -784,7 +784,7 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: no component is georeferenced.
             ConfigError: several are, and none was chosen; or options that do not fit the kind of file.
-            MissingDependencyError: laspy is not installed.
+            MissingDependencyError: laspy or ezdxf is not installed.
         """
         from gsmap.map.stages.export import Request
         from gsmap.map.stages.survey_export import SurveyOptions, export_survey

@@ -90,6 +90,11 @@ class Crs:
         return self._horizontal.to_epsg() if self._horizontal.is_projected else None
 
     @property
+    def unit_m(self) -> float:
+        """Metres per unit of eastings and northings; radians per unit of longitude and latitude."""
+        return float(self._horizontal.axis_info[0].unit_conversion_factor)
+
+    @property
     def has_own_heights(self) -> bool:
         """True if heights are in a system of the CRS (a geoid, a tide) rather than above the ellipsoid."""
         return bool(self.named.is_compound or self.named.is_vertical)

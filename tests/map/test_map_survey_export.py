@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from pyproj import Transformer
 
 import gsmap
 from gsmap.errors import ConfigError, NotFoundError
@@ -132,6 +133,32 @@ def test_a_floor_plan_has_footprints_in_longitude_and_latitude(tied: Path, site:
         middle = S.apply(np.zeros((1, 3)))[0, :2]
         assert (local.min(0) < middle + 3).all()
         assert (local.max(0) > middle - 3).all()
+
+
+def test_a_drawing_has_the_floor_plan_in_the_crs(tied: Path, site: Site, tmp_path: Path) -> None:
+    import ezdxf
+
+    with gsmap.map.open(tied) as m:
+        m.export_survey(tmp_path / "plan.geojson", merge="union")
+        m.export_survey(tmp_path / "plan.dxf", merge="union")
+        with raises(ConfigError, code="unsupported_crs"):
+            m.export_survey(tmp_path / "plan.dxf", crs="EPSG:4326")
+    plan = json.loads((tmp_path / "plan.geojson").read_text())
+    drawing = ezdxf.readfile(tmp_path / "plan.dxf")
+    assert drawing.units == 6
+    assert not drawing.audit().errors
+    lines = list(drawing.modelspace().query("LWPOLYLINE"))
+    assert all(line.closed for line in lines)
+    to_utm = Transformer.from_crs("EPSG:4326", "EPSG:25832", always_xy=True)
+    for name in site.names:
+        (feature,) = (f for f in plan["features"] if f["properties"].get("scene") == name)
+        ring = np.array(feature["geometry"]["coordinates"][0][0])[:-1]
+        expected = np.stack(to_utm.transform(*ring.T), axis=1)
+        drawn = [np.array(line.get_points("xy")) for line in lines if line.dxf.layer == f"footprint {name}"]
+        assert min(np.abs(one - expected).max() for one in drawn if one.shape == expected.shape) < 1e-3
+    about = [feature["properties"] for feature in plan["features"]]
+    named = {" ".join(one[key] for key in ("kind", "scene") if key in one) for one in about}
+    assert {line.dxf.layer for line in lines} == named
 
 
 def test_a_map_without_a_place_is_refused(site: Site, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,7 +17,8 @@ from gsmap.export.survey_files import (
     pixel_size,
     polygons_of,
     render_orthophoto,
-    require_points_library,
+    require_library,
+    write_dxf,
     write_geojson,
     write_geotiff,
     write_points,
@@ -37,7 +39,11 @@ from gsmap.types.world import WorldFrame
 from gsmap.world.crs import WGS84, crs
 from gsmap.world.frame import from_frame
 
-KINDS = {".las": "points", ".laz": "points", ".tif": "orthophoto", ".tiff": "orthophoto", ".geojson": "floor plan"}
+KINDS = {
+    **dict.fromkeys((".las", ".laz"), "points"),
+    **dict.fromkeys((".tif", ".tiff"), "orthophoto"),
+    **dict.fromkeys((".geojson", ".dxf"), "floor plan"),
+}
 """Kind of file by suffix."""
 
 _SOLID = 0.3  # opacity from which a Gaussian is a point of the surface
@@ -55,7 +61,7 @@ class SurveyOptions:
     """Options of a survey export.
 
     Args:
-        crs: CRS of the file; None for that of the map. A floor plan is in longitude and latitude (WGS 84) always.
+        crs: CRS of the file; None for that of the map. GeoJSON is in longitude and latitude (WGS 84) always.
         pixel_size: side of a pixel of an orthophoto, in the unit of the CRS; None for at most 8192 pixels on a side.
     """
 
@@ -84,13 +90,12 @@ def export_survey(
     kind = KINDS[out.suffix.lower()]
     if options.pixel_size is not None and kind != "orthophoto":
         raise ConfigError(f"--pixel-size applies to orthophotos (.tif), not to a {kind}", code="option_not_applicable")
-    if options.crs is not None and kind == "floor plan":
+    if options.crs is not None and out.suffix.lower() == ".geojson":
         raise ConfigError(
             "--crs does not apply to GeoJSON, whose coordinates are longitude and latitude (RFC 7946)",
             code="option_not_applicable",
         )
-    if kind == "points":
-        require_points_library(out)
+    require_library(out)
     planned = plan(store, replace(request, format="ply", up="z"), settings, known)
     component, placed = _component(planned, request.component)
     planned = replace(planned, tiles=[tile for tile in planned.tiles if tile.component == component])
@@ -104,7 +109,8 @@ def export_survey(
         if kind == "orthophoto":
             notes = _write_orthophoto(out, whole, eyes, placed, system, options.pixel_size)
         else:
-            notes = _write_floor_plan(out, whole, eyes, placed, _footprints(store, planned, placed))
+            to = WGS84 if out.suffix.lower() == ".geojson" else system
+            notes = _write_floor_plan(out, whole, eyes, placed, to, _footprints(store, planned, placed))
     of_tiles = world_notes(planned.world, planned.recipe.format, planned.recipe.up)
     return (*(note for note in planned.notes if note not in of_tiles), *notes)
 
@@ -236,21 +242,30 @@ def _write_floor_plan(
     whole: Gaussians,
     eyes: np.ndarray,
     placed: GeoreferencedComponent,
+    system: str,
     footprints: Iterator[tuple[dict[str, object], Sequence[np.ndarray]]],
 ) -> tuple[str, ...]:
-    def geographic(ring: np.ndarray) -> np.ndarray:
-        return from_frame(placed.frame, np.c_[ring, np.zeros(len(ring))], WGS84)[:, :2]
+    here, is_drawing = crs(system), system != WGS84
+    if is_drawing and here.projected_epsg is None:
+        raise ConfigError(
+            f"a drawing needs a projected CRS with an EPSG code, and {here.text} is none: choose one with --crs",
+            code="unsupported_crs",
+        )
+
+    def in_crs(ring: np.ndarray) -> np.ndarray:
+        return from_frame(placed.frame, np.c_[ring, np.zeros(len(ring))], system)[:, :2]
 
     features = []
     for properties, found in (*footprints, *_walls(whole, eyes)):
-        polygons = [[geographic(ring) for ring in polygon] for polygon in polygons_of(found)]
+        polygons = [[in_crs(ring) for ring in polygon] for polygon in polygons_of(found)]
         if polygons:
             features.append((properties, polygons))
-    write_output(out, lambda path: write_geojson(path, features))
+    write = partial(write_dxf, unit_m=here.unit_m) if is_drawing else write_geojson
+    write_output(out, lambda path: write(path, features))
     kinds = [properties["kind"] for properties, _ in features]
     return (
         f"{kinds.count('footprint')} footprints of scenes and {kinds.count('walls')} cross section of walls, in "
-        "longitude and latitude (WGS 84)",
+        + (here.text if is_drawing else "longitude and latitude (WGS 84)"),
     )
 
 
