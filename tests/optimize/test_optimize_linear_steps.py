@@ -16,7 +16,7 @@ from gsmap.optimize.measurements import Measurements, measurements
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import chordal
 from gsmap.optimize.state import State
-from gsmap.types import Edge
+from gsmap.types import Edge, Sim3
 
 
 @pytest.mark.guards("answers")
@@ -61,6 +61,24 @@ def test_poses_of_unknown_scale_follow_from_exact_edges() -> None:
     np.testing.assert_allclose(found.log_scales, truth.log_scales, atol=1e-9)
     np.testing.assert_allclose(found.translations, truth.translations, atol=1e-8)
     np.testing.assert_allclose(found.rotations, truth.rotations, atol=1e-8)
+
+
+@pytest.mark.guards("answers")
+def test_edges_of_scenes_with_other_units_count_by_their_sigmas_in_the_map() -> None:
+    """Sigmas are in the unit of an edge's source: two edges that contradict each other meet at their weighted mean."""
+    scale, sigma, apart = 4.0, 0.1, np.array([1.0, -2.0, 0.5])
+    known, places = Similarities.identity(3), np.array([[0.0, 0, 0], [10.0, 0, 0]])
+    known = Similarities(known.rotations, np.vstack([places, np.zeros((1, 3))]), np.log([1.0, 1.0, scale]))
+    at = Sim3(np.eye(3), np.array([4.0, 5.0, 6.0]), scale)
+    information = np.diag([1e4] * 3 + [sigma**-2] * 3 + [1e6])
+    edges = [
+        Edge("s0", "s2", known.item(0).inverse() @ at, information),
+        Edge("s2", "s1", Sim3(at.rotation, at.translation + apart, scale).inverse() @ known.item(1), information),
+    ]
+    m = measurements(["s0", "s1", "s2"], edges, rigid=False)
+    found = chordal(m, np.arange(3) < 2, known)
+    weights = np.array([(sigma * scale) ** -2, sigma**-2])  # the sources are s2, four times as large, and s1
+    np.testing.assert_allclose(found.translations[2], at.translation + apart * weights[1] / weights.sum(), atol=1e-9)
 
 
 def graph_of(pairs: list[tuple[int, int]], count: int, confirmed: tuple[int, ...] = ()) -> Measurements:

@@ -158,8 +158,9 @@ def test_three_points_tie_a_map_and_say_that_nothing_checks_them() -> None:
 def test_a_scale_bar_alone_gives_the_metre_and_nothing_else() -> None:
     site = surveyed_site(6, SMALL)
     a, b = site.names[0], site.names[3]
-    length = float(np.linalg.norm(site.truth[0].translation - site.truth[3].translation))
-    bar = ScaleBar("bar", (a, b), np.zeros((2, 3)), (1e-3, 1e-3), length, 0.002)
+    ends = np.array([[0.5, -3.0, 0.25], [-2.0, 1.0, 4.0]])  # each in its scene's frame
+    length = float(np.linalg.norm(site.truth[0].apply(ends[0]) - site.truth[3].apply(ends[1])))
+    bar = ScaleBar("bar", (a, b), ends, (1e-3, 1e-3), length, 0.002)
     _, tie = solved(site, Survey(bars=(bar,)))
     assert tie.S_world_map is None
     assert tie.metres_per_unit == pytest.approx(0.5, rel=1e-3)
