@@ -86,20 +86,22 @@ class ChunkedGaussians:
 
     def _read(self, chunks: np.ndarray) -> None:
         """Read chunks into the arrays, and add them to the fine index."""
-        ranges = [(int(a), int(b)) for a, b in join_ranges(self._coarse.starts, chunks)]
-        found = self._source.read(ranges)
-        if self._gaussians is None:
-            n = self._source.num_gaussians
-            shapes = {name: (n, *getattr(found, name).shape[1:]) for name in FIELDS}
-            self._gaussians = Gaussians(**{name: np.empty(shape, np.float32) for name, shape in shapes.items()})
-        at = 0
-        for start, stop in ranges:
-            part = found[at : at + stop - start]
-            at += stop - start
-            for name in FIELDS:
-                getattr(self._gaussians, name)[start:stop] = getattr(part, name)
-            built, first = ChunkIndex.build(part, _ROWS), start // _ROWS
-            for name in ("low", "high", "radius"):
-                values = getattr(built, name)
-                getattr(self._fine, name)[first : first + len(values)] = values
+        if not len(chunks):
+            self._put(self._source.read([]), 0)
+        for start, stop in self._coarse.starts[np.stack([chunks, chunks + 1], axis=1)].tolist():
+            # One at a time, so that the memory of one chunk is used again for the next.
+            self._put(self._source.read([(start, stop)]), start)
         self._is_read[chunks] = True
+
+    def _put(self, part: Gaussians, start: int) -> None:
+        """Copy a chunk to the rows from ``start`` on."""
+        n, stop = self._source.num_gaussians, start + len(part)
+        if self._gaussians is None:
+            shapes = {name: (n, *getattr(part, name).shape[1:]) for name in FIELDS}
+            self._gaussians = Gaussians(**{name: np.empty(shape, np.float32) for name, shape in shapes.items()})
+        for name in FIELDS:
+            getattr(self._gaussians, name)[start:stop] = getattr(part, name)
+        built, first = ChunkIndex.build(part, _ROWS), start // _ROWS
+        for name in ("low", "high", "radius"):
+            values = getattr(built, name)
+            getattr(self._fine, name)[first : first + len(values)] = values
