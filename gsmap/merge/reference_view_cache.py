@@ -22,7 +22,7 @@ import numpy as np
 
 from gsmap.geometry.boxes import inside, moved_box
 from gsmap.methods import text_digest
-from gsmap.render import render
+from gsmap.render import ChunkIndex, render
 from gsmap.types import Cameras, Gaussians, Sim3
 
 _CAN_BE_HELD = 256 << 20
@@ -197,7 +197,7 @@ class SceneReferenceViews:
     store: ReferenceViewCache
 
     @cached_property
-    def _nearby(self) -> RegionCache[tuple[Gaussians, np.ndarray]]:
+    def _nearby(self) -> RegionCache[tuple[Gaussians, ChunkIndex, np.ndarray]]:
         return RegionCache(self._with_keys, self.around)
 
     def of(self, camera: int) -> ReferenceView:
@@ -210,9 +210,9 @@ class SceneReferenceViews:
         return self._nearby.cell(self.cameras.centers[camera])
 
     def _seen(self, camera: int) -> ReferenceView:
-        gaussians, keys = self._nearby.of(self.cameras.centers[camera])
+        gaussians, index, keys = self._nearby.of(self.cameras.centers[camera])
         view = self.cameras[camera].resized(self.longest_side_px)
-        seen = render(gaussians, view, max_weight=True)
+        seen = render(gaussians, view, max_weight=True, index=index)
         dominant = seen.dominant_id[0]
         pixels = np.bincount(dominant[dominant >= 0], minlength=len(gaussians))
         rows = np.flatnonzero(seen.max_weight > 0)
@@ -222,10 +222,11 @@ class SceneReferenceViews:
             _box_of(view, depth), keys[rows], pixels[rows].astype(np.int32), seen.max_weight[rows], depth
         )
 
-    def _with_keys(self, box: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    def _with_keys(self, box: np.ndarray) -> tuple[Gaussians, ChunkIndex, np.ndarray]:
+        """Return the Gaussians in a box without view-dependent colour, which views do not keep, and their keys."""
         found = self.load(box)
-        found = found[inside(found.means, box)]
-        return found, keys_of(found.means)
+        found = found.degree_0(inside(found.means, box))
+        return found, ChunkIndex.build(found), keys_of(found.means)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from gsmap.merge import photos
 from gsmap.merge.changes import ResolvedScenes, newest_first
 from gsmap.merge.overlap import share_in_view
 from gsmap.merge.reference_view_cache import surface_axes
-from gsmap.render import Rendering, render
+from gsmap.render import ChunkIndex, Rendering, render
 from gsmap.types import Cameras, Gaussians, PosedScene
 from gsmap.types.progress import Progress
 
@@ -105,6 +105,11 @@ def render_references(
     todo.sort(
         key=lambda one: (one[0], () if (shared := reference_views[one[0]]) is None else shared.cell(one[1]), one[1])
     )
+    indices = [ChunkIndex.build(piece) for piece in pieces]
+    whole_indices = [
+        index if piece is scene.gaussians else ChunkIndex.build(scene.gaussians)
+        for index, piece, scene in zip(indices, pieces, scenes, strict=True)
+    ]
     for done, (i, c, camera) in enumerate(todo):
         progress(done / len(todo), "rendering reference views")
         disputed = None
@@ -115,7 +120,7 @@ def render_references(
                 continue
             depth = shared.depth(sight)
         else:
-            seen = render(scenes[i].gaussians, camera, max_weight=True)
+            seen = render(scenes[i].gaussians, camera, max_weight=True, index=whole_indices[i])
             disputed = settled.outdated_pixels(i, camera) if settled is not None and settled.is_disputed(i) else None
             _count(seen, disputed, pixels[i], sure[i], largest[i])
             depth = seen.depth[0]
@@ -128,7 +133,7 @@ def render_references(
         if shared is None and pieces[i] is scenes[i].gaussians:
             colour, alpha = seen.colour[0][window], seen.alpha[0][window]
         else:
-            local = render(pieces[i], _cropped(camera, window), depth=False, dominant_id=False)
+            local = render(pieces[i], _cropped(camera, window), depth=False, dominant_id=False, index=indices[i])
             colour, alpha = local.colour[0], local.alpha[0]
         weight = alpha * counts[window]
         share = float(weight.sum() / counts.size)

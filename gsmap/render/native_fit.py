@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gsmap._native import fit_step, image_loss
@@ -37,6 +39,7 @@ class NativeFitter(Fitter):
         super().__init__(gaussians, learning_rates, options=options)
         self._background = np.asarray(self.options.background, np.float32)
         self._views: list[native.View] = []
+        self._pixels = np.empty(0, np.float32)  # memory of images, which is used again: new pages must be cleared
         self._set([a.copy() for a in native.arrays_of(gaussians)])
         self._moments = [[np.zeros_like(a) for a in self._values] for _ in range(2)]
         self._updates = np.zeros(len(self), np.uint32)
@@ -70,10 +73,9 @@ class NativeFitter(Fitter):
             return 0.0
         while len(self._views) < count:
             self._views.append(native.View())
-        out = native.allocate(count, height, width, 0, False, False, False)
         counted = self._statistics if options.statistics else None
+        out, gradient = self._images(count, height, width)
         out["max_weight"] = None if counted is None else counted.max_weight
-        gradient = np.empty_like(out["colour"])
         arrays = tuple(self._values)
         loss = 0.0
         for i in range(count):
@@ -112,6 +114,17 @@ class NativeFitter(Fitter):
             seen=None if counted is None else counted.seen,
         )
         return loss
+
+    def _images(self, count: int, height: int, width: int) -> tuple[dict[str, Any], np.ndarray]:
+        """Return images by name as in `native.allocate`, and (V, H, W, 3) for gradients; all undefined."""
+        n = count * height * width
+        if len(self._pixels) < 7 * n:
+            self._pixels = np.empty(7 * n, np.float32)
+        shape = (count, height, width)
+        colour, gradient, alpha = np.split(self._pixels[: 7 * n], [3 * n, 6 * n])
+        images: dict[str, Any] = dict.fromkeys(("depth", "dominant_id", "max_weight"))
+        images |= {"colour": colour.reshape(*shape, 3), "alpha": alpha.reshape(shape)}
+        return images, gradient.reshape(*shape, 3)
 
     def keep(self, rows: np.ndarray) -> None:
         self._moments = [[a[rows] for a in moment] for moment in self._moments]
